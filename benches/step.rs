@@ -32,12 +32,12 @@ use gsscale::render::{
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
-use gsscale::train::batch::HostRows;
-use gsscale::train::catch_up::{gather, visible_rows};
-use gsscale::train::comparison::Comparison;
-use gsscale::train::pages::{PagedScene, row_tables};
-use gsscale::train::step::train_step;
-use gsscale::train::working_set::WorkingSet;
+use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::catch_up::{gather, visible_rows};
+use gsscale::train::step::comparison::Comparison;
+use gsscale::train::step::pages::{PagedScene, row_tables};
+use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::working_set::WorkingSet;
 use serde_json::json;
 use std::time::{Duration, Instant};
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};

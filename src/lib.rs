@@ -55,14 +55,14 @@
 //!    ([`config::key::Class`]).
 //! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
 //! 3. `config/limits.rs`: the options of the room that obeys the key. No room but `train` sees the config.
-//! 4. `train/changes.rs`, `BEFORE_ITS_TIME`: if older programs did what one value of the key says. Otherwise a run that they
+//! 4. `train/run/changes.rs`, `BEFORE_ITS_TIME`: if older programs did what one value of the key says. Otherwise a run that they
 //!    began resumes only with `--accept-changes`.
 //! 5. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
 //!    file again. `tests/programs/cli.rs` lists the words of all enumerations.
 //!
 //! **A setting that one backend lacks**
 //! 1. `render/mod.rs`: a method of [`render::Renderer`] whose default refuses, an error with its remedy; `weigh_rows` is the example.
-//! 2. `train/run.rs`, `begin`: asks the renderer before the output folder exists.
+//! 2. `train/run/begin.rs`, `begin`: asks the renderer before the output folder exists.
 //!
 //! **A densification strategy**
 //! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
@@ -71,11 +71,11 @@
 //!    strategy.
 //!
 //! **A loss term, or another correction of the picture than [`appearance`]**
-//! 1. `train/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
+//! 1. `train/step/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
 //!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
-//!    it needs is a field of [`train::comparison::Comparison`].
-//! 2. `train/trainer.rs` and `train/first_look.rs`: fill that field, for steps and for the first rehearsal.
-//! 3. `train/step.rs`, after `loss_value`: adds the term to the loss that is logged.
+//!    it needs is a field of [`train::step::comparison::Comparison`].
+//! 2. `train/state/trainer.rs` and `train/preflight/first_look.rs`: fill that field, for steps and for the first rehearsal.
+//! 3. `train/step/train_step.rs`, after `loss_value`: adds the term to the loss that is logged.
 //! 4. The weight is a config key; parameters that are trained are a resumable value.
 //! 5. A term of the picture and the photo alone, for the CPU only or where its time matters: instead the stage itself,
 //!    `kernels/image_loss.rs`, its options in `LossOptions`, and `image_loss.wgsl` among the shaders. Masked pixels do not count.
@@ -91,7 +91,7 @@
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and
 //!    `decode`, a new `VERSION`, and in `check` which values are impossible.
-//! 2. `train/trainer.rs`: uses `self.state`. Commits and resumes need no change.
+//! 2. `train/state/trainer.rs`: uses `self.state`. Commits and resumes need no change.
 //! 3. `tests/programs/ckpt/fixture.rs` says how the store that later versions must open is written again.
 //!
 //! **An eviction order**

@@ -9,8 +9,8 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::render::lpips::InputRange;
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::eval::{EvalExtras, evaluate_ply};
-use gsscale::train::facts::read_resolved;
+use gsscale::train::log::facts::read_resolved;
+use gsscale::train::state::eval::{EvalExtras, evaluate_ply};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

@@ -10,12 +10,12 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::out_folder::{Existing, default_out, remedy_of_existing};
-use gsscale::train::progress::Count;
-use gsscale::train::request::{RunOutcome, RunRequest};
-use gsscale::train::restart::go_on;
-use gsscale::train::resume::{ResumeRequest, resume};
-use gsscale::train::run::run;
+use gsscale::train::log::progress::Count;
+use gsscale::train::run::begin::run;
+use gsscale::train::run::out_folder::{Existing, default_out, remedy_of_existing};
+use gsscale::train::run::request::{RunOutcome, RunRequest};
+use gsscale::train::run::restart::go_on;
+use gsscale::train::run::resume::{ResumeRequest, resume};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

@@ -16,8 +16,8 @@ use gsscale::config::limits::RunOptions;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
-use gsscale::train::catch_up::gather;
-use gsscale::train::pages::{PagedScene, row_tables};
+use gsscale::train::step::catch_up::gather;
+use gsscale::train::step::pages::{PagedScene, row_tables};
 use serde_json::{Value, json};
 use std::hint::black_box;
 

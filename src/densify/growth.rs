@@ -11,7 +11,7 @@
 //! of a view would be the children of the most important ones, and the loss would say nothing about the count.
 //! `benches/RESULTS.md` has the measurements, also of what failed.
 //!
-//! Not here: how the loss is measured (`train::leave_out`), which views are held out (`train::held_out`), which rows grow
+//! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`), which rows grow
 //! ([`super::long_axis`]).
 //!
 //! Invariants: 1. a decision is a function of the step, of the loss, and of the decisions before it, which a commit holds;

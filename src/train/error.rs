@@ -3,6 +3,7 @@
 //! This file uses no other file of the module, so that all others can use it.
 
 use crate::base::error::InputError;
+use crate::base::units::MIB;
 use crate::page::map::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::render::RenderError;
@@ -76,7 +77,31 @@ pub enum TrainError {
     },
 }
 
+impl TrainError {
+    /// Adds the name of the view to an error about missing frames.
+    pub(crate) fn with_view_name(mut self, name: &str) -> TrainError {
+        if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {
+            *what = format!("{what} ({name})");
+        }
+        self
+    }
+
+    /// Flags with which a run that lacked frames can resume; empty for other errors. They include room for more growth,
+    /// since other views may outgrow the frames next.
+    pub(super) fn memory_flags(&self) -> String {
+        match self {
+            TrainError::Outgrown { least: Some(least), .. } => {
+                format!(" --host-mem {}MiB (at least {}MiB)", (least + least / 2) / MIB, least.div_ceil(MIB))
+            }
+            TrainError::Outgrown { source: PagingError::WorkingSet { pages, .. }, .. } => {
+                format!(" --frames {pages} (at least)")
+            }
+            _ => String::new(),
+        }
+    }
+}
+
 /// Wraps an error of storing a page, so that an import can return it.
-pub(super) fn not_stored(error: &impl std::fmt::Display) -> InputError {
+pub(crate) fn not_stored(error: &impl std::fmt::Display) -> InputError {
     InputError::new("--spill-dir", format!("a page could not be stored: {error}"), "see the cause")
 }

@@ -1,76 +1,29 @@
-//! Training: the module where all others meet. Dependencies between its files have no cycle.
+//! Training: the module where all others meet. Its rooms, each of which may use those above it in the table:
 //!
-//! | task | files |
+//! | room | task |
 //! | --- | --- |
-//! | set up and run | [`request`], [`run`], `run_folder` (a run in its output folder), [`prepare`], [`start`] (first Gaussians; `gaussian_pages` from a file of any size), [`tiers`] (where pages live), [`machine`] (threads, renderer), [`signals`] (Ctrl-C) |
-//! | memory | [`memory`], [`probe`] and [`preflight`] (does the run fit: `largest_view`, `first_frames`, `drive_space`, `plan_text`), [`budget`] and `fitting` (frames of a growing scene), `outgrown` (a scene that no longer fits), [`staging`] |
-//! | one step | [`step`], `soundness` (stops a run that diverged or trains nothing), [`comparison`] (from picture to loss and back; also for `view`, which renders without a step), [`batch`] (gather, update; [`device_rows`] on a device that holds pages, [`device_tier`], `device_ahead`), [`working_set`], [`catch_up`] (cull, evaluate), `update`, `dense` (dense Adam) |
-//! | state and loop | [`pages`], [`trainer`], `save` (as a file), [`training_loop`], `look_ahead` (the plan of coming views), [`eval`], [`costs`], `growth_checks` with `held_out` and `leave_out` (how many Gaussians the scene needs) |
-//! | commits | [`checkpoint`], `first_commit` (of a run in memory), [`full_drive`], [`restart`] (after a lost device), [`resume`] with `changes` and [`dataset_print`] (may the run resume) |
-//! | results | `appearance_file`, [`out_folder`], [`report`], [`progress`], [`page_map`], [`facts`] |
-//! | stores | `ownership` (which run owns a store, who may delete it), `places`, [`first_look`] (for a plan), [`stores`] (what tools do with checkpoints) |
+//! | [`error`] | errors of training, commits and tools |
+//! | [`inputs`] | the prepared dataset, first Gaussians from files, threads and renderer of the machine |
+//! | [`log`] | metrics, progress, facts |
+//! | [`memory`] | the estimate by part, the budget of frames |
+//! | [`step`] | one step ([`step::train_step`]) and the pages under it |
+//! | [`state`] | the trainer, the plan of coming views, evaluation, how many Gaussians the scene needs |
+//! | [`commits`] | when and to which folder a run commits; full drives |
+//! | [`stores`] | whose a store is, opening one, and what `gsscale-ckpt` does with it |
+//! | [`start`] | the first scene and the tiers |
+//! | [`preflight`] | does the run fit, and what will it cost |
+//! | [`run`] | [`run::begin`], the loop, resume, restart, results |
+//!
+//! `tests/tidy.rs` holds that neither rooms nor the files of a room form a circle.
 
-mod appearance_file;
-pub mod batch;
-pub mod budget;
-pub mod catch_up;
-mod changes;
-pub mod checkpoint;
-pub mod comparison;
-pub mod costs;
-pub mod dataset_print;
-mod dense;
-mod device_ahead;
-#[cfg_attr(not(feature = "gpu"), path = "device_memory_absent.rs")]
-mod device_memory;
-pub mod device_rows;
-pub mod device_tier;
-mod drive_space;
+pub mod commits;
 pub mod error;
-pub mod eval;
-pub mod facts;
-mod first_commit;
-mod first_frames;
-pub mod first_look;
-mod fitting;
-pub mod forecast;
-pub mod full_drive;
-mod gaussian_pages;
-mod growth_checks;
-mod held_out;
-mod largest_view;
-mod leave_out;
-mod look_ahead;
-pub mod machine;
+pub mod inputs;
+pub mod log;
 pub mod memory;
-mod more_steps;
-pub mod out_folder;
-mod outgrown;
-mod ownership;
-pub mod page_map;
-pub mod pages;
-mod places;
-mod plan_text;
 pub mod preflight;
-pub mod prepare;
-pub mod probe;
-pub mod progress;
-pub mod report;
-pub mod request;
-pub mod restart;
-pub mod resume;
 pub mod run;
-mod run_folder;
-mod save;
-pub mod signals;
-mod soundness;
-pub mod staging;
 pub mod start;
+pub mod state;
 pub mod step;
 pub mod stores;
-pub mod tiers;
-pub mod trainer;
-pub mod training_loop;
-mod update;
-pub mod view;
-pub mod working_set;

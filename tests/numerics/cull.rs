@@ -18,12 +18,12 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
-use gsscale::train::batch::HostRows;
-use gsscale::train::catch_up::{evaluate_all, gather, visible_rows};
-use gsscale::train::comparison::Comparison;
-use gsscale::train::pages::PagedScene;
-use gsscale::train::step::train_step;
-use gsscale::train::working_set::WorkingSet;
+use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::catch_up::{evaluate_all, gather, visible_rows};
+use gsscale::train::step::comparison::Comparison;
+use gsscale::train::step::pages::PagedScene;
+use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::working_set::WorkingSet;
 
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();

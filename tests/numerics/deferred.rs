@@ -11,7 +11,7 @@ use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rows::{BLOCK_LANES, RowsMut, RowsNow, first_lane};
 use gsscale::scene::state::SceneState;
-use gsscale::train::catch_up;
+use gsscale::train::step::catch_up;
 
 const STEPS: u32 = 5200;
 

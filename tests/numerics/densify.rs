@@ -16,7 +16,7 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
-use gsscale::train::catch_up;
+use gsscale::train::step::catch_up;
 use std::collections::{BTreeMap, HashMap};
 
 const SEED: u64 = 11;

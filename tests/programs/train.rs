@@ -7,8 +7,8 @@ use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
-use gsscale::train::prepare::{Prepared, prepare};
-use gsscale::train::trainer::Trainer;
+use gsscale::train::inputs::prepare::{Prepared, prepare};
+use gsscale::train::state::trainer::Trainer;
 use std::path::Path;
 use tempfile::TempDir;
 

@@ -20,12 +20,12 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::page_layout::capacity_bytes;
-use gsscale::train::batch::HostRows;
-use gsscale::train::comparison::Comparison;
 use gsscale::train::error::TrainError;
-use gsscale::train::pages::PagedScene;
-use gsscale::train::step::{StepOutcome, train_step};
-use gsscale::train::working_set::WorkingSet;
+use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::comparison::Comparison;
+use gsscale::train::step::pages::PagedScene;
+use gsscale::train::step::train_step::{StepOutcome, train_step};
+use gsscale::train::step::working_set::WorkingSet;
 use std::io::ErrorKind;
 
 const STEPS: u32 = 5;

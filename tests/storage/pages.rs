@@ -20,7 +20,7 @@ use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RoundThr
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, read_page, write_page};
 use gsscale::scene::partition::{first_fill, partition};
 use gsscale::scene::state::SceneState;
-use gsscale::train::catch_up::evaluate_all;
+use gsscale::train::step::catch_up::evaluate_all;
 use std::collections::{BTreeMap, HashMap};
 
 const SEED: u64 = 11;

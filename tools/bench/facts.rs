@@ -9,9 +9,9 @@ use gsscale::scene::camera::Camera;
 use gsscale::schedule::order::Order;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
-use gsscale::train::forecast::{Reach, mean_pixels, reach};
-use gsscale::train::pages::PagedScene;
-use gsscale::train::prepare::prepare;
+use gsscale::train::inputs::prepare::prepare;
+use gsscale::train::preflight::forecast::{Reach, mean_pixels, reach};
+use gsscale::train::step::pages::PagedScene;
 use std::path::Path;
 
 /// Memory limit for choosing an order of views, bytes.

@@ -1,6 +1,6 @@
 //! `gsscale-bench run NAME --data DIR`: trains a published scene and prints our figures beside the published figures.
 //!
-//! Checks the dataset's folder, trains through `train::run` (as `gsscale-train` does), evaluates, and compares the
+//! Checks the dataset's folder, trains through `train::run::begin` (as `gsscale-train` does), evaluates, and compares the
 //! figures (`published_table`). Writes only the output folder and the pages in `--spill-dir`.
 
 use super::published_table::{Comparison, Ours};
@@ -16,12 +16,12 @@ use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::render::lpips::InputRange;
 use gsscale::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::eval::{EvalExtras, evaluate_ply};
-use gsscale::train::out_folder::Existing;
-use gsscale::train::report::Summary;
-use gsscale::train::request::RunRequest;
-use gsscale::train::run::run;
-use gsscale::train::trainer::Trainer;
+use gsscale::train::log::report::Summary;
+use gsscale::train::run::begin::run;
+use gsscale::train::run::out_folder::Existing;
+use gsscale::train::run::request::RunRequest;
+use gsscale::train::state::eval::{EvalExtras, evaluate_ply};
+use gsscale::train::state::trainer::Trainer;
 use serde_json::Value;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};

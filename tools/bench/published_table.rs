@@ -9,7 +9,7 @@ use gsscale::config::published::PublishedRun;
 use gsscale::optim::moments::Moments;
 use gsscale::render::metrics::SsimVariant;
 use gsscale::report::html::{Cell, Page};
-use gsscale::train::report::{Summary, TestMetrics};
+use gsscale::train::log::report::{Summary, TestMetrics};
 use serde_json::{Value, json};
 use std::path::Path;
 

@@ -18,7 +18,7 @@ use gsscale::report::results_log::successful_run;
 use gsscale::report::stability_page::{CLEAN, Lost, NO_REMEDY, lost, spread_of_clean, stability_page};
 use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
-use gsscale::train::prepare::prepare;
+use gsscale::train::inputs::prepare::prepare;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

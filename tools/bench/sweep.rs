@@ -17,7 +17,7 @@ use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::report::Summary;
+use gsscale::train::log::report::Summary;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};

@@ -7,7 +7,7 @@ use gsscale::base::units::{format_bytes, format_grouped, format_seconds};
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::batches::cut_views;
 use gsscale::paging::simulation::replay::WINDOW_STEPS;
-use gsscale::train::forecast::{Forecast, Reach};
+use gsscale::train::preflight::forecast::{Forecast, Reach};
 use serde_json::{Value, json};
 
 /// A line of the table.

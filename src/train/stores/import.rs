@@ -29,9 +29,9 @@ use crate::scene::partition::first_fill;
 use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
-use crate::train::gaussian_pages::{GaussianSpace, GaussianWriter};
-use crate::train::memory::host_bytes_peak;
-use crate::train::pages::PageRules;
+use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter};
+use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::step::pages::PageRules;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 

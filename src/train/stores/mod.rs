@@ -12,6 +12,8 @@ mod export;
 mod import;
 mod inspect;
 mod list;
+pub mod opened;
+pub(crate) mod ownership;
 mod salvage;
 mod start;
 mod verify;
@@ -26,9 +28,6 @@ pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 pub use start::StoredStart;
 pub use verify::{Fault, Verdict, verify};
 
-use super::error::TrainError;
-use super::facts::read_resolved;
-use super::ownership::check_owner;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
@@ -37,6 +36,9 @@ use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::report::run_files::CONFIG_FILE;
+use crate::train::error::TrainError;
+use crate::train::log::facts::read_resolved;
+use crate::train::stores::ownership::check_owner;
 use std::path::{Path, PathBuf};
 
 impl From<ReadError> for TrainError {

@@ -13,10 +13,10 @@ use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
-use crate::train::catch_up::evaluate_all;
 use crate::train::error::TrainError;
-use crate::train::pages::PagedScene;
-use crate::train::prepare::truncate_sh;
+use crate::train::inputs::prepare::truncate_sh;
+use crate::train::step::catch_up::evaluate_all;
+use crate::train::step::pages::PagedScene;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 

@@ -1,0 +1,397 @@
+//! The commits of a run: when to commit, and the state that a commit holds.
+//!
+//! A periodic commit runs beside training: a cut between two steps, its pages written during the following steps
+//! ([`crate::paging`]), then the transaction. A commit that must complete first (before a stop, at the end, on a full
+//! drive) is written at once.
+//!
+//! Invariants: 1. commits happen between steps and do not change the run; 2. a commit holds all state on which later
+//! steps depend: a run resumed from it ends with the same bytes; 3. clocks decide only when to commit; 4. a run in
+//! memory creates its checkpoint at its first commit, so a short run writes none; on a full drive such a run loses its
+//! commits and continues.
+
+use super::first_commit::FirstCommit;
+use crate::base::trace;
+use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
+use crate::checkpoint::run_state::{Origin, RunState};
+use crate::config::file::TrainConfig;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::map::commit::{CommitError, Commits};
+use crate::paging::stats::SlotSpace;
+use crate::scene::state::row_bytes;
+use crate::train::error::TrainError;
+use crate::train::log::report::MetricsLog;
+use crate::train::state::trainer::Trainer;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// A commit beside training that is not written after this time is completed at once.
+const BESIDE_SECONDS: f64 = 20.0;
+/// Least time between a commit and an early commit for space.
+const EARLY_SECONDS: f64 = 10.0;
+/// Fewer than 1/10 of the slots free counts as few.
+const FEW_FREE: u64 = 10;
+/// An early commit must free at least 1/20 of the slots.
+const WORTH_FREEING: u64 = 20;
+
+/// The commits of a run.
+#[derive(Debug)]
+pub struct Checkpoint {
+    /// `None` before the first commit of a run in memory.
+    pub(crate) commits: Option<Commits>,
+    /// Creates the store at the first commit of a run in memory.
+    first: Option<FirstCommit>,
+    /// The folder created by that first commit.
+    spill: Option<SpillDir>,
+    /// Name under which the next commit is kept.
+    name: Option<String>,
+    pub(crate) folder: PathBuf,
+    /// The run can continue without commits: all pages are in memory.
+    pub(super) is_optional: bool,
+    /// A commit found no space, and the warning was printed.
+    warned_full: bool,
+    /// How long to wait for space.
+    pub(super) full_wait: Duration,
+    /// Step at which space was last made, whether on the store's drive, and when. A second attempt at the same step
+    /// waits for space instead.
+    pub(super) space_made: Option<(u32, bool, Instant)>,
+    interval: CommitInterval,
+    started: Instant,
+    /// When the last commit became durable.
+    last: Instant,
+    last_cut: Instant,
+    beside: Option<Beside>,
+    /// How the run was started; see [`Checkpoint::set_origin`].
+    origin: Option<Origin>,
+    done: u64,
+    /// Step of the last commit.
+    last_step: Option<u32>,
+}
+
+/// A commit in progress beside training.
+#[derive(Debug)]
+struct Beside {
+    run_state: Vec<u8>,
+    step: u32,
+    cut: Instant,
+    waited: Duration,
+    /// The pager's commit seconds before this commit.
+    pager_seconds: f64,
+}
+
+impl Checkpoint {
+    /// Commits to the store in `folder` at the interval of the config; the first commit follows one interval from now.
+    pub fn new(commits: Commits, folder: &Path, config: &TrainConfig) -> Checkpoint {
+        Checkpoint { commits: Some(commits), ..Checkpoint::without(folder, config) }
+    }
+
+    /// Commits of a run in memory: the first commit creates the store with `first`.
+    pub(crate) fn later(first: FirstCommit, config: &TrainConfig) -> Checkpoint {
+        let folder = first.folder().to_path_buf();
+        Checkpoint { first: Some(first), is_optional: true, ..Checkpoint::without(&folder, config) }
+    }
+
+    fn without(folder: &Path, config: &TrainConfig) -> Checkpoint {
+        let now = Instant::now();
+        Checkpoint {
+            commits: None,
+            first: None,
+            spill: None,
+            name: None,
+            folder: folder.to_path_buf(),
+            is_optional: false,
+            warned_full: false,
+            full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
+            space_made: None,
+            interval: CommitInterval::new(config.commit_every),
+            started: now,
+            last: now,
+            last_cut: now,
+            beside: None,
+            origin: None,
+            done: 0,
+            last_step: None,
+        }
+    }
+
+    /// Sets how the run was started. Must precede the first commit.
+    pub fn set_origin(&mut self, origin: Origin) {
+        self.origin = Some(origin);
+        (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
+    }
+
+    /// Sets whether the run continues without commits on a full drive.
+    pub fn set_optional(&mut self, is_optional: bool) {
+        self.is_optional = is_optional;
+    }
+
+    /// Folder of the store, which may not exist yet.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Keeps the next commit under `name`; later commits do not replace it.
+    pub fn keep_next_as(&mut self, name: String) {
+        self.name = Some(name);
+    }
+
+    /// Whether to commit after the last step. A run in memory without commits should not: it would write all pages to a
+    /// checkpoint that is removed at once.
+    pub fn needs_last_commit(&self) -> bool {
+        self.commits.is_some()
+    }
+
+    /// Ends committing and returns the folder that the first commit of a run in memory created, if any.
+    pub fn into_folder(self) -> Option<SpillDir> {
+        self.spill
+    }
+
+    /// Whether the store has a commit since it was opened.
+    pub fn has_commit(&self) -> bool {
+        self.done > 0
+    }
+
+    /// Commits since the store was opened.
+    pub(crate) fn commits_done(&self) -> u64 {
+        self.done
+    }
+
+    /// The folder that the first commit of a run in memory created.
+    pub(crate) fn spill(&self) -> Option<&SpillDir> {
+        self.spill.as_ref()
+    }
+
+    /// Step of the last commit since the store was opened.
+    pub fn last_step(&self) -> Option<u32> {
+        self.last_step
+    }
+
+    /// Costs of the commits so far.
+    pub fn report(&self) -> CommitReport {
+        self.interval.report(self.started.elapsed().as_secs_f64())
+    }
+
+    /// Called between two steps: begins a commit if one is due, and completes one whose pages are written.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::commit`].
+    pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if self.is_optional {
+            self.interval.limit_bytes(trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64);
+        }
+        if !trainer.scene.pager.is_frozen() {
+            // A failed write abandoned it; the next step returns the error.
+            self.beside = None;
+        }
+        let result = match &self.beside {
+            // A commit named after a step must hold that step.
+            _ if self.name.is_some() => self.commit(trainer, metrics),
+            None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
+            None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
+            None if self.may_be_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
+            Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
+            _ => Ok(()),
+        };
+        self.tolerate_full_drive(result)
+    }
+
+    /// Whether an early commit for free slots is allowed. The time limit prevents a commit at every step, since slots
+    /// kept by names stay taken.
+    fn may_be_early(&self) -> bool {
+        !self.is_optional && self.last.elapsed().as_secs_f64() >= EARLY_SECONDS
+    }
+
+    fn is_time(&self) -> bool {
+        self.interval.is_due(self.last.elapsed().as_secs_f64())
+    }
+
+    /// For a run in memory, turns a lack of space into a warning; the next attempt follows one interval later.
+    fn tolerate_full_drive(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
+        match result {
+            Err(error) if self.is_optional && error.is_out_of_space() => {
+                if !std::mem::replace(&mut self.warned_full, true) {
+                    eprintln!("warning: nothing can be committed: {error}");
+                }
+                // The next commit would hold another step, so drop the name.
+                if let Some(name) = self.name.take() {
+                    eprintln!("warning: {name} is not kept");
+                }
+                self.last = Instant::now();
+                Ok(())
+            }
+            done => done,
+        }
+    }
+
+    /// Abandons the commit in progress after `why`, a lack of space; the run continues without it.
+    pub(super) fn give_up(&mut self, trainer: &mut Trainer, why: TrainError) -> Result<(), TrainError> {
+        self.beside = None;
+        trainer.scene.pager.thaw();
+        self.tolerate_full_drive(Err(why))
+    }
+
+    /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;
+    /// after a lack of space the next commit tries again.
+    fn make_first(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        let Some(first) = &self.first else { return Ok(()) };
+        match first.make(&mut trainer.scene.pager) {
+            Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
+            Err(error) if error.is_out_of_space() => return Err(error),
+            Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
+        }
+        self.first = None;
+        Ok(())
+    }
+
+    fn begin(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        let Some(origin) = &self.origin else { return Ok(()) };
+        let cut = Instant::now();
+        trainer.drain()?;
+        let pager_seconds = trainer.scene.pager.commit_seconds();
+        let state = trainer.run_state(origin, metrics.sync()?);
+        let run_state = bytes_of(&state)?;
+        trainer.scene.pager.freeze()?;
+        self.beside = Some(Beside { run_state, step: state.trainer.step, cut, waited: cut.elapsed(), pager_seconds });
+        // Without pages to write, complete the commit now.
+        if trainer.scene.pager.is_frozen_written() { self.finish(trainer) } else { Ok(()) }
+    }
+
+    fn finish(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        let Some(beside) = self.beside.take() else { return Ok(()) };
+        let began = Instant::now();
+        let pager = &mut trainer.scene.pager;
+        pager.finish_frozen()?;
+        let note = format!("step {}", beside.step);
+        let Some(commits) = &mut self.commits else { return Ok(()) };
+        let Some((_, bytes)) = pager.commit_frozen(commits, &beside.run_state, note.as_bytes())? else {
+            return Ok(());
+        };
+        let beside_steps = pager.commit_seconds() - beside.pager_seconds;
+        let waited = (beside.waited + began.elapsed()).as_secs_f64() + beside_steps;
+        self.acknowledged(beside.step, beside.cut, waited, bytes);
+        Ok(())
+    }
+
+    /// Completes the commit in progress after a step that failed half-way, so that the run loses no more than that step.
+    /// The step changed no page of the cut before the page was written.
+    ///
+    /// # Errors
+    /// A page of the cut cannot be written; earlier commits are intact.
+    pub(crate) fn finish_cut(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
+        if trainer.scene.pager.is_frozen() { self.finish(trainer) } else { Ok(()) }
+    }
+
+    /// Commits the current state at once and abandons a commit in progress.
+    ///
+    /// # Errors
+    /// The commit failed; earlier commits are intact.
+    pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        if self.origin.is_none() {
+            return Ok(());
+        }
+        let _span = trace::span("commit");
+        let cut = Instant::now();
+        trainer.drain()?;
+        self.beside = None;
+        self.make_first(trainer)?;
+        let name = self.name.clone();
+        let Some(origin) = &self.origin else { return Ok(()) };
+        let Some(commits) = &mut self.commits else { return Ok(()) };
+        let written = trainer.scene.pager.stats().bytes_written;
+        trainer.scene.pager.flush()?;
+        let state = trainer.run_state(origin, metrics.sync()?);
+        let note = format!("step {}", state.trainer.step);
+        trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
+        self.name = None;
+        let bytes = trainer.scene.pager.stats().bytes_written - written;
+        self.acknowledged(state.trainer.step, cut, cut.elapsed().as_secs_f64(), bytes);
+        Ok(())
+    }
+
+    /// As [`Checkpoint::commit`], but a lack of space is only a warning.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::commit`], except for space.
+    pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
+        match self.commit(trainer, metrics) {
+            Err(error) if error.is_out_of_space() => {
+                eprintln!("warning: the last steps are not committed: {error}");
+                Ok(())
+            }
+            done => done,
+        }
+    }
+
+    fn acknowledged(&mut self, step: u32, cut: Instant, waited: f64, bytes: u64) {
+        self.done += 1;
+        self.last_step = Some(step);
+        let until_durable = cut.elapsed().as_secs_f64();
+        let at_risk = self.last_cut.elapsed().as_secs_f64();
+        self.interval.add(CommitCost { waited, until_durable, bytes, at_risk });
+        (self.last, self.last_cut) = (Instant::now(), cut);
+    }
+
+    /// Whether an early commit is needed to free slots.
+    fn space_is_short(&self, trainer: &Trainer) -> bool {
+        let Some(space) = trainer.scene.pager.slot_space().filter(is_worth_a_commit) else { return false };
+        let left = crate::page::folder::file_system::free_bytes(&self.folder).ok().flatten();
+        left.is_some_and(|left| left < space.segment_bytes)
+    }
+}
+
+/// Whether few slots are free and a commit would free enough.
+fn is_worth_a_commit(space: &SlotSpace) -> bool {
+    let SlotSpace { total, free, retired, .. } = *space;
+    free * FEW_FREE < total && retired * WORTH_FREEING >= total
+}
+
+fn is_late(beside: &Beside) -> bool {
+    beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS
+}
+
+fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
+    state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))
+}
+
+impl Trainer {
+    /// The run state between two steps, without the pages.
+    pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> RunState {
+        RunState {
+            origin: origin.clone(),
+            device: self.renderer.device(),
+            trainer: self.state.clone(),
+            events: self.events().events().to_vec(),
+            histogram: self.scene.histogram.filled(),
+            rows: self.scene.rows(),
+            rows_bound: self.scene.rows_bound(),
+            metrics_bytes,
+            traffic: self.scene.pager.stats(),
+        }
+    }
+
+    /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
+    /// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
+    pub fn restore(&mut self, state: &RunState) {
+        let fresh = std::mem::replace(&mut self.state, state.trainer.clone());
+        if !self.state.appearance.is_as_large_as(&fresh.appearance) {
+            self.state.appearance = fresh.appearance;
+        }
+        if !self.state.outliers.is_as_large_as(&fresh.outliers) {
+            self.state.outliers = fresh.outliers;
+        }
+        self.scene.pager.restore_stats(state.traffic);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_commit_before_its_time_must_be_needed_and_of_use() {
+        let space = |total, free, retired| SlotSpace { total, free, retired, segment_bytes: 1 };
+        assert!(is_worth_a_commit(&space(100, 9, 5)) && is_worth_a_commit(&space(100, 0, 100)));
+        assert!(!is_worth_a_commit(&space(100, 10, 50)), "there are slots");
+        assert!(!is_worth_a_commit(&space(100, 0, 4)), "it would make hardly any free");
+        assert!(!is_worth_a_commit(&space(0, 0, 0)), "there are none yet");
+    }
+}

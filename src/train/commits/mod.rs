@@ -1,0 +1,7 @@
+//! Commits of a run: when, to which folder, and what happens on a full drive.
+
+pub mod checkpoint;
+pub(crate) mod first_commit;
+pub mod full_drive;
+pub(crate) mod reserve;
+mod save;

@@ -1,0 +1,9 @@
+//! What a run is given: the prepared dataset and its print, first Gaussians from files, the threads and renderer of the
+//! machine, signals.
+
+pub mod dataset_print;
+pub(crate) mod gaussian_pages;
+pub mod machine;
+pub(crate) mod places;
+pub mod prepare;
+pub mod signals;

@@ -1,0 +1,124 @@
+//! The drive of the pages: whether it holds them, and how much a run writes to it.
+//!
+//! Not here: a drive that is full during a run ([`crate::train::commits::full_drive`]).
+//!
+//! Invariant: a drive that cannot hold the first pages is refused; one that may not hold the growth is a warning.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
+use crate::config::file::TrainConfig;
+use crate::dataset::loader::Dataset;
+use crate::page::folder::file_system::free_bytes;
+use crate::paging::pager::PagerConfig;
+use crate::paging::simulation::replay::{ReplayOptions, replay};
+use crate::scene::partition::first_fill;
+use crate::schedule::visibility::ViewPages;
+use crate::train::inputs::places::drive_of;
+use crate::train::memory::largest_view::train_cameras;
+use crate::train::memory::staging::PLAN_BYTES;
+use crate::train::state::trainer::Trainer;
+
+/// Epochs that are simulated to estimate the bytes a run writes.
+const PLAYED_EPOCHS: u32 = 3;
+/// Versions of a page on the drive: one per commit kept (two), and one being written.
+pub(super) const VERSIONS: u64 = 3;
+/// Additional slots of writes in flight.
+const SLOTS_IN_FLIGHT: u64 = 64;
+
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
+/// free space passes.
+///
+/// # Errors
+/// The drive has too little free space.
+pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
+    let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
+    let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
+    let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    let pages = rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
+    free.map_or(Ok(()), |free| refuse_small_drive(free, pages, frame_bytes))
+}
+
+/// Bytes of `pages` pages on the drive, with slots of writes in flight.
+fn drive_bytes(pages: u64, frame_bytes: u64) -> u64 {
+    pages.saturating_add(SLOTS_IN_FLIGHT).saturating_mul(frame_bytes)
+}
+
+fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()> {
+    let needed = drive_bytes(pages, frame_bytes);
+    if free >= needed {
+        return Ok(());
+    }
+    let problem = format!(
+        "the drive has {} free, but the run may need {}: {pages} pages of {}, and room for pages that are being written",
+        format_bytes(free),
+        format_bytes(needed),
+        format_bytes(frame_bytes)
+    );
+    let remedy = "free space on it, choose another drive, or lower --sh-degree";
+    Err(InputError::new("--spill-dir", problem, remedy))
+}
+
+/// Number of named checkpoints from `--save-every`; each may hold a version of every page.
+fn checkpoints_kept(config: &TrainConfig) -> u64 {
+    u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0))
+}
+
+/// Refuses a drive that cannot hold the `now` pages of a scene, and warns of one that may not hold the `most` pages of the
+/// grown scene with its last commits.
+pub(super) fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2], frame_bytes: u64) -> InputResult<()> {
+    let kept = checkpoints_kept(config);
+    refuse_small_drive(free, now, frame_bytes)?;
+    let with_past = drive_bytes(most, frame_bytes).saturating_mul(VERSIONS.saturating_add(kept));
+    if free < with_past {
+        let (named, fewer) = match kept {
+            0 => (String::new(), ""),
+            kept => (format!(" and {kept} named checkpoints"), ", keep fewer checkpoints with --save-every"),
+        };
+        eprintln!(
+            "warning: the scene with its last two commits{named} may take {} on the drive, which has {} free: lower \
+             --max-gaussians{fewer}, or commit less often with --commit-every",
+            format_bytes(with_past),
+            format_bytes(free)
+        );
+    }
+    Ok(())
+}
+
+/// Bytes that a run writes to the drive, without commits.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct StepWrites {
+    /// The import.
+    pub import: f64,
+    /// A step with the Gaussians of now, and with those of the end.
+    pub of_step: [f64; 2],
+}
+
+/// The bytes that a run with `frames` frames, possibly more than pages, writes whose pages become `growth` times as many: by
+/// simulation of a few epochs with the pages of now. At the end as many frames hold fewer of the pages, and a view takes more
+/// of them.
+pub(crate) fn step_writes(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    frames: usize,
+    growth: f64,
+) -> StepWrites {
+    let cameras = train_cameras(dataset);
+    let index = trainer.scene.pager.index();
+    let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
+    let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
+    let views = ViewPages::new(index, &cameras);
+    let of_step = |frames: usize| {
+        let options =
+            ReplayOptions { frames, policy: config.evict, reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
+        let played = replay(&views, &page_bytes, trainer.view_order(), &options);
+        let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
+        written as f64 / f64::from(steps.max(1))
+    };
+    // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
+    let then = ((frames as f64 / growth.max(1.0)) as usize).max(views.most().min(frames)).min(index.len());
+    let frames = frames.min(index.len()).max(1);
+    let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
+    let now = of_step(frames);
+    StepWrites { import, of_step: [now, if then < frames { of_step(then) } else { now } * growth.max(1.0)] }
+}

@@ -1,0 +1,145 @@
+//! The frames with which a run begins: for whole views where the budget holds them, else for views in batches.
+//!
+//! Not here: frames of a scene that has grown (`fitting`).
+//!
+//! Invariant: a budget that holds no batch of the largest view is refused, with the least budget that would do.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::{format_bytes, format_bytes_up};
+use crate::config::file::TrainConfig;
+use crate::train::memory::budget::{FRAMES_LEAST, frames_and_batch};
+use crate::train::memory::estimate::{MemoryEstimate, obtainable_bytes};
+use crate::train::memory::staging::with_staging;
+use crate::train::step::working_set::WorkingSet;
+
+/// Pages are numbered in 32 bits.
+const PAGES_MOST: u64 = u32::MAX as u64;
+
+/// What the largest view needs.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LargestNeed {
+    /// Bytes of a frame.
+    pub frame_bytes: u64,
+    /// Pages of the view.
+    pub pages: u64,
+}
+
+/// Frames at the start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct FirstFrames {
+    /// Number of frames.
+    pub frames: u64,
+    /// The most pages of a batch of a view.
+    pub pages_most: usize,
+}
+
+impl FirstFrames {
+    /// Enough for every view in one batch.
+    fn of_whole_views(frames: u64) -> FirstFrames {
+        FirstFrames { frames, pages_most: usize::MAX }
+    }
+}
+
+/// Frames at the start, and the budget from which they follow.
+pub(super) fn first_frames(
+    config: &TrainConfig,
+    need: &LargestNeed,
+    host_mem: Option<u64>,
+    memory: &MemoryEstimate,
+) -> InputResult<(FirstFrames, Option<u64>)> {
+    if config.frames > 0 {
+        check_frames(u64::from(config.frames))?;
+        return Ok((FirstFrames::of_whole_views(u64::from(config.frames)), host_mem));
+    }
+    // By the estimate without growth: the cap may never be reached, and growth takes frames when it happens.
+    if let Some(frames) = whole_views(need, host_mem, memory) {
+        return Ok((frames, host_mem));
+    }
+    let host_mem = raise_to_least(config, host_mem, least_memory(need, memory, host_mem));
+    Ok((frames_of_budget(config, need, host_mem, memory)?, host_mem))
+}
+
+/// Least budget with which the largest view has its frames.
+fn least_memory(need: &LargestNeed, memory: &MemoryEstimate, host_mem: Option<u64>) -> u64 {
+    let rest = memory.fixed() - memory.staging + view_spare(memory) + need.pages * need.frame_bytes;
+    with_margin(with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX)), memory)
+}
+
+/// A budget that is enough at the next start too: the part of the graphics driver is measured, and differs from start to
+/// start by up to 1/20.
+fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
+    bytes + bytes / 50 + memory.base / 16
+}
+
+/// Margin for a view slightly larger than the rendered ones: its vectors grow by an eighth.
+fn view_spare(memory: &MemoryEstimate) -> u64 {
+    (memory.view - memory.view_pixels) / 8
+}
+
+/// Frames with which every view is one batch; `None` where the budget leaves too few.
+fn whole_views(need: &LargestNeed, host_mem: Option<u64>, memory: &MemoryEstimate) -> Option<FirstFrames> {
+    // Without a budget, the system reports no available memory: set no limit.
+    let Some(budget) = host_mem else { return Some(FirstFrames::of_whole_views(PAGES_MOST)) };
+    let frames = budget.saturating_sub(memory.fixed() + view_spare(memory)) / need.frame_bytes;
+    (frames >= need.pages).then(|| FirstFrames::of_whole_views(frames.min(PAGES_MOST)))
+}
+
+/// Frames within the budget: for whole views, or for views in batches.
+pub(super) fn frames_of_budget(
+    config: &TrainConfig,
+    need: &LargestNeed,
+    host_mem: Option<u64>,
+    memory: &MemoryEstimate,
+) -> InputResult<FirstFrames> {
+    let (whole, budget) = (whole_views(need, host_mem, memory), host_mem.unwrap_or(u64::MAX));
+    if let Some(whole) = whole {
+        return Ok(whole);
+    }
+    let rendering = memory.view - memory.working;
+    let beside = memory.fixed() - memory.working - memory.copies + (rendering - memory.view_pixels.min(rendering)) / 8;
+    let of_a_page = 2 * need.frame_bytes + page_working(config) + memory.copies.min(need.frame_bytes);
+    let Some(left) = budget.checked_sub(beside).filter(|left| *left >= of_a_page) else {
+        let problem = format!(
+            "{} are too little: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a view {}",
+            format_bytes(budget),
+            format_bytes(beside),
+            format_bytes(of_a_page)
+        );
+        let floor = with_staging(beside - memory.staging + of_a_page, memory.staging, budget);
+        let remedy = format!(
+            "give at least {} ({} keeps each view in one batch), or lower --image-cache, --prefetch-bytes, --page-rows, \
+             --sh-degree or the size of the photos",
+            format_bytes_up(with_margin(floor, memory)),
+            format_bytes_up(least_memory(need, memory, host_mem))
+        );
+        return Err(InputError::new("--host-mem", problem, remedy));
+    };
+    let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
+    Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
+}
+
+/// `host_mem`, raised to `least` with a warning if the user set no budget and the machine has the memory.
+pub(super) fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
+    let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
+    let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
+    eprintln!(
+        "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more \
+         as long as the machine has it; --host-mem sets a limit",
+        format_bytes(least),
+        format_bytes(short)
+    );
+    Some(least)
+}
+
+fn check_frames(frames: u64) -> InputResult<()> {
+    if frames >= FRAMES_LEAST as u64 {
+        return Ok(());
+    }
+    let problem = format!("{frames} is too few: a step writes one page back while it reads another");
+    Err(InputError::new("--frames", problem, format!("give at least {FRAMES_LEAST}")))
+}
+
+/// Bytes of the working set for the rows of one full page.
+pub(super) fn page_working(config: &TrainConfig) -> u64 {
+    u64::from(config.page_rows) * WorkingSet::row_bytes(config.sh_degree) as u64
+}

@@ -1,0 +1,126 @@
+//! Adjusts the number of frames between steps and raises the budget, as [`crate::train::memory::budget`] computes them.
+
+use crate::base::units::format_bytes;
+use crate::paging::error::PagingError;
+use crate::scene::camera::Camera;
+use crate::scene::columns::row_width;
+use crate::train::memory::budget::{HostBudget, SPARE_SHARE, ViewMemory};
+use crate::train::memory::staging::PLAN_BYTES_LEAST;
+use crate::train::state::trainer::Trainer;
+use crate::train::step::working_set::WorkingSet;
+
+/// The number of frames rises only by more than 1/16, to avoid small changes at every step.
+const FRAME_RISE_SHARE: usize = 16;
+
+impl Trainer {
+    /// Keeps the run within this budget from now on by adjusting its number of frames.
+    pub fn set_budget(&mut self, budget: HostBudget) {
+        self.budget = Some(budget);
+    }
+
+    /// Memory of the largest view so far.
+    pub(crate) fn view_memory(&self) -> ViewMemory {
+        let [working, rendering] = self.view_bytes();
+        let width = row_width(self.working.columns.sh_degree) as u64;
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+            .map(|degree| working / width * row_width(degree) as u64 + rendering);
+        ViewMemory { now, at_last }
+    }
+
+    /// Memory of a view whose pages hold `rows` rows, in one batch: what is held already, unless no view with as many rows was
+    /// one batch so far.
+    fn view_memory_of(&self, rows: u64) -> ViewMemory {
+        let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
+        if rows <= self.whole_rows {
+            return held;
+        }
+        let visible = (rows as f64 * self.visible_share) as u64;
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+            .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
+        ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
+    }
+
+    /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
+    /// fit in one batch is cut into batches that do.
+    pub(crate) fn fit_frames(&mut self, camera: &Camera) {
+        let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
+        let pages = self.scene.pager.pages_of_view(camera);
+        let index = self.scene.pager.index();
+        let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let needed = pages.len();
+        let view = self.view_memory_of(rows);
+        let mut frames = budget.frames(&self.scene, view, needed);
+        self.pages_most = usize::MAX;
+        if frames < needed && self.raise_for_frames(budget, needed) {
+            frames = needed;
+        } else if frames < needed {
+            let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);
+            // Between the passes, the batches keep the numbers of their rows in view.
+            let numbers = (rows as f64 * self.visible_share) as u64 * size_of::<u32>() as u64;
+            (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1] + numbers, row_bytes);
+            if self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows)) {
+                self.whole_rows = 0;
+            }
+        }
+        let pager = &mut self.scene.pager;
+        let now = pager.frames_max();
+        if frames > now + now / FRAME_RISE_SHARE || (frames > now && needed >= now) {
+            pager.allow_frames(frames);
+        } else {
+            pager.limit_frames(frames);
+        }
+    }
+
+    /// Adds the frames that a step lacked, as `error` reports, if memory is left for them. On true the step can be
+    /// repeated, with more frames than before.
+    pub(crate) fn add_missing_frames(&mut self, error: &PagingError) -> bool {
+        let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
+        let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
+        let mut most = budget.frames_at_most(&self.scene, self.view_memory());
+        if most < needed && !self.raise_for_frames(budget, needed) {
+            // The plan is optional: with a small plan the run reads more pages and continues.
+            let Some(smaller) = budget.with_small_plan() else { return false };
+            most = smaller.frames_at_most(&self.scene, self.view_memory());
+            if most < needed {
+                return false;
+            }
+            self.scene.pager.limit_plan(PLAN_BYTES_LEAST);
+            self.budget = Some(smaller);
+        }
+        let wanted = needed + needed / SPARE_SHARE;
+        self.scene.pager.allow_frames(wanted.min(most).max(needed));
+        true
+    }
+
+    /// Raises the budget for a step that needs `needed` frames; see [`HostBudget::raised`].
+    fn raise_for_frames(&mut self, budget: HostBudget, needed: usize) -> bool {
+        let frames = (needed * self.scene.pager.frame_bytes()) as u64;
+        let bytes = budget.bytes_beside_frames(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
+        self.raise_budget(budget, bytes)
+    }
+
+    /// Raises the budget to keep all pages in memory; see [`HostBudget::raised`].
+    pub(crate) fn raise_for_all_pages(&mut self, budget: HostBudget) -> bool {
+        let bytes = budget.bytes_of_all(&self.scene, self.view_memory().at_last, true);
+        self.raise_budget(budget, bytes)
+    }
+
+    fn raise_budget(&mut self, budget: HostBudget, bytes: u64) -> bool {
+        let Some(raised) = budget.raised(bytes) else { return false };
+        if !budget.is_raised {
+            eprintln!(
+                "warning: from step {} on the scene needs more than {}, the default share of the free memory: the run \
+                 takes more as long as the machine has it; --host-mem sets a limit",
+                self.state.step,
+                format_bytes(budget.bytes)
+            );
+        }
+        self.budget = Some(raised);
+        true
+    }
+
+    /// Whether all pages stay in memory.
+    pub(crate) fn is_in_memory(&self) -> bool {
+        self.scene.pager.frames_max() == usize::MAX
+    }
+}

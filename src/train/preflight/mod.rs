@@ -1,0 +1,14 @@
+//! Before a run: does it fit in memory and on the drives, and what will it cost?
+//!
+//! [`plan`] holds the verdict; the other files measure and compute its parts.
+
+#[cfg_attr(not(feature = "gpu"), path = "device_memory_absent.rs")]
+pub(crate) mod device_memory;
+pub(crate) mod drive_space;
+mod first_frames;
+pub mod first_look;
+mod fitting;
+pub mod forecast;
+pub mod plan;
+pub(crate) mod plan_text;
+pub mod probe;

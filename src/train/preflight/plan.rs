@@ -1,0 +1,279 @@
+//! Plans the tiers before the first step: what each tier will hold, whether it fits, and the number of frames.
+//!
+//! Invariant: a run that cannot fit is refused here, with numbers and alternatives. Growth that may not fit is a
+//! warning.
+
+use super::drive_space::check_drive;
+use super::first_frames::{FirstFrames, LargestNeed, first_frames, frames_of_budget, page_working, raise_to_least};
+use super::probe::{Probe, estimate};
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
+use crate::config::file::TrainConfig;
+use crate::dataset::loader::Dataset;
+use crate::paging::simulation::auto::automatic_order;
+use crate::scene::partition::first_fill;
+use crate::schedule::order::Order;
+use crate::schedule::visibility::ViewPages;
+use crate::train::error::TrainError;
+use crate::train::memory::budget::{HostBudget, frames_and_batch};
+use crate::train::memory::estimate::{MemoryEstimate, obtainable_bytes, rows_at_most};
+use crate::train::memory::largest_view::{LargestView, cut_views, largest_view, train_cameras};
+use crate::train::memory::staging::{PLAN_BYTES, staging_bytes};
+use crate::train::start::tiers::{Tiers, budget_in_memory, first_staging_bytes};
+use crate::train::state::trainer::Trainer;
+
+/// Growth factor that scenes hardly ever reach; growth beyond it causes no warning.
+const GROWTH_UNLIKELY: f64 = 20.0;
+
+/// A view that is measured in batches has frames and a working set of 1/16 of the budget: the splats of the view may need
+/// nearly all of the rest.
+const PROBE_BATCH_SHARE: u64 = 16;
+/// Bytes that a renderer holds for a row in view at least, beside intersections.
+const SPLAT_BYTES: u64 = 150;
+
+/// Pages, frames and drive space of a run.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TierPlan {
+    /// Pages now, and their known upper bound.
+    pub pages: [u64; 2],
+    /// Bytes of a frame and of a slot on the drive.
+    pub frame_bytes: u64,
+    /// Frames, possibly more than pages; `None` for a run in memory, which has one frame per page.
+    pub frames: Option<u64>,
+    /// The user set the number of frames.
+    pub(super) frames_are_named: bool,
+    /// The view that needs most pages.
+    pub(crate) largest_view: LargestView,
+    /// Training views that need several batches, and the most batches of one of them.
+    pub(crate) cut_views: (usize, usize),
+    /// Free bytes of the drive; `None` without a drive or if the system does not report them.
+    pub free_bytes: Option<u64>,
+}
+
+/// Chooses the number of frames and completes the estimates of [`super::probe::estimate`] with it.
+///
+/// # Errors
+/// The budget or the drive is too small.
+pub fn plan_tiers(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    tiers: &Tiers,
+    host_mem: Option<u64>,
+    memory: &mut [MemoryEstimate; 3],
+) -> InputResult<TierPlan> {
+    let mut plan = TierPlan {
+        pages: pages_now_and_most(config, trainer),
+        frame_bytes: trainer.scene.pager.frame_bytes() as u64,
+        frames: None,
+        frames_are_named: config.frames > 0,
+        free_bytes: tiers.free_bytes()?,
+        largest_view: largest_view(dataset, trainer.scene.pager.index()),
+        cut_views: (0, 1),
+    };
+    if trainer.scene.pager.frames_max() == usize::MAX {
+        plan_in_memory(config, trainer, host_mem, memory)?;
+        return Ok(plan);
+    }
+    let staging = staging_bytes(trainer.scene.pager.prefetch_bytes(), tiers.codec);
+    memory.iter_mut().for_each(|m| m.staging = staging);
+    let (frames, host_mem) = plan_frames(config, trainer, &plan, host_mem, memory)?;
+    plan.frames = Some(frames);
+    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.pages_most);
+    if config.view_order.0.is_none() {
+        trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
+    }
+    warn_of_growth(config, &plan, host_mem, memory);
+    if let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) {
+        check_drive(config, free, plan.pages, plan.frame_bytes)?;
+    }
+    Ok(plan)
+}
+
+/// Pages now, and their known upper bound. Not all pages are full (giants have pages of their own); new pages are taken
+/// to be as full as the present ones.
+fn pages_now_and_most(config: &TrainConfig, trainer: &Trainer) -> [u64; 2] {
+    let (pages, rows) = (trainer.scene.pager.index().len() as u64, trainer.scene.rows());
+    let rows_max = rows_at_most(config, rows);
+    let fill = first_fill(config.page_rows as usize, config.strategy.grows()) as u64;
+    let grown = (pages as f64 * rows_max as f64 / rows.max(1) as f64).ceil() as u64;
+    [pages, grown.max(rows_max.div_ceil(fill))]
+}
+
+/// The budget of a run that keeps all pages in memory.
+fn plan_in_memory(
+    config: &TrainConfig,
+    trainer: &mut Trainer,
+    asked: Option<u64>,
+    memory: &[MemoryEstimate; 3],
+) -> InputResult<()> {
+    let host_mem = raise_to_least(config, asked, memory[0].total());
+    if trainer.scene.pager.slot_space().is_none() {
+        // A resumed run has a drive already and can start paging.
+        check_in_memory(memory, host_mem)?;
+    }
+    if let Some(budget) = host_mem {
+        let first = budget_in_memory(config, budget, &memory[0]);
+        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
+    }
+    Ok(())
+}
+
+/// The frames and the batches of a run with a drive, and the budget from which they follow; completes the estimates.
+fn plan_frames(
+    config: &TrainConfig,
+    trainer: &mut Trainer,
+    plan: &TierPlan,
+    asked: Option<u64>,
+    memory: &mut [MemoryEstimate; 3],
+) -> InputResult<(u64, Option<u64>)> {
+    let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
+    let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
+    trainer.pages_most = pages_most;
+    trainer.scene.pager.allow_frames(frames as usize);
+    trainer.scene.pager.limit_frames(frames as usize);
+    if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
+        let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
+        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
+    }
+    for memory in memory {
+        memory.frames = memory.frames.min(frames * plan.frame_bytes);
+        if pages_most < usize::MAX {
+            let of_batch = (pages_most as u64).saturating_mul(page_working(config)).min(memory.working);
+            memory.view -= memory.working - of_batch;
+            memory.copies = memory.copies.min(pages_most as u64 * plan.frame_bytes);
+        }
+    }
+    Ok((frames, host_mem))
+}
+
+/// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`plan_tiers`]
+/// allows the rest afterwards. Where the budget may not hold them beside the rows of the view, the view is measured in batches.
+/// Returns the index of that view. Runs in memory or with --frames are left unchanged.
+pub fn allow_largest_view(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    host_mem: Option<u64>,
+) -> Option<usize> {
+    let LargestView { view, pages: needed, .. } = largest_view(dataset, trainer.scene.pager.index());
+    if config.frames > 0 || trainer.scene.pager.frames_max() == usize::MAX {
+        return view;
+    }
+    let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
+    // A default budget may rise once the memory of a view is known.
+    let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
+    let mut frames = needed;
+    let of_page = frame_bytes + page_working(config) + u64::from(config.page_rows) * SPLAT_BYTES;
+    if let Some(budget) = most.filter(|budget| needed * of_page > *budget) {
+        let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
+        if (fewer as u64) < needed {
+            (frames, trainer.pages_most) = (fewer as u64, pages);
+        }
+    }
+    trainer.scene.pager.allow_frames(frames as usize);
+    view
+}
+
+/// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number
+/// of frames reduced in proportion.
+fn auto_order(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    frames: u64,
+    plan: &TierPlan,
+) -> InputResult<Order> {
+    let [now, most] = plan.pages;
+    let cameras = train_cameras(dataset);
+    let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
+    let frames = if frames >= most { now } else { frames * now / most };
+    // A run whose views fit now is planned as one whose views fit.
+    let least = if plan.frames.is_some_and(|frames| frames as usize >= views.most()) { views.most() } else { 1 };
+    let frames = (frames as usize).max(least);
+    automatic_order(&views, &cameras, now as usize, frames, config.seed, PLAN_BYTES as u64)
+        .map_err(|e| InputError::new("--view-order", e.to_string(), "name one: shuffle, groups:N or tour"))
+}
+
+/// Number of frames within `host_mem`, as [`plan_tiers`] chooses it. For planning without a run: `trainer` holds the
+/// `view_pages` pages of the largest view.
+///
+/// # Errors
+/// The budget does not hold that view, or the view cannot be rendered.
+pub(super) fn frames_within(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    probe: &Probe,
+    view_pages: u64,
+    host_mem: u64,
+) -> Result<u64, TrainError> {
+    let ([mut memory, ..], _) = estimate(config, dataset, trainer, probe, probe.rows)?;
+    memory.staging = first_staging_bytes(config, host_mem);
+    let need = LargestNeed { frame_bytes: trainer.scene.pager.frame_bytes() as u64, pages: view_pages };
+    Ok(frames_of_budget(config, &need, Some(host_mem), &memory)?.frames)
+}
+
+/// Warns if views may outgrow the frames: the pages of the largest view grow in proportion to the Gaussians, while
+/// the frames shrink.
+fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, memory: &[MemoryEstimate; 3]) {
+    let ([now, most], Some(frames)) = (plan.pages, plan.frames) else { return };
+    if !config.strategy.grows() {
+        return;
+    }
+    let LargestView { pages: needed, name: view, .. } = &plan.largest_view;
+    if *needed > frames {
+        // The description of the pages says so.
+        return;
+    }
+    let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
+    let left = match host_mem.filter(|_| config.frames == 0) {
+        None => frames,
+        Some(budget) => budget.saturating_sub(memory[1].fixed()) / plan.frame_bytes,
+    };
+    let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);
+    let until = match config.max_gaussians {
+        0 if times >= GROWTH_UNLIKELY => return,
+        0 => "growth has no cap (--max-gaussians)".to_string(),
+        _ if then <= left => return,
+        cap => format!("with --max-gaussians {cap} the view may need {then} pages with {left} frames"),
+    };
+    eprintln!(
+        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has \
+         grown about {times:.1} times, steps on such views take several batches and read more; more --frames or --host-mem \
+         avoid it"
+    );
+}
+
+/// Growth factor of the scene at which the largest view needs all frames.
+fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool) -> f64 {
+    // With --frames the number of frames does not shrink as the rows of a view grow.
+    let of_rows = if are_fixed { 0 } else { of_rows };
+    let needed = plan.largest_view.pages * plan.frame_bytes;
+    (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
+}
+
+fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>) -> InputResult<()> {
+    let Some(budget) = host_mem else { return Ok(()) };
+    if start.total() > budget {
+        let problem = format!(
+            "{} are too little: the scene needs about {} of memory ({} for Gaussians)",
+            format_bytes(budget),
+            format_bytes(start.total()),
+            format_bytes(start.frames)
+        );
+        let remedy = "name a folder on a fast drive with --spill-dir, raise --host-mem, or lower --image-cache, \
+                      --sh-degree or the size of the photos";
+        return Err(InputError::new("--host-mem", problem, remedy));
+    }
+    if most.total() > budget {
+        eprintln!(
+            "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; \
+             name a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or \
+             the size of the photos",
+            format_bytes(most.total()),
+            format_bytes(budget)
+        );
+    }
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! The plan of a run's tiers as text, as a run prints it at its start.
+
+use super::forecast::{Forecast, Reach};
+use crate::base::units::{format_bytes, format_grouped, format_seconds};
+use crate::config::file::TrainConfig;
+use crate::page::folder::file_system::free_bytes;
+use crate::paging::pager::PagerConfig;
+use crate::scene::partition::first_fill;
+use crate::train::commits::reserve::reserve_bytes;
+use crate::train::inputs::places::drive_of;
+use crate::train::memory::largest_view::LargestView;
+use crate::train::start::first_scene::Start;
+use crate::train::start::tiers::Tiers;
+
+/// Rated endurance of a common drive of 500 GB, bytes written.
+const ENDURANCE_BYTES: f64 = 300e12;
+
+/// What becomes of the number of Gaussians, in the words of a forecast.
+pub fn growth(forecast: &Forecast) -> String {
+    let last = format_grouped(forecast.gaussians[1]);
+    match forecast.reach {
+        Reach::Constant => String::from(" (no densification)"),
+        Reach::Kept => String::from(", which stays their number (too few photos to decide by)"),
+        Reach::Cap => format!(", growing to at most {last}"),
+        Reach::Guess => {
+            format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
+        }
+        Reach::Decided => {
+            format!(
+                ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"
+            )
+        }
+    }
+}
+
+/// The description of memory, drive and time that a run prints at its start.
+pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
+    let (plan, memory) = (&forecast.tiers, forecast.memory_at_end());
+    let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
+    let LargestView { pages: largest, mean, .. } = &plan.largest_view;
+    let mut text = format!(
+        "pages   {} of up to {}; a view needs {mean:.0} on average, {largest} at most\n",
+        plan.pages[0],
+        format_bytes(plan.frame_bytes)
+    );
+    if let (views @ 1.., most) = plan.cut_views {
+        text.push_str(&format!(
+            "        {views} views are larger than the frames: steps on them take up to {most} batches\n"
+        ));
+    }
+    let frames = match plan.frames {
+        None => String::from("Gaussians with their optimizer state"),
+        Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {
+            String::from("frames of pages, one for every page")
+        }
+        Some(frames) => format!("{frames} frames of pages"),
+    };
+    let grows = forecast.gaussians[1] > forecast.gaussians[0];
+    let at = if grows { format!(", with {} Gaussians", format_grouped(forecast.gaussians[1])) } else { String::new() };
+    let start = format!(" ({} at the start)", format_bytes(forecast.memory[0].total()));
+    let start = if grows { start.as_str() } else { "" };
+    text.push_str(&format!("memory  about {} at the peak{at}{start}\n", format_bytes(memory.total())));
+    if let (None, Some(limit)) = (plan.frames, forecast.host_mem.filter(|limit| *limit < memory.total())) {
+        text.push_str(&format!(
+            "        more than --host-mem {}: when the scene has grown that far, its pages move to checkpoint/\n",
+            format_bytes(limit)
+        ));
+    }
+    text.push_str(&part(&frames, memory.frames));
+    text.push_str(&part("one view: rows, gradients, images", memory.view));
+    text.push_str(&part("decoded photos (--image-cache)", memory.targets));
+    if memory.staging > 0 {
+        text.push_str(&part("encoded pages in transfer, and the plan", memory.staging));
+    }
+    text.push_str(&part("index of the pages", memory.index));
+    text.push_str(&part("program and tables", memory.base + memory.copies));
+    text.push_str(&drive(forecast, tiers, &at));
+    text.push_str(&format!(
+        "time    about {} for {} steps{at}, without evaluation\n",
+        format_seconds(forecast.seconds),
+        format_grouped(forecast.steps.into())
+    ));
+    text
+}
+
+/// The lines about drives.
+fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
+    let (plan, commits) = (&forecast.tiers, forecast.commit_bytes_most);
+    let commits = match commits > 0.0 {
+        true => format!("commits write {} at most", format_bytes(commits as u64)),
+        false => String::from("no periodic commits"),
+    };
+    if !tiers.spills() {
+        let [checkpoint, ply] = [forecast.drive_bytes_most, forecast.ply_bytes].map(format_bytes);
+        return format!("drive   checkpoint {checkpoint} at most, PLY {ply}{at}; {commits}\n");
+    }
+    let now = if at.is_empty() {
+        String::new()
+    } else {
+        format!(" ({} at the start)", format_bytes(plan.pages[0] * plan.frame_bytes))
+    };
+    // A dry run keeps the pages in memory, whatever the run will use.
+    let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
+    format!(
+        "drive   {} of pages{at}{now}{by} ({}), {} free\n        \
+         each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
+         about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
+        format_bytes(forecast.drive_bytes),
+        tiers.codec,
+        plan.free_bytes.map_or(String::from("unknown"), format_bytes),
+        format_bytes(tiers.segment_bytes),
+        format_bytes(reserve_bytes(tiers.segment_bytes)),
+        format_bytes(forecast.bytes_written as u64),
+        100.0 * forecast.bytes_written / ENDURANCE_BYTES
+    )
+}
+
+/// Describes a scene that a dry run cannot plan because its pages exceed half of the budget; `None` if they fit. A dry
+/// run writes no pages: it keeps the pages of the drive in memory, in at most half of the budget.
+pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
+    let (spill_dir, budget) = (config.residence().spill_dir()?, host_mem?);
+    let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
+    if pages.saturating_mul(frame) <= budget / 2 {
+        return None;
+    }
+    let free = free_bytes(&drive_of(spill_dir)).ok().flatten();
+    Some(format!(
+        "scene   {} views to train on, {} held out\n\
+         start   {} Gaussians\n\
+         pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
+         memory  {} in all, fewer than {} pages at once\n\
+         views   unknown: their needs follow from pages on the drive, and a dry run writes none.\n        \
+         The run itself checks them before its first step.",
+        start.dataset.train_views().len(),
+        start.dataset.test_views().len(),
+        start.rows,
+        format_bytes(frame),
+        format_bytes(pages.saturating_mul(frame)),
+        free.map_or(String::from("unknown"), format_bytes),
+        format_bytes(budget),
+        (budget / frame).max(1),
+    ))
+}

@@ -1,0 +1,305 @@
+//! A run from command line to result: load, check, plan, print the plan, train.
+//!
+//! Not here: what happens in the output folder (`run_folder`).
+//!
+//! Invariant: the output folder is created after the dataset was read, so bad input leaves no files.
+
+use super::changes::with_absolute_paths;
+use super::out_folder::{self, Existing};
+use super::request::{RunOutcome, RunRequest};
+use super::run_folder::{Begun, train_into};
+use crate::base::error::InputError;
+use crate::base::identity::RunId;
+use crate::checkpoint::run_state::DatasetPrint;
+use crate::config::choice::Device;
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::config::residence::Residence;
+use crate::config::values::Up;
+use crate::dataset::loader::Dataset;
+use crate::optim::method::OptimizerPlace;
+use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::render::Renderer;
+use crate::report::run_files::CONFIG_FILE;
+use crate::scene::partition::first_fill;
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::inputs::signals::StopFlag;
+use crate::train::memory::estimate::list_bytes;
+use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
+use crate::train::preflight::device_memory;
+use crate::train::preflight::drive_space::{StepWrites, check_first_drive, step_writes};
+use crate::train::preflight::forecast::{Forecast, Measured, Reach, mean_pixels, reach};
+use crate::train::preflight::plan;
+use crate::train::preflight::plan_text;
+use crate::train::preflight::probe::{Probe, estimate};
+use crate::train::start::first_scene::Start;
+use crate::train::start::first_scene::dataset_print;
+use crate::train::start::tiers::{self, Tiers};
+use crate::train::state::held_out::{keeps_first_count, too_few_to_decide};
+use crate::train::state::trainer::Trainer;
+use crate::train::step::soundness::no_view_sees;
+use std::path::{Path, PathBuf};
+
+/// Runs a request from beginning to end.
+///
+/// # Errors
+/// Bad input (leaves no files), or a failure while training (the last good step is written).
+pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
+    let config = &request.config;
+    config.check()?;
+    machine::set_up(config)?;
+    if !request.dry_run {
+        out_folder::check(&request.out, request.existing)?;
+    }
+    let host_mem = host_budget(config);
+    let start = Start::read(&request.scene, config, host_mem)?;
+    let sh_degree_start = start.sh_degree_start;
+    if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+        if !request.quiet {
+            crate::say!("{known}");
+        }
+        return Ok(RunOutcome {
+            summary: None,
+            exit_code: 0,
+            out: request.out.clone(),
+            keeps_checkpoint: config.keep_checkpoint,
+        });
+    }
+    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
+        && remove_uncommitted(spill_dir, false)?
+    {
+        eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+    }
+    let FirstTrainer { dataset, trainer, tiers, print, driver } = first_trainer(request, start, host_mem)?;
+    let run = RunId::draw();
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
+/// after it.
+pub(super) struct FirstTrainer {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// The trainer.
+    pub trainer: Trainer,
+    /// Where its pages live.
+    pub tiers: Tiers,
+    /// Digest of the dataset.
+    pub print: DatasetPrint,
+    /// Bytes allocated by the graphics driver.
+    pub driver: u64,
+}
+
+/// Makes the first pages of a scene, and their trainer.
+///
+/// # Errors
+/// The drive or the device cannot be used, or the source of the Gaussians cannot be read again.
+pub(super) fn first_trainer(
+    request: &RunRequest,
+    start: Start,
+    host_mem: Option<u64>,
+) -> Result<FirstTrainer, TrainError> {
+    let config = &request.config;
+    check_first_drive(config, start.rows)?;
+    let (renderer, options, driver) = begin(request.quiet, config, &start)?;
+    let fill = first_fill(config.page_rows as usize, options.strategy.grows());
+    let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
+    // Drop the tiers after the trainer, whose pages may lie there.
+    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    if !request.dry_run {
+        tiers.commit_in(&request.out, config);
+    }
+    let print = dataset_print(&start)?;
+    let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
+    let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
+    Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
+}
+
+/// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
+pub(crate) fn begin(
+    quiet: bool,
+    config: &TrainConfig,
+    start: &Start,
+) -> Result<(Box<dyn Renderer>, RunOptions, u64), TrainError> {
+    for warning in &start.dataset.warnings {
+        eprintln!("warning: {warning}");
+    }
+    if keeps_first_count(config, &start.dataset) {
+        eprintln!("warning: {}", too_few_to_decide(&start.dataset));
+    }
+    let mut options =
+        RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    if config.up == Up::Auto {
+        options.up = start.up()?;
+    }
+    let before = host_bytes_now().unwrap_or(0);
+    let (mut renderer, word) = machine::renderer(config)?;
+    // On from here, so that probing allocates what the steps need.
+    renderer.weigh_rows(options.strategy.needs_weights())?;
+    if options.optimizer_on == OptimizerPlace::Device && renderer.pages().is_none() {
+        let problem = format!("the {} backend holds no pages", renderer.name());
+        let remedy = "give a GPU with --device, or use --optimizer-on host";
+        return Err(InputError::new("--optimizer-on device", problem, remedy).into());
+    }
+    if options.optimizer_on == OptimizerPlace::Device && options.strategy.needs_weights() {
+        let problem = "a device that updates the pages collects gradients, not the blending weights of Gaussians";
+        let remedy = "use --growth-score gradient with --recycle 0, or --optimizer-on host";
+        return Err(InputError::new("--optimizer-on device", problem, remedy).into());
+    }
+    // Without a search for a device, a difference is the noise of the allocator.
+    let driver = match config.device {
+        Device::Cpu => 0,
+        Device::Gpu(_) => host_bytes_now().unwrap_or(0).saturating_sub(before),
+    };
+    if let Some(word) = word.filter(|_| !quiet) {
+        eprintln!("{word}");
+    }
+    Ok((renderer, options, driver))
+}
+
+/// The forecast of a run, as its dry run makes it: nothing is written. `None` if a dry run cannot hold the scene.
+///
+/// # Errors
+/// Those of a dry run.
+pub fn forecast(scene: &Path, config: &TrainConfig) -> Result<Option<Forecast>, TrainError> {
+    let (scene, config) = (scene.to_path_buf(), config.clone());
+    let request =
+        RunRequest { scene, out: PathBuf::new(), config, dry_run: true, existing: Existing::Refuse, quiet: true };
+    let host_mem = host_budget(&request.config);
+    let start = Start::read(&request.scene, &request.config, host_mem)?;
+    if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
+        return Ok(None);
+    }
+    let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
+    plan(&request.config, &dataset, &tiers, &mut trainer, (host_mem, driver)).map(Some)
+}
+
+/// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
+fn plan(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    tiers: &Tiers,
+    trainer: &mut Trainer,
+    (host_mem, driver): (Option<u64>, u64),
+) -> Result<Forecast, TrainError> {
+    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
+    let largest = plan::allow_largest_view(config, dataset, trainer, host_mem);
+    if largest.is_none() {
+        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
+    }
+    let probe = Probe::of_run(dataset, trainer, largest, driver);
+    let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
+    let pixels = mean_pixels(dataset.train_views().iter().map(|&view| &dataset.views[view].camera));
+    let (last, known) = match keeps_first_count(config, dataset) {
+        true => (rows, Reach::Kept),
+        false => reach(config, rows, pixels, steps_done),
+    };
+    let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
+    device_memory::check(config, &memory)?;
+    let plan = plan::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;
+    let growth = last as f64 / rows.max(1) as f64;
+    let writes = match plan.frames {
+        Some(frames) => step_writes(config, dataset, trainer, frames as usize, growth),
+        None => StepWrites::default(),
+    };
+    let measured = Measured {
+        rows,
+        reach: (last, known),
+        steps_done,
+        view_seconds: times.seconds,
+        visible_share: times.visible_share,
+        writes,
+    };
+    Ok(Forecast::new(config, memory, plan, &measured, host_mem))
+}
+
+/// Plans a run, prints the plan, and trains to the end.
+pub(super) fn plan_and_train(
+    request: &RunRequest,
+    dataset: &Dataset,
+    mut tiers: Tiers,
+    mut trainer: Trainer,
+    begun: Begun,
+) -> Result<RunOutcome, TrainError> {
+    let config = &request.config;
+    let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver))?;
+    if !request.quiet {
+        let of_device = device_memory::describe(config, forecast.memory_at_end());
+        let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
+        let plan = describe(request, dataset, &trainer, &plan_text::growth(&forecast), &of_tiers);
+        match request.dry_run {
+            // What was asked for goes to standard output.
+            true => crate::say!("{plan}"),
+            false => eprintln!("{plan}"),
+        }
+    }
+    if request.dry_run {
+        return Ok(RunOutcome {
+            summary: None,
+            exit_code: 0,
+            out: request.out.clone(),
+            keeps_checkpoint: config.keep_checkpoint,
+        });
+    }
+    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
+    out_folder::make_folder(&request.out)?;
+    // Take the lock before removing files; hold it to the end.
+    let _lock = out_folder::lock(&request.out)?;
+    if begun.past.is_none() {
+        out_folder::make(&request.out, request.existing)?;
+    }
+    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
+    if tiers.can_resume() {
+        let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
+        let elsewhere = spill_dir_flag(request);
+        eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
+    }
+    tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
+    outcome
+}
+
+/// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
+fn spill_dir_flag(request: &RunRequest) -> String {
+    let [kept, now] = [TrainConfig::read(&request.out.join(CONFIG_FILE)), Ok(request.config.clone())]
+        .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
+    match now {
+        Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
+        _ => String::new(),
+    }
+}
+
+/// Text of the plan: dataset, start and tiers.
+fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: &str, tiers: &str) -> String {
+    let (config, rows) = (&request.config, trainer.scene.rows());
+    let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
+    let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
+    let results = match request.out.as_os_str().is_empty() {
+        true => String::new(),
+        false => format!(", results in {}", request.out.display()),
+    };
+    let commits = match config.residence() {
+        Residence::Memory => "to checkpoint/ in the results (see --commit-every)",
+        Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
+        Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
+    };
+    let text = format!(
+        "scene   {}: {} views to train on, {} held out, at most {size}\n\
+         start   {} Gaussians, SH degree {}{growth}\n\
+         run     {} steps on {} threads ({}), rendered by {}{results}\n\
+         commit  {commits}\n\
+         {tiers}",
+        request.scene.display(),
+        dataset.train_views().len(),
+        dataset.test_views().len(),
+        rows,
+        config.sh_degree,
+        config.steps,
+        rayon::current_num_threads(),
+        limits::simd_path(config).name(),
+        trainer.renderer.device(),
+    );
+    text.trim_end().to_string()
+}

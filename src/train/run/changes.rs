@@ -1,0 +1,220 @@
+//! Differences between a run and its resume: the config, key by key, and the dataset.
+//!
+//! The class of a key ([`Class`]) decides: a key that changes no number of the result may change, with a message; a key
+//! that changes numbers is refused unless the user accepts it; a key of the page layout cannot change.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::simd::SimdPath;
+use crate::checkpoint::run_state::{DatasetPrint, RunState};
+use crate::config::file::{KEYS, TrainConfig};
+use crate::config::key::{Class, Key};
+use crate::config::limits;
+use crate::dataset::loader::Dataset;
+use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};
+use serde::Deserialize;
+use std::path::Path;
+
+/// What programs did that did not know a key, as the value of the key. A key that is missing here counts as changed when an older
+/// run resumes.
+const BEFORE_ITS_TIME: [(&str, &str); 5] = [
+    ("appearance", "off"),
+    ("robust-views", "false"),
+    ("quality", "normal"),
+    ("optimizer-on", "auto"),
+    ("optimizer-on", "host"),
+];
+
+/// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
+/// (numbers, length, place of the checkpoint).
+///
+/// # Errors
+/// None for a valid config.
+pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConfig) -> InputResult<TrainConfig> {
+    let broken = |e: String| InputError::new(file, e, "report this as a bug");
+    let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
+    let (of_file, mut kept) = (table(of_file)?, table(config)?);
+    for name in KEYS.iter().filter(|key| !key.class.lasts()).map(Key::name) {
+        kept.extend(of_file.get(&name).map(|value| (name, value.clone())));
+    }
+    let kept = TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))?;
+    Ok(with_absolute_paths(kept))
+}
+
+/// The config with absolute paths.
+pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
+    let absolute = |path: &String| match path.as_str() {
+        "" => String::new(),
+        path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
+    };
+    TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
+}
+
+/// Refuses to resume from pages trained with too small an epsilon: their bounds do not hold, and a new epsilon does not
+/// repair them. Checks the config of the commit, since the config in the run's folder may have changed.
+fn check_eps_of_commit(file: &Path, then: &TrainConfig) -> InputResult<()> {
+    let Err(error) = then.check_adam_eps() else { return Ok(()) };
+    let problem = format!("the last commit was trained with an invalid --adam-eps: {}", error.problem);
+    let remedy = "start a new run from its Gaussians: gsscale-ckpt export, then --init-ply with that file";
+    Err(InputError::new(file, problem, remedy))
+}
+
+/// Differences, one line each.
+#[derive(Debug, Default, PartialEq)]
+pub(super) struct Changes {
+    /// Differences that change no number.
+    pub free: Vec<String>,
+    /// Differences that change numbers.
+    pub numbers: Vec<String>,
+    /// Differences with which the run cannot resume.
+    pub fixed: Vec<String>,
+}
+
+impl Changes {
+    /// Compares the keys of `config` with those of the last commit.
+    ///
+    /// # Errors
+    /// The config of the commit cannot be read.
+    pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
+        let broken = |e: String| InputError::new(file, e, "start the run again");
+        let written: toml::Table = state.origin.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
+        let then = TrainConfig::parse(&state.origin.config).map_err(broken)?;
+        let table = |config: &TrainConfig| {
+            toml::Table::try_from(config).map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))
+        };
+        let (there, here) = (table(&then)?, table(config)?);
+        let mut changes = Changes::default();
+        for (name, now) in &here {
+            let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
+            // A key unknown to the older commit counts as a difference, so that the user sees its default.
+            // It counts as known if the programs of that time can only have done one thing.
+            let was_done = |value: &toml::Value| {
+                let value = value.as_str().map_or_else(|| value.to_string(), String::from);
+                BEFORE_ITS_TIME.contains(&(name.as_str(), value.as_str()))
+            };
+            let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
+            if class.is_derived() || then == Some(now) {
+                continue;
+            }
+            let lines = match class {
+                Class::Layout => &mut changes.fixed,
+                class if class.is_free() => &mut changes.free,
+                _ => &mut changes.numbers,
+            };
+            let then = then.map_or_else(|| "absent".to_string(), toml::Value::to_string);
+            lines.push(format!("{name} was {then} and is {now}"));
+        }
+        check_eps_of_commit(file, &then)?;
+        let [was, is] = [&then, config].map(limits::schedule_steps);
+        if was != is {
+            changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
+        }
+        changes.add_path(&state.origin.simd, limits::simd_path(config));
+        Ok(changes)
+    }
+
+    /// Adds a difference of instruction path. Two paths of the same bits class change no number.
+    fn add_path(&mut self, there: &str, here: SimdPath) {
+        if there == here.name() {
+            return;
+        }
+        let line = format!("simd was {there} and is {}", here.name());
+        let has_same_bits = SimdPath::from_name(there).is_some_and(|path| path.bits_class() == here.bits_class());
+        if has_same_bits {
+            self.free.push(format!("{line} (the same bits)"));
+        } else {
+            self.numbers.push(line);
+        }
+    }
+
+    /// Adds the differences of the dataset.
+    pub fn add_dataset(&mut self, dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) {
+        let DatasetChanges { lines, fixed } = dataset_changes(dataset, there, here);
+        self.numbers.extend(lines);
+        self.fixed.extend(fixed);
+    }
+
+    /// Refuses differences that exclude a resume, and differences in numbers without `accept`.
+    ///
+    /// # Errors
+    /// There is such a difference.
+    pub fn check(&self, place: &Path, accept: bool) -> InputResult<()> {
+        let list = |lines: &[String]| lines.iter().map(|line| format!("\n    {line}")).collect::<String>();
+        if !self.fixed.is_empty() {
+            let all = [self.fixed.as_slice(), &self.numbers].concat();
+            let problem = format!("the Gaussians of this run do not fit these changes:{}", list(&all));
+            let remedy = "undo the changes, or start a new run from the Gaussians: --init-ply with its point_cloud.ply";
+            return Err(InputError::new(place, problem, remedy));
+        }
+        if accept || self.numbers.is_empty() {
+            return Ok(());
+        }
+        let problem = format!("these changes would change the numbers of the run:{}", list(&self.numbers));
+        let remedy = "undo the changes, accept them with --accept-changes, or start a new run with another --out";
+        Err(InputError::new(place, problem, remedy))
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::appearance::AppearanceMode;
+    use crate::checkpoint::run_state::{Origin, RunIdentity};
+
+    #[test]
+    fn another_path_changes_numbers_where_its_bits_are_others() {
+        let changes = |there: &str, here: SimdPath| {
+            let mut changes = Changes::default();
+            changes.add_path(there, here);
+            [changes.free.len(), changes.numbers.len(), changes.fixed.len()]
+        };
+        for path in SimdPath::ALL {
+            assert_eq!(changes(path.name(), path), [0, 0, 0]);
+            // A path that only another program knows.
+            assert_eq!(changes("neon", path), [0, 1, 0]);
+        }
+        assert_eq!(changes("avx512", SimdPath::Avx2), [1, 0, 0]);
+        assert_eq!(changes("avx2", SimdPath::Avx512), [1, 0, 0]);
+        for fused in [SimdPath::Avx2, SimdPath::Avx512] {
+            assert_eq!(changes("baseline", fused), [0, 1, 0]);
+            assert_eq!(changes(fused.name(), SimdPath::Baseline), [0, 1, 0]);
+        }
+    }
+
+    /// A run that began before a key existed goes on as it was, and only so.
+    #[test]
+    fn a_run_without_the_key_of_appearance_was_off() {
+        let config = TrainConfig::default();
+        let text = toml::to_string(&config).unwrap();
+        let without: String =
+            text.lines().filter(|line| !line.starts_with("appearance")).map(|line| format!("{line}\n")).collect();
+        assert!(without.len() < text.len());
+        let dataset = DatasetPrint {
+            views: Vec::new(),
+            first_rows: 1,
+            points: 0,
+            scene_scale: 1.0,
+            origin: [0.0; 3],
+            scale: 1.0,
+        };
+        let simd = limits::simd_path(&config).name().to_string();
+        let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
+        let state = RunState::without_past(origin, "cpu".to_string(), 1);
+        let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
+        assert_eq!(changes(&config), Changes::default());
+        let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
+        assert_eq!(on.numbers, ["appearance was \"off\" and is \"full\""]);
+    }
+
+    #[test]
+    fn what_lasts_is_kept() {
+        let of_file = TrainConfig { threads: 3, frames: 7, seed: 1, ..TrainConfig::default() };
+        let now = TrainConfig { threads: 1, steps: 9, seed: 2, keep_checkpoint: true, ..TrainConfig::default() };
+        let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();
+        assert_eq!(kept, TrainConfig { threads: 3, frames: 7, ..now.clone() });
+        // The folder of its pages goes with the run, wherever a later life is started.
+        let now = TrainConfig { spill_dir: "copy".into(), ..now };
+        let kept = kept_config(Path::new("config.toml"), &of_file, &now).unwrap();
+        assert!(Path::new(&kept.spill_dir).is_absolute() && kept.spill_dir.ends_with("copy"), "{}", kept.spill_dir);
+    }
+}

@@ -1,0 +1,17 @@
+//! A run from its request to its results: begin, the loop, resume, restart, the output folder.
+//!
+//! [`begin`] is the page to read first.
+
+mod appearance_file;
+pub mod begin;
+mod changes;
+pub mod costs;
+mod more_steps;
+pub mod out_folder;
+mod outgrown;
+pub mod page_map;
+pub mod request;
+pub mod restart;
+pub mod resume;
+mod run_folder;
+pub mod training_loop;

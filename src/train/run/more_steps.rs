@@ -1,0 +1,98 @@
+//! More steps for a finished run whose checkpoint is gone: the run goes on from its PLY.
+//!
+//! Kept: the Gaussians, the number of steps, and with it the schedule, the metrics and the identity of the run. Lost with the
+//! checkpoint: Adam's moments and the statistics of densification. Adam's first updates without moments are up to three
+//! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
+//! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]).
+//!
+//! Invariants: 1. the earlier result stays, under the name of its step; 2. nothing is renamed before the scene was found; 3. a
+//! run that is cut off before its first commit goes on from the same PLY when it is asked again.
+
+use super::begin::{first_trainer, plan_and_train};
+use super::changes::with_absolute_paths;
+use super::out_folder::Existing;
+use super::request::{RunOutcome, RunRequest};
+use super::run_folder::{Begun, Past};
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::config::file::TrainConfig;
+use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::inputs::places::absolute;
+use crate::train::log::facts::Resolved;
+use crate::train::log::report::Summary;
+use crate::train::memory::estimate::host_budget;
+use crate::train::start::first_scene::Start;
+use std::path::{Path, PathBuf};
+
+/// A finished run, and the config with which it goes on.
+pub(super) struct Finished<'a> {
+    /// Its output folder.
+    pub out: &'a Path,
+    /// Its scene.
+    pub scene: &'a Path,
+    /// Config with more steps.
+    pub config: TrainConfig,
+    /// Content of its config.toml.
+    pub file: Option<(TrainConfig, Resolved)>,
+    /// Its identity.
+    pub run: RunId,
+    /// Its summary.
+    pub summary: &'a Summary,
+    /// Print only warnings and errors.
+    pub quiet: bool,
+}
+
+impl Finished<'_> {
+    /// Trains from the PLY to the new number of steps.
+    ///
+    /// # Errors
+    /// The scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
+    pub fn go_on(self) -> Result<RunOutcome, TrainError> {
+        let Finished { out, scene, file, run, summary, quiet, .. } = self;
+        machine::set_up(&self.config)?;
+        if !scene.exists() {
+            let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
+            return Err(InputError::new(scene, "the scene of this run is not there", remedy).into());
+        }
+        let kept = keep_result(out, summary.steps)?;
+        eprintln!(
+            "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
+             lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
+            out.display(),
+            kept.display()
+        );
+        let init_ply = absolute(&kept).to_string_lossy().into_owned();
+        let config = TrainConfig { init_ply, ..self.config };
+        let host_mem = host_budget(&config);
+        let start = Start::read(scene, &config, host_mem)?;
+        let (sh_degree_start, first_rows) = (start.sh_degree_start, start.rows);
+        let past = Past {
+            config: with_absolute_paths(config.clone()),
+            metrics_bytes: std::fs::metadata(out.join(METRICS_FILE)).map_or(0, |about| about.len()),
+            step: summary.steps,
+            has_changed: false,
+            file,
+            first_rows,
+        };
+        let (scene, out) = (scene.to_path_buf(), out.to_path_buf());
+        let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
+        let mut first = first_trainer(&request, start, host_mem)?;
+        first.trainer.begin_after(summary.steps, summary.train_seconds);
+        let (print, driver) = (first.print, first.driver);
+        let begun = Begun { print, sh_degree_start, past: Some(past), host_mem, driver, run };
+        plan_and_train(&request, &first.dataset, first.tiers, first.trainer, begun)
+    }
+}
+
+/// Gives the result of `step` in `out` the name of its step; returns its path.
+fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
+    let (result, kept) = (out.join(PLY_FILE), out.join(saved_ply_name(step)));
+    match std::fs::rename(&result, &kept) {
+        Ok(()) => Ok(kept),
+        // An earlier attempt was cut off before its first commit.
+        Err(_) if !result.exists() && kept.is_file() => Ok(kept),
+        Err(error) => Err(InputError::io(&result, "keeping the result under the name of its step", &error)),
+    }
+}

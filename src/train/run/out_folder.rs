@@ -1,0 +1,243 @@
+//! The output folder of a new run: checks it, creates it, locks it, and clears it of an earlier run on --overwrite.
+//!
+//! Invariants: 1. only files with this program's names beside a run's config, and that run's own checkpoint
+//! (`ownership`), are removed; 2. the refusal of a folder with a resumable run names the command that resumes it.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::base::whole_file::{folder_of, sync_folder};
+use crate::config::file::TrainConfig;
+use crate::config::residence::checkpoint_folder;
+use crate::exchange::tensorboard::is_event_file;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
+use crate::train::error::TrainError;
+use crate::train::log::facts::read_resolved;
+use crate::train::stores::ownership::{check_removable, remove_checkpoint_in};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::path::{Path, PathBuf};
+
+/// Treatment of an existing output folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Existing {
+    /// Refuse the folder unless it is empty.
+    Refuse,
+    /// Remove the earlier run's results and its checkpoint in the folder.
+    Overwrite,
+    /// Use the folder: this run was cut off there before its first commit.
+    BeginAgain,
+}
+
+/// Lock file of an output folder; it stays there, empty.
+const LOCK: &str = ".gsscale-lock";
+
+/// The lock on an output folder, held until dropped.
+#[derive(Debug)]
+pub(crate) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
+
+/// Locks an existing output folder. On file systems without locks this does nothing.
+///
+/// # Errors
+/// Another process trains into the folder.
+pub(crate) fn lock(out: &Path) -> InputResult<OutLock> {
+    let file = OpenOptions::new().write(true).create(true).truncate(false).open(out.join(LOCK));
+    let Ok(file) = file else { return Ok(OutLock(None)) };
+    match file.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            let remedy = "wait for it to end, stop it (Ctrl-C commits first), or choose another --out";
+            Err(InputError::new(out, "another process trains into this folder", remedy))
+        }
+        _ => Ok(OutLock(Some(file))),
+    }
+}
+
+/// Whether a folder is empty except for the lock file.
+pub fn is_empty(out: &Path) -> bool {
+    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
+}
+
+/// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
+/// without a scene; with `-2`, `-3` and so on where that is taken.
+pub fn default_out(scene: Option<&Path>) -> PathBuf {
+    let folder = |scene: &Path| {
+        // A name such as `.` or `scans/..` is no name; one that does not exist is refused later.
+        let whole = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
+        let folder = if whole.is_file() { folder_of(&whole).to_path_buf() } else { whole };
+        folder.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned())
+    };
+    let name = scene.map_or_else(|| "demo".to_string(), folder);
+    let numbered = |n: u32| Path::new("runs").join(if n == 1 { name.clone() } else { format!("{name}-{n}") });
+    let is_free = |out: &PathBuf| !out.exists() || is_empty(out);
+    (1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1))
+}
+
+/// Refuses an output folder in which a run may not begin.
+///
+/// # Errors
+/// The folder is not empty and `existing` refuses it, or its checkpoint belongs to another run.
+pub(crate) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    match existing {
+        Existing::Refuse => Ok(check_new(out)?),
+        Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
+        Existing::BeginAgain => Ok(()),
+    }
+}
+
+/// Identity of the run whose config lies in `out`.
+fn run_in(out: &Path) -> RunId {
+    read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
+}
+
+fn check_new(out: &Path) -> InputResult<()> {
+    if !out.exists() {
+        return Ok(());
+    }
+    if is_empty(out) {
+        return Ok(());
+    }
+    Err(InputError::new(out, "exists already", remedy_of_existing(out)))
+}
+
+/// The remedy for an existing output folder: resume its run, or another folder. `--overwrite` is proposed only where there
+/// is no result to lose.
+pub fn remedy_of_existing(out: &Path) -> String {
+    let Ok(config) = TrainConfig::read(&out.join(CONFIG_FILE)) else {
+        return "choose another --out; --overwrite replaces the results of a run".to_string();
+    };
+    let residence = config.residence();
+    let has_result = out.join(PLY_FILE).exists();
+    let shown = out.display();
+    match SpillDir::exists_in(&residence.checkpoint_folder(out)) {
+        false if has_result => {
+            format!("choose another --out, or give its run more steps: gsscale-train --resume {shown} --steps N")
+        }
+        false => "choose another --out, or replace it with --overwrite".to_string(),
+        true if has_result => format!("resume its run with gsscale-train --resume {shown}, or choose another --out"),
+        true => {
+            let over = match residence.spill_dir() {
+                None => "--overwrite".to_string(),
+                Some(spill_dir) => format!("--overwrite after removing {}", spill_dir.display()),
+            };
+            format!(
+                "resume its run with gsscale-train --resume {shown}; or choose another --out, or start over with {over}"
+            )
+        }
+    }
+}
+
+/// Creates the folder durably.
+///
+/// # Errors
+/// The folder cannot be created.
+pub(super) fn make_folder(out: &Path) -> InputResult<()> {
+    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    let is_new = !out.exists();
+    std::fs::create_dir_all(out).map_err(io)?;
+    // The names of new parent folders are not synced.
+    if is_new { sync_folder(folder_of(out)).map_err(io) } else { Ok(()) }
+}
+
+/// Creates the folder, checks that it is writable, and removes an earlier run's files.
+///
+/// # Errors
+/// The folder cannot be written, or its checkpoint belongs to another run.
+pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
+    make_folder(out)?;
+    let probe = out.join(".gsscale-probe");
+    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
+    // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
+    if existing == Existing::Refuse || !out.join(CONFIG_FILE).is_file() {
+        return Ok(());
+    }
+    if existing == Existing::BeginAgain {
+        // A run that was cut off before its first commit left nothing else; results must stay.
+        return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
+    }
+    // First, because an active run in the folder makes this fail.
+    remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
+    Ok(remove_files(out, |_| true)?)
+}
+
+/// Removes the evaluation of an earlier state, since comparisons would use it for this run.
+pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
+    remove_files(out, |tells| tells == Tells::Evaluation)
+}
+
+/// Removes the files of [`RUN_FILES`] that tell about `which` parts of an earlier run.
+fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
+    let files = RUN_FILES.iter().filter(|(_, tells)| which(*tells));
+    files.map(|(file, _)| file).try_for_each(|file| match file {
+        RunFile::File(name) => remove_file(&out.join(name)),
+        RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
+        RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
+        RunFile::Pictures(folder) => {
+            remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
+        }
+    })
+}
+
+fn remove_file(path: &Path) -> InputResult<()> {
+    match std::fs::remove_file(path) {
+        Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
+        _ => Ok(()),
+    }
+}
+
+/// Removes the files that are ours from `folder`, and from its subfolders if `is_deep`; then folders that are empty.
+/// TensorBoard would draw curves that stay into those of the new run.
+fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputResult<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
+    for entry in entries.flatten() {
+        let path = entry.path();
+        match entry.file_type() {
+            Ok(kind) if kind.is_dir() && is_deep => remove_in(&path, is_ours, is_deep)?,
+            Ok(kind) if kind.is_file() && is_ours(&path) => remove_file(&path)?,
+            _ => {}
+        }
+    }
+    let _ = std::fs::remove_dir(folder);
+    Ok(())
+}
+
+/// The PLY files that `--save-every` wrote.
+pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
+    let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
+    let is_saved = |path: &PathBuf| path.file_name().and_then(|name| name.to_str()).is_some_and(is_saved_ply);
+    Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::exchange::tensorboard::EventFile;
+
+    #[test]
+    fn curves_of_an_earlier_run_go_and_others_files_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path();
+        let events = out.join("tensorboard");
+        for _ in 0..2 {
+            EventFile::create(&events, None).unwrap().write(1, &[("loss/train", 0.5)]).unwrap();
+        }
+        let count = || std::fs::read_dir(&events).map_or(0, Iterator::count);
+        make(out, Existing::Overwrite).unwrap();
+        assert_eq!(count(), 2, "no run's config, so they are not a run's");
+        std::fs::write(out.join("config.toml"), "").unwrap();
+        std::fs::write(events.join("events.out.tfevents.0123456789.host.1.0"), "of another program").unwrap();
+        make(out, Existing::Overwrite).unwrap();
+        assert_eq!(count(), 1);
+        std::fs::remove_file(events.join("events.out.tfevents.0123456789.host.1.0")).unwrap();
+        std::fs::write(out.join("config.toml"), "").unwrap();
+        for name in ["evaluated.json", "evaluated-as.toml"] {
+            std::fs::write(out.join(name), "of the earlier run").unwrap();
+        }
+        make(out, Existing::Overwrite).unwrap();
+        assert!(!events.exists());
+        assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
+    }
+}

@@ -1,0 +1,36 @@
+//! A run as a user asks for it, and how it ended.
+
+use super::out_folder::Existing;
+use crate::config::file::TrainConfig;
+use crate::train::log::report::Summary;
+use std::path::PathBuf;
+
+/// The run to start.
+#[derive(Debug, Clone)]
+pub struct RunRequest {
+    /// Scene folder (or transforms.json).
+    pub scene: PathBuf,
+    /// Output folder; may be empty for a dry run.
+    pub out: PathBuf,
+    /// Checked config.
+    pub config: TrainConfig,
+    /// Print the plan and stop.
+    pub dry_run: bool,
+    /// Treatment of an existing output folder.
+    pub existing: Existing,
+    /// Print only warnings and errors.
+    pub quiet: bool,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone)]
+pub struct RunOutcome {
+    /// Content of summary.json; `None` for a dry run.
+    pub summary: Option<Summary>,
+    /// Exit code of the process: 0, or 130/143 after a stop request.
+    pub exit_code: i32,
+    /// The output folder.
+    pub out: PathBuf,
+    /// The run keeps its checkpoint after its end.
+    pub keeps_checkpoint: bool,
+}

@@ -1,0 +1,57 @@
+//! Goes on with a run in the same process after its device was lost: from its last commit, with the device opened anew.
+//!
+//! A driver that was reset or updated, or a device that was unplugged for a moment, then costs the steps since that commit.
+//!
+//! Invariants: 1. a run that goes on this way ends with the same bytes as one that was resumed by hand ([`super::resume`]), so as one
+//! that was never interrupted; 2. other errors end the run.
+
+use super::request::RunOutcome;
+use super::resume::{ResumeRequest, resume};
+use crate::config::file::TrainConfig;
+use crate::gpu::GpuError;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::render::RenderError;
+use crate::report::run_files::CONFIG_FILE;
+use crate::train::error::TrainError;
+use std::path::Path;
+
+impl TrainError {
+    /// Whether the cause is the loss of the device, so that the run can go on once the device is back.
+    pub fn is_device_lost(&self) -> bool {
+        match self {
+            TrainError::Render(RenderError::Device(error)) => matches!(error, GpuError::DeviceLost { .. }),
+            TrainError::Torn { source } => source.is_device_lost(),
+            _ => false,
+        }
+    }
+}
+
+/// Whether the run in an output folder has a commit, or can begin again because all of it was in memory.
+fn can_go_on(out: &Path) -> bool {
+    TrainConfig::read(&out.join(CONFIG_FILE)).is_ok_and(|config| {
+        let residence = config.residence();
+        residence.spill_dir().is_none() || SpillDir::exists_in(&residence.checkpoint_folder(out))
+    })
+}
+
+/// Goes on with the run of `request` for as long as it ends with the loss of its device, at most `most` times. `ended` is how the run
+/// has ended so far.
+///
+/// # Errors
+/// The error that ended the run last.
+pub fn go_on(
+    mut ended: Result<RunOutcome, TrainError>,
+    request: &ResumeRequest,
+    most: u32,
+) -> Result<RunOutcome, TrainError> {
+    for restart in 1..=most {
+        match ended {
+            Err(error) if error.is_device_lost() && can_go_on(&request.out) => {
+                eprintln!("warning: {error}\n  the run goes on in this process (restart {restart} of at most {most})");
+                ended = resume(request);
+            }
+            ended => return ended,
+        }
+    }
+    ended
+}

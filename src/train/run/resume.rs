@@ -1,0 +1,448 @@
+//! Resumes a run that stopped, or that ended and kept its checkpoint, from its output folder.
+//!
+//! Invariants: 1. a resumed run ends with the same bytes as an uninterrupted one; 2. a resume with changed numbers or
+//! another dataset is refused with the differences. If the user accepts them, every page is evaluated once at the step
+//! of the change by the old rules and continues by the new; 3. a refused resume changes nothing; 4. the checkpoint is
+//! sufficient: the output folder only names it, and missing files there are written again; 5. a checkpoint of another
+//! run is neither used nor removed (`ownership`).
+
+use super::begin::{begin, plan_and_train, run};
+use super::changes::{Changes, kept_config};
+use super::more_steps::Finished;
+use super::out_folder::{self, Existing};
+use super::request::{RunOutcome, RunRequest};
+use super::run_folder::{Begun, Past};
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::base::simd::SimdPath;
+use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
+use crate::config::choice::Chosen;
+use crate::config::file::{TrainConfig, TrainOverrides};
+use crate::config::limits::{self, RunOptions};
+use crate::config::residence::checkpoint_folder;
+use crate::densify::stats::GradHistogram;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::map::commit::CommitError;
+use crate::page::tool::reading::Access;
+use crate::paging::pager::Pager;
+use crate::render::Renderer;
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
+use crate::report::run_report::write_run_report;
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::inputs::places::absolute;
+use crate::train::log::facts::{Resolved, read_resolved};
+use crate::train::log::report::{StepLine, Summary};
+use crate::train::memory::estimate::host_budget;
+use crate::train::start::first_scene::Start;
+use crate::train::start::first_scene::dataset_print;
+use crate::train::start::tiers::Tiers;
+use crate::train::state::trainer::Trainer;
+use crate::train::step::pages::PagedScene;
+use crate::train::stores::opened::Stored;
+use crate::train::stores::ownership::{Claim, last_state, open_own};
+use std::path::{Path, PathBuf};
+
+/// Remedy for an unusable config.toml.
+const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume restores it from the checkpoint; if the pages \
+                              lie in a spill directory, name it with --spill-dir";
+
+/// The run to resume, and the settings given now.
+#[derive(Debug, Clone)]
+pub struct ResumeRequest {
+    /// Its output folder.
+    pub out: PathBuf,
+    /// Flags.
+    pub keys: TrainOverrides,
+    /// Its scene, if it moved.
+    pub scene: Option<PathBuf>,
+    /// Accept changed numbers and another dataset.
+    pub accept_changes: bool,
+    /// Print only warnings and errors.
+    pub quiet: bool,
+}
+
+/// Resumes a run and trains to its end.
+///
+/// # Errors
+/// No run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
+pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
+    // Do not read or remove files of an active run.
+    let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
+    let earlier = Earlier::find(request)?;
+    let mut config = earlier.config.clone();
+    request.keys.clone().apply(&mut config);
+    config.check()?;
+    if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
+        return Ok(outcome);
+    }
+    let folder = stored_folder(&request.out, &config);
+    if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
+        drop(lock);
+        keep_rates(&mut config, &request.keys, &earlier.config);
+        let (out, scene, quiet) = (request.out.as_path(), earlier.scene.as_path(), request.quiet);
+        return Finished { out, scene, config, file: earlier.file, run: earlier.run, summary: &summary, quiet }.go_on();
+    }
+    let is_in_output = config.residence().spill_dir().is_none();
+    let found = open_own(&folder, earlier.claim(request), is_in_output);
+    // The resumed run takes the lock again.
+    drop(lock);
+    match found {
+        Ok(Some(stored)) => resume_from(request, &earlier, config, earlier.adopted(stored)),
+        Ok(None) => restart(request, &earlier, config),
+        // A run in memory creates its checkpoint at its first commit.
+        Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
+            restart(request, &earlier, config)
+        }
+        Err(error) => Err(error),
+    }
+}
+
+/// Facts of a run before its checkpoint is opened.
+struct Earlier {
+    /// Path of config.toml, which may not exist.
+    path: PathBuf,
+    /// Its content; `None` if it is missing.
+    file: Option<(TrainConfig, Resolved)>,
+    /// Its config, from the file or from the checkpoint.
+    config: TrainConfig,
+    /// Its scene.
+    scene: PathBuf,
+    /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
+    run: RunId,
+}
+
+impl Earlier {
+    /// Reads config.toml or, if it is missing, the checkpoint in the output folder or in the given spill directory.
+    fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
+        let path = request.out.join(CONFIG_FILE);
+        if path.exists() {
+            let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
+            let config = TrainConfig::read(&path)?;
+            let scene = request.scene.clone().unwrap_or_else(|| facts.scene.clone());
+            return Ok(Earlier { run: facts.run, file: Some((config.clone(), facts)), config, scene, path });
+        }
+        let named = request.keys.spill_dir.as_deref().filter(|folder| !folder.is_empty());
+        let folder = named.map_or_else(|| checkpoint_folder(&request.out), PathBuf::from);
+        let nothing = || {
+            let problem = format!("there is neither a config.toml nor a checkpoint in {}", folder.display());
+            let remedy =
+                "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir";
+            InputError::new(&request.out, problem, remedy)
+        };
+        if !SpillDir::exists_in(&folder) {
+            return Err(nothing().into());
+        }
+        let state = last_state(&folder, Access::Map)?;
+        let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
+        if Path::new(&state.origin.run.out) != absolute(&request.out) && has_results(&request.out) {
+            let problem = format!(
+                "it holds results, and the checkpoint in {} is that of {}",
+                folder.display(),
+                state.origin.run.out
+            );
+            let remedy = "name that output folder, or one that does not exist yet";
+            return Err(InputError::new(&request.out, problem, remedy).into());
+        }
+        eprintln!("warning: {} is missing: restoring it from the checkpoint", path.display());
+        // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
+        let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
+        let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.origin.run.scene));
+        Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
+    }
+
+    /// `stored`, whose folder is removed at the end if the run made it.
+    fn adopted(&self, mut stored: Stored) -> Stored {
+        let is_own = |(config, facts): &(TrainConfig, Resolved)| {
+            facts.made_spill_dir && config.residence().spill_dir().is_some_and(|dir| stored.is_in(dir))
+        };
+        if self.file.as_ref().is_some_and(is_own) {
+            stored.adopt_folder();
+        }
+        stored
+    }
+
+    /// The claim that the run's checkpoint must satisfy.
+    fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
+        let is_named = request.keys.spill_dir.as_ref().is_some_and(|folder| !folder.is_empty());
+        Claim { run: self.run, out: &request.out, is_named }
+    }
+}
+
+/// The summary of a run that did all of its steps, has no checkpoint any more, and is to do more steps. A run that was to
+/// keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
+fn result_to_continue(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    config: &TrainConfig,
+    folder: &Path,
+) -> Option<Summary> {
+    let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps)?;
+    let is_gone = !SpillDir::exists_in(folder) && !earlier.config.keep_checkpoint;
+    (is_gone && earlier.file.is_some()).then_some(summary)
+}
+
+fn read_summary(out: &Path) -> Option<Summary> {
+    serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
+}
+
+/// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
+/// lie elsewhere.
+fn has_results(out: &Path) -> bool {
+    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
+    let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
+    let has = |name: &str| out.join(name).exists();
+    let has_saved = || out_folder::saved(out).is_ok_and(|saved| !saved.is_empty());
+    has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+}
+
+/// Restarts a run that was cut off before its first commit, from its config.
+///
+/// # Errors
+/// The run left results that would be replaced; else as [`run`].
+fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
+    if has_results(&request.out) {
+        let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
+                       removes its checkpoint";
+        let remedy = format!(
+            "start a new run from its Gaussians with another --out and --init-ply {}",
+            request.out.join(PLY_FILE).display()
+        );
+        return Err(InputError::new(&request.out, problem, remedy).into());
+    }
+    let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
+    eprintln!("{} was cut off before its first commit: it begins again", out.display());
+    let existing = Existing::BeginAgain;
+    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet })
+}
+
+/// Resumes from a checkpoint.
+fn resume_from(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    mut config: TrainConfig,
+    stored: Stored,
+) -> Result<RunOutcome, TrainError> {
+    let (file, scene) = (&earlier.path, earlier.scene.clone());
+    machine::set_up(&config)?;
+    let host_mem = host_budget(&config);
+    let state = stored.run_state.clone();
+    keep_schedule(&mut config, &request.keys, &state);
+    check_steps(&config, &state)?;
+    let mut changes = Changes::of_config(file, &state, &config)?;
+    changes.check(file, request.accept_changes)?;
+    if !scene.is_dir() {
+        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
+        return Err(InputError::new(&scene, "the scene of this run is not there", remedy).into());
+    }
+    let start = Start::look(&scene, &config, &request.out, host_mem)?;
+    let print = dataset_print(&start)?;
+    changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
+    changes.numbers.extend(first_degree_change(&start, &state, &print));
+    changes.check(&start.dataset.image_folder, request.accept_changes)?;
+    let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
+    print_resume(request, &state, &config, &changes, &*renderer);
+    let dataset = start.into_dataset();
+    let (pager, tiers) = Tiers::resume(stored, &config, host_mem.unwrap_or(u64::MAX))?;
+    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    let has_changed = !changes.numbers.is_empty();
+    let pages = match has_changed {
+        false => restore_pages(pager, &restore_options(&options, &state), &state)?,
+        true => pages_with_new_rules(pager, &options, &state)?,
+    };
+    let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
+    trainer.restore(&state);
+    let past = Past {
+        config: kept_config(file, &earlier.config, &config)?,
+        metrics_bytes: state.metrics_bytes,
+        step: state.trainer.step,
+        has_changed,
+        file: earlier.file.clone(),
+        first_rows: state.origin.dataset.first_rows,
+    };
+    let run = identity_of(earlier.run, &state);
+    let begun = Begun { print, sh_degree_start: state.origin.sh_degree_start, past: Some(past), host_mem, driver, run };
+    let (out, quiet) = (request.out.clone(), request.quiet);
+    let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
+    plan_and_train(&request, &dataset, tiers, trainer, begun)
+}
+
+/// The identity of a resumed run: its own, that of its checkpoint, or a new one.
+fn identity_of(run: RunId, state: &RunState) -> RunId {
+    [run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
+}
+
+/// Folder of a run's checkpoint.
+fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
+    config.residence().checkpoint_folder(out)
+}
+
+/// Keeps the rate schedule of a run that is extended to more steps.
+fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
+    if let Ok(then) = TrainConfig::parse(&state.origin.config) {
+        keep_rates(config, keys, &then);
+    }
+}
+
+/// Keeps the rate schedule of `then` unless a flag gives another.
+fn keep_rates(config: &mut TrainConfig, keys: &TrainOverrides, then: &TrainConfig) {
+    if keys.schedule_steps.is_none() && config.steps != then.steps {
+        config.schedule_steps = limits::schedule_steps(then);
+    }
+}
+
+fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
+    if config.steps >= state.trainer.step {
+        return Ok(());
+    }
+    let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.trainer.step);
+    Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
+}
+
+/// Prints the resume and its differences.
+fn print_resume(
+    request: &ResumeRequest,
+    state: &RunState,
+    config: &TrainConfig,
+    changes: &Changes,
+    renderer: &dyn Renderer,
+) {
+    if renderer.device() != state.device {
+        let (there, here) = (&state.device, renderer.device());
+        eprintln!("warning: the renderer was {there} and is {here}: its rounding differs");
+    }
+    changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.trainer.step));
+    if !changes.numbers.is_empty() {
+        eprintln!("warning: every page is updated to that step by the old rules and rewritten once");
+    }
+    if request.quiet {
+        return;
+    }
+    let other = match changes.free.as_slice() {
+        [] => String::new(),
+        free => format!("; {}", free.join(", ")),
+    };
+    eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
+}
+
+/// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
+/// behind, unless it is to be kept, the user named another folder, it belongs to another run, or it cannot be opened. A
+/// run that was rolled back since is not finished.
+fn finished_outcome(
+    request: &ResumeRequest,
+    config: &TrainConfig,
+    earlier: &Earlier,
+) -> Result<Option<RunOutcome>, TrainError> {
+    let summary = read_summary(&request.out).filter(|s| s.finished && s.steps >= config.steps);
+    let Some(summary) = summary else { return Ok(None) };
+    let folder = stored_folder(&request.out, config);
+    let is_its_place = folder == stored_folder(&request.out, &earlier.config);
+    let stored = if SpillDir::exists_in(&folder) {
+        open_own(&folder, earlier.claim(request), config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
+            eprintln!("warning: {} is left alone: {error}", folder.display());
+            None
+        })
+    } else {
+        None
+    };
+    if stored.as_ref().is_some_and(|stored| stored.run_state.trainer.step < config.steps && stored.is_whole()) {
+        return Ok(None);
+    }
+    let is_kept = config.keep_checkpoint && stored.is_some();
+    let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.origin.run.id == earlier.run;
+    if let Some(stored) = stored.filter(|stored| is_its_place && !config.keep_checkpoint && is_its_own(stored)) {
+        earlier.adopted(stored).remove()?;
+        // An earlier process of the run may have created the folder in its results; it is empty now.
+        let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
+    }
+    write_run_report(&request.out, &|_, _| {})?;
+    if !request.quiet {
+        let more = if is_kept { "" } else { " from its PLY" };
+        let (out, steps) = (request.out.display(), summary.steps);
+        eprintln!("{out} is finished: all {steps} steps, with results; --steps N continues it{more}");
+    }
+    Ok(Some(RunOutcome {
+        summary: Some(summary),
+        exit_code: 0,
+        out: request.out.clone(),
+        keeps_checkpoint: config.keep_checkpoint,
+    }))
+}
+
+fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
+    let broken = |e: RunStateError| CommitError::Contradiction(e.to_string());
+    let histogram = GradHistogram::from_filled(&state.histogram);
+    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
+    let events = state.event_log().map_err(broken)?;
+    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
+}
+
+/// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
+fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
+    let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
+    let then = config_before(&then, &state.origin.simd, SimdPath::is_supported)
+        .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
+    let old = restore_options(&RunOptions::new(&then, state.origin.dataset.scene_scale), state);
+    let mut pages = restore_pages(pager, &old, state)?;
+    if pages.change_rules(options, state.trainer.step)? {
+        eprintln!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
+    }
+    Ok(pages)
+}
+
+/// The config by which the pages were trained, on an instruction path with the same bits if this machine has one, else
+/// on the path of the config or the best available: another path changes only the rounding.
+fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath) -> bool) -> Option<TrainConfig> {
+    let on = |simd: Option<SimdPath>| TrainConfig { simd: Chosen(simd), ..then.clone() };
+    let path = SimdPath::from_name(simd);
+    let class = path.map(SimdPath::bits_class);
+    let of_class = SimdPath::ALL.into_iter().filter(|path| Some(path.bits_class()) == class);
+    let of_class = of_class.map(|path| on(Some(path)));
+    let mut all = std::iter::once(on(path)).chain(of_class).chain([on(then.simd.0), on(None)]);
+    all.find(|c| is_supported(limits::simd_path(c)))
+}
+
+/// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
+/// degree. Accepted changes of keys may give another first degree now.
+fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
+    RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options.clone() }
+}
+
+/// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or
+/// Gaussians only the config can differ, and its keys are compared elsewhere.
+fn first_degree_change(start: &Start, state: &RunState, here: &DatasetPrint) -> Option<String> {
+    if state.origin.dataset.points == here.points {
+        return None;
+    }
+    let (there, here) = (state.origin.sh_degree_start, start.sh_degree_start);
+    (there != here).then(|| format!("the SH degree of the first Gaussians was {there} and is {here}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pages_go_on_by_their_own_config_on_a_machine_without_its_path() {
+        let then =
+            TrainConfig { means_lr: 0.5, seed: 9, simd: Chosen(Some(SimdPath::Avx512)), ..TrainConfig::default() };
+        let here = |paths: &[SimdPath]| config_before(&then, "avx512", |path| paths.contains(&path));
+        let with = |simd: Option<SimdPath>| Some(TrainConfig { simd: Chosen(simd), ..then.clone() });
+        assert_eq!(here(&SimdPath::ALL), with(Some(SimdPath::Avx512)));
+        assert_eq!(
+            here(&[SimdPath::Avx2, SimdPath::Baseline]),
+            with(Some(SimdPath::Avx2)),
+            "the same bits on another path"
+        );
+        // What `auto` stands for depends on the machine: it is asked for after the path itself, the two of its class,
+        // and that of the config.
+        let asked = std::cell::Cell::new(0);
+        let last = |_| asked.replace(asked.get() + 1) == 4;
+        assert_eq!(config_before(&then, "avx512", last), with(None));
+        let baseline = TrainConfig { simd: Chosen(Some(SimdPath::Baseline)), ..then.clone() };
+        let found = config_before(&baseline, "avx512", |path| path == SimdPath::Baseline);
+        assert_eq!(found, Some(baseline), "that of the config comes next");
+        // Never by another config.
+        assert_eq!(here(&[]), None);
+    }
+}

@@ -1,0 +1,308 @@
+//! A run in its output folder: the files at its beginning, the loop, the files at its end.
+//!
+//! Not here: whether the folder may be used ([`super::out_folder`]), the plan ([`super::begin`]), what the loop writes on its way.
+//!
+//! Invariants: 1. a run that is stopped or fails after its first step still writes the PLY of its last good step; 2. the
+//! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past.
+
+use super::appearance_file::write_appearance;
+use super::changes::with_absolute_paths;
+use super::costs::Meter;
+use super::out_folder;
+use super::page_map::write_page_map;
+use super::request::{RunOutcome, RunRequest};
+use super::training_loop::LoopOutputs;
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
+use crate::config::choice::{Chosen, LogFormat};
+use crate::config::file::TrainConfig;
+use crate::config::limits;
+use crate::config::values::Up;
+use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::format::ExportFormat;
+use crate::exchange::meta::ExportFrame;
+use crate::exchange::sink::Written;
+use crate::report::run_files::{
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SPZ_FILE, SUMMARY_FILE,
+};
+use crate::report::run_report::write_run_report;
+use crate::train::commits::checkpoint::Checkpoint;
+use crate::train::error::TrainError;
+use crate::train::inputs::places::absolute;
+use crate::train::inputs::signals::StopFlag;
+use crate::train::log::facts::{Resolved, write_config};
+use crate::train::log::progress::{Count, Progress};
+use crate::train::log::report::{MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
+use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::start::tiers::Tiers;
+use crate::train::state::trainer::Trainer;
+use std::path::Path;
+
+/// The past of a resumed run.
+pub(super) struct Past {
+    /// The config to keep from now on.
+    pub config: TrainConfig,
+    /// Length of its metrics.
+    pub metrics_bytes: u64,
+    /// Steps done.
+    pub step: u32,
+    /// Numbers have changed, which is committed at once.
+    pub has_changed: bool,
+    /// Content of its config.toml; `None` if the file is missing and must be restored.
+    pub file: Option<(TrainConfig, Resolved)>,
+    /// Number of its first Gaussians.
+    pub first_rows: u64,
+}
+
+/// Facts with which a run begins or resumes.
+pub(super) struct Begun {
+    /// Digest of the dataset.
+    pub print: DatasetPrint,
+    /// SH degree of the first step.
+    pub sh_degree_start: u8,
+    /// The past of a resumed run.
+    pub past: Option<Past>,
+    /// Budget, bytes.
+    pub host_mem: Option<u64>,
+    /// Bytes allocated by the graphics driver.
+    pub driver: u64,
+    /// Identity of the run.
+    pub run: RunId,
+}
+
+/// The config to keep: with choices resolved and absolute paths.
+fn resolved_config(config: &TrainConfig, trainer: &Trainer) -> TrainConfig {
+    let view_order = Chosen(Some(trainer.view_order().order()));
+    let up = trainer.options.up.map_or(Up::Keep, Up::Along);
+    let optimizer_on = Chosen(Some(trainer.options.optimizer_on));
+    with_absolute_paths(TrainConfig { view_order, up, optimizer_on, ..config.clone() })
+}
+
+/// Writes config.toml (on resume only if it changed); returns the origin for all commits.
+fn begin_files(
+    request: &RunRequest,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    begun: &Begun,
+    made_spill_dir: bool,
+) -> InputResult<Origin> {
+    let simd = limits::simd_path(&request.config).name().to_string();
+    let path = request.out.join(CONFIG_FILE);
+    let config = match &begun.past {
+        Some(past) => {
+            // It belongs to the Gaussians before the change.
+            out_folder::remove_evaluation(&request.out)?;
+            let made_again = Resolved { gaussians: past.first_rows, ..resolved(request, dataset, trainer, begun.run) };
+            let before = past.file.as_ref().map_or(&made_again, |(_, facts)| facts);
+            let facts = Resolved { run: begun.run, scene: absolute(&request.scene), ..before.clone() };
+            let kept = (past.config.clone(), facts);
+            if past.file.as_ref() != Some(&kept) {
+                write_config(&path, &kept.0, &kept.1)?;
+            }
+            kept.0
+        }
+        None => {
+            let kept = resolved_config(&request.config, trainer);
+            let facts = resolved(request, dataset, trainer, begun.run);
+            write_config(&path, &kept, &Resolved { made_spill_dir, ..facts })?;
+            kept
+        }
+    };
+    let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
+    let config = toml::to_string(&config).map_err(fail)?;
+    let [out, scene] = [&request.out, &request.scene].map(|path| absolute(path).to_string_lossy().into_owned());
+    let run = RunIdentity { id: begun.run, out, scene };
+    Ok(Origin { config, simd, sh_degree_start: begun.sh_degree_start, dataset: begun.print.clone(), run })
+}
+
+/// Trains to the end, and writes the results. `stop` asks for an early end.
+///
+/// # Errors
+/// A failure while training, after the last good step was written, or the folder cannot be written.
+pub(super) fn train_into(
+    request: &RunRequest,
+    dataset: &Dataset,
+    mut trainer: Trainer,
+    (stop, tiers): (&StopFlag, &mut Tiers),
+    begun: Begun,
+) -> Result<RunOutcome, TrainError> {
+    let (config, out) = (&request.config, &request.out);
+    let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
+    let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
+    let keeps = tiers.keeps_checkpoint();
+    let mut checkpoint = tiers.checkpoint.as_mut();
+    if let Some(checkpoint) = &mut checkpoint {
+        checkpoint.set_origin(origin);
+        if begun.past.is_some_and(|p| p.has_changed) {
+            let committed = checkpoint.commit(&mut trainer, &mut metrics);
+            committed.or_else(|why| checkpoint.make_space(&mut trainer, &mut metrics, stop, why))?;
+        }
+    }
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
+    let meter = Meter::start(&trainer);
+    metrics.start_clock(trainer.train_seconds());
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
+    let looped = trainer.run(dataset, &targets, &mut outputs);
+    let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
+    let ply = Trainer::ply_path(out);
+    let saved = save_result(dataset, &mut trainer, &ply, config.export);
+    // Return the error that ended the run; a failure to write its last rows is an additional warning.
+    let (looped, written) = match (looped, saved) {
+        (Err(error), Err(other)) => {
+            eprintln!("warning: {} cannot be written: {other}", ply.display());
+            return Err(error);
+        }
+        (looped, saved) => (looped, saved?),
+    };
+    warn_of_ply(config, &written, &ply);
+    // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
+    let asked = stop.exit_code();
+    let tested = looped.and_then(|()| match asked {
+        None => evaluate_result(request, dataset, &targets, &mut trainer, &mut metrics),
+        Some(_) => Ok(None),
+    });
+    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
+        // Commit again, with the result of the evaluation.
+        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
+    }
+    let summary = Summary {
+        gaussians: written.rows + written.skipped,
+        test: tested.as_ref().ok().copied().flatten(),
+        // A run without its evaluation is not finished: a resume evaluates it.
+        finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
+        outlier_views: trainer.outlier_views(dataset),
+        costs,
+        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
+        ..summary_of(request, &trainer)
+    };
+    write_summary(&out.join(SUMMARY_FILE), &summary)?;
+    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
+    write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
+    write_report(request)?;
+    tested?;
+    tiers.is_done = summary.finished;
+    Ok(RunOutcome {
+        summary: Some(summary),
+        exit_code: stop.exit_code().unwrap_or(0),
+        out: out.clone(),
+        keeps_checkpoint: config.keep_checkpoint,
+    })
+}
+
+/// Writes the Gaussians at the current step as a PLY and in the format that was asked for, and beside them the way to the dataset's coordinates.
+fn save_result(
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    ply: &Path,
+    format: ExportFormat,
+) -> Result<Written, TrainError> {
+    let written = trainer.save(dataset, ply)?;
+    let meta = trainer.scene_meta(dataset);
+    ExportFormat::Ply.write_transform(ply, &meta, written.frame)?;
+    if format == ExportFormat::Spz {
+        let spz = ply.with_file_name(SPZ_FILE);
+        let compressed = trainer.export(dataset, &spz, format)?;
+        format.write_transform(&spz, &meta, compressed.frame)?;
+        if compressed.rows < written.rows {
+            let lost = written.rows - compressed.rows;
+            eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", spz.display());
+        }
+    }
+    Ok(written)
+}
+
+/// Evaluates the result, with pictures, and logs the evaluation.
+fn evaluate_result(
+    request: &RunRequest,
+    dataset: &Dataset,
+    targets: &TargetCache,
+    trainer: &mut Trainer,
+    metrics: &mut MetricsLog,
+) -> Result<Option<TestMetrics>, TrainError> {
+    let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
+    let pictures = request.out.join(PICTURES_FOLDER);
+    // A run that was killed after the commit of its last evaluation has the line already.
+    let is_logged = trainer.state.test.is_some_and(|test| test.step == trainer.state.step);
+    let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
+    if let Some(test) = test.filter(|_| !is_logged) {
+        metrics.write_evaluation(trainer.steps_done(), test, &pictures)?;
+    }
+    Ok(test)
+}
+
+fn write_report(request: &RunRequest) -> InputResult<()> {
+    let shown = std::cell::OnceCell::new();
+    let show = |done: usize, all: usize| {
+        let count = || Count::new("pictures put into the report", all as u32, request.quiet);
+        shown.get_or_init(count).show(done as u32);
+    };
+    write_run_report(&request.out, &show)?;
+    Ok(())
+}
+
+/// The log of metrics of a new run, or of a run that resumes after `past`.
+fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<MetricsLog> {
+    let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
+    match log {
+        LogFormat::Json => Ok(metrics),
+        LogFormat::Tensorboard => metrics.with_events(&out.join(EVENTS_FOLDER), past.map(|past| past.step + 1)),
+    }
+}
+
+/// Warns if the final PLY differs from the request.
+fn warn_of_ply(config: &TrainConfig, written: &Written, ply: &Path) {
+    if written.frame == ExportFrame::Local && config.export_frame == ExportFrame::Dataset {
+        eprintln!(
+            "warning: dataset coordinates exceed the precision of f32, so {} holds local positions; \
+             its comments give origin and scale",
+            ply.display()
+        );
+    }
+    if written.skipped > 0 {
+        eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
+    }
+}
+
+/// The part of the summary that the trainer knows: not finished, not evaluated.
+fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
+    let (rows_skipped, steps_skipped) = trainer.skipped();
+    Summary {
+        steps: trainer.steps_done(),
+        gaussians: trainer.scene.rows(),
+        train_seconds: trainer.train_seconds(),
+        host_bytes_peak: host_bytes_peak().unwrap_or(0),
+        test: None,
+        scene: request.scene.clone(),
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        ssim_variant: request.config.ssim_variant.to_string(),
+        finished: false,
+        rows_skipped_non_finite: rows_skipped,
+        steps_skipped_non_finite: steps_skipped,
+        outlier_views: Vec::new(),
+        costs: StepCosts::default(),
+        growth: trainer.growth().to_vec(),
+        tiers: trainer.tier_traffic(),
+        commits: None,
+    }
+}
+
+fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: RunId) -> Resolved {
+    Resolved {
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        run,
+        scene: absolute(&request.scene),
+        simd: limits::simd_path(&request.config).name().to_string(),
+        threads: rayon::current_num_threads(),
+        device: trainer.renderer.device(),
+        train_views: dataset.train_views().len(),
+        test_views: dataset.test_views().len(),
+        gaussians: trainer.scene.rows(),
+        origin: dataset.frame.origin.to_array(),
+        scale: dataset.frame.scale,
+        scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
+        made_spill_dir: false,
+    }
+}

@@ -1,0 +1,350 @@
+//! The start of a run: first Gaussians in memory, or points or Gaussians that are streamed into pages.
+//!
+//! With a spill directory, points and Gaussians in files are streamed, so the scene may exceed memory. The Gaussians of
+//! a store are always streamed. Random points are made in memory.
+//!
+//! Invariant: streamed and whole input give the same pages, bit for bit ([`crate::dataset::import`]).
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::ids::PageId;
+use crate::base::units::format_bytes;
+use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::colmap;
+use crate::dataset::frame::Extent;
+use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, PointSource, import_points};
+use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
+use crate::dataset::model::{PointCloud, RawScene, TakePoint};
+use crate::dataset::read::{ReadOptions, read_scene};
+use crate::dataset::up::estimate_up;
+use crate::exchange::ply;
+use crate::paging::pager::Pager;
+use crate::scene::columns::{Columns, row_width};
+use crate::scene::init::InitOptions;
+use crate::scene::log_scales::LogScaleRange;
+use crate::scene::partition::first_fill;
+use crate::scene::state::SceneState;
+use crate::train::error::TrainError;
+use crate::train::error::not_stored;
+use crate::train::inputs::dataset_print::view_print;
+use crate::train::inputs::dataset_print::{GaussiansPrint, points_print};
+use crate::train::inputs::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead};
+use crate::train::inputs::places::folder_beside;
+use crate::train::inputs::prepare::ply_warnings;
+use crate::train::inputs::prepare::{Prepared, check_first_rows, check_train_views, giants_warning, prepare};
+use crate::train::memory::estimate::check_photos_fit;
+use crate::train::step::pages::{PagedScene, first_pages};
+use crate::train::stores::StoredStart;
+use rayon::prelude::*;
+use std::path::{Path, PathBuf};
+
+/// Memory of an import without a budget, bytes.
+const BUDGET_DEFAULT: u64 = 1 << 30;
+/// The input of the first Gaussians gets 1/3 of the budget.
+const BUDGET_SHARE: u64 = 3;
+
+/// A dataset and the source of its first Gaussians.
+pub struct Start {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// SH degree of the first step.
+    pub sh_degree_start: u8,
+    /// Number of first Gaussians; an upper bound for point clouds.
+    pub rows: u64,
+    /// Digest of their source; the same for streamed and whole input.
+    pub points: u64,
+    from: FirstRows,
+}
+
+enum FirstRows {
+    Columns(Columns),
+    Points { cloud: Cloud, extent: Extent, init: InitOptions },
+    Gaussians(GaussianFile),
+    Store(Box<StoredStart>),
+}
+
+impl Start {
+    /// Reads the scene. Points that can be streamed take no more memory than `host_mem` allows.
+    ///
+    /// # Errors
+    /// As [`prepare`].
+    pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        if config.residence().spill_dir().is_none() && !Path::new(&config.init_ply).is_dir() {
+            return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
+        }
+        Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
+    }
+
+    /// As [`Start::read`], for inspection of a run's start: avoids creating Gaussians. `folder` holds unnamed temporary
+    /// files for data that exceeds memory.
+    ///
+    /// # Errors
+    /// As [`prepare`].
+    pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        if Path::new(&config.init_ply).is_dir() {
+            return Start::of_store(scene, config, host_mem)?.with_photos_that_fit(host_mem);
+        }
+        let start = match Start::stream(scene, config, &budget(folder, host_mem))? {
+            Some(start) => start,
+            None => Start::in_memory(scene, config, host_mem)?,
+        };
+        start.with_photos_that_fit(host_mem)
+    }
+
+    /// Refused where a photo cannot be decoded in `host_mem`.
+    fn with_photos_that_fit(self, host_mem: Option<u64>) -> InputResult<Start> {
+        check_photos_fit(&self.dataset, host_mem)?;
+        Ok(self)
+    }
+
+    fn in_memory(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        check_gaussians_fit(config, host_mem)?;
+        let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
+        let points = match dataset.points.as_slice() {
+            [] => {
+                let mut print = GaussiansPrint::default();
+                print.add(&columns);
+                print.digest()
+            }
+            points => points_print(&(points, dataset.colors.as_slice()))?.0,
+        };
+        Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, points, from: FirstRows::Columns(columns) })
+    }
+
+    /// From the Gaussians of a store.
+    fn of_store(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        let folder = Path::new(&config.init_ply);
+        let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
+        let store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
+            TrainError::Input(error) => error,
+            other => InputError::new(folder, other.to_string(), "see the cause"),
+        })?;
+        let mut raw = read_scene(scene, &limits::read_options(config))?;
+        raw.points = PointCloud::default();
+        let dataset = load_dataset(raw, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let rows = store.rows_at_most();
+        check_first_rows(folder, config, rows)?;
+        let sh_degree_start = store.sh_degree().max(limits::first_sh_degree(config));
+        let points = store.digest()?;
+        Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Store(Box::new(store)) })
+    }
+
+    /// From the Gaussians of a file, which are read once here to know that all of them can be.
+    fn of_gaussians(scene: &Path, config: &TrainConfig, mut raw: RawScene, file: &Path) -> InputResult<Start> {
+        raw.points = PointCloud::default();
+        let mut dataset = load_dataset(raw, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
+        let range = LogScaleRange::of_scene(dataset.scene_scale);
+        let gaussians = GaussianFile::open(file, config.sh_degree, frame, range)?;
+        let (mut print, mut rows) = (GaussiansPrint::default(), 0);
+        let GaussiansRead { meta, far, giants } = gaussians.read(&mut |columns| {
+            print.add(columns);
+            rows += columns.rows() as u64;
+            Ok(())
+        })?;
+        dataset.warnings.extend(ply_warnings(file, &meta, far));
+        dataset.warnings.extend(giants_warning(file, giants));
+        check_first_rows(file, config, rows)?;
+        let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));
+        Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
+    }
+
+    /// `None` where neither points nor Gaussians are in a file.
+    fn stream(scene: &Path, config: &TrainConfig, budget: &Budget<'_>) -> InputResult<Option<Start>> {
+        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..limits::read_options(config) })?;
+        let file = match config.init_ply.as_str() {
+            "" => raw.points_path.take(),
+            path => Some(PathBuf::from(path)),
+        };
+        let Some(file) = file else { return Ok(None) };
+        if is_ply(&file) && ply::holds_gaussians(&file)? {
+            return Start::of_gaussians(scene, config, raw, &file).map(Some);
+        }
+        let mut warnings = Vec::new();
+        let cloud = Cloud::gather(budget, |take| read_points(&file, &mut warnings, take))?;
+        if cloud.is_empty() {
+            return Ok(None);
+        }
+        raw.warnings.append(&mut warnings);
+        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &limits::load_options(config))?;
+        check_train_views(scene, &dataset)?;
+        let extent = local.extent;
+        let (points, rows) = points_print(&local)?;
+        if rows == 0 {
+            return Ok(None);
+        }
+        let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
+        let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
+        let from = FirstRows::Points { cloud, extent, init };
+        Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
+    }
+
+    /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
+    /// whole input.
+    ///
+    /// # Errors
+    /// The points cannot be read.
+    pub(crate) fn up(&self) -> InputResult<Option<[f64; 3]>> {
+        let cameras = self.dataset.views.iter().map(|view| &view.camera);
+        estimate_up(cameras, |take| match &self.from {
+            FirstRows::Points { cloud, extent, .. } => {
+                let points = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
+                points.read(&mut |position, _| {
+                    take(position);
+                    Ok(())
+                })
+            }
+            _ => {
+                self.dataset.points.iter().for_each(|&position| take(position));
+                Ok(())
+            }
+        })
+    }
+
+    /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store
+    /// with its lock.
+    pub(crate) fn into_dataset(self) -> Dataset {
+        self.dataset
+    }
+
+    /// The dataset, and the first Gaussians as pages in `pager`.
+    ///
+    /// # Errors
+    /// The source cannot be read again, or a page could not be stored.
+    pub fn into_pages(
+        mut self,
+        pager: Pager,
+        options: &RunOptions,
+        config: &TrainConfig,
+        host_mem: Option<u64>,
+    ) -> Result<(Dataset, PagedScene), TrainError> {
+        let mut scene = PagedScene::empty(pager, options);
+        let folder = folder_beside(Path::new(&config.spill_dir));
+        let insert = &mut |id, state: SceneState| Ok(scene.insert_first_page(id, &state)?);
+        let moved = self.for_each_page(options, &folder, host_mem, insert)?;
+        if moved > 0 {
+            eprintln!(
+                "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved \
+                 into its range"
+            );
+        }
+        Ok((self.dataset, scene))
+    }
+
+    /// Passes the first pages to `take` in the order of their ids, with the SH degree of the first step and log-scales
+    /// within the range of the scene. Returns how many log-scales were moved into it. `folder` holds temporary files for
+    /// data that exceeds memory. May be called repeatedly.
+    ///
+    /// # Errors
+    /// The source cannot be read again, or `take` failed.
+    pub(crate) fn for_each_page(
+        &mut self,
+        options: &RunOptions,
+        folder: &Path,
+        host_mem: Option<u64>,
+        take: &mut dyn FnMut(PageId, SceneState) -> Result<(), TrainError>,
+    ) -> Result<u64, TrainError> {
+        let (range, mut moved) = (LogScaleRange::of_scene(options.scene_scale), 0);
+        let (sh_degree, budget) = (options.sh_degree_at(0), budget(folder, host_mem));
+        let fill = first_fill(options.page_rows, options.strategy.grows());
+        let frame = self.dataset.frame;
+        let mut failed = None;
+        // Keep the error of `take` itself: the import would wrap it.
+        let mut take_state = |id, mut state: SceneState| {
+            state.raise_sh_degree(sh_degree);
+            moved += range.clamp_all(&mut state.columns.scales);
+            take(id, state).map_err(|error| not_stored(failed.insert(error)))
+        };
+        let done = match &mut self.from {
+            FirstRows::Columns(columns) => first_pages(columns, fill, sh_degree, &mut take_state),
+            FirstRows::Points { cloud, extent, init } => {
+                let import = ImportOptions { init, fill, budget };
+                let source = LocalCloud { cloud, extent: *extent, frame };
+                let taken = import_points(&source, &import, &mut |page| take_state(page.id, page.into_state()));
+                taken.map(|_| ())
+            }
+            FirstRows::Gaussians(file) => {
+                let mut rows = GaussianWriter::new(file.path(), GaussianSpace { folder, memory: budget.bytes });
+                let read = file.read(&mut |columns| rows.push_all(columns));
+                read.and_then(|_| rows.finish()).and_then(|rows| rows.for_each_page(fill, &mut take_state))
+            }
+            FirstRows::Store(store) => {
+                let (frame, sizes) = ((frame.origin.to_array(), frame.scale), (options.page_rows, sh_degree));
+                let mut number = 0;
+                store.for_each_page(frame, sizes, &mut |mut state| {
+                    moved += range.clamp_all(&mut state.columns.scales);
+                    take(PageId::initial(number), state)?;
+                    number += 1;
+                    Ok(())
+                })?;
+                return Ok(moved);
+            }
+        };
+        match failed {
+            Some(error) => Err(error),
+            None => {
+                done?;
+                Ok(moved)
+            }
+        }
+    }
+}
+
+/// A third of the memory: frames take a share, and the system caches the files just written.
+fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
+    Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / BUDGET_SHARE) as usize }
+}
+
+/// Refuses a PLY of Gaussians that exceeds memory, by its header: without a spill directory the file is read whole.
+fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
+    let file = Path::new(&config.init_ply);
+    let is_read = !config.init_ply.is_empty() && is_ply(file);
+    let Some(budget) = host_mem.filter(|_| is_read) else { return Ok(()) };
+    let rows = ply::stated_rows(file)?;
+    let bytes = rows.saturating_mul(row_width(config.sh_degree) as u64 * 4);
+    if bytes <= budget || !ply::holds_gaussians(file)? {
+        return Ok(());
+    }
+    let problem = format!(
+        "its {rows} Gaussians take {} while they are read, above --host-mem {}",
+        format_bytes(bytes),
+        format_bytes(budget)
+    );
+    let remedy = "name a folder on a fast drive with --spill-dir: the Gaussians are then streamed into pages";
+    Err(InputError::new(file, problem, remedy))
+}
+
+fn is_ply(file: &Path) -> bool {
+    !file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bin") || e.eq_ignore_ascii_case("txt"))
+}
+
+fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
+    if !is_ply(file) {
+        return colmap::stream_points(file, warnings, take);
+    }
+    let dropped = ply::stream_points(file, take)?;
+    if dropped > 0 {
+        warnings.push(format!("{}: {dropped} points are not finite, dropped", file.display()));
+    }
+    Ok(())
+}
+
+/// The dataset print of a run's start.
+///
+/// # Errors
+/// A photo or a mask cannot be read.
+pub fn dataset_print(start: &Start) -> InputResult<DatasetPrint> {
+    let dataset = &start.dataset;
+    let views: InputResult<Vec<ViewPrint>> = dataset.views.par_iter().map(view_print).collect();
+    Ok(DatasetPrint {
+        views: views?,
+        first_rows: start.rows,
+        points: start.points,
+        scene_scale: dataset.scene_scale,
+        origin: dataset.frame.origin.to_array(),
+        scale: dataset.frame.scale,
+    })
+}

@@ -1,0 +1,263 @@
+//! Evaluation of held-out views: PSNR, SSIM, LPIPS, and pictures of render beside photo. Leaves the scene unchanged.
+//!
+//! PSNR is of the pictures as they are. Two further figures have their own names and are never mixed with it: after an
+//! affine or quadratic colour correction ([`ColorCorrected`]), and of the right halves after a fit of appearance to the left
+//! halves ([`HalfFitted`]).
+
+use crate::appearance::AppearanceMode;
+use crate::appearance::fit::Pair;
+use crate::appearance::picture::{Lens, Look};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::loader::{Dataset, load_dataset};
+use crate::dataset::read::read_scene;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::frames::to_local;
+use crate::exchange::ply::{PlyContent, read_ply};
+use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
+use crate::render::lpips::weights::read_lpips;
+use crate::render::lpips::{InputRange, Lpips};
+use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
+use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::VIEWS_FILE;
+use crate::scene::camera::Camera;
+use crate::scene::image::{Image, Target};
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::inputs::prepare::ply_warnings;
+use crate::train::log::progress::Count;
+use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
+use crate::train::memory::estimate::{check_photos_fit, host_budget};
+use crate::train::step::pages::PagedScene;
+use crate::train::step::view::draw;
+use crate::train::step::working_set::WorkingSet;
+use std::path::{Path, PathBuf};
+
+/// Steps of the fit to the left half of a photo: it has converged long before.
+const FIT_ROUNDS: usize = 10;
+
+/// Views and metrics of an evaluation.
+pub struct EvalRequest<'a> {
+    /// Indices in `dataset.views`.
+    pub views: &'a [usize],
+    /// Variant of SSIM.
+    pub ssim: SsimVariant,
+    /// Folder for pictures (render beside photo) and the figures of each view, created if missing; `None` for none.
+    pub pictures: Option<&'a Path>,
+    /// LPIPS network and its input range; `None` for no LPIPS.
+    pub lpips: Option<(&'a Lpips, InputRange)>,
+    /// Method of colour correction; `None` for no colour-corrected PSNR.
+    pub color_correct: Option<ColorCorrect>,
+    /// What is fitted to the left half of each photo; off for no such figures.
+    pub appearance: AppearanceMode,
+    /// Called with the number of views done, after each.
+    pub progress: &'a dyn Fn(u32),
+}
+
+/// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
+/// metrics and do not count in the means. `None` if no view has metrics.
+///
+/// # Errors
+/// A photo cannot be decoded, pages could not be pinned, the renderer failed, or a picture cannot be written.
+pub fn evaluate(
+    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
+    renderer: &mut dyn Renderer,
+    (dataset, targets): (&Dataset, &TargetCache),
+    options: &RenderOptions,
+    request: &EvalRequest<'_>,
+) -> Result<Option<TestMetrics>, TrainError> {
+    if request.views.is_empty() {
+        return Ok(None);
+    }
+    let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut corrected, mut halves, mut figures) = (Vec::new(), Vec::new(), Vec::new());
+    for (i, &view) in request.views.iter().enumerate() {
+        targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
+        let target = targets.get(view)?;
+        let camera = &dataset.views[view].camera;
+        draw((&mut *scene, now, &mut *working), renderer, camera, options)?;
+        let image = renderer.image()?;
+        let mut of_view = (None, None);
+        if target.counts() {
+            psnrs.push(json_psnr(psnr(image, &target)));
+            of_view.0 = psnrs.last().copied();
+            let fit = request.color_correct;
+            corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
+            halves.extend(half_fitted(image, &target, camera, request.appearance));
+            // NaN: every SSIM window is masked although some border pixels are not.
+            of_view.1 = Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan());
+            ssims.extend(of_view.1);
+            // NaN: the picture is too small for the network.
+            let distance = request.lpips.map(|(lpips, range)| lpips.distance(image, &target, range));
+            distances.extend(distance.filter(|x| !x.is_nan()));
+        }
+        if let Some(folder) = request.pictures {
+            let path = picture_path(folder, dataset, view);
+            write_pair(&path, image, &target)?;
+            let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
+        }
+        (request.progress)(i as u32 + 1);
+    }
+    if let Some(folder) = request.pictures {
+        let name = Path::new(VIEWS_FILE).file_name().unwrap_or_default();
+        write_whole(&folder.join(name), serde_json::Value::from(figures).to_string().as_bytes())?;
+    }
+    if psnrs.is_empty() {
+        return Ok(None);
+    }
+    let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
+    let lpips = (!distances.is_empty()).then(|| mean(&distances));
+    let color_corrected = request.color_correct.map(|method| ColorCorrected { method, cc_psnr: mean(&corrected) });
+    let half_fitted = (!halves.is_empty()).then(|| {
+        let [right_psnr, fitted_right_psnr] = [0, 1].map(|i| mean(&halves.iter().map(|h| h[i]).collect::<Vec<_>>()));
+        HalfFitted { model: request.appearance, right_psnr, fitted_right_psnr }
+    });
+    let views = psnrs.len() as u32;
+    Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, color_corrected, half_fitted }))
+}
+
+/// PSNR of the right half of a picture: as it is, and under the correction that brings the left half closest to the
+/// photo. `None` if nothing is to be fitted, or a half is masked.
+fn half_fitted(image: &Image, target: &Target, camera: &Camera, mode: AppearanceMode) -> Option<[f64; 2]> {
+    if !mode.is_on() {
+        return None;
+    }
+    let width = image.width as usize;
+    let is_right = |i: usize| i % width >= width / 2;
+    let counts = |i: usize| is_right(i) && target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
+    let mask = (0..image.pixels()).map(|i| if counts(i) { u8::MAX } else { 0 }).collect();
+    let right = Target { mask: Some(mask), ..target.clone() };
+    if !right.counts() {
+        return None;
+    }
+    let start = Look { lens: Lens::of(camera), ..Look::default() };
+    let pair = Pair { drawn: &image.rgb, photo: target };
+    let values = pair.image_values(&start, mode.image_values(), 0..width / 2, FIT_ROUNDS)?;
+    let mut fitted = image.clone();
+    Look { image: values, ..start }.correct(&mut fitted.rgb, width, None);
+    Some([image, &fitted].map(|picture| json_psnr(psnr(picture, &right))))
+}
+
+/// File of a view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
+/// index if two views would share a file.
+fn picture_path(folder: &Path, dataset: &Dataset, view: usize) -> PathBuf {
+    let flat = |name: &str| {
+        let flat = name.replace(['/', '\\'], "_");
+        flat.rsplit_once('.').map_or(flat.clone(), |(stem, _)| stem.to_string())
+    };
+    let stem = flat(&dataset.views[view].name);
+    let is_shared = dataset.views.iter().filter(|v| flat(&v.name) == stem).count() > 1;
+    folder.join(if is_shared { format!("{view:05}_{stem}.png") } else { format!("{stem}.png") })
+}
+
+/// Writes render (left) beside photo (right).
+fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
+    let folder = path.parent().unwrap_or(path);
+    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder for pictures", &e))?;
+    let (w, h) = (image.width as usize, image.height as usize);
+    let render = image.to_rgb8();
+    let mut both = Vec::with_capacity(6 * w * h);
+    for y in 0..h {
+        both.extend_from_slice(&render[3 * w * y..3 * w * (y + 1)]);
+        both.extend_from_slice(&target.rgb[3 * w * y..3 * w * (y + 1)]);
+    }
+    image::save_buffer(path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
+        .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
+}
+
+/// Report of `gsscale-eval`.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct EvalReport {
+    /// The PLY.
+    pub ply: PathBuf,
+    /// Folder of the scene.
+    pub scene: PathBuf,
+    /// Gaussians in the PLY.
+    pub gaussians: u64,
+    /// Variant of SSIM.
+    pub ssim_variant: String,
+    /// Network and input range of LPIPS (`alex, signed`), if measured.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub lpips_variant: Option<String>,
+    /// Means over the held-out views; `None` without held-out views.
+    pub test: Option<TestMetrics>,
+}
+
+/// Optional outputs of the evaluation of a PLY.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EvalExtras<'a> {
+    /// Folder for pictures.
+    pub pictures: Option<&'a Path>,
+    /// LPIPS weights and the input range of the network.
+    pub lpips: Option<(&'a Path, InputRange)>,
+}
+
+/// Evaluates a PLY of Gaussians on the held-out views of a scene.
+///
+/// # Errors
+/// The PLY, the scene or the weights cannot be used, or a picture cannot be written.
+pub fn evaluate_ply(
+    ply: &Path,
+    scene: &Path,
+    config: &TrainConfig,
+    extras: &EvalExtras<'_>,
+) -> Result<EvalReport, TrainError> {
+    machine::set_up(config)?;
+    let lpips = match extras.lpips {
+        None => None,
+        Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
+    };
+    let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(ply)? else {
+        let problem = "holds points, not Gaussians (no property f_dc_0)";
+        return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
+    };
+    let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
+    check_photos_fit(&dataset, host_budget(config))?;
+    let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+    for warning in dataset.warnings.iter().chain(&ply_warnings(ply, &meta, far)) {
+        eprintln!("warning: {warning}");
+    }
+    if columns.rows() == 0 {
+        let problem = "no Gaussian lies within the coordinate range of this scene";
+        return Err(InputError::new(ply, problem, "give a PLY that was trained on this scene").into());
+    }
+    let run = RunOptions::new(config, dataset.scene_scale);
+    let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
+    let gaussians = columns.rows() as u64;
+    // Evaluate with the file's SH degree; the config's is for training.
+    let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
+    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
+    let mut pages = PagedScene::new(&columns, pager, &bands)?;
+    drop(columns);
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let views = dataset.test_views();
+    let shown = Count::new("views compared", views.len() as u32, false);
+    let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
+    let request = EvalRequest {
+        views: &views,
+        ssim: run.ssim_variant,
+        pictures: extras.pictures,
+        lpips: of_lpips,
+        color_correct: run.color_correct,
+        appearance: run.appearance,
+        progress: &|done| shown.show(done),
+    };
+    let (mut renderer, word) = machine::renderer(config)?;
+    if let Some(word) = word {
+        eprintln!("{word}");
+    }
+    let now = (&mut pages, 0, &mut WorkingSet::default());
+    let test = evaluate(now, &mut *renderer, (&dataset, &targets), &render, &request)?;
+    Ok(EvalReport {
+        ply: ply.to_path_buf(),
+        scene: scene.to_path_buf(),
+        gaussians,
+        ssim_variant: config.ssim_variant.to_string(),
+        lpips_variant: of_lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
+        test,
+    })
+}

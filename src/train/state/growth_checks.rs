@@ -1,0 +1,68 @@
+//! The checks of a run that decides its count: what the held-out training views lose without their faintest Gaussians.
+//!
+//! Not here: the decision ([`crate::densify::growth`]), the views (`held_out`), the loss of one of them (`leave_out`).
+//!
+//! Invariants: 1. a check changes no row; 2. a check that failed is still due.
+
+use super::leave_out::{Compared, psnr_without_faint};
+use super::trainer::Trainer;
+use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
+use crate::render::color_correct::ColorCorrect;
+use crate::train::error::TrainError;
+use std::time::Instant;
+
+impl Trainer {
+    /// Decides how many Gaussians the run allows from the round after the last step on, if that is due.
+    ///
+    /// # Errors
+    /// A photo cannot be decoded, pages could not be had, or the renderer failed. The decision is still due then.
+    pub(super) fn check_growth(
+        &mut self,
+        step: u32,
+        dataset: &Dataset,
+        targets: &TargetCache,
+    ) -> Result<(), TrainError> {
+        let strategy = self.options.strategy.clone();
+        let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };
+        // Without held-out views the count stays as it is.
+        if self.held_out.positions().is_empty() || self.state.growth.checks.last().is_some_and(|last| last.step > step)
+        {
+            return Ok(());
+        }
+        let started = Instant::now();
+        self.drain()?;
+        let lost = self.mean_loss(dataset, targets)?;
+        let count = [self.scene.rows_bound(), self.state.growth.allowed()];
+        self.state.growth.checks.push(rule.check(number, step, count, lost));
+        self.state.train_seconds += started.elapsed().as_secs_f64();
+        Ok(())
+    }
+
+    /// Mean over the held-out views of the decibels lost without the faintest quarter; 0 if no view counts.
+    fn mean_loss(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<f64, TrainError> {
+        let views: Vec<usize> = self.held_out.positions().iter().map(|&at| self.train_views[at]).collect();
+        let render = self.render_options();
+        let mut losses = Vec::with_capacity(views.len());
+        for (i, &view) in views.iter().enumerate() {
+            targets.prefetch(&views[i..views.len().min(i + 2)]);
+            let target = targets.get(view)?;
+            if !target.counts() {
+                continue;
+            }
+            let compared = Compared {
+                camera: &dataset.views[view].camera,
+                target: &target,
+                render: &render,
+                loss: &self.options.loss,
+                pages_most: self.pages_most,
+                // A photo that was never trained on has no exposure yet.
+                correct: self.options.appearance.is_on().then_some(ColorCorrect::Affine),
+            };
+            let now = (&mut self.scene, self.state.step, &mut self.working);
+            let [whole, without] = psnr_without_faint(now, &mut *self.renderer, &compared)?;
+            losses.push(whole - without);
+        }
+        Ok(losses.iter().sum::<f64>() / losses.len().max(1) as f64)
+    }
+}

@@ -1,0 +1,131 @@
+//! What a view would lose without its faintest Gaussians: the picture is drawn twice, with all rows, and without the
+//! quarter of the drawn rows that have the least blending weight in this view.
+//!
+//! The loss says how crowded the scene is. Where Gaussians are scarce, even the faintest carry detail; where they abound,
+//! neighbours hide what a removed one leaves ([`crate::densify::growth`] decides by it).
+//!
+//! Invariants: 1. nothing is stored; 2. the loss is a function of the scene, the step and the view: rows are ordered by
+//! weight, then by their place in the view; 3. memory beside the renderer's is that of one batch of rows, and four bytes a
+//! row of the view.
+
+use crate::base::ids::PageNo;
+use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
+use crate::render::metrics::psnr;
+use crate::render::{LossOptions, RenderOptions, Renderer};
+use crate::scene::camera::Camera;
+use crate::scene::image::Target;
+use crate::train::error::TrainError;
+use crate::train::log::report::json_psnr;
+use crate::train::step::pages::PagedScene;
+use crate::train::step::view::{batches, begin};
+use crate::train::step::working_set::WorkingSet;
+
+/// One row of so many of the drawn ones is left out.
+const LEFT_OUT_OF: usize = 4;
+
+/// What a view needs to be drawn and compared.
+pub(super) struct Compared<'a> {
+    pub camera: &'a Camera,
+    pub target: &'a Target,
+    pub render: &'a RenderOptions,
+    pub loss: &'a LossOptions,
+    /// Most pages of a batch.
+    pub pages_most: usize,
+    /// A correction of the pictures before they are compared.
+    pub correct: Option<ColorCorrect>,
+}
+
+/// PSNR of a view with all rows, and without the faintest quarter of the rows drawn, dB.
+///
+/// # Errors
+/// Pages could not be had, or the renderer failed.
+pub(super) fn psnr_without_faint(
+    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
+    renderer: &mut dyn Renderer,
+    view: &Compared<'_>,
+) -> Result<[f64; 2], TrainError> {
+    let pages = scene.pager.pages_of_view(view.camera);
+    let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(view.pages_most));
+    renderer.weigh_rows(true)?;
+    let mut draw = Draw { scene, now, working, renderer, view, batches: &batches };
+    let whole = draw.picture(None)?;
+    let weights = draw.weights()?;
+    let without = draw.picture(Some(&are_kept(&weights)))?;
+    Ok([whole, without])
+}
+
+/// Whether each row stays: all but the faintest quarter of those that were drawn.
+fn are_kept(weights: &[f32]) -> Vec<bool> {
+    let mut drawn: Vec<u32> = (0..weights.len() as u32).filter(|&row| weights[row as usize] > 0.0).collect();
+    let left_out = drawn.len() / LEFT_OUT_OF;
+    let mut kept = vec![true; weights.len()];
+    if left_out > 0 {
+        // Weights are positive here, so their bits are in the order of their values.
+        drawn.select_nth_unstable_by_key(left_out - 1, |&row| (weights[row as usize].to_bits(), row));
+        drawn[..left_out].iter().for_each(|&row| kept[row as usize] = false);
+    }
+    kept
+}
+
+struct Draw<'a, 'v> {
+    scene: &'a mut PagedScene,
+    now: u32,
+    working: &'a mut WorkingSet,
+    renderer: &'a mut dyn Renderer,
+    view: &'a Compared<'v>,
+    batches: &'a [&'a [PageNo]],
+}
+
+impl Draw<'_, '_> {
+    /// Draws the rows that stay, all without a list, and compares the picture; returns its PSNR.
+    fn picture(&mut self, kept: Option<&[bool]>) -> Result<f64, TrainError> {
+        begin(self.renderer, self.view.camera, self.view.render, self.batches)?;
+        let mut first = 0;
+        for batch in self.batches {
+            self.scene.gather_pages(batch, self.view.camera, self.now, self.working)?;
+            let rows = self.working.row_from_working.len();
+            if let Some(kept) = kept {
+                self.working.columns.retain_rows(|_, row| kept[first + row]);
+            }
+            self.renderer.rows_in(&self.working.columns)?;
+            first += rows;
+        }
+        self.renderer.picture()?;
+        let (image, target) = (self.renderer.image()?, self.view.target);
+        Ok(json_psnr(match self.view.correct {
+            Some(how) => color_corrected_psnr(image, target, how),
+            None => psnr(image, target),
+        }))
+    }
+
+    /// The blending weights of all rows of the picture that was drawn last.
+    fn weights(&mut self) -> Result<Vec<f32>, TrainError> {
+        self.renderer.loss(self.view.target, self.view.loss)?;
+        self.renderer.picture_back()?;
+        let mut parts = Vec::with_capacity(self.batches.len());
+        for (i, batch) in self.batches.iter().enumerate().rev() {
+            if i + 1 < self.batches.len() {
+                self.scene.gather_pages(batch, self.view.camera, self.now, self.working)?;
+            }
+            let WorkingSet { columns, gradients, .. } = &mut *self.working;
+            self.renderer.rows_out(i, columns, gradients)?;
+            parts.push(gradients.weights.iter().map(|[weight, _]| *weight).collect::<Vec<f32>>());
+        }
+        parts.reverse();
+        Ok(parts.concat())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_of_the_drawn_rows_is_left_out_the_faintest_first() {
+        let kept = are_kept(&[0.0, 3.0, 1.0, 2.0, 1.0, 4.0, 0.0, 5.0, 6.0, 7.0]);
+        // Eight rows are drawn; of the two that weigh 1, both go. Rows that are not drawn cost nothing.
+        assert_eq!(kept, [true, true, false, true, false, true, true, true, true, true]);
+        assert_eq!(are_kept(&[1.0; 4]), [false, true, true, true], "the first of equals");
+        assert!(are_kept(&[1.0; 3]).iter().all(|kept| *kept) && are_kept(&[]).is_empty());
+    }
+}

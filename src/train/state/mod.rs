@@ -1,0 +1,9 @@
+//! The state of a training run and what reads it between steps: the trainer, the plan of coming views, evaluation, and how
+//! many Gaussians the scene needs.
+
+pub mod eval;
+mod growth_checks;
+pub(crate) mod held_out;
+mod leave_out;
+mod look_ahead;
+pub mod trainer;

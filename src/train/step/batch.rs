@@ -1,0 +1,212 @@
+//! Gather and update: how a step reads and writes the rows of a batch of pinned pages. [`RowBackend`] is the interface,
+//! [`HostRows`] the form for rows in host memory, whatever device draws them. The form for pages on a device is
+//! [`super::device_rows`].
+//!
+//! Invariants: between [`RowBackend::rows_in`] and [`RowBackend::update`] of a batch, the rows stay unchanged, because the
+//! update starts from the gathered values.
+
+use super::catch_up;
+use super::pages::{PageRules, PagedScene, row_tables};
+use super::update::{StepGradients, update_pages};
+use super::working_set::WorkingSet;
+use crate::base::ids::PageNo;
+use crate::paging::pinned::PinnedPage;
+use crate::render::Renderer;
+use crate::scene::camera::Camera;
+use crate::train::error::TrainError;
+
+/// What an update did.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct UpdateCounts {
+    /// Rows that the optimizer rewrote.
+    pub updated: u64,
+    /// Rows left as they were because a gradient or a result was not finite.
+    pub skipped: u64,
+    /// Rows that were drawn; counted only where no row was rewritten.
+    pub drawn: u64,
+}
+
+/// A step, as gather and update see it.
+#[derive(Debug, Clone, Copy)]
+pub struct AtStep<'a> {
+    /// 0-based step.
+    pub step: u32,
+    /// Camera of the view.
+    pub camera: &'a Camera,
+}
+
+/// Where the rows of a step are gathered and updated. Calls come in the order of the methods, for each batch; the renderer's own
+/// stages (`begin_view`, `picture`, loss) lie between them.
+pub trait RowBackend {
+    /// The renderer of the view.
+    fn renderer(&mut self) -> &mut dyn Renderer;
+
+    /// The most pages of a batch.
+    fn pages_most(&self) -> usize {
+        usize::MAX
+    }
+
+    /// Pages outside of a batch that must be written back some time and that the pager takes for clean.
+    fn pages_held(&self) -> usize {
+        0
+    }
+
+    /// Pins the pages of a batch; again if `is_again`, on the way out.
+    ///
+    /// # Errors
+    /// As [`crate::paging::pager::Pager::pin_batch`].
+    fn pin(
+        &mut self,
+        scene: &mut PagedScene,
+        step: u32,
+        pages: &[PageNo],
+        is_again: bool,
+    ) -> Result<Vec<PinnedPage>, TrainError> {
+        Ok(match is_again {
+            true => scene.pager.pin_batch_again(step, pages)?,
+            false => scene.pager.pin_batch(step, pages)?,
+        })
+    }
+
+    /// Brings the pinned frames up to date that events are about to change.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn before_events(&mut self, scene: &PagedScene, pinned: &mut [PinnedPage]) -> Result<(), TrainError>;
+
+    /// Gathers the rows of the pages that the view may draw, as they are at the step, and hands them to the renderer. The pages
+    /// must have applied all events. Returns how many.
+    ///
+    /// # Errors
+    /// The renderer failed.
+    fn rows_in(
+        &mut self,
+        scene: &mut PagedScene,
+        pinned: &[PinnedPage],
+        at: AtStep<'_>,
+        working: &mut WorkingSet,
+    ) -> Result<usize, TrainError>;
+
+    /// The device is at work on the picture of a view of one batch: copies for the next step may begin. Does not wait.
+    ///
+    /// # Errors
+    /// The device failed.
+    fn beside_picture(&mut self, _: &mut PagedScene) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    /// Takes the gradients of the splats back to the rows of a batch, by its number; where its pages were pinned again, the
+    /// rows are gathered again.
+    ///
+    /// # Errors
+    /// The renderer failed.
+    fn rows_out(
+        &mut self,
+        scene: &mut PagedScene,
+        batch_again: (usize, bool),
+        pinned: &[PinnedPage],
+        at: AtStep<'_>,
+        working: &mut WorkingSet,
+    ) -> Result<(), TrainError>;
+
+    /// Applies the gradients to the pages: optimizer, bounds and, if `collects`, densification statistics.
+    ///
+    /// # Errors
+    /// The device failed; the pages in memory belong to no step then ([`TrainError::Torn`]).
+    fn update(
+        &mut self,
+        scene: &mut PagedScene,
+        batch: usize,
+        pinned: &mut [PinnedPage],
+        at: AtStep<'_>,
+        working: &WorkingSet,
+        collects: bool,
+    ) -> Result<UpdateCounts, TrainError>;
+
+    /// Unpins the pages of a batch.
+    fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
+        scene.pager.release(pinned);
+    }
+}
+
+/// Rows in host memory.
+pub struct HostRows<'a> {
+    renderer: &'a mut dyn Renderer,
+}
+
+impl<'a> HostRows<'a> {
+    /// Rows in host memory, drawn by `renderer`.
+    pub fn new(renderer: &'a mut dyn Renderer) -> HostRows<'a> {
+        HostRows { renderer }
+    }
+}
+
+/// Culls the rows of the pages for `camera` and evaluates the visible rows at 0-based `step`. The pages must have
+/// applied all events.
+pub fn gather(rules: &PageRules, pages: &[PinnedPage], step: u32, camera: &Camera, working: &mut WorkingSet) {
+    let tables = row_tables(pages);
+    let WorkingSet { row_from_working, columns, .. } = working;
+    catch_up::visible_rows(&tables, &rules.adam, step, camera, row_from_working);
+    catch_up::gather(&tables, rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+}
+
+impl RowBackend for HostRows<'_> {
+    fn renderer(&mut self) -> &mut dyn Renderer {
+        self.renderer
+    }
+
+    /// The frames hold the rows.
+    fn before_events(&mut self, _: &PagedScene, _: &mut [PinnedPage]) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    fn rows_in(
+        &mut self,
+        scene: &mut PagedScene,
+        pinned: &[PinnedPage],
+        AtStep { step, camera }: AtStep<'_>,
+        working: &mut WorkingSet,
+    ) -> Result<usize, TrainError> {
+        gather(&scene.rules, pinned, step, camera, working);
+        self.renderer.rows_in(&working.columns)?;
+        Ok(working.row_from_working.len())
+    }
+
+    fn rows_out(
+        &mut self,
+        scene: &mut PagedScene,
+        (batch, is_again): (usize, bool),
+        pinned: &[PinnedPage],
+        AtStep { step, .. }: AtStep<'_>,
+        working: &mut WorkingSet,
+    ) -> Result<(), TrainError> {
+        let WorkingSet { row_from_working, columns, gradients, .. } = working;
+        if is_again {
+            let rules = &scene.rules;
+            catch_up::gather(&row_tables(pinned), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+        }
+        Ok(self.renderer.rows_out(batch, columns, gradients)?)
+    }
+
+    fn update(
+        &mut self,
+        scene: &mut PagedScene,
+        _: usize,
+        pinned: &mut [PinnedPage],
+        AtStep { step, camera }: AtStep<'_>,
+        working: &WorkingSet,
+        collects: bool,
+    ) -> Result<UpdateCounts, TrainError> {
+        let WorkingSet { row_from_working, columns, gradients, .. } = working;
+        let size = [camera.width, camera.height];
+        let input = StepGradients { step, rows: row_from_working, columns, gradients, size };
+        let counts = update_pages(scene, pinned, &input, collects);
+        let is_drawn = |radii: &&[u32; 2]| **radii != [0, 0];
+        let drawn = if counts.updated == 0 { gradients.radii.iter().filter(is_drawn).count() } else { 0 };
+        Ok(UpdateCounts {
+            updated: counts.updated as u64,
+            skipped: counts.skipped_non_finite as u64,
+            drawn: drawn as u64,
+        })
+    }
+}

@@ -1,0 +1,136 @@
+//! Gather and update on a device that holds the pages ([`DeviceTier`]): what crosses the bus in a step are the payloads of
+//! the pages that the device lacks, one table of the optimizer, and some 50 bytes a page back.
+//!
+//! Not here: which page lies in which slot (`device_tier`), the stages (`render`).
+//!
+//! Invariant: an update that failed is [`TrainError::Torn`]: pages that exist on the device alone may be changed.
+
+use super::batch::{AtStep, RowBackend, UpdateCounts};
+use super::device_tier::{DeviceTier, device_of};
+use super::pages::PagedScene;
+use super::working_set::WorkingSet;
+use crate::base::ids::PageNo;
+use crate::paging::pinned::PinnedPage;
+use crate::render::Renderer;
+use crate::scene::camera::Camera;
+use crate::train::error::TrainError;
+
+/// Rows on the device of a renderer.
+pub struct DeviceRows<'a> {
+    tier: &'a mut DeviceTier,
+    renderer: &'a mut dyn Renderer,
+    /// Number and camera of the next step.
+    next: Option<(u32, &'a Camera)>,
+}
+
+impl<'a> DeviceRows<'a> {
+    /// Begins 0-based `step` on the pages that `renderer` holds. The next step, if there is one, draws `next`.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn new(
+        tier: &'a mut DeviceTier,
+        scene: &mut PagedScene,
+        renderer: &'a mut dyn Renderer,
+        (step, next): (u32, Option<&'a Camera>),
+    ) -> Result<DeviceRows<'a>, TrainError> {
+        tier.begin_step(scene, renderer, step)?;
+        Ok(DeviceRows { tier, renderer, next: next.map(|camera| (step + 1, camera)) })
+    }
+}
+
+impl RowBackend for DeviceRows<'_> {
+    fn renderer(&mut self) -> &mut dyn Renderer {
+        self.renderer
+    }
+
+    fn pages_most(&self) -> usize {
+        self.tier.slots()
+    }
+
+    fn pages_held(&self) -> usize {
+        self.tier.pages_held()
+    }
+
+    fn pin(
+        &mut self,
+        scene: &mut PagedScene,
+        step: u32,
+        pages: &[PageNo],
+        is_again: bool,
+    ) -> Result<Vec<PinnedPage>, TrainError> {
+        self.tier.pin(scene, self.renderer, pages, |scene, others| match is_again {
+            true => scene.pager.pin_batch_again(step, others),
+            false => scene.pager.pin_batch(step, others),
+        })
+    }
+
+    fn before_events(&mut self, scene: &PagedScene, pinned: &mut [PinnedPage]) -> Result<(), TrainError> {
+        self.tier.before_events(scene, self.renderer, pinned)
+    }
+
+    fn rows_in(
+        &mut self,
+        scene: &mut PagedScene,
+        pinned: &[PinnedPage],
+        at: AtStep<'_>,
+        _: &mut WorkingSet,
+    ) -> Result<usize, TrainError> {
+        let pages = self.tier.load(scene, self.renderer, pinned)?;
+        let step = scene.rules.adam.at(at.step).numbers();
+        Ok(device_of(self.renderer)?.pages_in(&pages, &step)?)
+    }
+
+    fn beside_picture(&mut self, scene: &mut PagedScene) -> Result<(), TrainError> {
+        self.next.map_or(Ok(()), |next| self.tier.begin_ahead(scene, self.renderer, next))
+    }
+
+    fn rows_out(
+        &mut self,
+        scene: &mut PagedScene,
+        (batch, is_again): (usize, bool),
+        pinned: &[PinnedPage],
+        _: AtStep<'_>,
+        _: &mut WorkingSet,
+    ) -> Result<(), TrainError> {
+        if is_again {
+            self.tier.load(scene, self.renderer, pinned)?;
+        }
+        device_of(self.renderer)?.pages_out(batch)?;
+        match self.next.filter(|_| batch == 0) {
+            // The device is at work on the gradients, which only `loss_value` and what follows wait for.
+            Some((step, _)) => self.tier.load_ahead(scene, self.renderer, step),
+            None => Ok(()),
+        }
+    }
+
+    fn update(
+        &mut self,
+        _: &mut PagedScene,
+        batch: usize,
+        pinned: &mut [PinnedPage],
+        _: AtStep<'_>,
+        _: &WorkingSet,
+        collects: bool,
+    ) -> Result<UpdateCounts, TrainError> {
+        let pages = self.tier.loaded(pinned);
+        let results = device_of(self.renderer)?.update_pages(batch, &pages, collects);
+        let results = results.map_err(|error| TrainError::Torn { source: Box::new(error.into()) })?;
+        let mut counts = UpdateCounts::default();
+        for (page, result) in pinned.iter_mut().filter(|page| page.meta.rows > 0).zip(results) {
+            counts.updated += u64::from(result.updated);
+            counts.skipped += u64::from(result.skipped);
+            counts.drawn += u64::from(result.drawn);
+            if let Some(bounds) = result.bounds() {
+                (page.meta.bounds, page.dirty) = (bounds, true);
+                self.tier.changed(page.page);
+            }
+        }
+        counts.drawn = if counts.updated == 0 { counts.drawn } else { 0 };
+        Ok(counts)
+    }
+
+    fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
+        self.tier.release(scene, pinned);
+    }
+}

@@ -1,0 +1,431 @@
+//! The pages of a run on a device: which page lies in which slot, which slots are newer than their frames, and what was copied.
+//!
+//! A device is one more level of the cache of [`crate::paging`], with the same table of frames and the same order of
+//! eviction. A page that lies on the device has its frame as well while a step works on it, and until its slot was copied
+//! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
+//! nor evicts it.
+//!
+//! Not here: copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
+//! it, and the step waits.
+//!
+//! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
+//! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
+
+use super::pages::PagedScene;
+use crate::base::ids::PageNo;
+use crate::base::trace;
+use crate::kernels::uniforms_pages::SplitNumbers;
+use crate::optim::bounds::SplitLimits;
+use crate::page::format::slot_header::HEADER_BYTES;
+use crate::paging::error::PagingError;
+use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::frames::table::FrameTable;
+use crate::paging::pinned::PinnedPage;
+use crate::render::pages::{DeviceSlot, PageRenderer, PageRules, SlotPage};
+use crate::render::{RenderError, Renderer};
+use crate::train::error::TrainError;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// The share of the device memory of a run that slots may take; views keep the rest.
+pub const SLOTS_SHARE: u64 = 2;
+/// Slots that a growing scene adds at once, in parts of those it has.
+const MORE_SLOTS_SHARE: usize = 4;
+
+/// What was copied between frames and slots.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SlotTraffic {
+    /// Payloads copied to the device.
+    pub loads: u64,
+    /// Those copied while the device computed the step before.
+    #[serde(default)]
+    pub loads_ahead: u64,
+    /// Their bytes.
+    pub bytes_loaded: u64,
+    /// Payloads copied back.
+    pub drains: u64,
+    /// Their bytes.
+    pub bytes_drained: u64,
+    /// Pages of batches that were on the device already.
+    pub hits: u64,
+}
+
+/// The pages of a run on a device.
+#[derive(Debug)]
+pub struct DeviceTier {
+    pub(crate) slots: FrameTable<DeviceSlot>,
+    /// Slots that have been given out, so that each is given out once.
+    given: u32,
+    /// Most slots that there may be.
+    slots_most: usize,
+    /// Pages whose slot is newer than their frame, pinned in the pager, outside of the batch of a step.
+    pub(crate) held: BTreeMap<PageNo, PinnedPage>,
+    /// Pages that the next step needs and the device lacks, from `begin_ahead` to `load_ahead`.
+    pub(crate) coming: Vec<PageNo>,
+    /// Pages whose slots are being copied back, with their slots, from `begin_ahead` to `finish_leaving`.
+    pub(super) leaving: Vec<(PinnedPage, DeviceSlot)>,
+    /// Slots of the batch of a step, and whether they are newer than the frames.
+    in_use: BTreeMap<PageNo, (DeviceSlot, bool)>,
+    pub(crate) traffic: SlotTraffic,
+}
+
+/// The device of a renderer.
+pub(super) fn device_of(renderer: &mut dyn Renderer) -> Result<&mut dyn PageRenderer, TrainError> {
+    let name = renderer.name();
+    renderer.pages().ok_or(TrainError::Render(RenderError::NoPages { backend: name }))
+}
+
+/// How many slots of `slot_bytes` bytes lie in the share of `room` bytes: buffers may take a quarter more than is asked.
+pub(crate) fn slots_in(room: u64, slot_bytes: u64) -> u64 {
+    room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
+}
+
+/// How many slots for payloads of at most `payload` bytes a device memory of `device_mem` bytes holds, beside what a view takes.
+pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
+    usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
+}
+
+/// There is no slot for a page of a batch.
+fn no_slot(device: &dyn PageRenderer) -> TrainError {
+    RenderError::NoSlots { bytes: device.slot_bytes() }.into()
+}
+
+/// Bytes of a page's payload.
+fn payload_bytes(page: &PinnedPage) -> usize {
+    page.layout().bytes()
+}
+
+impl DeviceTier {
+    /// Prepares a device for the pages of a run of `steps` steps.
+    ///
+    /// # Errors
+    /// The device failed or has no room, or the run's optimizer is not one that devices have.
+    pub fn new(scene: &PagedScene, renderer: &mut dyn Renderer, steps: u32) -> Result<DeviceTier, TrainError> {
+        let name = renderer.name();
+        let numbers = scene.rules.adam.numbers(steps);
+        let numbers = numbers.ok_or(TrainError::Render(RenderError::NoPages { backend: name }))?;
+        let SplitLimits { grow_grad2d, split_scale, reach } = *scene.rules.splits();
+        let splits = SplitNumbers { grow_grad2d, split_scale, reach };
+        let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
+        let device = device_of(renderer)?;
+        device.hold_pages(&PageRules { payload_bytes, numbers, splits })?;
+        let slots_most = slots_in(device.room(), device.slot_bytes()).clamp(1, u64::from(u32::MAX / 2));
+        let mut tier = DeviceTier {
+            slots: FrameTable::new(0, EvictPolicy::FarthestNextUse),
+            given: 0,
+            slots_most: slots_most as usize,
+            held: BTreeMap::new(),
+            coming: Vec::new(),
+            leaving: Vec::new(),
+            in_use: BTreeMap::new(),
+            traffic: SlotTraffic::default(),
+        };
+        tier.fit(scene, renderer)?;
+        Ok(tier)
+    }
+
+    /// Slots.
+    pub fn slots(&self) -> usize {
+        self.slots.frames_max()
+    }
+
+    /// Pages that are newer than their frames and outside of a batch.
+    pub fn pages_held(&self) -> usize {
+        self.held.len() + self.leaving.len()
+    }
+
+    /// What was copied so far.
+    pub fn traffic(&self) -> SlotTraffic {
+        self.traffic
+    }
+
+    /// Makes slots for all pages of the scene, as far as the share of the device memory goes.
+    fn fit(&mut self, scene: &PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        let (have, pages) = (self.slots(), scene.pager.index().len().max(1));
+        if have >= pages.min(self.slots_most) {
+            return Ok(());
+        }
+        let wanted = pages.max(have + have / MORE_SLOTS_SHARE).min(self.slots_most) - have;
+        let added = device_of(renderer)?.add_slots(wanted)?;
+        if added < wanted {
+            self.slots_most = have + added;
+        }
+        self.slots.allow_frames(have + added);
+        match self.slots() {
+            0 => Err(no_slot(device_of(renderer)?)),
+            _ => Ok(()),
+        }
+    }
+
+    /// A step begins.
+    pub(super) fn begin_step(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        step: u32,
+    ) -> Result<(), TrainError> {
+        self.coming.clear();
+        self.finish_leaving(scene, renderer)?;
+        self.slots.begin_step(step);
+        self.fit(scene, renderer)
+    }
+
+    /// Pins the pages of a batch in the pager; those that are held are pinned already. Held pages give up frames that the batch
+    /// needs.
+    pub(crate) fn pin(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        pages: &[PageNo],
+        pin: impl FnOnce(&mut PagedScene, &[PageNo]) -> Result<Vec<PinnedPage>, PagingError>,
+    ) -> Result<Vec<PinnedPage>, TrainError> {
+        let (own, others): (Vec<PageNo>, Vec<PageNo>) = pages.iter().partition(|page| self.held.contains_key(page));
+        // As many frames again as the batch has pages: for pages that split, and for reads ahead.
+        let most = scene.pager.frames_max().saturating_sub(others.len() + pages.len()).max(own.len());
+        self.drain_to(scene, renderer, most, pages)?;
+        scene.pager.set_held(self.held.len() - own.len());
+        let mut pinned = pin(scene, &others)?;
+        pinned.extend(own.iter().filter_map(|page| self.held.remove(page)));
+        pinned.sort_unstable_by_key(|page| page.meta.id);
+        Ok(pinned)
+    }
+
+    /// Copies held pages back until at most `most` are held, those that are needed last first, but none of `kept`.
+    fn drain_to(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        most: usize,
+        kept: &[PageNo],
+    ) -> Result<(), TrainError> {
+        if self.held.len() <= most {
+            return Ok(());
+        }
+        let mut pages: Vec<PageNo> = self.held.keys().copied().filter(|page| !kept.contains(page)).collect();
+        pages.sort_by_key(|page| (std::cmp::Reverse(scene.pager.next_use(*page)), page.0));
+        pages.truncate(self.held.len() - most);
+        self.drain_pages(scene, renderer, &pages)
+    }
+
+    /// Copies these held pages back to their frames and unpins them. Their slots stay, and equal the frames.
+    fn drain_pages(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        pages: &[PageNo],
+    ) -> Result<(), TrainError> {
+        let mut drained: Vec<PinnedPage> = pages.iter().filter_map(|page| self.held.remove(page)).collect();
+        let copied = self.copy_back(renderer, drained.iter_mut());
+        if let Err(error) = copied {
+            self.held.extend(drained.into_iter().map(|page| (page.page, page)));
+            return Err(error);
+        }
+        scene.pager.release(drained);
+        Ok(())
+    }
+
+    /// Copies the slots of pages, which are newer, to their frames.
+    fn copy_back<'a>(
+        &mut self,
+        renderer: &mut dyn Renderer,
+        pages: impl Iterator<Item = &'a mut PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let slots = &mut self.slots;
+        let in_slots: Vec<_> = pages.map(|page| (slots.begin_write(page.page), page)).collect();
+        let in_slots = in_slots.into_iter().map(|(slot, page)| (page, slot));
+        self.fill_frames(in_slots, |copies| Ok(device_of(renderer)?.read_slots(copies)?))
+    }
+
+    /// Fills the frames of pages, whose slots are being written back, with what `read` finds in the slots.
+    pub(super) fn fill_frames<'a>(
+        &mut self,
+        pages: impl Iterator<Item = (&'a mut PinnedPage, DeviceSlot)>,
+        read: impl FnOnce(&mut [(DeviceSlot, &mut [u8])]) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        let (mut moved, mut copies) = (Vec::new(), Vec::new());
+        for (page, slot) in pages {
+            let bytes = payload_bytes(page);
+            moved.push((page.page, slot));
+            copies.push((slot, &mut page.payload_mut()[..bytes]));
+        }
+        if copies.is_empty() {
+            return Ok(());
+        }
+        let bytes: usize = copies.iter().map(|(_, payload)| payload.len()).sum();
+        let _span = trace::span("drain").with("pages", moved.len() as u64).with("bytes", bytes as u64);
+        let copied = read(&mut copies);
+        for (page, slot) in &moved {
+            self.slots.finish_write(*page, *slot, copied.is_ok());
+        }
+        self.traffic.drains += moved.len() as u64;
+        self.traffic.bytes_drained += bytes as u64;
+        copied
+    }
+
+    /// Copies all held pages back, and adds what the device counted to the histogram: the scene is as though the host had taken
+    /// all steps.
+    ///
+    /// # Errors
+    /// The device failed; the pages that are still held exist there alone.
+    pub fn drain(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        self.finish_leaving(scene, renderer)?;
+        self.drain_to(scene, renderer, 0, &[])?;
+        self.take_bins(scene, renderer)
+    }
+
+    /// Adds what the device counted to the histogram.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub(crate) fn take_bins(&self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        scene.histogram.add_changes(&device_of(renderer)?.take_bins()?);
+        Ok(())
+    }
+
+    /// Copies pinned pages back that events are about to change, and gives up their slots.
+    pub(super) fn before_events(
+        &mut self,
+        scene: &PagedScene,
+        renderer: &mut dyn Renderer,
+        pinned: &mut [PinnedPage],
+    ) -> Result<(), TrainError> {
+        let slots = &self.slots;
+        let behind = pinned.iter_mut().filter(|page| scene.rules.is_behind(&page.meta));
+        let (newer, equal): (Vec<_>, Vec<_>) = behind.partition(|page| slots.is_dirty(page.page));
+        let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
+        self.copy_back(renderer, newer.into_iter())?;
+        for page in pages {
+            if self.slots.state(page).is_some() {
+                self.slots.evict(page);
+            }
+        }
+        Ok(())
+    }
+
+    /// Puts the pages of a batch into slots; payloads that are missing are copied there.
+    pub(crate) fn load(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        pinned: &[PinnedPage],
+    ) -> Result<Vec<SlotPage>, TrainError> {
+        let mut missing = Vec::new();
+        let with_rows = || pinned.iter().filter(|page| page.meta.rows > 0);
+        for page in with_rows() {
+            match self.slots.pin(page.page, true) {
+                Some(in_slot) => drop(self.in_use.insert(page.page, in_slot)),
+                None => missing.push(page),
+            }
+        }
+        self.traffic.hits += self.in_use.len() as u64;
+        self.make_room(scene, renderer, missing.len())?;
+        let mut copies = Vec::new();
+        for page in missing {
+            let Some(slot) = self.new_slot(page.page, scene.pager.next_use(page.page)) else {
+                return Err(no_slot(device_of(renderer)?));
+            };
+            self.slots.pin(page.page, true);
+            self.in_use.insert(page.page, (slot, false));
+            copies.push((slot, &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]));
+        }
+        if !copies.is_empty() {
+            let written = device_of(renderer).and_then(|device| Ok(device.write_slots(&copies)?));
+            if let Err(error) = written {
+                self.forget(&copies);
+                return Err(error);
+            }
+            self.traffic.loads += copies.len() as u64;
+            self.traffic.bytes_loaded += copies.iter().map(|(_, payload)| payload.len() as u64).sum::<u64>();
+        }
+        let in_slot =
+            |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.0, layout: page.layout() });
+        Ok(with_rows().filter_map(in_slot).collect())
+    }
+
+    /// A free slot for the payload of a page, which is to be copied there; `None` where no slot is free.
+    pub(super) fn new_slot(&mut self, page: PageNo, next_use: u32) -> Option<DeviceSlot> {
+        let given = &mut self.given;
+        let slot = self.slots.begin_load(page, next_use, || {
+            *given += 1;
+            DeviceSlot(*given - 1)
+        })?;
+        self.slots.finish_load(page, slot);
+        Some(slot)
+    }
+
+    /// Gives up slots that were not filled.
+    fn forget(&mut self, copies: &[(DeviceSlot, &[u8])]) {
+        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other == slot);
+        let pages: Vec<PageNo> =
+            self.in_use.iter().filter(|(_, (slot, _))| unfilled(slot)).map(|(page, _)| *page).collect();
+        for page in pages {
+            if let Some((slot, _)) = self.in_use.remove(&page) {
+                self.slots.unpin(page, slot, false);
+                self.slots.evict(page);
+            }
+        }
+    }
+
+    /// The pages of a batch in the slots that [`DeviceTier::load`] gave them.
+    pub(super) fn loaded(&self, pinned: &[PinnedPage]) -> Vec<SlotPage> {
+        let in_slot =
+            |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.0, layout: page.layout() });
+        pinned.iter().filter_map(in_slot).collect()
+    }
+
+    /// Empties slots until `wanted` are free: of the pages that are needed last, by the plan.
+    fn make_room(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        wanted: usize,
+    ) -> Result<(), TrainError> {
+        if self.slots.free_frames() >= wanted {
+            return Ok(());
+        }
+        self.plan_uses(scene);
+        // All of them are read together, so the step waits once.
+        let mut newer = Vec::new();
+        while self.slots.free_frames() + newer.len() < wanted {
+            let Some(victim) = self.slots.victim() else { break };
+            match victim.dirty {
+                true => newer.push((victim.page, self.slots.begin_write(victim.page))),
+                false => self.slots.evict(victim.page),
+            }
+        }
+        newer.iter().for_each(|(page, slot)| self.slots.finish_write(*page, *slot, false));
+        let newer: Vec<PageNo> = newer.into_iter().map(|(page, _)| page).collect();
+        self.drain_pages(scene, renderer, &newer)?;
+        newer.into_iter().for_each(|page| self.slots.evict(page));
+        match self.slots.free_frames() < wanted {
+            true => Err(no_slot(device_of(renderer)?)),
+            false => Ok(()),
+        }
+    }
+
+    /// Takes over from the plan when the pages in slots are needed next.
+    pub(super) fn plan_uses(&mut self, scene: &PagedScene) {
+        let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
+        pages.into_iter().for_each(|page| self.slots.set_next_use(page, scene.pager.next_use(page)));
+    }
+
+    /// Notes that an update has changed a page of the batch in its slot.
+    pub(crate) fn changed(&mut self, page: PageNo) {
+        if let Some((_, is_newer)) = self.in_use.get_mut(&page) {
+            *is_newer = true;
+        }
+    }
+
+    /// Takes the pages of a batch back: those that are newer on the device stay pinned in the pager.
+    pub(super) fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
+        for (page, (slot, is_newer)) in std::mem::take(&mut self.in_use) {
+            self.slots.unpin(page, slot, is_newer);
+        }
+        let (held, others): (Vec<_>, Vec<_>) = pinned.into_iter().partition(|page| self.slots.is_dirty(page.page));
+        for page in held {
+            scene.pager.note_meta(&page);
+            self.held.insert(page.page, page);
+        }
+        scene.pager.release(others);
+    }
+}

@@ -1,0 +1,497 @@
+//! The pages of a run and their shared state (optimizer, event log, statistics, counts): creates the first pages,
+//! applies events, and evaluates pages at a step.
+//!
+//! Invariants: 1. a stored page applies events only when a training step pins it; evaluation and export apply events to
+//! copies. The step at which a page applies an event therefore does not depend on frames, evaluation or saves; 2. after
+//! [`PagedScene::apply_pending`] every pinned page is stored with the current SH degree; 3. `rows_bound` is at least
+//! the number of rows that the scene would have if every page had applied every event.
+
+use super::catch_up::{evaluate_all, gather, visible_rows};
+use super::working_set::WorkingSet;
+use crate::base::ids::{PageId, PageNo};
+use crate::base::room;
+use crate::config::limits::RunOptions;
+use crate::dataset::import::{ImportOptions, PointSource, import_points};
+use crate::densify::replay::{PageEdit, PendingEvents, Replay};
+use crate::densify::stats::GradHistogram;
+use crate::densify::strategy::{Effect, Strategy, effect_of};
+use crate::optim::bounds::SplitLimits;
+use crate::optim::deferred::DeferredAdam;
+use crate::optim::method::Method;
+use crate::page::format::slot_header::HEADER_BYTES;
+use crate::paging::error::PagingError;
+use crate::paging::pager::Pager;
+use crate::paging::pinned::PinnedPage;
+use crate::scene::camera::Camera;
+use crate::scene::columns::{Column, Columns};
+use crate::scene::events::{Event, EventKind, EventLog};
+use crate::scene::log_scales::LogScaleRange;
+use crate::scene::page_layout::{read_page, write_page};
+use crate::scene::page_meta::{PageBounds, PageMeta};
+use crate::scene::page_split::SplitTooDeep;
+use crate::scene::partition::{first_fill, partition};
+use crate::scene::rows::{Rows, RowsNow};
+use crate::scene::state::SceneState;
+use crate::train::error::TrainError;
+use crate::train::error::not_stored;
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// Pages evaluated together; copies of all of them are in memory at once.
+pub(crate) const PAGES_PER_BATCH: usize = 32;
+
+/// State shared by all pages.
+pub struct PageRules {
+    /// The optimizer.
+    pub adam: DeferredAdam,
+    events: EventLog,
+    seed: u64,
+    page_rows: usize,
+    /// The densification strategy.
+    pub(crate) strategy: Arc<dyn Strategy>,
+    /// Limits within which an unseen row may split; used by page bounds.
+    splits: SplitLimits,
+    sh_degree: u8,
+}
+
+/// Receives the rows of some pages as tables with consecutive row numbers.
+pub(super) type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
+
+/// The pages of a run and their shared state.
+pub struct PagedScene {
+    /// Cache and storage of the pages.
+    pub pager: Pager,
+    /// State shared by all pages.
+    pub rules: PageRules,
+    /// Gradient statistics of rows since the last densification round.
+    pub histogram: GradHistogram,
+    rows: u64,
+    rows_bound: u64,
+}
+
+impl PageRules {
+    pub(crate) fn new(options: &RunOptions) -> PageRules {
+        let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd)
+            .with_moments(options.moments)
+            .with_log_scales(LogScaleRange::of_scene(options.scene_scale));
+        PageRules {
+            adam: if options.optimizer == Method::Sparse { adam.without_catch_up() } else { adam },
+            events: EventLog::default(),
+            seed: options.seed,
+            page_rows: options.page_rows,
+            strategy: options.strategy.clone(),
+            splits: options.strategy.split_limits(options.scene_scale),
+            sh_degree: options.sh_degree_at(0),
+        }
+    }
+
+    /// Limits within which an unseen row may split.
+    pub(crate) fn splits(&self) -> &SplitLimits {
+        &self.splits
+    }
+
+    /// Current SH degree, as raised by events.
+    pub fn sh_degree(&self) -> u8 {
+        self.sh_degree
+    }
+
+    /// Capacity of a page, rows.
+    pub(crate) fn page_rows(&self) -> usize {
+        self.page_rows
+    }
+
+    /// Bounds of a page with these rows, for the index.
+    pub(crate) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
+        self.adam.page_bounds(rows, &self.splits)
+    }
+
+    fn pending(&self) -> PendingEvents<'_> {
+        PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
+    }
+
+    /// Whether a page has not applied all events.
+    pub(super) fn is_behind(&self, meta: &PageMeta) -> bool {
+        (meta.events_applied as usize) < self.events.len()
+    }
+
+    /// The index entry of a page that holds `state` with all events applied.
+    pub(crate) fn meta(&self, id: PageId, state: &SceneState) -> PageMeta {
+        PageMeta {
+            id,
+            rows: state.rows() as u32,
+            sh_degree: state.sh_degree(),
+            events_applied: self.events.len() as u32,
+            bounds: self.bounds(&state.view()),
+        }
+    }
+}
+
+impl PagedScene {
+    /// Creates the pages of the first Gaussians. The uid of a row is its row number in `columns`.
+    ///
+    /// # Errors
+    /// A page could not be stored.
+    pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
+        let mut scene = PagedScene::empty(pager, options);
+        let fill = first_fill(options.page_rows, options.strategy.grows());
+        first_pages(columns, fill, scene.rules.sh_degree, &mut |id, state| scene.insert_first_page(id, &state))?;
+        Ok(scene)
+    }
+
+    /// Creates the pages of the first Gaussians from points that may exceed memory; the result equals
+    /// [`PagedScene::new`] for the same points.
+    ///
+    /// # Errors
+    /// The points cannot be read, or a page could not be stored.
+    pub fn import(
+        source: &dyn PointSource,
+        import: &ImportOptions<'_>,
+        pager: Pager,
+        options: &RunOptions,
+    ) -> Result<PagedScene, TrainError> {
+        let mut scene = PagedScene::empty(pager, options);
+        let mut failed = None;
+        let imported = import_points(source, import, &mut |page| {
+            let id = page.id;
+            let mut state = page.into_state();
+            state.raise_sh_degree(scene.rules.sh_degree);
+            scene.insert_first_page(id, &state).map_err(|error| not_stored(failed.insert(error)))
+        });
+        match failed {
+            Some(error) => Err(error.into()),
+            None => Ok(imported.map(|_| scene)?),
+        }
+    }
+
+    /// A scene without pages.
+    pub(crate) fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
+        let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
+        PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
+    }
+
+    /// A scene from the pages and the shared state of a checkpoint.
+    pub(crate) fn restore(
+        pager: Pager,
+        options: &RunOptions,
+        events: EventLog,
+        histogram: GradHistogram,
+        [rows, rows_bound]: [u64; 2],
+    ) -> PagedScene {
+        let mut rules = PageRules::new(options);
+        // Replay the logged raises: the configured schedule may have changed since.
+        rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
+        for event in events.events() {
+            if let EventKind::RaiseShDegree { degree } = event.kind {
+                rules.sh_degree = degree;
+            }
+        }
+        rules.events = events;
+        PagedScene { pager, rules, histogram, rows, rows_bound }
+    }
+
+    /// Adds a page of first Gaussians.
+    pub(crate) fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
+        let meta = self.rules.meta(id, state);
+        self.pager.insert(meta, |payload| {
+            write_page(state, payload);
+        })?;
+        self.rows += state.rows() as u64;
+        self.rows_bound += state.rows() as u64;
+        Ok(())
+    }
+
+    /// Rows of the stored pages, without the effect of pending events.
+    pub fn rows(&self) -> u64 {
+        self.rows
+    }
+
+    /// Upper bound of the rows after every page has applied every event.
+    pub fn rows_bound(&self) -> u64 {
+        self.rows_bound
+    }
+
+    /// The event log.
+    pub fn events(&self) -> &EventLog {
+        &self.rules.events
+    }
+
+    /// Logs an event; each page applies it when a step next pins the page. A densification round adds the growth of all
+    /// rows that may grow to `rows_bound` and clears the statistics.
+    pub fn log_event(&mut self, event: Event) {
+        self.rules.events.push(event);
+        match effect_of(&event.kind) {
+            Effect::RaiseShDegree { degree } => self.rules.sh_degree = degree,
+            Effect::Round(round) => {
+                self.rows_bound += round.promised(self.rows_bound, &self.histogram);
+                self.histogram.clear();
+            }
+            Effect::ResetOpacity { .. } => {}
+        }
+    }
+
+    /// Applies pending events to the pinned pages. A page that outgrows its capacity splits and takes a frame per new
+    /// page; the list stays ascending by id.
+    ///
+    /// # Errors
+    /// No frame is free for a split, or a page cannot be split; the page keeps its rows then.
+    pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
+        if pages.iter().all(|p| !self.rules.is_behind(&p.meta)) {
+            return Ok(());
+        }
+        let mut added = Vec::new();
+        let mut done = Ok(());
+        for batch in pages.chunks_mut(PAGES_PER_BATCH) {
+            let is_behind = |p: &&mut PinnedPage| self.rules.is_behind(&p.meta);
+            let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(is_behind).collect();
+            let pending = self.rules.pending();
+            let replays: Vec<Result<Replay, SplitTooDeep>> = behind
+                .par_iter_mut()
+                .map(|p| pending.apply(p.meta.id, p.meta.events_applied as usize, &mut p.rows_mut(0)))
+                .collect();
+            for (page, replay) in behind.into_iter().zip(replays) {
+                let stored = replay.map_err(TrainError::from).and_then(|r| self.store_replay(page, r, &mut added));
+                done = done.and(stored);
+            }
+            if done.is_err() {
+                break;
+            }
+        }
+        pages.append(&mut added);
+        pages.sort_unstable_by_key(|p| p.meta.id);
+        done
+    }
+
+    /// Stores the result of a replay in `page`; if the page split, all parts but the first go to `added`.
+    fn store_replay(
+        &mut self,
+        page: &mut PinnedPage,
+        replay: Replay,
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let Replay { edit, rounds, .. } = replay;
+        if let PageEdit::Replaced(parts) = &edit {
+            self.store_parts(page, parts, added)?;
+        } else {
+            page.meta.events_applied = self.rules.events.len() as u32;
+            if edit == PageEdit::InPlace {
+                page.meta.bounds = self.rules.bounds(&page.rows(0));
+            }
+        }
+        page.dirty = true;
+        for round in rounds {
+            self.rows = self.rows.saturating_add_signed(round.rows_change);
+            // The max matters for pages whose statistics differ from the round's: they return more than was promised.
+            let promised = self.rows_bound.saturating_sub(round.promised).saturating_add_signed(round.rows_change);
+            self.rows_bound = promised.max(self.rows);
+        }
+        Ok(())
+    }
+
+    fn store_parts(
+        &mut self,
+        page: &mut PinnedPage,
+        parts: &[(PageId, SceneState)],
+        added: &mut Vec<PinnedPage>,
+    ) -> Result<(), TrainError> {
+        let mut frames = Vec::new();
+        for _ in 1..parts.len() {
+            match self.pager.take_frame() {
+                Ok(frame) => frames.push(frame),
+                Err(error) => {
+                    frames.into_iter().for_each(|frame| self.pager.return_frame(frame));
+                    return Err(error.into());
+                }
+            }
+        }
+        let mut frames = frames.into_iter();
+        for (part, (id, state)) in parts.iter().enumerate() {
+            let meta = self.rules.meta(*id, state);
+            if part == 0 {
+                write_page(state, page.payload_mut());
+                page.meta = meta;
+            } else if let Some(mut frame) = frames.next() {
+                write_page(state, &mut frame.as_mut_slice()[HEADER_BYTES..]);
+                added.push(self.pager.add_split(meta, frame));
+            }
+        }
+        Ok(())
+    }
+
+    /// Switches to the rules of `options` after `now` steps. Every page applies its pending events and missed steps at
+    /// the old rates and gets new bounds, so every page is read and rewritten once. The histogram is recounted; returns
+    /// whether the recount differs, as it does after a salvage that left statistics out.
+    ///
+    /// # Errors
+    /// Pages could not be pinned.
+    pub(crate) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<bool, TrainError> {
+        let mut rules = PageRules::new(options);
+        rules.events = self.rules.events.clone();
+        rules.sh_degree = self.rules.sh_degree;
+        let batch = (self.pager.frames_max() / 2).clamp(1, PAGES_PER_BATCH);
+        let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
+        let mut histogram = GradHistogram::default();
+        for pages in pages.chunks(batch) {
+            let mut pinned = self.pager.acquire_pages(pages)?;
+            let applied = self.apply_pending(&mut pinned);
+            if applied.is_ok() {
+                // New pages from splits are pinned too, so every row is counted.
+                pinned.iter().for_each(|page| histogram.add_rows(&page.rows(0)));
+                let at = self.rules.adam.at(now);
+                pinned.par_iter_mut().for_each(|page| {
+                    let mut rows = page.rows_mut(0);
+                    (0..rows.rows()).for_each(|row| at.settle_row(&mut rows, row));
+                    page.meta.bounds = rules.bounds(&page.rows(0));
+                    page.dirty = true;
+                });
+            }
+            self.pager.release(pinned);
+            applied?;
+        }
+        self.rules = rules;
+        let is_changed = histogram != self.histogram;
+        self.histogram = histogram;
+        Ok(is_changed)
+    }
+
+    /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
+    /// copies. Stored pages stay unchanged.
+    ///
+    /// # Errors
+    /// Pages could not be pinned.
+    pub fn gather_pages(
+        &mut self,
+        pages: &[PageNo],
+        camera: &Camera,
+        now: u32,
+        working: &mut WorkingSet,
+    ) -> Result<(), PagingError> {
+        let WorkingSet { row_from_working, columns, .. } = working;
+        if columns.sh_degree != self.rules.sh_degree {
+            *columns = Columns::zeros(0, self.rules.sh_degree);
+        }
+        columns.resize(0);
+        let mut part = Columns::zeros(0, self.rules.sh_degree);
+        self.visit(pages, &mut |rules, tables| {
+            visible_rows(tables, &rules.adam, now, camera, row_from_working);
+            gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
+            append(columns, &part);
+            Ok::<(), PagingError>(())
+        })
+    }
+
+    /// Passes all rows, evaluated after `now` steps, to `each` in batches, in the order of page ids. Stored pages stay
+    /// unchanged.
+    ///
+    /// # Errors
+    /// Pages could not be pinned, or `each` failed.
+    pub fn for_all_rows<E: From<PagingError>>(
+        &mut self,
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let index = self.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.retain(|p| index[p.index()].rows > 0);
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        self.for_rows_of(&pages, now, each)
+    }
+
+    /// As [`PagedScene::for_all_rows`], for `pages` only.
+    ///
+    /// # Errors
+    /// Pages could not be pinned, or `each` failed.
+    pub fn for_rows_of<E: From<PagingError>>(
+        &mut self,
+        pages: &[PageNo],
+        now: u32,
+        each: &mut dyn FnMut(&Columns) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+    }
+
+    /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies.
+    pub(crate) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
+        // The copies of a batch take as much memory as its frames.
+        let batch = PAGES_PER_BATCH.min(self.pager.frames_max() / 2).max(1);
+        for pages in pages.chunks(batch) {
+            let pinned = self.pager.acquire_pages(pages)?;
+            let rules = &self.rules;
+            let pending = rules.pending();
+            let copies: Vec<Option<SceneState>> = pinned
+                .par_iter()
+                .map(|page| {
+                    let mut state = rules.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
+                    pending.apply_to_table(page.meta.events_applied as usize, &mut state);
+                    Some(state)
+                })
+                .collect();
+            let tables = pinned.iter().zip(&copies);
+            let mut tables: Vec<Rows<'_>> =
+                tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)).collect();
+            let mut first_row = 0;
+            for table in &mut tables {
+                table.first_row = first_row;
+                first_row += table.rows();
+            }
+            let done = each(rules, &tables);
+            drop(tables);
+            self.pager.release(pinned);
+            done?;
+        }
+        Ok(())
+    }
+}
+
+/// The rows of the pages as tables with consecutive row numbers.
+pub fn row_tables(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
+    let mut first_row = 0;
+    let mut tables = Vec::with_capacity(pages.len());
+    for page in pages {
+        tables.push(page.rows(first_row));
+        first_row += page.meta.rows as usize;
+    }
+    tables
+}
+
+/// Partitions Gaussians in memory into first pages of at most `fill` rows, stored with `sh_degree`, and passes each to
+/// `take`. The uid of a row is its row number in `columns`.
+///
+/// # Errors
+/// Those of `take`.
+pub(crate) fn first_pages<E>(
+    columns: &Columns,
+    fill: usize,
+    sh_degree: u8,
+    take: &mut dyn FnMut(PageId, SceneState) -> Result<(), E>,
+) -> Result<(), E> {
+    let pages = partition(&columns.means, &columns.scales, fill);
+    (0..)
+        .zip(pages.iter())
+        .try_for_each(|(page, rows)| take(PageId::initial(page), first_rows(columns, rows, sh_degree)))
+}
+
+/// The listed rows of `columns` as untrained rows whose uids are their row numbers. SH bands above `sh_degree` are
+/// dropped.
+fn first_rows(columns: &Columns, rows: &[u32], sh_degree: u8) -> SceneState {
+    let mut out = Columns::zeros(rows.len(), sh_degree);
+    for column in Column::ALL {
+        let width = column.width(sh_degree);
+        if width == 0 {
+            continue;
+        }
+        for (to, &row) in out.column_mut(column).chunks_exact_mut(width).zip(rows) {
+            let from = columns.row(column, row as usize);
+            let kept = width.min(from.len());
+            to[..kept].copy_from_slice(&from[..kept]);
+        }
+    }
+    let mut state = SceneState::from_columns(out);
+    state.uid.iter_mut().zip(rows).for_each(|(uid, &row)| *uid = u64::from(row));
+    state
+}
+
+fn append(to: &mut Columns, more: &Columns) {
+    for column in Column::ALL {
+        room::extend(to.column_mut(column), more.column(column));
+    }
+}

@@ -1,0 +1,179 @@
+//! Watches that a run trains something: warns of skipped rows and steps, and stops a run that diverged or in which
+//! nothing counts, with the cause.
+//!
+//! Invariants: 1. nothing here changes a number of the result: a run is stopped or goes on; 2. a run that stops here
+//! keeps its last commit and writes its last good step.
+
+use super::train_step::{Skipped, StepOutcome};
+use crate::base::error::InputError;
+use crate::checkpoint::run_state::TrainerState;
+use crate::dataset::loader::Dataset;
+use crate::scene::image::Target;
+use crate::train::error::TrainError;
+
+/// Consecutive unsound steps that end a run.
+const UNSOUND_STEPS_MAX: u32 = 3;
+/// Most names of views that a message lists.
+const NAMES_LISTED: usize = 20;
+
+/// The steps since a row was last rewritten, in this process.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Idle {
+    /// Steps.
+    steps: usize,
+    /// Steps whose photo is masked completely.
+    masked: usize,
+    /// Steps whose view had rows.
+    with_rows: usize,
+    /// Steps whose view drew a row.
+    with_drawn: usize,
+    /// The user was told of steps that draw rows and change none.
+    is_told: bool,
+}
+
+/// A run in which no training view sees a Gaussian, before its first step or later.
+pub(crate) fn no_view_sees(dataset: &Dataset, gaussians: u64) -> InputError {
+    let views = dataset.train_views().len();
+    if gaussians == 0 {
+        return no_gaussian_left(dataset);
+    }
+    let problem = format!("none of the {views} training views sees any of the {gaussians} Gaussians");
+    let remedy = "check that poses and points come from the same reconstruction, and the convention of the poses";
+    InputError::new(&dataset.image_folder, problem, remedy)
+}
+
+fn no_gaussian_left(dataset: &Dataset) -> InputError {
+    let problem = "no Gaussian is left: resets and pruning have removed all of them";
+    let remedy = "lower --prune-opa, raise --reset-every or --prune-scale3d, or lower the learning rates";
+    InputError::new(&dataset.image_folder, problem, remedy)
+}
+
+/// Counts the skipped rows and steps of a step in `state`, and warns of the first. `init_ply` is the file from which the
+/// run started, or empty.
+///
+/// # Errors
+/// This is one of [`UNSOUND_STEPS_MAX`] unsound steps in a row.
+pub(crate) fn note_soundness(
+    state: &mut TrainerState,
+    outcome: &StepOutcome,
+    view: &str,
+    init_ply: &str,
+) -> Result<(), TrainError> {
+    let step = state.step;
+    if outcome.rows_skipped > 0 && state.rows_skipped == 0 {
+        eprintln!(
+            "warning: at step {step}, view {view}, {} Gaussians keep their values because their gradients are not \
+             finite or above 1e18; later ones are counted in summary.json",
+            outcome.rows_skipped
+        );
+    }
+    if outcome.skipped.is_some() && state.steps_skipped == 0 {
+        let problem = problem_of(outcome);
+        eprintln!("warning: step {step} is skipped: {problem} (view {view}); later ones are counted in summary.json");
+    }
+    state.rows_skipped += outcome.rows_skipped;
+    state.steps_skipped += u32::from(outcome.skipped.is_some());
+    if !outcome.is_unsound() {
+        state.steps_skipped_in_a_row = 0;
+        return Ok(());
+    }
+    state.steps_skipped_in_a_row += 1;
+    if state.steps_skipped_in_a_row < UNSOUND_STEPS_MAX {
+        return Ok(());
+    }
+    let remedy = match init_ply {
+        "" => "lower the learning rates; with the default rates, report this as a bug and attach the scene".to_string(),
+        ply => format!(
+            "check {ply}, from which the run started: colours (f_dc, f_rest), positions and scales of a sound file are \
+             below 1e6; if it is sound, lower the learning rates"
+        ),
+    };
+    let (problem, count) = (problem_of(outcome), state.steps_skipped_in_a_row);
+    Err(TrainError::NonFinite { problem, step, view: view.to_string(), count, remedy })
+}
+
+/// Names views that have become outliers.
+pub(crate) fn warn_of_outliers(found: &[usize], step: u32, are_left_out: bool, dataset: &Dataset) {
+    if found.is_empty() {
+        return;
+    }
+    let names: Vec<&str> = found.iter().take(NAMES_LISTED).map(|&view| dataset.views[view].name.as_str()).collect();
+    let more = found.len().saturating_sub(NAMES_LISTED);
+    let names = names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() };
+    let (are, remedy) = match are_left_out {
+        true => ("are left out from here on", "check them"),
+        false => ("contradict the scene", "check them, or leave such views out with --robust-views"),
+    };
+    eprintln!(
+        "warning: step {step}: the photos of {} views {are}, because they differ from their pictures far more than \
+         others do (a wrong pose, another place, another exposure); {remedy}: {names}",
+        found.len()
+    );
+}
+
+impl Idle {
+    /// Counts steps that change no row.
+    ///
+    /// # Errors
+    /// No Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
+    /// masked completely, no view sees a Gaussian, or no Gaussian is opaque enough to be drawn.
+    pub fn note(
+        &mut self,
+        outcome: &StepOutcome,
+        (step, gaussians): (u32, u64),
+        target: &Target,
+        dataset: &Dataset,
+    ) -> Result<(), TrainError> {
+        let place = format!("step {step}");
+        if gaussians == 0 {
+            return Err(no_gaussian_left(dataset).at(place).into());
+        }
+        if outcome.updated > 0 {
+            *self = Idle { is_told: self.is_told, ..Idle::default() };
+        }
+        if outcome.updated > 0 || outcome.skipped.is_some() {
+            return Ok(());
+        }
+        self.steps += 1;
+        self.masked += usize::from(!target.counts());
+        self.with_rows += usize::from(outcome.rows > 0);
+        self.with_drawn += usize::from(outcome.drawn > 0);
+        let views = dataset.train_views().len();
+        // So many steps in a row hold a whole epoch.
+        if self.steps < 2 * views {
+            return Ok(());
+        }
+        let fail = |problem: String, remedy: &str| {
+            Err(InputError::new(&dataset.image_folder, problem, remedy).at(place.as_str()).into())
+        };
+        if self.masked == self.steps {
+            let problem = format!("the masks of all {views} training views exclude every pixel: nothing is trained");
+            let remedy = "white in masks/ and opaque in photos means keep: see --invert-masks, or use --masks=false";
+            return fail(problem, remedy);
+        }
+        if self.with_rows == 0 {
+            return Err(no_view_sees(dataset, gaussians).at(place).into());
+        }
+        if self.with_drawn == 0 {
+            let problem =
+                format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
+            let remedy = "raise --init-opacity, raise --reset-every, or lower --opacities-lr";
+            return fail(problem, remedy);
+        }
+        if !std::mem::replace(&mut self.is_told, true) {
+            eprintln!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
+        }
+        Ok(())
+    }
+}
+
+/// What is wrong with an unsound step.
+fn problem_of(outcome: &StepOutcome) -> String {
+    let of_rows =
+        |rows: u64| format!("gradients of {rows} of {} Gaussians are not finite or far too large", outcome.rows);
+    match outcome.skipped {
+        Some(Skipped::Loss) => "the loss is not finite".to_string(),
+        Some(Skipped::Gradients(rows)) => of_rows(rows),
+        None => of_rows(outcome.rows_skipped),
+    }
+}

@@ -1,0 +1,146 @@
+//! Ownership of stores: which run a store belongs to, and who may delete what.
+//!
+//! A run draws an identity when it begins ([`RunId`]) and writes it to its config.toml and into every commit. A path is
+//! not an identity: another run can create a new spill directory under the same name.
+//!
+//! | who | may delete | only if |
+//! | --- | --- | --- |
+//! | a run that begins with `--spill-dir P` | the store in `P` | the store holds no commit ([`crate::page::tool::uncommitted`]) |
+//! | a run in memory, at its first commit | the store in `OUT/checkpoint` | the store holds no commit |
+//! | a run that ends, `--keep-checkpoint` absent | the store that it made or resumed from | this process holds the store's lock, and FORMAT has the store's identity |
+//! | a run that is refused or fails before its first commit | the store that it made | as above |
+//! | `--resume OUT` of a finished run | the checkpoint that a kill left in the run's own folder | the last commit has the identity of the run in `OUT`, and `--keep-checkpoint` is absent |
+//! | `--overwrite` | the store in `OUT/checkpoint` | the store holds no commit, or its last commit has the identity of the run in `OUT` |
+//! | any run | anything in `OUT` | it holds the lock of `OUT` |
+//! | `--resume OUT` of a run that was cut off before its first commit | metrics and event files in `OUT` | there is neither a result nor a saved PLY nor a logged commit |
+//! | `--overwrite` | results in `OUT`, by name; pictures in `renders/test` | there is a config.toml beside them |
+//! | `gsscale-ckpt rollback`, `prune` with `OUT` | generations and names of the store that `OUT` leads to | the last commit has the identity of the run in `OUT` |
+//! | `gsscale-ckpt clone`, `salvage`, `import` | their own unfinished store | the folder was made by this process |
+//! | a sweep of `gsscale-bench` | its own unfinished runs and their pages | the folder has the sweep's mark in its name, or its record in it |
+//!
+//! In all cases, files inside a spill directory are deleted by the store's identity ([`SpillDir::remove`]); other files
+//! stay, and so does a store that cannot be opened.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
+use crate::checkpoint::run_state::{RunIdentity, RunState};
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::tool::reading::{Access, StoreReader, WitnessRule};
+use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::train::error::TrainError;
+use crate::train::inputs::places::absolute;
+use crate::train::stores::opened::Stored;
+use std::path::Path;
+
+/// Refuses the checkpoint of another run.
+///
+/// # Errors
+/// `of_store` and `run` are both known and differ.
+pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> InputResult<()> {
+    if !of_store.id.is_other_than(run) {
+        return Ok(());
+    }
+    let (problem, remedy) = match of_store.out.as_str() {
+        "" => (
+            String::from("it holds the checkpoint of another run"),
+            String::from("name the folder that holds the pages of this run with --spill-dir"),
+        ),
+        out => (
+            format!("it holds the checkpoint of another run, that of {out}"),
+            format!(
+                "name the folder that holds the pages of this run with --spill-dir; the other run continues with \
+                 gsscale-train --resume {out}"
+            ),
+        ),
+    };
+    Err(InputError::new(folder, problem, remedy))
+}
+
+/// The run that a checkpoint must belong to.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Claim<'a> {
+    /// Its identity; unknown if its config.toml has none.
+    pub run: RunId,
+    /// Its output folder.
+    pub out: &'a Path,
+    /// The user named the folder of the checkpoint on this command line.
+    pub is_named: bool,
+}
+
+impl Claim<'_> {
+    /// Refuses the checkpoint of another run. A run without an identity owns a checkpoint that names its output folder
+    /// or that the user named.
+    fn check(&self, folder: &Path, of_store: &RunIdentity) -> InputResult<()> {
+        let out = absolute(self.out);
+        let is_here = Path::new(&of_store.out) == out;
+        if !self.run.is_known() && of_store.id.is_known() && !self.is_named && !is_here {
+            return check_owner(folder, of_store, RunId::draw());
+        }
+        if is_here && of_store.id.is_other_than(self.run) {
+            let problem = "it holds the checkpoint of an earlier run in the same output folder";
+            let remedy = "name the folder that holds the pages of this run with --spill-dir; to resume the earlier run, \
+                          name a new output folder and this folder with --spill-dir";
+            return Err(InputError::new(folder, problem, remedy));
+        }
+        check_owner(folder, of_store, self.run)
+    }
+}
+
+/// Opens the checkpoint in `folder`; `None` if it has no commit.
+///
+/// # Errors
+/// The checkpoint belongs to another run, cannot be opened, or is in use.
+pub(crate) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
+    // Opening a map for writing changes its file, so check the owner by reading. An unreadable map is refused below.
+    if let Ok(state) = last_state(folder, Access::Map) {
+        claim.check(folder, &state.origin.run)?;
+    }
+    let Some(stored) = Stored::open(folder, allow_remote)? else { return Ok(None) };
+    claim.check(folder, &stored.run_state.origin.run)?;
+    Ok(Some(stored))
+}
+
+/// Reads the run state of the last commit without writing.
+///
+/// # Errors
+/// The store has no commit or cannot be opened.
+pub(crate) fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
+    let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
+    let bytes = store.run_state(store.find(None)?)?;
+    let wrong = |problem: String| InputError::new(folder, problem, "use the program that made it");
+    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()))?)
+}
+
+/// Removes the checkpoint that `run` left in its output folder, for a run that starts over there.
+///
+/// # Errors
+/// The checkpoint belongs to another run, cannot be opened, or is in use; it stays, and the new run must not begin.
+pub(crate) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
+    check_removable(folder, run)?;
+    if SpillDir::exists_in(folder) && !remove_uncommitted(folder, true)? {
+        SpillDir::open(folder, true)?.remove()?;
+    }
+    // Succeeds only if the folder is empty.
+    let _ = std::fs::remove_dir(folder);
+    Ok(())
+}
+
+/// Checks whether [`remove_checkpoint_in`] may remove the checkpoint.
+///
+/// # Errors
+/// As [`remove_checkpoint_in`].
+pub(crate) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainError> {
+    if !SpillDir::exists_in(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
+        return Ok(());
+    }
+    let by_hand = format!("if you do not need it, remove it (rm -r {}), or choose another --out", folder.display());
+    let refuse = |problem: String| InputError::new(folder, problem, by_hand.clone());
+    let state = last_state(folder, Access::Pages)
+        .map_err(|e| refuse(format!("the checkpoint in it cannot be opened, so it is not removed: {e}")))?;
+    if state.origin.run.id.is_known() && state.origin.run.id == run {
+        return Ok(());
+    }
+    let whose =
+        if state.origin.run.out.is_empty() { String::new() } else { format!(", that of {}", state.origin.run.out) };
+    Err(refuse(format!("it holds the checkpoint of another run{whose}, so it is not removed")).into())
+}
