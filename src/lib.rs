@@ -32,7 +32,7 @@
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
 //! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose |
-//! | [`exchange`] | PLY in and out, SPZ out; what TensorBoard reads |
+//! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
@@ -87,7 +87,7 @@
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
-//!    whole. `exchange/mod.rs` names the file.
+//!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
 //! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. Runs and
 //!    `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
 //! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.

@@ -137,7 +137,7 @@ choices! {
     "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
-    "export": ExportFormat { Ply = "ply", Spz = "spz" }
+    "export": ExportFormat { Ply = "ply", Spz = "spz", Sog = "sog" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
 
