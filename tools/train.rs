@@ -223,13 +223,14 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             None => String::from("not evaluated"),
         };
         eprintln!(
-            "{} {} steps, {} Gaussians, {} of training; {test}",
+            "{} {} steps, {} Gaussians, {} of training",
             if summary.finished { "done:" } else { "stopped after" },
             format_grouped(summary.steps.into()),
             format_grouped(summary.gaussians),
             format_seconds(summary.train_seconds),
         );
         let out = &outcome.out;
+        eprintln!("  quality     {test}");
         eprintln!("  Gaussians   {}", out.join(PLY_FILE).display());
         eprintln!("  report      {}", out.join(REPORT_FILE).display());
         if summary.finished {

@@ -29,7 +29,7 @@ use crate::train::memory::estimate::list_bytes;
 use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
 use crate::train::preflight::device_memory;
 use crate::train::preflight::drive_space::{StepWrites, check_first_drive, step_writes};
-use crate::train::preflight::forecast::{Forecast, Measured, Reach, mean_pixels, reach};
+use crate::train::preflight::forecast::{Forecast, Measured, Reach, reach};
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
@@ -192,10 +192,9 @@ fn plan(
     }
     let probe = Probe::of_run(dataset, trainer, largest, driver);
     let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
-    let pixels = mean_pixels(dataset.train_views().iter().map(|&view| &dataset.views[view].camera));
     let (last, known) = match keeps_first_count(config, dataset) {
         true => (rows, Reach::Kept),
-        false => reach(config, rows, pixels, steps_done),
+        false => reach(config, rows, steps_done),
     };
     let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check(config, &memory)?;
@@ -230,6 +229,7 @@ pub(super) fn plan_and_train(
         let of_device = device_memory::describe(config, forecast.memory_at_end());
         let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
         let plan = describe(request, dataset, &trainer, &plan_text::growth(&forecast), &of_tiers);
+        let plan = plan_text::folded(&plan);
         match request.dry_run {
             // What was asked for goes to standard output.
             true => crate::say!("{plan}"),
@@ -275,7 +275,7 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: &str, tiers: &str) -> String {
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
-    let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
+    let size = largest.map_or(String::new(), |c| format!("{}x{} pixels", c.width, c.height));
     let results = match request.out.as_os_str().is_empty() {
         true => String::new(),
         false => format!(", results in {}", request.out.display()),
