@@ -18,7 +18,7 @@ use crate::config::residence::Residence;
 use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
-use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
 use crate::scene::partition::first_fill;
@@ -33,6 +33,7 @@ use crate::train::preflight::forecast::{Forecast, Measured, Reach, reach};
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
+use crate::train::preflight::results_space::check_drive_of_results;
 use crate::train::start::first_scene::Start;
 use crate::train::start::first_scene::dataset_print;
 use crate::train::start::tiers::{self, Tiers};
@@ -49,22 +50,16 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
     machine::set_up(config)?;
-    if !request.dry_run {
-        out_folder::check(&request.out, request.existing)?;
-    }
+    check_folders(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+        check_first_drive(config, start.rows)?;
         if !request.quiet {
             crate::say!("{known}");
         }
-        return Ok(RunOutcome {
-            summary: None,
-            exit_code: 0,
-            out: request.out.clone(),
-            keeps_checkpoint: config.keep_checkpoint,
-        });
+        return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
         && remove_uncommitted(spill_dir, false)?
@@ -75,6 +70,15 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let run = RunId::draw();
     let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
     plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// Refuses folders in which the run may not begin, before anything else is read. Changes nothing, so dry runs refuse what runs refuse.
+fn check_folders(request: &RunRequest) -> Result<(), TrainError> {
+    out_folder::check(&request.out, request.existing)?;
+    match request.config.residence().spill_dir() {
+        Some(spill_dir) => Ok(check_usable(spill_dir, false)?),
+        None => Ok(()),
+    }
 }
 
 /// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
@@ -236,13 +240,11 @@ pub(super) fn plan_and_train(
             false => eprintln!("{plan}"),
         }
     }
+    if begun.past.is_none() {
+        check_drive_of_results(config, &request.out, &forecast)?;
+    }
     if request.dry_run {
-        return Ok(RunOutcome {
-            summary: None,
-            exit_code: 0,
-            out: request.out.clone(),
-            keeps_checkpoint: config.keep_checkpoint,
-        });
+        return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     out_folder::make_folder(&request.out)?;
