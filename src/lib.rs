@@ -88,9 +88,10 @@
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
 //!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
-//! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. Runs and
-//!    `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
-//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.
+//! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. `gsscale-ckpt
+//!    export` follows; its help names the formats (`tools/ckpt/export.rs`). The PLY remains: resumes, `gsscale-eval` and more steps read it.
+//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file. `train/run/run_folder.rs`,
+//!    `save_result`: the run writes it.
 //!
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
