@@ -63,7 +63,7 @@ fn listed(words: &[&str]) -> String {
     }
 }
 
-/// An optional choice; the key's word for `None` is `auto`, or `off` for an optional feature.
+/// An optional choice. `None` is written `auto`, or `off` for a feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen<T>(pub Option<T>);
 

@@ -53,7 +53,7 @@ pub enum RunFile {
     Pictures(&'static str),
 }
 
-/// The part of a run that a file tells about, which decides when a later run in the folder removes it.
+/// What a file is about. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
     /// How the run began.
@@ -84,7 +84,7 @@ pub const RUN_FILES: [(RunFile, Tells); 18] = [
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),
-    // Before the pictures, whose folder goes when it is empty.
+    // First, so that the folder is empty when its pictures are removed.
     (RunFile::File(VIEWS_FILE), Tells::Result),
     (RunFile::Pictures(PICTURES_FOLDER), Tells::Result),
 ];
