@@ -224,7 +224,8 @@ config_keys! {
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
-        /// Format of the result: ply, or spz (as well, about a tenth of the bytes, for viewers)
+        /// Format of the result: ply; or as well, for viewers, spz (about a tenth of the bytes) or sog (a folder with
+        /// levels of detail, which viewers load in parts)
         export: ExportFormat = ExportFormat::Ply => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;

@@ -6,8 +6,10 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, sync_folder};
+use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
+use crate::exchange::sog::is_of_sog;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
@@ -175,6 +177,12 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
         // A run that was cut off before its first commit left nothing else; results must stay.
         return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
     }
+    // Before anything is removed: without its config the rest would not be taken for a run's.
+    for (file, _) in &RUN_FILES {
+        if let RunFile::Sog(folder) = file {
+            check_ours(&out.join(folder), is_of_sog)?;
+        }
+    }
     // First, because an active run in the folder makes this fail.
     remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
     Ok(remove_files(out, |_| true)?)
@@ -192,6 +200,7 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
         RunFile::File(name) => remove_file(&out.join(name)),
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
+        RunFile::Sog(folder) => remove_ours(&out.join(folder), is_of_sog),
         RunFile::Pictures(folder) => {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
         }
