@@ -567,14 +567,18 @@ fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
     let (out, spill) = (drive.0.join("out"), folder.path().join("spill"));
     let mut flags = args(&scene, &out, &spill);
     flags.extend(["--commit-every", "0.02", "--disk-full-wait", "0.2", "--quiet"]);
-    let seven = flags.iter().position(|arg| *arg == "7").unwrap();
-    flags[seven] = "1";
+    for (usual, here) in [("7", "1"), ("60", "300")] {
+        let at = flags.iter().position(|arg| *arg == usual).unwrap();
+        flags[at] = here;
+    }
     let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
     let command = command.args(&flags);
     let child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
     let began = Instant::now();
-    while !out.join("metrics.jsonl").exists() {
-        assert!(began.elapsed() < Duration::from_secs(120), "the run does not begin");
+    let commits = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["commits"].as_u64();
+    let metrics = || std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
+    while !metrics().lines().filter_map(commits).any(|commits| commits > 0) {
+        assert!(began.elapsed() < Duration::from_secs(120), "the run does not commit");
         std::thread::sleep(Duration::from_millis(1));
     }
     // A drive that is full at the beginning is refused.
