@@ -163,7 +163,7 @@ impl World<'_> {
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let mode = options.appearance;
         let look = mode.is_on().then(|| (mode, Look { lens: Lens::of(&camera), ..Look::default() }));
-        let comparison = Comparison { target: &target, loss: options.loss, look, is_left_out: false };
+        let comparison = Comparison { look, ..Comparison::new(&target, options.loss) };
         let mut step = |number| {
             let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();

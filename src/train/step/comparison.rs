@@ -6,8 +6,8 @@
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
 //! picture stays where the renderer keeps it; 3. the loss, its gradient and the errors that rows are weighed by are those of
-//! the corrected picture; 4. nothing here changes the values of a correction: what was found for them is left for the
-//! trainer, which stores it only if the step is taken.
+//! the corrected picture; 4. nothing here changes the values of a correction: the trainer reads `found` after the step and
+//! stores it only if the step is taken.
 
 use crate::appearance::AppearanceMode;
 use crate::appearance::fit::Pair;
@@ -25,7 +25,7 @@ pub struct Comparison<'a> {
     pub loss: LossOptions,
     /// The correction of the picture, and which of its values are trained; `None` without correction.
     pub look: Option<(AppearanceMode, Look)>,
-    /// The view is compared with its photo, and that is all: there is no gradient.
+    /// Only the loss is measured: the view is not trained on.
     pub is_left_out: bool,
 }
 
@@ -45,7 +45,12 @@ impl Correction {
     }
 }
 
-impl Comparison<'_> {
+impl<'a> Comparison<'a> {
+    /// A view that is trained on, without correction.
+    pub fn new(target: &'a Target, loss: LossOptions) -> Comparison<'a> {
+        Comparison { target, loss, look: None, is_left_out: false }
+    }
+
     /// Corrects the picture that `renderer` has drawn, compares it with the photo, and takes the loss back to the splats.
     ///
     /// # Errors
