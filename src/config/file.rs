@@ -114,9 +114,9 @@ config_keys! {
         /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
         /// run keeps its first value
         [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
-        /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr where they are not given:
-        /// run-length (by --steps; the classic values from 30,000 steps on) or classic (their defaults below). A
-        /// resumed run keeps its values
+        /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
+        /// also of --scales-lr and --shn-lr, where they are not given: run-length (by --steps; the classic values from
+        /// 30,000 steps on) or classic (their defaults below). A resumed run keeps its values
         schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
         seed: u64 = 42 => Numbers;
