@@ -378,6 +378,9 @@ impl Trainer {
         if !self.state.outliers.is_as_large_as(&fresh.outliers) {
             self.state.outliers = fresh.outliers;
         }
+        if !self.state.blocks.is_as_large_as(&fresh.blocks) {
+            self.state.blocks = fresh.blocks;
+        }
         self.scene.pager.restore_stats(state.traffic);
     }
 }

@@ -16,9 +16,10 @@ use std::path::Path;
 
 /// What programs did that did not know a key, as the value of the key. A key that is missing here counts as changed when an older
 /// run resumes.
-const BEFORE_ITS_TIME: [(&str, &str); 5] = [
+const BEFORE_ITS_TIME: [(&str, &str); 6] = [
     ("appearance", "off"),
     ("robust-views", "false"),
+    ("robust-pixels", "false"),
     ("quality", "normal"),
     ("optimizer-on", "auto"),
     ("optimizer-on", "host"),
