@@ -17,7 +17,8 @@ mod support;
 
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::isect_emit::Isect;
-use gsscale::kernels::rasterize_fwd::{Lists, Raster, TILE_PIXELS, rasterize_fwd};
+use gsscale::kernels::raster::{Lists, TILE_PIXELS};
+use gsscale::kernels::rasterize_fwd::{Raster, rasterize_fwd};
 use gsscale::kernels::splats::{Grid, Splat};
 use gsscale::kernels::stages::STAGES;
 use gsscale::kernels::tile_range::TileRange;

@@ -154,17 +154,8 @@ fn is_seen(page: DevicePage, row: u32) -> bool {
 
 /// One workgroup for each page.
 @compute @workgroup_size(256)
-fn cull(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-) {
-    let p = linear_group(workgroup, workgroups);
+fn cull(place: SubgroupPlace) {
+    let p = linear_group(place.workgroup, place.workgroups);
     // The same for the whole workgroup.
     if p >= u.page_count || pages[p].slab != u.slab {
         return;
@@ -172,51 +163,39 @@ fn cull(
     let page = pages[p];
     var before = 0u;
     for (var first = 0u; first < page.rows; first += 256u) {
-        let row = first + lane;
+        let row = first + place.lane;
         var seen = false;
         if row < page.rows {
             seen = is_seen(page, row);
         }
-#ifdef SUBGROUPS
-        let scanned = workgroup_scan(u32(seen), lane, subgroup, subgroups, subgroup_lane);
-#else
-        let scanned = workgroup_scan(u32(seen), lane);
-#endif
+        let scanned = workgroup_scan(u32(seen), place);
         if seen {
             found[page.first_row + before + scanned.before] = row;
         }
         before += scanned.total;
         workgroupBarrier();
     }
-    if lane == 0u {
+    if place.lane == 0u {
         counts[p] = before;
     }
 }
 
 /// One workgroup for each page, of any slab.
 @compute @workgroup_size(256)
-fn list(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let p = linear_group(workgroup, workgroups);
+fn list(place: Place) {
+    let p = linear_group(place.workgroup, place.workgroups);
     if p >= u.page_count {
         return;
     }
-    for (var i = lane; i < counts[p]; i += 256u) {
+    for (var i = place.lane; i < counts[p]; i += 256u) {
         rows[pages[p].first_listed + i] = vec2<u32>(p, found[pages[p].first_row + i]);
     }
 }
 
 /// One invocation for each float of the output.
 @compute @workgroup_size(256)
-fn gather(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn gather(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= u.row_count * u.width {
         return;
     }
@@ -247,12 +226,8 @@ fn split_reach(page: DevicePage, row: u32, sigma: f32) -> f32 {
 
 /// Bounds of the pages that an update has changed: one workgroup for each page.
 @compute @workgroup_size(256)
-fn bounds(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let p = linear_group(workgroup, workgroups);
+fn bounds(place: Place) {
+    let p = linear_group(place.workgroup, place.workgroups);
     if p >= u.page_count || pages[p].slab != u.slab {
         return;
     }
@@ -261,7 +236,7 @@ fn bounds(
     var low = vec3<f32>(3.4e38);
     var high = vec3<f32>(-3.4e38);
     var sigma_max = 0.0;
-    for (var row = lane; row < page.rows; row += 256u) {
+    for (var row = place.lane; row < page.rows; row += 256u) {
         var log_scale = -3.4e38;
         for (var c = 0u; c < 3u; c++) {
             log_scale = max(log_scale, hull(page, SCALES, row, c, u.scales_rate).y);
@@ -279,21 +254,21 @@ fn bounds(
         sigma_max = max(sigma_max, sigma);
     }
     for (var c = 0u; c < 3u; c++) {
-        parts[c][lane] = low[c];
-        parts[3u + c][lane] = high[c];
+        parts[c][place.lane] = low[c];
+        parts[3u + c][place.lane] = high[c];
     }
-    parts[6][lane] = sigma_max;
+    parts[6][place.lane] = sigma_max;
     for (var half = 128u; half > 0u; half = half / 2u) {
         workgroupBarrier();
-        if lane < half {
+        if place.lane < half {
             for (var c = 0u; c < 3u; c++) {
-                parts[c][lane] = min(parts[c][lane], parts[c][lane + half]);
-                parts[3u + c][lane] = max(parts[3u + c][lane], parts[3u + c][lane + half]);
+                parts[c][place.lane] = min(parts[c][place.lane], parts[c][place.lane + half]);
+                parts[3u + c][place.lane] = max(parts[3u + c][place.lane], parts[3u + c][place.lane + half]);
             }
-            parts[6][lane] = max(parts[6][lane], parts[6][lane + half]);
+            parts[6][place.lane] = max(parts[6][place.lane], parts[6][place.lane + half]);
         }
     }
-    if lane == 0u {
+    if place.lane == 0u {
         for (var c = 0u; c < 3u; c++) {
             results[p].low[c] = bitcast<u32>(parts[c][0]);
             results[p].high[c] = bitcast<u32>(parts[3u + c][0]);

@@ -14,6 +14,7 @@
 // iterations.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
+#import "shared/subgroup_place.wgsl"
 
 struct LossUniforms {
     width: u32,
@@ -75,18 +76,6 @@ var<workgroup> patch_two: array<vec2<f32>, PATCH_LEN>;
 var<workgroup> patch_one: array<f32, PATCH_LEN>;
 /// Filtered along rows: x, y, x^2 + y^2, x y; or the three maps.
 var<workgroup> filtered: array<vec4<f32>, FILTERED_LEN>;
-
-/// Position of an invocation in the dispatch.
-struct Place {
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_invocation_id) in_subgroup: u32,
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-#endif
-}
 
 /// The share of work of a workgroup.
 struct Job {
@@ -170,9 +159,9 @@ fn down_4(t: u32) -> array<vec4<f32>, 4> {
 
 /// Adds the lanes' sums in the memory of the patch, which is no longer needed; the first lane gets the result.
 #ifdef SUBGROUPS
-fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
+fn sum_lanes(place: SubgroupPlace, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     let part = subgroupAdd(value);
-    if place.in_subgroup == 0u {
+    if place.subgroup_lane == 0u {
         patch_two[place.subgroup] = part.xy;
         patch_one[place.subgroup] = part.z;
     }
@@ -186,27 +175,26 @@ fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
     return sum;
 }
 #else
-fn sum_lanes(place: Place, lanes: u32, value: vec3<f32>) -> vec3<f32> {
-    let lane = place.lane;
-    patch_two[lane] = value.xy;
-    patch_one[lane] = value.z;
+fn sum_lanes(place: SubgroupPlace, lanes: u32, value: vec3<f32>) -> vec3<f32> {
+    patch_two[place.lane] = value.xy;
+    patch_one[place.lane] = value.z;
     workgroupBarrier();
     // Sixteen parts of equally many lanes.
     let each = lanes / 16u;
     var sum = vec3<f32>();
-    if lane < 16u {
+    if place.lane < 16u {
         for (var k = 0u; k < each; k++) {
-            sum += vec3<f32>(patch_two[each * lane + k], patch_one[each * lane + k]);
+            sum += vec3<f32>(patch_two[each * place.lane + k], patch_one[each * place.lane + k]);
         }
     }
     workgroupBarrier();
-    if lane < 16u {
-        patch_two[lane] = sum.xy;
-        patch_one[lane] = sum.z;
+    if place.lane < 16u {
+        patch_two[place.lane] = sum.xy;
+        patch_one[place.lane] = sum.z;
     }
     workgroupBarrier();
     sum = vec3<f32>();
-    if lane == 0u {
+    if place.lane == 0u {
         for (var k = 0u; k < 16u; k++) {
             sum += vec3<f32>(patch_two[k], patch_one[k]);
         }
@@ -231,10 +219,9 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
 }
 
 @compute @workgroup_size(64)
-fn ssim_map(place: Place) {
-    let lane = place.lane;
+fn ssim_map(place: SubgroupPlace) {
     let j = job(linear_group(place.workgroup, place.workgroups));
-    for (var at = lane; at < PATCH_LEN; at += LANES) {
+    for (var at = place.lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
         var both = vec2<f32>();
         if j.exists && pixel != 0xffffffffu {
@@ -243,7 +230,7 @@ fn ssim_map(place: Place) {
         patch_two[at] = both;
     }
     workgroupBarrier();
-    for (var at = lane; at < FOURS_LEN; at += LANES) {
+    for (var at = place.lane; at < FOURS_LEN; at += LANES) {
         let first = (at / 4u) * PATCH + 4u * (at % 4u);
         var v: array<vec4<f32>, SPAN>;
 #repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
@@ -255,8 +242,8 @@ fn ssim_map(place: Place) {
 #end
     }
     workgroupBarrier();
-    let column = lane % TILE;
-    let row = lane / TILE * 4u;
+    let column = place.lane % TILE;
+    let row = place.lane / TILE * 4u;
     let means = down_4(row * TILE + column);
     let x = j.x0 + column;
     let pixels = loss.width * loss.height;
@@ -279,17 +266,16 @@ fn ssim_map(place: Place) {
     }
 #end
     let total = sum_lanes(place, LANES, sum);
-    if lane == 0u && j.exists {
+    if place.lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total, 0.0);
     }
 }
 
 @compute @workgroup_size(64)
-fn gradient(place: Place) {
-    let lane = place.lane;
+fn gradient(place: SubgroupPlace) {
     let j = job(linear_group(place.workgroup, place.workgroups));
     let pixels = loss.width * loss.height;
-    for (var at = lane; at < PATCH_LEN; at += LANES) {
+    for (var at = place.lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
         var two = vec2<f32>();
         var one = 0.0;
@@ -304,7 +290,7 @@ fn gradient(place: Place) {
         patch_one[at] = one;
     }
     workgroupBarrier();
-    for (var at = lane; at < FOURS_LEN; at += LANES) {
+    for (var at = place.lane; at < FOURS_LEN; at += LANES) {
         let first = (at / 4u) * PATCH + 4u * (at % 4u);
         var v: array<vec4<f32>, SPAN>;
 #repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
@@ -316,8 +302,8 @@ fn gradient(place: Place) {
 #end
     }
     workgroupBarrier();
-    let column = lane % TILE;
-    let row = lane / TILE * 4u;
+    let column = place.lane % TILE;
+    let row = place.lane / TILE * 4u;
     let d = down_4(row * TILE + column);
     let x = j.x0 + column;
     var sum = vec3<f32>();
@@ -337,37 +323,32 @@ fn gradient(place: Place) {
     }
 #end
     let total = sum_lanes(place, LANES, sum);
-    if lane == 0u && j.exists {
+    if place.lane == 0u && j.exists {
         partials[j.partial] = vec4<f32>(total.xy, partials[j.partial].z, 0.0);
     }
 }
 
 @compute @workgroup_size(256)
-fn sum_partials(place: Place) {
-    let lane = place.lane;
+fn sum_partials(place: SubgroupPlace) {
     let group = linear_group(place.workgroup, place.workgroups);
     let each = PARTIALS_EACH * WORKGROUP;
     var sum = vec3<f32>();
     for (var k = 0u; k < PARTIALS_EACH; k++) {
-        let at = group * each + k * WORKGROUP + lane;
+        let at = group * each + k * WORKGROUP + place.lane;
         if at < loss.partial_count {
             sum += partials[at].xyz;
         }
     }
     let total = sum_lanes(place, WORKGROUP, sum);
-    if lane == 0u && group < (loss.partial_count + each - 1u) / each {
+    if place.lane == 0u && group < (loss.partial_count + each - 1u) / each {
         sums[group] = vec4<f32>(total, 0.0);
     }
 }
 
 /// Squared difference of picture and photo at each pixel, mean over the channels; 0 where the pixel is excluded.
 @compute @workgroup_size(256)
-fn squared_errors(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let pixel = linear_index(workgroup, workgroups, lane, WORKGROUP);
+fn squared_errors(place: Place) {
+    let pixel = linear_index(place, WORKGROUP);
     if pixel >= loss.width * loss.height {
         return;
     }

@@ -48,12 +48,8 @@ fn rows_in_range(reach: Reach, tile_x: u32) -> vec2<u32> {
 
 /// Counts intersections before any is emitted.
 @compute @workgroup_size(256)
-fn isect_count(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let rank = linear_index(workgroup, workgroups, lane, 256u);
+fn isect_count(place: Place) {
+    let rank = linear_index(place, 256u);
     if rank >= view.row_count {
         return;
     }
@@ -84,12 +80,8 @@ fn rank_from_isect(isect: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn isect_emit(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let isect = linear_index(workgroup, workgroups, lane, 256u);
+fn isect_emit(place: Place) {
+    let isect = linear_index(place, 256u);
     if isect >= min(offsets[view.row_count], view.capacity) {
         return;
     }

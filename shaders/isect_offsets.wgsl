@@ -35,12 +35,8 @@ fn first_of_tile(tile: u32, count: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn isect_offsets(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let tile = linear_index(workgroup, workgroups, lane, 256u);
+fn isect_offsets(place: Place) {
+    let tile = linear_index(place, 256u);
     if tile > lists.tile_count {
         return;
     }

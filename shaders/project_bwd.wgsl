@@ -96,12 +96,8 @@ fn sigmoid_slope(logit: f32) -> f32 {
 }
 
 @compute @workgroup_size(256)
-fn project_bwd(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn project_bwd(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= view.row_count {
         return;
     }

@@ -33,12 +33,8 @@ fn on_screen(mean: f32, radius: f32, size: f32) -> bool {
 }
 
 @compute @workgroup_size(256)
-fn project_fwd(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn project_fwd(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= view.row_count {
         return;
     }

@@ -5,6 +5,7 @@
 // No workgroup waits for another, and the execution order of workgroups cannot change a place.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
+#import "shared/subgroup_place.wgsl"
 #import "shared/splat.wgsl"
 
 struct SortUniforms {
@@ -75,12 +76,8 @@ fn counts_at(word: u32, lane: u32) -> u32 {
 /// Keys and values of the sort by depth: the bits of a drawn row's depth (positive, so they sort like the depths) and
 /// the row. Rows that are not drawn come last. The capacity is the number of rows.
 @compute @workgroup_size(256)
-fn depth_keys(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn depth_keys(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= sort.capacity {
         return;
     }
@@ -94,19 +91,10 @@ var<workgroup> counts_of_parts: array<u32, 2048>;
 
 /// First half of a pass: fills the histogram.
 @compute @workgroup_size(256)
-fn radix_histogram(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-) {
-    let block = linear_group(workgroup, workgroups);
+fn radix_histogram(place: SubgroupPlace) {
+    let block = linear_group(place.workgroup, place.workgroups);
     let count = min(live[sort.live_at], sort.capacity);
-    let first = block * BLOCK_KEYS + lane * KEYS;
+    let first = block * BLOCK_KEYS + place.lane * KEYS;
     var counts = DigitCounts(0u, 0u);
     for (var i = 0u; i < KEYS; i++) {
         if first + i < count {
@@ -114,54 +102,45 @@ fn radix_histogram(
         }
     }
 #ifdef SUBGROUPS
-    let parts = subgroups;
+    let parts = place.subgroups;
     for (var word = 0u; word < WORDS; word++) {
         let sum = subgroupAdd(digit_word(counts, word));
-        if subgroup_lane == 0u {
-            counts_of_parts[word * parts + subgroup] = sum;
+        if place.subgroup_lane == 0u {
+            counts_of_parts[word * parts + place.subgroup] = sum;
         }
     }
     workgroupBarrier();
 #else
     let parts = 32u;
     for (var word = 0u; word < WORDS; word++) {
-        counts_of_parts[word * 256u + lane] = digit_word(counts, word);
+        counts_of_parts[word * 256u + place.lane] = digit_word(counts, word);
     }
     workgroupBarrier();
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
-        sum += counts_of_parts[lane * 8u + i];
+        sum += counts_of_parts[place.lane * 8u + i];
     }
     workgroupBarrier();
-    counts_of_parts[lane] = sum;
+    counts_of_parts[place.lane] = sum;
     workgroupBarrier();
 #endif
-    if lane < DIGITS && block < sort.blocks {
+    if place.lane < DIGITS && block < sort.blocks {
         var total = 0u;
         for (var part = 0u; part < parts; part++) {
-            total += counts_of_parts[(lane & 7u) * parts + part];
+            total += counts_of_parts[(place.lane & 7u) * parts + part];
         }
-        histogram[lane * sort.blocks + block] = (total >> (16u * (lane / 8u))) & 0xffffu;
+        histogram[place.lane * sort.blocks + block] = (total >> (16u * (place.lane / 8u))) & 0xffffu;
     }
 }
 
 /// Second half of a pass, after the scan of the histogram: moves keys and values.
 @compute @workgroup_size(256)
-fn radix_sort(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-) {
-    let block = linear_group(workgroup, workgroups);
+fn radix_sort(place: SubgroupPlace) {
+    let block = linear_group(place.workgroup, place.workgroups);
     let count = min(live[sort.live_at], sort.capacity);
-    let first = block * BLOCK_KEYS + lane * KEYS;
-    if lane < DIGITS && block < sort.blocks {
-        block_places[lane] = places[lane * sort.blocks + block];
+    let first = block * BLOCK_KEYS + place.lane * KEYS;
+    if place.lane < DIGITS && block < sort.blocks {
+        block_places[place.lane] = places[place.lane * sort.blocks + block];
     }
     var counts = DigitCounts(0u, 0u);
     var key: array<u32, KEYS>;
@@ -180,28 +159,28 @@ fn radix_sort(
         let mine = digit_word(counts, word);
         let before = subgroupExclusiveAdd(mine);
         let sum = subgroupAdd(mine);
-        counts_before[counts_at(word, lane)] = before;
-        if subgroup_lane == 0u {
-            part_counts[word * subgroups + subgroup] = sum;
+        counts_before[counts_at(word, place.lane)] = before;
+        if place.subgroup_lane == 0u {
+            part_counts[word * place.subgroups + place.subgroup] = sum;
         }
     }
     workgroupBarrier();
     for (var word = 0u; word < WORDS; word++) {
         var base = 0u;
-        for (var part = 0u; part < subgroup; part++) {
-            base += part_counts[word * subgroups + part];
+        for (var part = 0u; part < place.subgroup; part++) {
+            base += part_counts[word * place.subgroups + part];
         }
         // An invocation's own entry.
-        counts_before[counts_at(word, lane)] += base;
+        counts_before[counts_at(word, place.lane)] += base;
     }
 #else
     for (var word = 0u; word < WORDS; word++) {
-        counts_before[counts_at(word, lane)] = digit_word(counts, word);
+        counts_before[counts_at(word, place.lane)] = digit_word(counts, word);
     }
     workgroupBarrier();
     // 32 parts of 8 invocations per word: each invocation processes one part of one word.
-    let word = lane / 32u;
-    let part = lane % 32u;
+    let word = place.lane / 32u;
+    let part = place.lane % 32u;
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
         let at = counts_at(word, 8u * part + i);
@@ -209,7 +188,7 @@ fn radix_sort(
         counts_before[at] = sum;
         sum += mine;
     }
-    part_counts[lane] = sum;
+    part_counts[place.lane] = sum;
     workgroupBarrier();
     var base = 0u;
     for (var p = 0u; p < part; p++) {
@@ -223,10 +202,10 @@ fn radix_sort(
     for (var i = 0u; i < KEYS; i++) {
         if first + i < count {
             let digit = (key[i] >> sort.shift) & (DIGITS - 1u);
-            let pair = counts_before[counts_at(digit & 7u, lane)];
-            let place = block_places[digit] + ((pair >> (16u * (digit / 8u))) & 0xffffu) + rank[i];
-            keys_out[place] = key[i];
-            values_out[place] = values[first + i];
+            let pair = counts_before[counts_at(digit & 7u, place.lane)];
+            let to = block_places[digit] + ((pair >> (16u * (digit / 8u))) & 0xffffu) + rank[i];
+            keys_out[to] = key[i];
+            values_out[to] = values[first + i];
         }
     }
 }

@@ -217,9 +217,7 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
 
 @compute @workgroup_size(64)
 fn rasterize_bwd(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    place: Place,
 #ifdef SUBGROUPS_OF_8
     @builtin(subgroup_id) part: u32,
     @builtin(subgroup_invocation_id) subgroup_lane: u32,
@@ -235,42 +233,34 @@ fn rasterize_bwd(
     let parts = 8u;
 #else
 #ifndef SUBGROUPS
-    let part = lane;
+    let part = place.lane;
     let parts = TILE_LANES;
 #endif
 #endif
-    let n = linear_group(workgroup, workgroups);
-    let grid = view.grid;
+    let n = linear_group(place.workgroup, place.workgroups);
     // Uniform across the workgroup.
     if n >= tiles_in_range(view.range) {
         return;
     }
-    let tile = tile_of_range(n, view.range, grid);
-    let pixel = pixel_of(tile, lane, grid);
-    let plane = grid.width * grid.height;
-    let at = pixel.y * grid.width + pixel.x;
-    let inside = (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width))
-        & vec4<bool>(pixel.y < grid.height);
-    var pixels = pixels_behind(at, plane, inside);
+    let here = pixels_of(n, place.lane, view.range, view.grid);
+    var pixels = pixels_behind(here.at, here.plane, here.inside);
     let stop = pixels.stop;
     atomicMax(&tile_stop, max(max(stop.x, stop.y), max(stop.z, stop.w)));
 
-    let list = tile_offsets[tile];
-    let count = tile_offsets[tile + 1u] - list;
+    let list = tile_offsets[here.tile];
+    let count = tile_offsets[here.tile + 1u] - list;
     let batch_size = min(TILE_LANES, PARTS_OF_BATCH / parts);
-    let x = vec4<f32>(f32(pixel.x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    let y = f32(pixel.y) + 0.5;
     var end = min(count, view.end);
     while end > view.first {
         let size = min(batch_size, end - view.first);
         let first = end - size;
         end = first;
         workgroupBarrier();
-        if lane < size {
-            let isect = isects[list + first + lane];
+        if place.lane < size {
+            let isect = isects[list + first + place.lane];
             let record = SPLAT_STRIDE * row_from_isect[isect];
-            batch_isects[lane] = isect;
-            batch[lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
+            batch_isects[place.lane] = isect;
+            batch[place.lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
         }
         workgroupBarrier();
         // Uniform: nothing changes it after the first barrier.
@@ -278,14 +268,14 @@ fn rasterize_bwd(
 #ifdef SUBGROUPS_OF_8
         for (var i = (size + 7u) / 8u * 8u; reached && i > 0u;) {
             i -= 8u;
-            take_off_8(&pixels, i, first, size, x, y, part, subgroup_lane);
+            take_off_8(&pixels, i, first, size, here.x, here.y, part, subgroup_lane);
         }
 #else
         for (var i = size; reached && i > 0u;) {
             i--;
             let splat = batch[i];
-            let dx = x - vec4<f32>(splat.mean.x);
-            let dy = y - splat.mean.y;
+            let dx = here.x - vec4<f32>(splat.mean.x);
+            let dy = here.y - splat.mean.y;
             let e = exponents(splat, dx, dy);
             let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(view.list_base + first + i) < stop);
             let to = i * SUMS * parts + part;
@@ -312,7 +302,7 @@ fn rasterize_bwd(
         }
 #endif
         workgroupBarrier();
-        for (var i = lane; i < size * SUMS; i += TILE_LANES) {
+        for (var i = place.lane; i < size * SUMS; i += TILE_LANES) {
             var sum = 0.0;
             if reached {
                 if parts < 4u {
@@ -334,8 +324,8 @@ fn rasterize_bwd(
     }
     if (view.flags & SEGMENT_LAST) == 0u {
         for (var i = 0u; i < 4u; i++) {
-            if inside[i] {
-                carry[at + i] = vec2<f32>(pixels.t[i], pixels.behind[i]);
+            if here.inside[i] {
+                carry[here.at + i] = vec2<f32>(pixels.t[i], pixels.behind[i]);
             }
         }
     }
@@ -377,16 +367,12 @@ fn isects_at(rank: u32) -> vec2<u32> {
 /// in a later range of tiles, stores its sums in place of its gradients, in the order of the sums, and the next window
 /// or range continues from there.
 @compute @workgroup_size(256)
-fn fold_rows(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let group = linear_group(workgroup, workgroups);
-    let rank = group * GROUP_ROWS + lane / SUMS;
-    let which = lane % SUMS;
+fn fold_rows(place: Place) {
+    let group = linear_group(place.workgroup, place.workgroups);
+    let rank = group * GROUP_ROWS + place.lane / SUMS;
+    let which = place.lane % SUMS;
     var sum = 0.0;
-    if lane < GROUP_ROWS * SUMS && rank < view.row_count {
+    if place.lane < GROUP_ROWS * SUMS && rank < view.row_count {
         let row = row_at(rank);
         let isects_of_row = isects_at(rank);
         let row_first = isects_of_row.x;
@@ -412,15 +398,15 @@ fn fold_rows(
             isect++;
         }
     }
-    row_sums[lane] = sum;
+    row_sums[place.lane] = sum;
     workgroupBarrier();
-    let own_rank = group * GROUP_ROWS + lane;
-    if lane >= GROUP_ROWS || own_rank >= view.row_count {
+    let own_rank = group * GROUP_ROWS + place.lane;
+    if place.lane >= GROUP_ROWS || own_rank >= view.row_count {
         return;
     }
     let row = row_at(own_rank);
     let at = SPLAT_STRIDE * row;
-    let s = lane * SUMS;
+    let s = place.lane * SUMS;
     let isects_of_row = isects_at(own_rank);
     let row_first = isects_of_row.x;
     let row_end = isects_of_row.y;
@@ -466,12 +452,8 @@ fn magnitudes(v: vec4<f32>) -> vec4<u32> {
 
 /// Counts the rows with a gradient that is too large for the optimizer, or not finite.
 @compute @workgroup_size(256)
-fn count_unusable(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn count_unusable(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= view.row_count {
         return;
     }

@@ -111,32 +111,22 @@ var<workgroup> finished: atomic<u32>;
 
 @compute @workgroup_size(64)
 fn rasterize_fwd(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
+    place: Place,
 #ifdef SUBGROUPS_OF_8
     @builtin(subgroup_invocation_id) subgroup_lane: u32,
 #endif
 ) {
-    let n = linear_group(workgroup, workgroups);
-    let grid = view.grid;
+    let n = linear_group(place.workgroup, place.workgroups);
     // Uniform across the workgroup.
     if n >= tiles_in_range(view.range) {
         return;
     }
-    let tile = tile_of_range(n, view.range, grid);
-    let pixel = pixel_of(tile, lane, grid);
-    let plane = grid.width * grid.height;
-    let at = pixel.y * grid.width + pixel.x;
-    let inside = (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width))
-        & vec4<bool>(pixel.y < grid.height);
-    var pixels = pixels_before(at, plane, inside);
+    let here = pixels_of(n, place.lane, view.range, view.grid);
+    var pixels = pixels_before(here.at, here.plane, here.inside);
 
-    let list = tile_offsets[tile];
-    let count = tile_offsets[tile + 1u] - list;
+    let list = tile_offsets[here.tile];
+    let count = tile_offsets[here.tile + 1u] - list;
     let end = min(count, view.end);
-    let x = vec4<f32>(f32(pixel.x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5);
-    let y = f32(pixel.y) + 0.5;
 #ifdef SUBGROUPS_OF_8
     for (var first = view.first; first < end; first += 8u) {
         if !subgroupAny(are_alive(pixels)) {
@@ -155,7 +145,7 @@ fn rasterize_fwd(
                 subgroupBroadcast(own.log2_opacity, LANE),
                 subgroupBroadcast(own.color, LANE),
             );
-            blend(&pixels, splat, exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y), view.list_base + first + LANE);
+            blend(&pixels, splat, exponents(splat, here.x - vec4<f32>(splat.mean.x), here.y - splat.mean.y), view.list_base + first + LANE);
         }
 #end
     }
@@ -170,14 +160,14 @@ fn rasterize_fwd(
         if atomicLoad(&finished) == TILE_LANES {
             break;
         }
-        if first + lane < end {
-            batch[lane] = splat_of(list + first + lane);
+        if first + place.lane < end {
+            batch[place.lane] = splat_of(list + first + place.lane);
         }
         workgroupBarrier();
         let batch_end = min(TILE_LANES, end - first);
         for (var i = 0u; alive && i < batch_end; i++) {
             let splat = batch[i];
-            let e = exponents(splat, x - vec4<f32>(splat.mean.x), y - splat.mean.y);
+            let e = exponents(splat, here.x - vec4<f32>(splat.mean.x), here.y - splat.mean.y);
             if any(e >= vec4<f32>(LOG2_ALPHA_MIN)) {
                 blend(&pixels, splat, e, view.list_base + first + i);
                 alive = are_alive(pixels);
@@ -188,5 +178,5 @@ fn rasterize_fwd(
         }
     }
 #endif
-    write_pixels(pixels, at, plane, inside);
+    write_pixels(pixels, here.at, here.plane, here.inside);
 }

@@ -25,47 +25,25 @@ struct ScanUniforms {
 const ITEMS: u32 = 8u;
 
 @compute @workgroup_size(256)
-fn scan_reduce(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-) {
-    let block = linear_group(workgroup, workgroups);
-    let first = (block * 256u + lane) * ITEMS;
+fn scan_reduce(place: SubgroupPlace) {
+    let block = linear_group(place.workgroup, place.workgroups);
+    let first = (block * 256u + place.lane) * ITEMS;
     var sum = 0u;
     for (var i = 0u; i < ITEMS; i++) {
         if first + i < level.count {
             sum = saturating_add(sum, values[first + i]);
         }
     }
-#ifdef SUBGROUPS
-    let scanned = workgroup_scan(sum, lane, subgroup, subgroups, subgroup_lane);
-#else
-    let scanned = workgroup_scan(sum, lane);
-#endif
-    if lane == 0u && block * (256u * ITEMS) < level.count {
+    let scanned = workgroup_scan(sum, place);
+    if place.lane == 0u && block * (256u * ITEMS) < level.count {
         offsets[block] = scanned.total;
     }
 }
 
 @compute @workgroup_size(256)
-fn scan(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-#ifdef SUBGROUPS
-    @builtin(subgroup_id) subgroup: u32,
-    @builtin(num_subgroups) subgroups: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-) {
-    let block = linear_group(workgroup, workgroups);
-    let first = (block * 256u + lane) * ITEMS;
+fn scan(place: SubgroupPlace) {
+    let block = linear_group(place.workgroup, place.workgroups);
+    let first = (block * 256u + place.lane) * ITEMS;
     var before: array<u32, ITEMS>;
     var sum = 0u;
     for (var i = 0u; i < ITEMS; i++) {
@@ -74,11 +52,7 @@ fn scan(
             sum = saturating_add(sum, values[first + i]);
         }
     }
-#ifdef SUBGROUPS
-    let scanned = workgroup_scan(sum, lane, subgroup, subgroups, subgroup_lane);
-#else
-    let scanned = workgroup_scan(sum, lane);
-#endif
+    let scanned = workgroup_scan(sum, place);
     var base = scanned.before;
     if level.has_bases != 0u {
         base = saturating_add(bases[block], base);

@@ -23,12 +23,8 @@
 #endif
 
 @compute @workgroup_size(256)
-fn sh_fwd(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn sh_fwd(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= view.row_count {
         return;
     }

@@ -75,12 +75,8 @@ fn is_in_range(row: u32) -> bool {
 
 /// Adds each splat to the counts of the tiles that it can reach.
 @compute @workgroup_size(256)
-fn range_tally(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn range_tally(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= segment.row_count {
         return;
     }
@@ -102,12 +98,8 @@ fn range_tally(
 
 /// Flags the splats that reach the range.
 @compute @workgroup_size(256)
-fn range_select(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn range_select(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= segment.row_count {
         return;
     }
@@ -116,12 +108,8 @@ fn range_select(
 
 /// Adds each splat that reaches the range at a wanted depth to the bin of its depth.
 @compute @workgroup_size(256)
-fn range_depths(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn range_depths(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= segment.row_count || !is_in_range(row) {
         return;
     }
@@ -136,38 +124,30 @@ fn place_of(row: u32) -> u32 {
 
 /// Copies the records of the flagged rows to their places.
 @compute @workgroup_size(256)
-fn range_gather(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn range_gather(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= segment.row_count {
         return;
     }
-    let place = place_of(row);
-    if place < segment.capacity {
+    let to = place_of(row);
+    if to < segment.capacity {
         for (var i = 0u; i < SPLAT_STRIDE; i++) {
-            compact[SPLAT_STRIDE * place + i] = records[SPLAT_STRIDE * row + i];
+            compact[SPLAT_STRIDE * to + i] = records[SPLAT_STRIDE * row + i];
         }
     }
 }
 
 /// Copies the records of the flagged rows back from their places.
 @compute @workgroup_size(256)
-fn range_scatter(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let row = linear_index(workgroup, workgroups, lane, 256u);
+fn range_scatter(place: Place) {
+    let row = linear_index(place, 256u);
     if row >= segment.row_count {
         return;
     }
-    let place = place_of(row);
-    if place < segment.capacity {
+    let to = place_of(row);
+    if to < segment.capacity {
         for (var i = 0u; i < SPLAT_STRIDE; i++) {
-            records_out[SPLAT_STRIDE * row + i] = compact_in[SPLAT_STRIDE * place + i];
+            records_out[SPLAT_STRIDE * row + i] = compact_in[SPLAT_STRIDE * to + i];
         }
     }
 }

@@ -65,12 +65,8 @@ fn is_usable(bits: u32) -> bool {
 
 /// One invocation for each row.
 @compute @workgroup_size(256)
-fn judge(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn judge(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= u.row_count {
         return;
     }
@@ -88,12 +84,8 @@ fn decay_at(steps: u32) -> u32 {
 
 /// One invocation for each float of the column.
 @compute @workgroup_size(256)
-fn step(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn step(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= u.row_count * u.width {
         return;
     }
@@ -157,12 +149,8 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>) {
 
 /// One invocation for each row; after all columns.
 @compute @workgroup_size(256)
-fn finish(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn finish(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= u.row_count {
         return;
     }

@@ -32,7 +32,7 @@
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
 //! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
-//! | [`exchange`] | PLY in and out, SPZ out; what TensorBoard reads |
+//! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
@@ -54,50 +54,56 @@
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
 //!    ([`config::key::Class`]).
 //! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
-//! 3. `config/limits.rs`: the options of the room that obeys the key. No room but `train` sees the config.
-//! 4. `train/run/changes.rs`, `BEFORE_ITS_TIME`: if older programs did what one value of the key says. Otherwise a run that they
-//!    began resumes only with `--accept-changes`.
+//! 3. `config/limits.rs`: puts the value into the options of the module that uses it. No module but `train` sees the config.
+//! 4. `train/run/changes.rs`, `BEFORE_ITS_TIME`: the value that means "as before the key existed", if there is one. Otherwise a run
+//!    of an older program resumes only with `--accept-changes`.
 //! 5. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
-//!    file again. `tests/programs/cli.rs` lists the words of all enumerations.
+//!    file again, also after a change of a help text. `tests/programs/cli.rs` lists the words of all enumerations. The lists
+//!    below lead here wherever they add a key or a word.
 //!
 //! **A setting that one backend lacks**
-//! 1. `render/mod.rs`: a method of [`render::Renderer`] whose default refuses, an error with its remedy; `weigh_rows` is the example.
+//! 1. `render/mod.rs`: a method of [`render::Renderer`]. The backend that lacks the setting returns an error with its remedy.
 //! 2. `train/run/begin.rs`, `begin`: asks the renderer before the output folder exists.
 //!
 //! **A densification strategy**
 //! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
-//!    event kind in `scene/events.rs` if a round needs other values than today's.
-//! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: keys to
-//!    strategy.
+//!    event kind in `scene/events.rs` if a round needs other values than today's. `densify/mod.rs` names the file.
+//! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
+//!    strategy from the keys.
 //!
 //! **A loss term, or another correction of the picture than [`appearance`]**
-//! 1. `train/step/comparison.rs`: the one place between picture and gradient, for steps and rehearsals. It works on the
+//! 1. `train/step/comparison.rs`: the one place between picture and gradient, for training and for the rehearsal before the first step. It works on the
 //!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
 //!    it needs is a field of [`train::step::comparison::Comparison`].
 //! 2. `train/state/trainer.rs` and `train/preflight/first_look.rs`: fill that field, for steps and for the first rehearsal.
-//! 3. `train/step/train_step.rs`, after `loss_value`: adds the term to the loss that is logged.
-//! 4. The weight is a config key; parameters that are trained are a resumable value.
+//!    What it finds is a field of [`train::step::comparison::Correction`], which the step reads afterwards.
+//! 3. `train/step/train_step.rs`, after each `loss_value`: adds the term to the loss that is logged.
+//! 4. The weight is a config key; parameters that are trained are a resumable value, which `Trainer::learn_appearance` changes after a
+//!    step that was not skipped. The term itself is a function in `render/`; a correction is a file in `appearance/`. If it has parameters
+//!    of photos, `train/state/growth_checks.rs` corrects the held-out photos as well.
 //! 5. A term of the picture and the photo alone, for the CPU only or where its time matters: instead the stage itself,
 //!    `kernels/image_loss.rs`, its options in `LossOptions`, and `image_loss.wgsl` among the shaders. Masked pixels do not count.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
-//!    whole. `exchange/mod.rs` names the file.
-//! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. Runs and
-//!    `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
-//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file.
+//!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
+//! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. `gsscale-ckpt
+//!    export` follows; its help names the formats (`tools/ckpt/export.rs`). The PLY remains: resumes, `gsscale-eval` and more steps read it.
+//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file. `train/run/run_folder.rs`,
+//!    `save_result`: the run writes it.
 //!
 //! **A resumable value**
-//! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and
-//!    `decode`, a new `VERSION`, and in `check` which values are impossible.
+//! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
+//!    `VERSION` and what the version before lacks, in `check` which values are impossible, and in `fitted_to` what a list of
+//!    another length becomes.
 //! 2. `train/state/trainer.rs`: uses `self.state`. Commits and resumes need no change.
-//! 3. `tests/programs/ckpt/fixture.rs` says how the store that later versions must open is written again.
+//! 3. `tests/fuzz/targets/map.rs`: the sample state. Only a new format of slots needs a new fixture (`tests/programs/ckpt/fixture.rs`).
 //!
 //! **An eviction order**
-//! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], its key of the order, and
-//!    whether the order ignores the plan. Runs, look-ahead and simulations share it.
-//!    `last_use` is the step of the last pin; a page that no step has pinned yet has 0.
+//! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], a place in `ALL`, its key of the order,
+//!    and whether the order ignores the plan. Runs, look-ahead and simulations share it.
+//!    `last_use` is the number of steps begun at the last pin; 0 for a page that was read ahead and not used yet.
 //! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 //! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 

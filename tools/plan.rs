@@ -267,7 +267,7 @@ fn load(args: &Args) -> InputResult<Scene> {
         },
         timed_on: look.step.map(|step| step.device),
         gaussians: look.gaussians,
-        frames_within: known.or(look.frames).map(|frames| (frames as f64 / args.growth) as u64),
+        frames_within: known.or(look.frames).map(|frames| ((frames as f64 / args.growth) as u64).max(1)),
         forecast,
         config,
         cameras,

@@ -16,6 +16,7 @@ use gsscale::train::run::out_folder::{Existing, default_out, remedy_of_existing}
 use gsscale::train::run::request::{RunOutcome, RunRequest};
 use gsscale::train::run::restart::go_on;
 use gsscale::train::run::resume::{ResumeRequest, resume};
+use gsscale::train::run::resume_plan::describe_resume;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -53,12 +54,12 @@ struct Args {
     /// Resume the run in this output folder, which was stopped, interrupted, or kept its checkpoint, with its config
     /// and scene. These may be given anew: memory, frames, threads, I/O, device and logging; more --steps; the scene or
     /// --init-ply if they moved
-    #[arg(long, value_name = "OUT", conflicts_with_all = ["out", "config", "demo", "dry_run", "overwrite"])]
+    #[arg(long, value_name = "OUT", conflicts_with_all = ["out", "config", "demo", "overwrite"])]
     resume: Option<PathBuf>,
     /// With --resume: continue although the dataset changed, or with other values of keys that change numbers
     #[arg(long, requires = "resume")]
     accept_changes: bool,
-    /// Print the resolved settings and the memory they need, then stop
+    /// Print what the run will need (with --resume: what it will do), then stop; nothing is written
     #[arg(long)]
     dry_run: bool,
     /// Print the GPUs available to --device, best first, then stop
@@ -121,6 +122,10 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
         let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet };
+        if args.dry_run {
+            gsscale::say!("{}", describe_resume(&request)?);
+            return Ok(RunOutcome::of_nothing(request.out));
+        }
         return go_on(resume(&request), &request, args.restarts);
     }
     let config = match (&args.config, args.demo) {
@@ -132,16 +137,15 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
-    let out = match args.out {
-        Some(out) => out,
-        None if args.dry_run => PathBuf::new(),
-        None => default_out(args.scene.as_deref()),
-    };
+    let out = args.out.unwrap_or_else(|| default_out(args.scene.as_deref()));
+    if args.demo {
+        check_demo_out(&out, args.overwrite)?;
+    }
     let mut scratch = None;
     let scene = match args.scene {
         Some(scene) => scene,
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
-        None => demo_scene(&out, &config, args.overwrite, args.quiet)?,
+        None => demo_scene(&out, &config, args.quiet)?,
     };
     let (dry_run, quiet) = (args.dry_run, args.quiet);
     let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
@@ -165,15 +169,20 @@ fn demo_config() -> TrainConfig {
     }
 }
 
-/// Generates the city beside the results, or reuses that of an earlier demo with the same seed.
-fn demo_scene(out: &Path, config: &TrainConfig, overwrite: bool, quiet: bool) -> Result<PathBuf, TrainError> {
-    let scene = out.join("scene");
+/// Refuses an output folder of a demo that holds more than the city of an earlier demo.
+fn check_demo_out(out: &Path, overwrite: bool) -> InputResult<()> {
     // A demo that was stopped before its first step left only its city.
     let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene" && entry.file_name() != ".gsscale-lock";
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
-        return Err(InputError::new(out, "exists already", remedy_of_existing(out)).into());
+        return Err(InputError::new(out, "exists already", remedy_of_existing(out)));
     }
+    Ok(())
+}
+
+/// Generates the city beside the results, or reuses that of an earlier demo with the same seed.
+fn demo_scene(out: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf, TrainError> {
+    let scene = out.join("scene");
     let same_seed = TrainConfig::read(&out.join(CONFIG_FILE)).is_ok_and(|earlier| earlier.seed == config.seed);
     if same_seed && scene.join("sparse/0/points3D.bin").is_file() {
         return Ok(scene);
@@ -223,13 +232,14 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             None => String::from("not evaluated"),
         };
         eprintln!(
-            "{} {} steps, {} Gaussians, {} of training; {test}",
+            "{} {} steps, {} Gaussians, {} of training",
             if summary.finished { "done:" } else { "stopped after" },
             format_grouped(summary.steps.into()),
             format_grouped(summary.gaussians),
             format_seconds(summary.train_seconds),
         );
         let out = &outcome.out;
+        eprintln!("  quality     {test}");
         eprintln!("  Gaussians   {}", out.join(PLY_FILE).display());
         eprintln!("  report      {}", out.join(REPORT_FILE).display());
         if summary.finished {

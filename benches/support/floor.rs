@@ -2,7 +2,7 @@
 
 use super::steady_time;
 use gsscale::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
-use gsscale::kernels::rasterize_fwd::exp2_bounded;
+use gsscale::kernels::raster::exp2_bounded;
 use gsscale::kernels::splats::LOG2_ALPHA_MIN;
 use rayon::prelude::*;
 use std::time::Duration;

@@ -82,7 +82,30 @@ fn tile_of_range(n: u32, range: vec4<u32>, grid: Grid) -> u32 {
     return (range.z + n / columns) * grid.tiles_x + range.x + n % columns;
 }
 
-/// The first of an invocation's four pixels.
-fn pixel_of(tile: u32, lane: u32, grid: Grid) -> vec2<u32> {
-    return 16u * vec2<u32>(tile % grid.tiles_x, tile / grid.tiles_x) + vec2<u32>(4u * (lane % 4u), lane / 4u);
+/// The four pixels of an invocation, side by side.
+struct TilePixels {
+    /// Number of the tile in the picture.
+    tile: u32,
+    /// Pixels of the picture, and index of the first of the four.
+    plane: u32,
+    at: u32,
+    /// Which of them lie in the picture.
+    inside: vec4<bool>,
+    /// Their centres.
+    x: vec4<f32>,
+    y: f32,
+}
+
+/// The pixels of invocation `lane` of the n-th tile of the range.
+fn pixels_of(n: u32, lane: u32, range: vec4<u32>, grid: Grid) -> TilePixels {
+    let tile = tile_of_range(n, range, grid);
+    let pixel = 16u * vec2<u32>(tile % grid.tiles_x, tile / grid.tiles_x) + vec2<u32>(4u * (lane % 4u), lane / 4u);
+    return TilePixels(
+        tile,
+        grid.width * grid.height,
+        pixel.y * grid.width + pixel.x,
+        (vec4<u32>(pixel.x) + vec4<u32>(0u, 1u, 2u, 3u) < vec4<u32>(grid.width)) & vec4<bool>(pixel.y < grid.height),
+        vec4<f32>(f32(pixel.x)) + vec4<f32>(0.5, 1.5, 2.5, 3.5),
+        f32(pixel.y) + 0.5,
+    );
 }

@@ -1,5 +1,6 @@
 // Exclusive prefix sum over the 256 invocations of a workgroup. Sums saturate: 0xffffffff means "this or more" and
 // stays so whatever is added, so an overflow anywhere shows in the total.
+#import "shared/subgroup_place.wgsl"
 
 /// One entry per invocation, or per subgroup if the adapter has subgroups.
 var<workgroup> scan_parts: array<u32, 256>;
@@ -25,44 +26,44 @@ fn saturating_join(low: u32, high: u32) -> u32 {
 }
 
 /// Every invocation of the workgroup must call this, and pass a barrier before the next call.
-fn workgroup_scan(value: u32, lane: u32, subgroup: u32, subgroups: u32, subgroup_lane: u32) -> WorkgroupScan {
+fn workgroup_scan(value: u32, place: SubgroupPlace) -> WorkgroupScan {
     let low = value & 0xffffu;
     let high = value >> 16u;
     var before = saturating_join(subgroupExclusiveAdd(low), subgroupExclusiveAdd(high));
     let all = saturating_join(subgroupAdd(low), subgroupAdd(high));
-    if subgroup_lane == 0u {
-        scan_parts[subgroup] = all;
+    if place.subgroup_lane == 0u {
+        scan_parts[place.subgroup] = all;
     }
     workgroupBarrier();
     var total = 0u;
     var base = 0u;
-    for (var s = 0u; s < subgroups; s++) {
-        base = select(base, total, s == subgroup);
+    for (var s = 0u; s < place.subgroups; s++) {
+        base = select(base, total, s == place.subgroup);
         total = saturating_add(total, scan_parts[s]);
     }
     return WorkgroupScan(saturating_add(base, before), total);
 }
 #else
 /// Every invocation of the workgroup must call this, and pass a barrier before the next call.
-fn workgroup_scan(value: u32, lane: u32) -> WorkgroupScan {
-    scan_parts[lane] = value;
+fn workgroup_scan(value: u32, place: SubgroupPlace) -> WorkgroupScan {
+    scan_parts[place.lane] = value;
     workgroupBarrier();
-    if lane < 16u {
+    if place.lane < 16u {
         var sum = 0u;
-        for (var i = 16u * lane; i < 16u * lane + 16u; i++) {
+        for (var i = 16u * place.lane; i < 16u * place.lane + 16u; i++) {
             let part = scan_parts[i];
             scan_parts[i] = sum;
             sum = saturating_add(sum, part);
         }
-        scan_segments[lane] = sum;
+        scan_segments[place.lane] = sum;
     }
     workgroupBarrier();
     var total = 0u;
     var base = 0u;
     for (var s = 0u; s < 16u; s++) {
-        base = select(base, total, s == lane / 16u);
+        base = select(base, total, s == place.lane / 16u);
         total = saturating_add(total, scan_segments[s]);
     }
-    return WorkgroupScan(saturating_add(base, scan_parts[lane]), total);
+    return WorkgroupScan(saturating_add(base, scan_parts[place.lane]), total);
 }
 #endif

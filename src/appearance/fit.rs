@@ -19,8 +19,8 @@ const SAMPLE: usize = 16_384;
 /// Differences below this count as squares, larger ones as absolute differences (Huber): moving objects, and detail that
 /// the picture does not have yet, must not outweigh the rest.
 const SMALL_DIFFERENCE: f64 = 0.05;
-/// Weight of the square of the exposure in stops. It takes one to six hundredths from an exposure of one stop, the more
-/// the darker the picture.
+/// Weight of the square of the exposure in stops. It shrinks an exposure of one stop by .01 to .06 stops, the more the darker
+/// the picture.
 const EXPOSURE_WEIGHT: f64 = 0.01;
 /// Weight of the squares of the numbers of a homography.
 const CHROMA_WEIGHT: f64 = 0.05;
@@ -194,7 +194,7 @@ impl Pair<'_> {
     }
 
     /// The vignetting, by channel, that brings the picture closest under the values of `look`, by one step from its
-    /// vignetting. The channels are taken as independent, which the gradient is not but the steps may be.
+    /// vignetting. The step ignores the coupling between channels, which is accurate enough for a step.
     pub fn falloff(&self, look: &Look) -> Option<[[f64; CHANNEL_VALUES]; 3]> {
         let model = PixelModel::<f64>::new(&look.image, &look.falloff);
         let rows = self.sum(

@@ -46,7 +46,7 @@ pub struct Look {
     pub lens: Lens,
 }
 
-/// Whether the photo says no more than that this value is at least 1.
+/// Whether the photo is white and the value at least 1: the photo then says no more about the value.
 #[inline(always)]
 fn is_white(photo: u8, value: f32) -> bool {
     photo == u8::MAX && value >= 1.0

@@ -20,12 +20,12 @@ const PER_UNIT: f64 = (1 << 24) as f64;
 const STORED_MOST: f64 = (1 << 30) as f64;
 /// Steps of Gauss-Newton at a sighting.
 const ROUNDS: usize = 2;
-/// Least weight of a sighting against the value before it.
+/// A new fit counts at least this much against the value before it.
 const IMAGE_GAIN_LEAST: f64 = 0.05;
 const CAMERA_GAIN_LEAST: f64 = 0.01;
 
-/// Weight of the sighting after `sightings` others: the first counts whole. The mean of all fits under weights that grow
-/// linearly has these weights, so the early fits, to a rough scene, are forgotten.
+/// Weight of the fit after `sightings` others: the first counts whole. The result is the mean in which the k-th fit has weight
+/// k, so the early fits, to a rough scene, are forgotten.
 fn gain(sightings: u32, least: f64) -> f64 {
     (2.0 / (f64::from(sightings) + 2.0)).max(least)
 }

@@ -1,6 +1,5 @@
-//! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes, files that
-//! are written whole. Knows neither
-//! Gaussians, pictures nor disk formats.
+//! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes, files and
+//! folders that are written whole. Knows neither Gaussians, pictures nor disk formats.
 
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod eight;
@@ -18,3 +17,4 @@ pub mod simd;
 pub mod trace;
 pub mod units;
 pub mod whole_file;
+pub mod whole_folder;

@@ -12,7 +12,7 @@
 use super::error::{InputError, InputResult};
 use std::fmt::Write as _;
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -59,9 +59,12 @@ fn sink() -> std::sync::MutexGuard<'static, Option<Sink>> {
 /// Begins the trace of the process in a new file. A trace that was begun before ends.
 ///
 /// # Errors
-/// The file cannot be created.
+/// The file exists already, or cannot be created.
 pub fn start(path: &Path) -> InputResult<()> {
-    let file = File::create(path).map_err(|error| InputError::io(path, "creating the trace", &error))?;
+    let file = File::create_new(path).map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => InputError::new(path, "exists already", "name another file, or remove this one"),
+        _ => InputError::io(path, "creating the trace", &error),
+    })?;
     let file = BufWriter::new(file);
     let path = path.to_path_buf();
     *sink() = Some(Sink { path, file, began: Instant::now(), is_first: true, failed: None });
@@ -172,9 +175,12 @@ mod tests {
         assert_eq!(events[1]["args"]["what"].as_str(), Some("a 'word'"));
         let of = |i: usize, key: &str| events[i][key].as_f64().unwrap();
         assert!(of(1, "ts") <= of(0, "ts") && of(0, "dur") <= of(1, "dur"), "{events:?}");
-        start(&path).unwrap();
+        let (whole, empty) = (std::fs::read(&path).unwrap(), folder.path().join("empty.json"));
+        let error = start(&path).unwrap_err().to_string();
+        assert!(error.contains("exists already") && std::fs::read(&path).unwrap() == whole, "{error}");
+        start(&empty).unwrap();
         finish().unwrap();
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "[]\n");
+        assert_eq!(std::fs::read_to_string(&empty).unwrap(), "[]\n");
         let error = start(&folder.path().join("none/trace.json")).unwrap_err().to_string();
         assert!(error.contains("none") && error.contains("remedy: check the path"), "{error}");
     }

@@ -21,11 +21,11 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 7;
-/// The version before blocks of photos: the same values without the last one.
+/// The version before blocks of photos: the same values without these, the last of the list.
 const WITHOUT_BLOCKS: u32 = 6;
-/// The version before outliers and checks of growth: the same values without the last three.
+/// The version before outliers and checks of growth: the same values without these two and what came later.
 const WITHOUT_OUTLIERS: u32 = 5;
-/// The version before appearance: the same values without the last four.
+/// The version before appearance: the same values without appearance and what came later.
 const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
@@ -119,6 +119,23 @@ pub struct TrainerState {
     pub blocks: BlockOutliers,
 }
 
+impl TrainerState {
+    /// This state for a trainer that began as `fresh`: lists by view or camera that have another length than the trainer's begin
+    /// again. They come from an older program, or from other photos.
+    pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
+        if !self.appearance.is_as_large_as(&fresh.appearance) {
+            self.appearance = fresh.appearance;
+        }
+        if !self.outliers.is_as_large_as(&fresh.outliers) {
+            self.outliers = fresh.outliers;
+        }
+        if !self.blocks.is_as_large_as(&fresh.blocks) {
+            self.blocks = fresh.blocks;
+        }
+        self
+    }
+}
+
 /// The state of a run between two steps, without its pages.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunState {
@@ -188,7 +205,7 @@ impl RunState {
     /// Encodes the state.
     ///
     /// # Errors
-    /// None for a valid state.
+    /// The state is not valid; a valid one never fails.
     pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
         let mut bytes = VERSION.to_le_bytes().to_vec();
         bytes.extend(self.encode()?);

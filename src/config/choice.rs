@@ -63,7 +63,7 @@ fn listed(words: &[&str]) -> String {
     }
 }
 
-/// An optional choice; the key's word for `None` is `auto`, or `off` for an optional feature.
+/// An optional choice. `None` is written `auto`, or `off` for a feature.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen<T>(pub Option<T>);
 
@@ -137,7 +137,7 @@ choices! {
     "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
-    "export": ExportFormat { Ply = "ply", Spz = "spz" }
+    "export": ExportFormat { Ply = "ply", Spz = "spz", Sog = "sog" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
 

@@ -57,7 +57,7 @@ macro_rules! config_keys {
         /// The keys as flags; `None` for flags that were not given.
         #[derive(Debug, Clone, Default, clap::Args)]
         pub struct TrainOverrides {
-            $($( $(#[doc = $doc])+ #[arg(long, help_heading = $heading $(, $($arg)+)?)] pub $name: Option<$ty>, )+)+
+            $($( $(#[doc = $doc])+ #[arg(long, help_heading = $heading, allow_negative_numbers = true $(, $($arg)+)?)] pub $name: Option<$ty>, )+)+
         }
 
         impl TrainOverrides {
@@ -90,7 +90,7 @@ config_keys! {
         /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
         test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
-        [allow_negative_numbers = true] test_after: i64 = -1 => Numbers;
+        test_after: i64 = -1 => Numbers;
         /// Use masks found in masks/ (white = keep), and the alpha of photos as a mask (opaque = keep). Without, transparent
         /// pixels show --background
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
@@ -228,7 +228,8 @@ config_keys! {
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
-        /// Format of the result: ply, or spz (as well, about a tenth of the bytes, for viewers)
+        /// Format of the result: ply; or as well, for viewers, spz (about a tenth of the bytes) or sog (a folder with
+        /// levels of detail, which viewers load in parts)
         export: ExportFormat = ExportFormat::Ply => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;

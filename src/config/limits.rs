@@ -40,7 +40,7 @@ pub struct RunOptions {
     pub max_gaussians: usize,
     /// Capacity of a page, rows.
     pub page_rows: usize,
-    /// View order; a shuffle while `auto` is unresolved.
+    /// View order; a shuffle until `auto` has been decided.
     pub view_order: Order,
     /// Render options, except for the current SH degree.
     pub render: RenderOptions,

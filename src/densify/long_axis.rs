@@ -5,7 +5,7 @@
 //! A round comes every `refine_every` steps. Its growth takes whole bins of the score histogram from the top, as many as
 //! fit under the cap. Its recycling takes whole bins of the histogram of mean blending weights from the bottom, at most
 //! a share of the rows that enough views weighed since the last round: where views come in spatial groups, every region
-//! then loses its share when the views come to it. The places that removed rows leave are given away by later rounds,
+//! then loses its share when the views come to it. The capacity that removed rows free is used only by later rounds,
 //! when the removals have been applied, so the cap holds at every step. There are no opacity resets.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of

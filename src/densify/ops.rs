@@ -46,7 +46,7 @@ pub struct RoundEdits {
     pub removed: Vec<u32>,
     /// Rows to append.
     pub added: SceneState,
-    /// The sums of both.
+    /// Numbers of rows by kind of edit, over the kept rows and the added ones.
     pub counts: RoundCounts,
 }
 

@@ -4,8 +4,8 @@
 //! Invariants: 1. only drawn rows change; 2. gradients are in NDC units, so thresholds do not depend on the image size;
 //! 3. the histogram counts every row with statistics exactly once in the bin of its mean score, and every row that
 //! enough views weighed exactly once in the bin of its mean weight, with integer counters, so the order of updates does
-//! not matter; 4. no counter wraps: removing a row from an empty bin, which happens only for statistics of another
-//! histogram, adds to [`GradHistogram::uncounted`].
+//! not matter; 4. no counter wraps: removing a row from an empty bin, which happens only if the row was never
+//! added to this histogram, adds to [`GradHistogram::uncounted`].
 
 pub use crate::scene::rows::mean_grad2d;
 use crate::scene::rows::{Rows, RowsMut};
@@ -83,7 +83,7 @@ impl GradHistogram {
         }
     }
 
-    /// Takes over what a device counted: `changes[bin]` rows more by mean score, modulo 2^32.
+    /// Adds what a device counted: `changes[bin]`, a signed number in a u32, is the change of the rows of that bin of mean scores.
     pub fn add_changes(&mut self, changes: &[u32]) {
         for (rows, change) in self.bins[..BINS].iter_mut().zip(changes) {
             let counted = i64::from(*rows) + i64::from(*change as i32);
@@ -141,8 +141,8 @@ impl GradHistogram {
         self.bins[BINS..].iter().take_while(fits).count() as u32
     }
 
-    /// The smallest threshold of at least `least` that at most `room` rows exceed, in whole bins: `least` itself, just
-    /// below the edge of a bin, or infinity.
+    /// The lowest threshold, at least `least`, above which at most `room` rows lie: `least` itself, just below the edge of
+    /// a bin, or infinity.
     pub fn threshold(&self, least: f32, room: u64) -> f32 {
         let first = bin(least);
         let mut above = 0u64;

@@ -60,7 +60,7 @@ pub struct DrawnRows<'a> {
 pub struct RowCount {
     /// Upper bound of the rows before the first event.
     pub rows: u64,
-    /// The most that the run allows at this step; the strategy's own cap, if any, holds as well.
+    /// The most rows that the run allows at this step. If the strategy has a cap of its own, the smaller of the two applies.
     pub allowed: u64,
 }
 
@@ -112,7 +112,8 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// statistics; the caller clears it after a round.
     fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind>;
 
-    /// Limits for the bounds of pages: a round splits only rows within these limits.
+    /// Limits for the bounds of pages: a round splits only rows within these limits, and children lie within their reach. Bounds and
+    /// the cull of a device rely on it, so a limit that is too narrow loses rows from pictures without an error.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits;
 }
 
@@ -190,19 +191,19 @@ pub trait Round: Sync {
     /// The fate of a row.
     fn fate(&self, row: &RowFacts) -> Fate;
 
-    /// Whether the statistics of a row may decide its fate. False only if [`Round::fate`] would duplicate, split and
-    /// prune the same rows of `rows` if they had no statistics.
+    /// Whether the round may edit rows because of their statistics. May be false only if all fates are the same with all
+    /// statistics set to 0.
     fn may_edit(&self, rows: &Rows<'_>) -> bool;
 
-    /// Whether the round keeps every row within these bounds that has no statistics. A page that missed many rounds
-    /// then computes its bounds once instead of deciding every row in every round.
+    /// Whether all rows without statistics whose values lie within these bounds survive the round unchanged. A page that
+    /// missed many rounds then computes its bounds once instead of deciding every row in every round.
     fn keeps_all(&self, extremes: &Extremes) -> bool;
 
-    /// Upper bound of the number of rows that grow, when the round is logged. The scene has at most `rows` rows, and
-    /// the histogram holds their statistics.
+    /// At the time the round is logged: at most this many rows will grow. The scene has at most `rows` rows, and the
+    /// histogram holds their statistics.
     fn promised(&self, rows: u64, histogram: &GradHistogram) -> u64;
 
-    /// The rows of a view that [`Round::promised`] counted, if their statistics are unchanged since the round.
+    /// The part of [`Round::promised`] that lies in `rows`, of a page that has not applied the round yet.
     fn promised_rows(&self, rows: &Rows<'_>) -> u64;
 }
 

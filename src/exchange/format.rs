@@ -3,6 +3,7 @@
 use super::meta::{ExportFrame, SceneMeta};
 use super::ply::PlyWriter;
 use super::sink::GaussianSink;
+use super::sog::{SogWriter, TREE_FILE, folder_of_tree, memory_bytes};
 use super::spz::{SPZ_UP, SpzWriter};
 use super::transform::write_transform;
 use crate::base::error::{InputError, InputResult};
@@ -16,21 +17,32 @@ pub enum ExportFormat {
     Ply,
     /// About a tenth of the bytes.
     Spz,
+    /// A folder that viewers load in parts, with levels of detail; named by the path of its [`TREE_FILE`].
+    Sog,
 }
 
 impl ExportFormat {
-    /// The format that the ending of a file name says.
+    /// The format that a file name says, by its ending or as a whole.
     ///
     /// # Errors
-    /// No format has this ending.
+    /// No format has this name.
     pub fn of_path(path: &Path) -> InputResult<ExportFormat> {
         let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
         let is = |word: &str| ending.eq_ignore_ascii_case(word);
         match () {
             () if is("ply") => Ok(ExportFormat::Ply),
             () if is("spz") => Ok(ExportFormat::Spz),
-            () => Err(InputError::new(path, "the ending of this file names no format", "let it end in .ply or .spz")),
+            () if path.file_name().is_some_and(|name| name == TREE_FILE) => Ok(ExportFormat::Sog),
+            () => {
+                let remedy = format!("let it end in .ply or .spz, or name a folder's {TREE_FILE}");
+                Err(InputError::new(path, "this file name names no format", remedy))
+            }
         }
+    }
+
+    /// Most memory that its sink takes beside the rows that it is given, bytes; a few MiB count as none.
+    pub fn memory_bytes(self) -> u64 {
+        if self == ExportFormat::Sog { memory_bytes() } else { 0 }
     }
 
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`.
@@ -47,6 +59,7 @@ impl ExportFormat {
         Ok(match self {
             ExportFormat::Ply => Box::new(PlyWriter::create(path, sh_degree, rows_at_most, meta)?),
             ExportFormat::Spz => Box::new(SpzWriter::create(path, sh_degree, meta)?),
+            ExportFormat::Sog => Box::new(SogWriter::create(folder_of_tree(path)?, sh_degree, meta)?),
         })
     }
 
@@ -57,6 +70,8 @@ impl ExportFormat {
     pub fn write_transform(self, path: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
         match self {
             ExportFormat::Ply => write_transform(path, meta, frame, meta.upright.map(|_| VIEWER_UP)),
+            // Beside the folder.
+            ExportFormat::Sog => write_transform(folder_of_tree(path)?, meta, frame, meta.upright.map(|_| VIEWER_UP)),
             ExportFormat::Spz => write_transform(path, &SpzWriter::spz_meta(meta), frame, meta.upright.map(|_| SPZ_UP)),
         }
     }

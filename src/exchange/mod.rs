@@ -1,10 +1,11 @@
-//! Exchange with other programs: scenes in and out as PLY, out as SPZ, scalars for TensorBoard.
+//! Exchange with other programs: scenes in and out as PLY, out as SPZ and SOG, scalars for TensorBoard.
 
 pub mod format;
 pub mod frames;
 pub mod meta;
 pub mod ply;
 pub mod sink;
+pub mod sog;
 pub mod spz;
 pub mod tensorboard;
 pub mod transform;

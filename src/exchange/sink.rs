@@ -6,6 +6,18 @@ use super::meta::ExportFrame;
 use crate::base::error::InputResult;
 use crate::scene::columns::Columns;
 
+/// Most levels of detail of a format.
+pub const LEVELS_MAX: usize = 4;
+
+/// Rows of a format with levels of detail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LevelCounts {
+    /// Of each level, the finest first.
+    pub rows: [u64; LEVELS_MAX],
+    /// Of giants, which viewers show beside any level.
+    pub always_shown: u64,
+}
+
 /// Summary of what was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Written {
@@ -17,6 +29,19 @@ pub struct Written {
     pub skipped: u64,
     /// Bytes written.
     pub bytes: u64,
+    /// Rows by level, if the format has levels.
+    pub levels: Option<LevelCounts>,
+}
+
+impl std::fmt::Display for LevelCounts {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let levels: Vec<String> = self.rows.iter().map(u64::to_string).collect();
+        write!(f, "levels of {} Gaussians", levels.join(", "))?;
+        if self.always_shown > 0 {
+            write!(f, ", and {} giants that are always shown", self.always_shown)?;
+        }
+        Ok(())
+    }
 }
 
 /// A file of Gaussians that is being written. Dropping a sink leaves the target as it was.

@@ -27,7 +27,7 @@ pub fn transform_path(file: &Path) -> PathBuf {
 }
 
 /// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`: two 4x4 matrices, row-major, for column vectors.
-/// `up` is that of an upright file.
+/// `up` is the direction that points up in the file; `None` if the Gaussians were not turned.
 ///
 /// # Errors
 /// The folder cannot be written.

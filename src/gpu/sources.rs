@@ -63,6 +63,7 @@ sources![
     "shared/raster.wgsl",
     "shared/sh.wgsl",
     "shared/splat.wgsl",
+    "shared/subgroup_place.wgsl",
     "shared/workgroup_scan.wgsl",
 ];
 

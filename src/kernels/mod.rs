@@ -12,6 +12,7 @@ pub mod page_words;
 pub mod project_bwd;
 pub mod project_fwd;
 pub mod radix_sort;
+pub mod raster;
 pub mod rasterize_bwd;
 pub mod rasterize_fwd;
 pub mod scan;

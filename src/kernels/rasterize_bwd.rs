@@ -14,7 +14,8 @@
 use super::constants::TILE;
 use super::lanes::Lane;
 use super::project_fwd::Projected;
-use super::rasterize_fwd::{Lists, Raster, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
+use super::raster::{Lists, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
+use super::rasterize_fwd::Raster;
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
 use super::tile_block::{Block, ROWS, prefetch_splats};
 use crate::base::math::LARGEST_SPLAT_GRAD;

@@ -2,8 +2,8 @@
 //!
 //! An untouched value moves by its momentum, monotonically, towards a limit ([`super::drift`]): value and limit bound
 //! it for all later steps. An opacity reset may rewrite a row in between, which changes only roundings. A densification
-//! round may split it, at most once, because the round clears the statistics that made it grow; its children then lie
-//! around it. The children are included in the box, rather than in a larger sigma (1.63 times for random splits: 3.33 +
+//! round may split it. That happens at most once, because the round clears the statistics that made the row grow. The
+//! children then lie around it. The children are included in the box, rather than in a larger sigma (1.63 times for random splits: 3.33 +
 //! 3.33 / 1.6 of 3.33), for two reasons: a row must not be missed if its parent is before the near plane, and the margin
 //! is then that of the row instead of the page's largest. Children are never larger than their parent along any axis of
 //! it, so sigma_max needs no factor: means of children lie within [`SplitLimits::reach`] of their parent (3.33 sigma for

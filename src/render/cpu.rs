@@ -18,10 +18,11 @@ use crate::kernels::isect_offsets::isect_offsets;
 use crate::kernels::project_bwd::project_bwd;
 use crate::kernels::project_fwd::{Projected, project_fwd};
 use crate::kernels::radix_sort::DepthSort;
+use crate::kernels::raster::Lists;
 use crate::kernels::rasterize_bwd::{
     FoldPart, FootprintGradients, Partial, Upstream, Weighing, WeightPartial, fold_rows, fold_weights, rasterize_bwd,
 };
-use crate::kernels::rasterize_fwd::{Lists, Raster, rasterize_fwd, untile};
+use crate::kernels::rasterize_fwd::{Raster, rasterize_fwd, untile};
 use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;
 use crate::kernels::sh_fwd::sh_fwd;

@@ -355,11 +355,12 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
                 .legend(move |(x, y)| Rectangle::new([(x, y - 4), (x + 12, y + 4)], color.filled()));
         }
     }
-    if !series.mark.is_line() {
+    // A line through one point has no length.
+    if !series.mark.is_line() || series.points.len() == 1 {
         let style = if series.mark == Mark::Rings { color.stroke_width(2) } else { color.filled() };
         let dots = series.points.iter().map(|&p| Circle::new(p, if series.mark == Mark::Rings { 4 } else { 3 }, style));
         let drawn = chart.draw_series(dots).map_err(text)?;
-        if is_named && series.mark != Mark::LineAndDots {
+        if is_named && !series.mark.is_line() && series.mark != Mark::LineAndDots {
             drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, style));
         }
     }
@@ -405,6 +406,14 @@ mod tests {
             assert!(all[..i].iter().all(|other| other != one), "{i}: {one:?}");
         }
         assert_eq!(color(all.len()), COLORS[0]);
+    }
+
+    #[test]
+    fn a_curve_of_one_point_is_a_dot() {
+        let dots = |points: Vec<(f64, f64)>| {
+            Chart::new("a", "b", "c").with("", points, Mark::Line).svg().matches("<circle").count()
+        };
+        assert_eq!([dots(vec![(60.0, 1.0)]), dots(vec![(60.0, 1.0), (61.0, 2.0)])], [1, 0]);
     }
 
     #[test]

@@ -15,6 +15,8 @@ const RAMP: [[f64; 3]; 5] =
     [[0.0, 34.0, 78.0], [53.0, 69.0, 108.0], [124.0, 123.0, 120.0], [187.0, 175.0, 113.0], [254.0, 232.0, 56.0]];
 /// Outlines of pages in memory and of others.
 const OUTLINES: [&str; 2] = ["#ffffff", "#3a4450"];
+/// Behind the pages.
+const BACKGROUND: &str = "#10151c";
 
 /// The colour at `heat` of 0 to 1.
 fn color(heat: f64) -> String {
@@ -28,17 +30,25 @@ fn color(heat: f64) -> String {
 pub fn page_map_legend(tiles: &[PageTile]) -> String {
     let most = tiles.iter().map(|t| t.views).max().unwrap_or(0).max(1);
     let stops = (0..=4).map(|i| color(f64::from(i) / 4.0)).collect::<Vec<_>>().join(",");
-    let swatch = |line: &str, meaning: &str| {
-        format!(
-            "<span style=\"white-space:nowrap\"><span style=\"display:inline-block;width:16px;height:16px;margin-right:6px;\
-             vertical-align:-3px;background:#35456c;border:2px solid {line};outline:1px solid #888\"></span>{meaning}</span>"
-        )
+    let is_mixed = tiles.iter().any(|t| t.resident) && tiles.iter().any(|t| !t.resident);
+    let places = match is_mixed {
+        true => swatch(OUTLINES[0], "in memory at the end") + &swatch(OUTLINES[1], "on the drive"),
+        // Two outlines would name one that the map does not have.
+        false => String::new(),
     };
-    let [inside, outside] = [swatch(OUTLINES[0], "in memory at the end"), swatch(OUTLINES[1], "on the drive")];
     format!(
         "<p style=\"display:flex;flex-wrap:wrap;align-items:center;gap:6px 14px;margin:8px 0 0;font-size:14px\">\
          <span style=\"white-space:nowrap\">needed by 0 views <span style=\"display:inline-block;width:110px;height:14px;\
-         vertical-align:-2px;background:linear-gradient(90deg,{stops})\"></span> {most} views</span>{inside}{outside}</p>"
+         vertical-align:-2px;background:linear-gradient(90deg,{stops})\"></span> {most} views</span>{places}</p>"
+    )
+}
+
+/// A page with this outline on the background of the map, and its meaning.
+fn swatch(line: &str, meaning: &str) -> String {
+    format!(
+        "<span style=\"white-space:nowrap\"><span style=\"display:inline-block;width:14px;height:14px;margin-right:6px;\
+         vertical-align:-5px;background:{};border:3px solid {line};outline:3px solid {BACKGROUND}\"></span>{meaning}</span>",
+        color(0.5)
     )
 }
 
@@ -70,7 +80,7 @@ pub fn page_map_svg(tiles: &[PageTile]) -> String {
     let size = extent.map(|e| e * scale);
     let most = tiles.iter().map(|t| t.views).max().unwrap_or(0).max(1);
     let mut svg = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {:.0} {:.0}\"><rect width=\"100%\" height=\"100%\" fill=\"#10151c\"/>\n",
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {:.0} {:.0}\"><rect width=\"100%\" height=\"100%\" fill=\"{BACKGROUND}\"/>\n",
         size[0].max(1.0),
         size[1].max(1.0)
     );
@@ -131,6 +141,9 @@ mod tests {
         // The legend has the colours of the map: those of no views and of the most.
         let legend = page_map_legend(&tiles);
         assert!(legend.contains(&color(0.0)) && legend.contains(&color(1.0)) && legend.contains("199 views"));
+        assert!(OUTLINES.iter().all(|line| legend.matches(&format!("solid {line}")).count() == 1), "{legend}");
+        let in_memory: Vec<PageTile> = tiles.iter().map(|tile| PageTile { resident: true, ..*tile }).collect();
+        assert!(!page_map_legend(&in_memory).contains("solid"), "one outline needs no words");
         assert!(svg.contains(&format!("fill=\"{}\"", color(0.0))) && svg.contains(&format!("fill=\"{}\"", color(1.0))));
     }
 }

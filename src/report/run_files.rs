@@ -19,6 +19,10 @@ pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
 pub const SPZ_FILE: &str = "point_cloud.spz";
 /// The way from its coordinates to those of the dataset, and back.
 pub const SPZ_TRANSFORM_FILE: &str = "point_cloud.spz.transform.json";
+/// Folder of the Gaussians at the end, in parts and levels of detail (`--export sog`).
+pub const SOG_FOLDER: &str = "point_cloud_sog";
+/// The way from their coordinates to those of the dataset, and back.
+pub const SOG_TRANSFORM_FILE: &str = "point_cloud_sog.transform.json";
 /// The page for people.
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
@@ -43,11 +47,13 @@ pub enum RunFile {
     SavedPlys,
     /// A folder of event files; other files in it are not ours.
     Events(&'static str),
+    /// A folder that `exchange::sog` writes; with files of others in it, it stays and a run fails.
+    Sog(&'static str),
     /// A folder tree of PNG files; other files in it are not ours.
     Pictures(&'static str),
 }
 
-/// The part of a run that a file tells about, which decides when a later run in the folder removes it.
+/// What a file is about. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
     /// How the run began.
@@ -61,7 +67,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 16] = [
+pub const RUN_FILES: [(RunFile, Tells); 18] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -70,13 +76,15 @@ pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(TRANSFORM_FILE), Tells::Result),
     (RunFile::File(SPZ_FILE), Tells::Result),
     (RunFile::File(SPZ_TRANSFORM_FILE), Tells::Result),
+    (RunFile::Sog(SOG_FOLDER), Tells::Result),
+    (RunFile::File(SOG_TRANSFORM_FILE), Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),
-    // Before the pictures, whose folder goes when it is empty.
+    // First, so that the folder is empty when its pictures are removed.
     (RunFile::File(VIEWS_FILE), Tells::Result),
     (RunFile::Pictures(PICTURES_FOLDER), Tells::Result),
 ];

@@ -167,15 +167,16 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     // A skipped step has the loss f64::MAX.
     let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
     let mut charts = Vec::new();
-    let mut chart = with_smooth(Chart::new("PSNR", "step", "dB"), "training view", curve(metrics, "step", train));
+    let (mut chart, mean) =
+        with_smooth(Chart::new("PSNR", "step", "dB"), "training view", curve(metrics, "step", train));
     let (held_out, mut of) = (curve(metrics, "step", test), "");
     if !held_out.is_empty() {
         chart = chart.with_color("held-out views", held_out, Mark::LineAndDots, 1);
         of = ", and of the held-out views";
     }
-    charts.push((chart.svg(), format!("PSNR of the view of each logged step and its running mean{of}.")));
-    let chart = with_smooth(Chart::new("Loss", "step", "loss"), "training view", curve(metrics, "step", loss));
-    charts.push((chart.zero_based().svg(), "Loss of the view of each logged step, and its running mean.".to_string()));
+    charts.push((chart.svg(), format!("PSNR of the view of each logged step{mean}{of}.")));
+    let (chart, mean) = with_smooth(Chart::new("Loss", "step", "loss"), "training view", curve(metrics, "step", loss));
+    charts.push((chart.zero_based().svg(), format!("Loss of the view of each logged step{mean}.")));
     let rows = curve(metrics, "step", |m| m["gaussians"].as_f64());
     let chart = Chart::new("Gaussians", "step", "").with("", rows, Mark::Line).zero_based();
     charts.push((chart.svg(), "Gaussians in the scene.".to_string()));
@@ -188,13 +189,14 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts
 }
 
-/// Adds a noisy curve: pale, and its running mean before it where it has points enough for one.
-fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> Chart {
+/// Adds a noisy curve: pale, and its running mean before it where it has points enough for one. Returns also what a caption says
+/// of the mean.
+fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> (Chart, &'static str) {
     let mean = smoothed(&points);
     if mean.is_empty() {
-        return chart.with_color(name, points, Mark::Line, 0);
+        return (chart.with_color(name, points, Mark::Line, 0), "");
     }
-    chart.with_color("", points, Mark::Faint, 0).with_color(name, mean, Mark::Line, 0)
+    (chart.with_color("", points, Mark::Faint, 0).with_color(name, mean, Mark::Line, 0), ", and its running mean")
 }
 
 /// Charts of memory and of the traffic between the tiers, if the run logged them.

@@ -31,7 +31,7 @@ pub struct RoundThresholds {
 }
 
 /// Thresholds of a round that splits rows along their longest axis and removes rows of little weight. Bins are those of
-/// the histograms in [`crate::densify::stats`]: nobody computes a quotient twice.
+/// the histograms in [`crate::densify::stats`], so that no mean is computed again with another rounding.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct LongAxisRound {
     /// Rows split whose mean growth score lies in this bin or above; at least 1.

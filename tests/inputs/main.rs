@@ -9,5 +9,6 @@ mod import;
 mod photos;
 mod ply;
 mod readers;
+mod sog;
 mod spz;
 mod synthetic;

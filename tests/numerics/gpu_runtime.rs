@@ -24,9 +24,8 @@ struct TestUniforms { count: u32, add: u32 }
 @group(0) @binding(1) var<storage, read> values_in: array<u32>;
 @group(0) @binding(2) var<storage, read_write> values_out: array<u32>;
 @compute @workgroup_size(256)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = linear_index(group, groups, local, 256u);
+fn main(place: Place) {
+    let i = linear_index(place, 256u);
     if i >= u.count { return; }
     values_out[i] = values_in[i] * FACTOR + u.add;
 }

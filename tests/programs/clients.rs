@@ -135,14 +135,20 @@ print(json.dumps({'train': curve('psnr/train'), 'test': curve('psnr/test'), 'ima
     assert_eq!(read["picture"], serde_json::json!([30, 192, 64, "\u{89}PNG"]));
 }
 
-#[test]
-fn splat_transform_reads_results() {
+/// The program; `None` after a printed skip.
+fn splat_transform() -> Option<PathBuf> {
     let folder = std::env::var_os("GSSCALE_NODE_BIN").map(PathBuf::from);
     let program = folder.map_or("splat-transform".into(), |folder| folder.join("splat-transform"));
-    if !Command::new(&program).arg("--version").output().is_ok_and(|output| output.status.success()) {
-        println!("SKIPPED: {} does not run (GSSCALE_NODE_BIN names its folder)", program.display());
-        return;
+    if Command::new(&program).arg("--version").output().is_ok_and(|output| output.status.success()) {
+        return Some(program);
     }
+    println!("SKIPPED: {} does not run (GSSCALE_NODE_BIN names its folder)", program.display());
+    None
+}
+
+#[test]
+fn splat_transform_reads_results() {
+    let Some(program) = splat_transform() else { return };
     let folder = TempDir::new().unwrap();
     let (scene, out) = small_run(folder.path(), &["--up", "keep", "--export", "spz"]);
     let (ply, copy) = (out.join("point_cloud.ply"), folder.path().join("copy.ply"));
@@ -156,4 +162,38 @@ fn splat_transform_reads_results() {
         Command::new(&program).args(["-w", text(&out.join("point_cloud.spz")), text(&from_spz)]).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     assert!((psnr_of(&from_spz, &scene) - psnr_of(&ply, &scene)).abs() < 0.5);
+}
+
+#[test]
+fn splat_transform_reads_streamed_sogs() {
+    let Some(program) = splat_transform() else { return };
+    let folder = TempDir::new().unwrap();
+    let (scene, out) = small_run(folder.path(), &["--up", "keep", "--export", "sog"]);
+    let sog = out.join("point_cloud_sog");
+    let tree: Value = serde_json::from_slice(&std::fs::read(sog.join("lod-meta.json")).unwrap()).unwrap();
+    let names: Vec<&str> = tree["filenames"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
+    let environment = tree["environment"].as_str();
+    let convert = |level: usize| {
+        let copy = folder.path().join(format!("{level}.ply"));
+        let of_level = names.iter().filter(|name| name.starts_with(&format!("{level}_")));
+        let files: Vec<PathBuf> = of_level.chain(&environment).map(|name| sog.join(name)).collect();
+        let mut command = Command::new(&program);
+        let output = command.arg("-w").args(&files).arg(&copy).output().unwrap();
+        assert!(output.status.success(), "{}", stderr(&output));
+        let header = String::from_utf8_lossy(&std::fs::read(&copy).unwrap()).into_owned();
+        let rows = header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap();
+        (rows.trim().parse::<u64>().unwrap(), psnr_of(&copy, &scene))
+    };
+    let giants = environment.map_or(0, |name| {
+        let meta: Value = serde_json::from_slice(&std::fs::read(sog.join(name)).unwrap()).unwrap();
+        meta["count"].as_u64().unwrap()
+    });
+    let whole = psnr_of(&out.join("point_cloud.ply"), &scene);
+    let levels: Vec<(u64, f64)> = (0..4).map(convert).collect();
+    for (level, (rows, _)) in levels.iter().enumerate() {
+        assert_eq!(Some(rows - giants), tree["counts"][level].as_u64());
+    }
+    // Scales of 256 values, colours of 256, harmonics of a few centres: half a decibel on a picture of some 20 dB.
+    assert!((levels[0].1 - whole).abs() < 0.5, "{levels:?} of {whole}");
+    assert!(levels.is_sorted_by(|a, b| a.1 > b.1) && levels[1].1 > whole - 4.0, "{levels:?} of {whole}");
 }

@@ -103,6 +103,19 @@ fn a_ply_with_absurd_colours_is_named_as_the_cause() {
 }
 
 #[test]
+fn a_run_that_fails_twice_names_the_first_cause() {
+    let folder = TempDir::new().unwrap();
+    let scene = small_city(folder.path());
+    let (ply, out) = (folder.path().join("bright.ply"), folder.path().join("out"));
+    gaussians(&scene, &ply, |columns| columns.sh0[..30].fill(1e30));
+    // A folder stands where the transform of the last rows is to be written.
+    std::fs::create_dir_all(out.join("point_cloud.transform.json")).unwrap();
+    let said = stopped(&scene, &out, &["--steps", "60", "--init-ply", text(&ply), "--overwrite"]);
+    assert!(said.contains("error: the run diverged"), "what ended the run: {said}");
+    assert!(said.contains("warning: ") && said.contains("cannot be written"), "what failed after it: {said}");
+}
+
+#[test]
 fn log_scales_and_opacities_of_a_ply_are_brought_into_range_and_said() {
     let folder = TempDir::new().unwrap();
     let scene = small_city(folder.path());

@@ -31,6 +31,9 @@ fn a_run_needs_no_folder_and_says_where_everything_is() {
     assert!(lines.iter().any(|line| line.starts_with("step 20: PSNR ")), "{said}");
     assert!(lines.last().is_some_and(|line| line.starts_with("step 50/50  500 Gaussians  PSNR ")), "{said}");
     assert!(lines.iter().all(|line| line.len() <= 80), "{said}");
+    let plan = said.lines().take_while(|line| !line.starts_with("step "));
+    assert!(plan.filter(|line| line.chars().count() > 80).count() == 0, "{said}");
+    assert!(done.iter().any(|line| line.starts_with("  quality     test PSNR ")), "{said}");
     let out = folder.path().join("runs/scene");
     assert!(out.join("point_cloud_000020.ply").is_file() && out.join("point_cloud_000040.ply").is_file());
 

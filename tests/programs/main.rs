@@ -13,6 +13,7 @@ mod cli;
 mod clients;
 #[cfg(unix)]
 mod drive_faults;
+mod dry_runs;
 mod exports;
 mod extremes;
 mod first_hour;

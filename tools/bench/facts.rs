@@ -10,7 +10,7 @@ use gsscale::schedule::order::Order;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
 use gsscale::train::inputs::prepare::prepare;
-use gsscale::train::preflight::forecast::{Reach, mean_pixels, reach};
+use gsscale::train::preflight::forecast::{Reach, reach};
 use gsscale::train::step::pages::PagedScene;
 use std::path::Path;
 
@@ -54,7 +54,7 @@ impl Facts {
         let gaussians = columns.rows() as u64;
         Ok(Facts {
             gaussians,
-            growth: growth(gaussians, mean_pixels(cameras.iter()), config),
+            growth: growth(gaussians, config),
             pages: scene.pager.index().len() as u64,
             largest_view: views.most() as u64,
             views,
@@ -94,8 +94,8 @@ impl Facts {
     }
 }
 
-fn growth(gaussians: u64, pixels: f64, config: &TrainConfig) -> f64 {
-    match reach(config, gaussians, pixels, 0) {
+fn growth(gaussians: u64, config: &TrainConfig) -> f64 {
+    match reach(config, gaussians, 0) {
         (_, Reach::Constant) => 1.0,
         (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,
     }

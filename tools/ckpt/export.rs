@@ -1,7 +1,8 @@
-//! `gsscale-ckpt export`: writes a generation as a PLY or SPZ.
+//! `gsscale-ckpt export`: writes a generation as a PLY, SPZ or SOG.
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::values::ByteSize;
+use gsscale::exchange::sink::LevelCounts;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ExportRequest, export, find_store};
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ Examples:
   gsscale-ckpt export runs/city --out city.ply
   gsscale-ckpt export runs/city --generation 41 --out then.ply
   gsscale-ckpt export runs/city --out city.spz
+  gsscale-ckpt export runs/city --out city/lod-meta.json
   gsscale-ckpt export runs/city --out small.ply --max-gaussians 2000000 --sh-degree 1
   gsscale-ckpt export runs/city --out block.ply --crop 350,120,-5,420,190,60
   gsscale-ckpt export runs/city --out city.ply --host-mem 256MiB
@@ -24,7 +26,8 @@ and --sh-degree the file is the one that gsscale-train would have written after 
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// The file to write; its ending names the format: .ply or .spz
+    /// The file to write; its name says the format: .ply, .spz, or lod-meta.json in a folder of its own (SOG with
+    /// levels of detail)
     #[arg(long, short, value_name = "FILE")]
     out: PathBuf,
     /// Number or name of a generation [default: the latest]
@@ -76,6 +79,9 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
             format_bytes(done.bytes_read),
             format_bytes(done.host_bytes_peak),
         );
+        if let Some(rows) = done.levels {
+            text += &format!("{}\n", LevelCounts { rows, always_shown: done.always_shown });
+        }
         if done.is_local {
             text += "positions are local: the file's comments give origin and scale\n";
         }

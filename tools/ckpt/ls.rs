@@ -11,7 +11,9 @@ Examples:
   gsscale-ckpt ls runs/village
   gsscale-ckpt ls /mnt/nvme/pages --json
 
-'bytes' counts all pages of a generation, 'alone' those that no other generation needs. Works while the run trains.";
+'Gaussians' counts those in pages, 'at most' how many they can be after pending events: pages that no view has needed since
+the last events apply them later, at an export too. 'bytes' counts all pages of a generation, 'alone' those that no other
+generation needs. Works while the run trains.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXAMPLES)]
@@ -26,7 +28,7 @@ pub struct Args {
 pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     let listed = list(&find_store(&args.dir)?)?;
     super::print(args.json, &listed, || {
-        let heads = ["generation", "step", "PSNR", "Gaussians", "pages", "alone", "bytes", "names"];
+        let heads = ["generation", "step", "PSNR", "Gaussians", "at most", "pages", "alone", "bytes", "names"];
         let mut rows = vec![heads.map(str::to_string).to_vec()];
         rows.extend(listed.generations.iter().map(row));
         let mut text = super::table(&rows);
@@ -52,6 +54,7 @@ fn row(line: &GenerationLine) -> Vec<String> {
         line.step.to_string(),
         line.psnr.map_or_else(|| "-".to_string(), |psnr| format!("{psnr:.2}")),
         line.gaussians.to_string(),
+        line.gaussians_at_most.to_string(),
         line.pages.to_string(),
         format_bytes(line.bytes_alone),
         format_bytes(line.bytes),

@@ -132,7 +132,7 @@ impl GaussianSink for PlyWriter {
             written.map_err(|e| failed("writing", &e))?;
         }
         part.finish(file)?;
-        Ok(Written { frame, rows, skipped: given - rows, bytes })
+        Ok(Written { frame, rows, skipped: given - rows, bytes, levels: None })
     }
 }
 

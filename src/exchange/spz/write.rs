@@ -145,7 +145,7 @@ impl GaussianSink for SpzWriter {
         let SpzWriter { part, out, rows_part, to_file, given, rows, .. } = *self;
         part.finish(out)?;
         drop(rows_part);
-        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes })
+        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels: None })
     }
 }
 

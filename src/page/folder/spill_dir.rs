@@ -7,7 +7,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::base::whole_file::sync_folder;
+use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
@@ -57,18 +57,11 @@ impl SpillDir {
     }
 
     fn create_in(folder: &Path, layout: SlotLayout, allow_remote: bool, made_folder: bool) -> InputResult<SpillDir> {
-        check_folder(folder)?;
-        let warnings = check_file_system(folder, allow_remote)?;
-        refuse_foreign_files(folder)?;
+        let warnings = check_new(folder, allow_remote)?;
         let lock = take_lock(folder)?;
         // Checked again under the lock: another process may have created a store just now.
         if read_format(folder)?.is_some() {
-            let remedy = format!(
-                "see whose it is (gsscale-ckpt ls {0}), continue that run (gsscale-train --resume with its output folder), \
-                 {OTHER_FOLDER}, or give that run up (rm -r {0})",
-                folder.display()
-            );
-            return Err(InputError::new(folder, "it holds the checkpoint of another run", remedy));
+            return Err(of_another_run(folder));
         }
         make_private(folder)?;
         sign_lock(folder, &lock)?;
@@ -204,8 +197,46 @@ impl SpillDir {
     }
 }
 
+/// Checks a folder in which a spill directory is to be created, and changes nothing. A store that is there already passes. Returns
+/// warnings about the drive.
+///
+/// # Errors
+/// As [`SpillDir::create`], but for a store of another run and a lock.
+pub(in crate::page) fn check_new(folder: &Path, allow_remote: bool) -> InputResult<Vec<String>> {
+    let is_there = std::fs::symlink_metadata(folder).is_ok();
+    if !is_there {
+        let above = folder_of(folder);
+        check_above(folder, above)?;
+        return check_file_system(above, allow_remote);
+    }
+    check_folder(folder)?;
+    let warnings = check_file_system(folder, allow_remote)?;
+    refuse_foreign_files(folder)?;
+    Ok(warnings)
+}
+
+/// Refuses a spill directory that cannot be created because there is no folder `above`.
+fn check_above(folder: &Path, above: &Path) -> InputResult<()> {
+    if above.is_dir() {
+        return Ok(());
+    }
+    let problem = format!("it cannot be created: {} is not a folder", above.display());
+    Err(InputError::new(folder, problem, format!("make that folder first, or {OTHER_FOLDER}")))
+}
+
+/// The refusal of a folder that holds the checkpoint of another run.
+pub(in crate::page) fn of_another_run(folder: &Path) -> InputError {
+    let remedy = format!(
+        "see whose it is (gsscale-ckpt ls {0}), continue that run (gsscale-train --resume with its output folder), \
+         {OTHER_FOLDER}, or give that run up (rm -r {0})",
+        folder.display()
+    );
+    InputError::new(folder, "it holds the checkpoint of another run", remedy)
+}
+
 /// Creates the folder, private, if the name is free. Returns whether it did.
 fn make_folder(folder: &Path) -> InputResult<bool> {
+    check_above(folder, folder_of(folder))?;
     let mut builder = std::fs::DirBuilder::new();
     #[cfg(unix)]
     {

@@ -18,7 +18,7 @@ use crate::page::map::witness::Witness;
 use crate::page::mutants::{Mutant, active};
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 
 /// Serial numbers that one opening of the store may use between two commits: opening a later generation starts beyond
@@ -27,7 +27,7 @@ use std::io;
 /// never relies on serial numbers; only a salvage without a map does.
 const SERIALS_PER_LIFE: u64 = 1 << 32;
 
-/// Most segments that an error lists.
+/// Most segments that an error lists, and most that are created again.
 const WRONG_SEGMENTS_LISTED: usize = 8;
 
 /// A page of a generation.
@@ -131,13 +131,23 @@ impl Opened {
         pages_at(&self.content.versions, generation)
     }
 
-    /// The paged store on an engine that has the segments of this store.
+    /// Checks that the segments with kept pages exist; changes nothing.
     ///
     /// # Errors
-    /// Segments are missing or have another length; the map names an impossible slot, or a slot twice.
+    /// A segment with kept pages is missing or has another length.
+    pub fn check_segments(&self, engine: &dyn PageEngine, layout: SlotLayout) -> Result<(), CommitError> {
+        let used = self.pages.iter().map(|page| &page.slot).chain(self.past.iter().map(|past| &past.slot));
+        check_segments(engine, layout, used).map(drop)
+    }
+
+    /// The paged store on an engine that has the segments of this store. Segments that are gone and hold no kept page are created again.
+    ///
+    /// # Errors
+    /// Segments with kept pages are missing or have another length; the map names an impossible slot, or a slot twice; no
+    /// space for a segment that is created again.
     pub fn paged_store(
         &self,
-        engine: Box<dyn PageEngine>,
+        mut engine: Box<dyn PageEngine>,
         layout: SlotLayout,
         codec: Codec,
     ) -> Result<PagedStore, CommitError> {
@@ -151,9 +161,12 @@ impl Opened {
         }
         let past: &[Past] = if active(Mutant::FreeListFromLatestOnly) { &[] } else { &self.past };
         used.extend(past.iter().map(|p| &p.slot));
-        let last = used.iter().map(|slot| slot.place.segment).max();
-        let segments = check_segments(engine.as_ref(), layout, last)?;
-        let mut paged = PagedStore::open(engine, config, segments, used)
+        let Segments { number, unusable } = check_segments(engine.as_ref(), layout, used.iter().copied())?;
+        for segment in unusable {
+            let made = engine.create_segment(segment, layout.segment_bytes());
+            made.map_err(CommitError::file("a segment file"))?;
+        }
+        let mut paged = PagedStore::open(engine, config, number, used)
             .map_err(|error| CommitError::Contradiction(error.to_string()))?;
         for past in past {
             paged.free_from(&past.slot, past.until);
@@ -162,27 +175,47 @@ impl Opened {
     }
 }
 
-/// Checks all segments up to `last`, the highest one that the map names, and returns their number. Stops after a few
-/// wrong segments, so that a map naming an absurdly high segment costs neither time nor memory.
-pub(in crate::page) fn check_segments(
+/// The segments of a store.
+pub(in crate::page) struct Segments {
+    /// Their number: up to the last one with a kept page.
+    pub number: u32,
+    /// Those without a kept page that are missing or have another length, ascending.
+    pub unusable: Vec<u32>,
+}
+
+/// Checks the segments of the `used` slots, and those before them. Stops after a few wrong segments, so that a map naming an
+/// absurdly high segment costs neither time nor memory.
+///
+/// # Errors
+/// A segment of a used slot, or more than a few of the others, are missing or have another length.
+pub(in crate::page) fn check_segments<'a>(
     engine: &dyn PageEngine,
     layout: SlotLayout,
-    last: Option<u32>,
-) -> Result<u32, CommitError> {
-    let Some(last) = last else { return Ok(0) };
-    let check = |segment| engine.check_segment(segment, layout.segment_bytes()).err().map(|e| (segment, e));
-    let wrong: Vec<String> = (0..=last)
-        .filter_map(check)
-        .take(WRONG_SEGMENTS_LISTED + 1)
-        .map(|(segment, error)| format!("{}: {error}", segment_file_name(segment)))
-        .collect();
-    match wrong.as_slice() {
-        [] => last.checked_add(1).ok_or_else(|| CommitError::Contradiction(format!("it names segment {last}"))),
-        [listed @ .., _] if listed.len() == WRONG_SEGMENTS_LISTED => {
-            Err(CommitError::Segments(format!("{}; and more", listed.join("; "))))
-        }
-        all => Err(CommitError::Segments(all.join("; "))),
+    used: impl Iterator<Item = &'a SlotRef>,
+) -> Result<Segments, CommitError> {
+    let used: BTreeSet<u32> = used.map(|slot| slot.place.segment).collect();
+    let Some(&last) = used.last() else { return Ok(Segments { number: 0, unusable: Vec::new() }) };
+    let check = |segment: u32| engine.check_segment(segment, layout.segment_bytes()).err().map(|e| (segment, e));
+    let few = WRONG_SEGMENTS_LISTED + 1;
+    let wrong: Vec<(u32, io::Error)> = used.iter().copied().filter_map(check).take(few).collect();
+    if !wrong.is_empty() {
+        return Err(wrong_segments(&wrong));
     }
+    let wrong: Vec<(u32, io::Error)> =
+        (0..last).filter(|segment| !used.contains(segment)).filter_map(check).take(few).collect();
+    if wrong.len() == few {
+        return Err(wrong_segments(&wrong));
+    }
+    let number = last.checked_add(1).ok_or_else(|| CommitError::Contradiction(format!("it names segment {last}")))?;
+    Ok(Segments { number, unusable: wrong.into_iter().map(|(segment, _)| segment).collect() })
+}
+
+fn wrong_segments(wrong: &[(u32, io::Error)]) -> CommitError {
+    let listed = wrong.iter().take(WRONG_SEGMENTS_LISTED);
+    let listed: Vec<String> =
+        listed.map(|(segment, error)| format!("{}: {error}", segment_file_name(*segment))).collect();
+    let more = if wrong.len() > WRONG_SEGMENTS_LISTED { "; and more" } else { "" };
+    CommitError::Segments(listed.join("; ") + more)
 }
 
 /// The pages that `generation` sees in `versions`, which are ordered by page, then generation.

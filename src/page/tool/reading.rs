@@ -266,7 +266,7 @@ impl StoreReader {
     /// A paged store of `pages` on an engine that cannot write.
     ///
     /// # Errors
-    /// The map names an impossible slot; a segment up to the last one that `pages` use is missing or has another
+    /// The map names an impossible slot; a segment that `pages` use, or many before it, are missing or have another
     /// length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
         let engine = ThreadedEngine::pread_read_only(&self.folder, threads)
@@ -274,8 +274,7 @@ impl StoreReader {
         let SpillFormat { store, layout, .. } = self.format;
         let config =
             PagedStoreConfig { store, layout, codec: Codec::Raw, generation: self.generations.next(), serial: 0 };
-        let last = pages.iter().map(|p| p.slot.place.segment).max();
-        let segments = check_segments(&engine, layout, last)?;
+        let segments = check_segments(&engine, layout, pages.iter().map(|p| &p.slot))?.number;
         let used = pages.iter().map(|p| &p.slot);
         let opened = PagedStore::open(Box::new(engine), config, segments, used);
         opened.map_err(|e| CommitError::Contradiction(e.to_string()).into())

@@ -8,9 +8,8 @@
 
 use crate::base::error::InputResult;
 use crate::page::folder::protocol_files::MAP_NAME;
-use crate::page::folder::spill_dir::SpillDir;
-use crate::page::folder::spill_dir::segments_in;
-use crate::page::tool::reading::latest_generation;
+use crate::page::folder::spill_dir::{SpillDir, check_new, of_another_run, segments_in};
+use crate::page::tool::reading::{format_at, latest_generation, refuse_if_in_use};
 use std::path::Path;
 
 impl SpillDir {
@@ -20,10 +19,40 @@ impl SpillDir {
     /// # Errors
     /// The folder cannot be read.
     pub fn holds_no_commit(&self) -> InputResult<bool> {
-        if std::fs::symlink_metadata(self.folder().join(MAP_NAME)).is_err() {
-            return Ok(segments_in(self.folder())?.is_empty());
-        }
-        Ok(latest_generation(self.folder(), self.format().store).is_ok_and(|latest| latest == 0))
+        holds_no_commit(self.folder(), self.format().store)
+    }
+}
+
+fn holds_no_commit(folder: &Path, store: u128) -> InputResult<bool> {
+    if std::fs::symlink_metadata(folder.join(MAP_NAME)).is_err() {
+        return Ok(segments_in(folder)?.is_empty());
+    }
+    Ok(latest_generation(folder, store).is_ok_and(|latest| latest == 0))
+}
+
+/// Whether the store in `folder` certainly holds no commit. Changes nothing.
+///
+/// # Errors
+/// There is no store, or the folder cannot be read.
+pub fn is_uncommitted(folder: &Path) -> InputResult<bool> {
+    let (format, _) = format_at(folder)?;
+    holds_no_commit(folder, format.store)
+}
+
+/// Checks whether a new run may put its store into `folder`, and changes nothing: the refusals of [`SpillDir::create`] after
+/// [`remove_uncommitted`].
+///
+/// # Errors
+/// The folder is not empty or cannot be used, or the store in it holds commits, cannot be opened, or is in use.
+pub fn check_usable(folder: &Path, allow_remote: bool) -> InputResult<()> {
+    check_new(folder, allow_remote)?;
+    if !SpillDir::exists_in(folder) {
+        return Ok(());
+    }
+    let _lock = refuse_if_in_use(folder)?;
+    match is_uncommitted(folder)? {
+        true => Ok(()),
+        false => Err(of_another_run(folder)),
     }
 }
 

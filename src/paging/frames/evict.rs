@@ -54,9 +54,8 @@ pub struct Candidate {
 /// Place of a page in the order: the greatest key is evicted first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Key {
-    /// The next use, or 0 under a policy that ignores it.
-    next_use: u32,
-    last_use: Reverse<u32>,
+    /// Two numbers that the policy orders by.
+    by: [u32; 2],
     page: Reverse<PageNo>,
 }
 
@@ -67,7 +66,7 @@ pub struct EvictOrder {
     /// By page: next use and last use of the pages in the order.
     uses: Vec<Option<(u32, u32)>>,
     len: usize,
-    /// At least the key of every page in the order. Keys of pages that have left or changed since are outdated.
+    /// The keys of all pages in the order, and outdated keys of pages that have left or changed since.
     heap: BinaryHeap<Key>,
 }
 
@@ -161,11 +160,12 @@ impl EvictOrder {
     }
 
     fn key(&self, candidate: Candidate) -> Key {
-        let next_use = match self.policy {
-            EvictPolicy::FarthestNextUse => candidate.next_use,
-            EvictPolicy::LeastRecentlyUsed => 0,
+        let age = u32::MAX - candidate.last_use;
+        let by = match self.policy {
+            EvictPolicy::FarthestNextUse => [candidate.next_use, age],
+            EvictPolicy::LeastRecentlyUsed => [age, 0],
         };
-        Key { next_use, last_use: Reverse(candidate.last_use), page: Reverse(candidate.page) }
+        Key { by, page: Reverse(candidate.page) }
     }
 
     /// Drops outdated keys when they are the greater part of the heap.

@@ -93,7 +93,7 @@ impl<M> FrameTable<M> {
         self.frames_max = self.frames_max.max(frames_max);
     }
 
-    /// Lowers the limit; never raises it. Free frames give their memory back at once, others when their pages are evicted.
+    /// Lowers the limit; never raises it. Free frames give their memory back at once, the others as they become free.
     pub fn limit_frames(&mut self, frames_max: usize) {
         self.frames_max = self.frames_max.min(frames_max);
         while self.excess() > 0

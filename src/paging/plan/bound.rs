@@ -50,6 +50,13 @@ impl FewestReads {
         self.set_last_use(page, now);
     }
 
+    /// A page lost its copy after the last step, whatever the cache does: the next step that needs the page reads it.
+    pub fn lose(&mut self, page: PageNo) {
+        if let Some(last) = self.last_use.get_mut(page.index()) {
+            *last = ABSENT;
+        }
+    }
+
     /// Adds the next step: the pages that it needs, each named once, with their bytes on the drive, and the number of frames at
     /// this step.
     pub fn step(&mut self, frames: usize, pages: impl Iterator<Item = (PageNo, u64)>) {

@@ -187,7 +187,7 @@ impl CacheModel {
         Ok(planned)
     }
 
-    /// Whether a page may be evicted while the step before `step` still computes, or `is_last` as nothing else is left.
+    /// Whether a page may be evicted while the step before `step` still computes. With `is_last`, no other page can go.
     fn may_go(&self, victim: &Candidate, step: u32, is_last: bool) -> bool {
         let ignores_plan = self.idle.policy().ignores_plan();
         is_last || ignores_plan || victim.next_use > step.saturating_add(FAR_STEPS)

@@ -87,7 +87,7 @@ pub fn replay(
     options: &ReplayOptions,
 ) -> Result<Replay, TooFewFrames> {
     let mut coming = Coming::new(views, order, options);
-    // The unit of the plan and of the model is a batch: a step of one batch is one of them.
+    // The unit of the plan and of the model is a batch. A step that fits is one batch.
     let mut plan = Plan::new(0, options.plan_bytes);
     let cache = CacheModel::new(options.frames, options.policy);
     let mut cache = if options.reads_ahead { cache.reading_ahead() } else { cache };

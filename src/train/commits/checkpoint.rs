@@ -371,16 +371,7 @@ impl Trainer {
     /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
     /// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
     pub fn restore(&mut self, state: &RunState) {
-        let fresh = std::mem::replace(&mut self.state, state.trainer.clone());
-        if !self.state.appearance.is_as_large_as(&fresh.appearance) {
-            self.state.appearance = fresh.appearance;
-        }
-        if !self.state.outliers.is_as_large_as(&fresh.outliers) {
-            self.state.outliers = fresh.outliers;
-        }
-        if !self.state.blocks.is_as_large_as(&fresh.blocks) {
-            self.state.blocks = fresh.blocks;
-        }
+        self.state = state.trainer.clone().fitted_to(std::mem::take(&mut self.state));
         self.scene.pager.restore_stats(state.traffic);
     }
 }

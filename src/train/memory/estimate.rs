@@ -60,11 +60,6 @@ impl MemoryEstimate {
         self.base + self.copies + self.view + self.staging + self.targets + self.index
     }
 
-    /// Limits the frames so that all parts fit into `budget`, but not below `least` bytes.
-    pub(crate) fn limit_frames(&mut self, budget: u64, least: u64) {
-        self.frames = self.frames.min(budget.saturating_sub(self.fixed()).max(least));
-    }
-
     /// All parts.
     pub fn total(&self) -> u64 {
         self.fixed() + self.frames

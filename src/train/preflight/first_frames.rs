@@ -118,6 +118,28 @@ pub(super) fn frames_of_budget(
     Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
 }
 
+/// Makes the estimate of a scene that has grown obey `budget` as the run will: by fewer frames, and where these do not hold the
+/// largest view of then (`need`), by views in batches. Returns the number of frames.
+pub(super) fn obey(config: &TrainConfig, need: &LargestNeed, budget: u64, memory: &mut MemoryEstimate) -> u64 {
+    let FirstFrames { frames, pages_most } = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
+        let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
+        let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
+        FirstFrames { frames: frames as u64, pages_most }
+    });
+    in_batches(config, memory, pages_most, need.frame_bytes);
+    memory.frames = memory.frames.min(frames.saturating_mul(need.frame_bytes));
+    frames
+}
+
+/// Takes the rows of a view, and the copies of a round, in batches of `pages_most` pages.
+pub(super) fn in_batches(config: &TrainConfig, memory: &mut MemoryEstimate, pages_most: usize, frame_bytes: u64) {
+    let pages = pages_most as u64;
+    let working = pages.saturating_mul(page_working(config)).min(memory.working);
+    memory.view -= memory.working - working;
+    memory.working = working;
+    memory.copies = memory.copies.min(pages.saturating_mul(frame_bytes));
+}
+
 /// `host_mem`, raised to `least` with a warning if the user set no budget and the machine has the memory.
 pub(super) fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);

@@ -163,8 +163,8 @@ impl World<'_> {
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let mode = options.appearance;
         let look = mode.is_on().then(|| (mode, Look { lens: Lens::of(&camera), ..Look::default() }));
-        let blocks = options.robust_pixels.then_some(BlocksBefore { states: &[], are_kept: false, all_count: false });
-        let comparison = Comparison { target: &target, loss: options.loss, look, blocks, is_left_out: false };
+        let blocks = options.robust_pixels.then_some(BlocksBefore::default());
+        let comparison = Comparison { look, blocks, ..Comparison::new(&target, options.loss) };
         let mut step = |number| {
             let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();

@@ -12,3 +12,4 @@ pub mod forecast;
 pub mod plan;
 pub(crate) mod plan_text;
 pub mod probe;
+pub(crate) mod results_space;

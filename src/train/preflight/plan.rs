@@ -4,7 +4,9 @@
 //! warning.
 
 use super::drive_space::check_drive;
-use super::first_frames::{FirstFrames, LargestNeed, first_frames, frames_of_budget, page_working, raise_to_least};
+use super::first_frames::{
+    FirstFrames, LargestNeed, first_frames, frames_of_budget, in_batches, obey, page_working, raise_to_least,
+};
 use super::probe::{Probe, estimate};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -138,11 +140,7 @@ fn plan_frames(
     }
     for memory in memory {
         memory.frames = memory.frames.min(frames * plan.frame_bytes);
-        if pages_most < usize::MAX {
-            let of_batch = (pages_most as u64).saturating_mul(page_working(config)).min(memory.working);
-            memory.view -= memory.working - of_batch;
-            memory.copies = memory.copies.min(pages_most as u64 * plan.frame_bytes);
-        }
+        in_batches(config, memory, pages_most, plan.frame_bytes);
     }
     Ok((frames, host_mem))
 }
@@ -229,7 +227,10 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
     let then = (*needed as f64 * most as f64 / now.max(1) as f64).ceil() as u64;
     let left = match host_mem.filter(|_| config.frames == 0) {
         None => frames,
-        Some(budget) => budget.saturating_sub(memory[1].fixed()) / plan.frame_bytes,
+        Some(budget) => {
+            let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: then };
+            obey(config, &need, budget, &mut memory[1].clone()).min(frames)
+        }
     };
     let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);
     let until = match config.max_gaussians {

@@ -15,6 +15,11 @@ use crate::train::start::tiers::Tiers;
 /// Rated endurance of a common drive of 500 GB, bytes written.
 const ENDURANCE_BYTES: f64 = 300e12;
 
+/// Columns of a terminal.
+const COLUMNS: usize = 80;
+/// Before the text of a plan's lines, below their heads.
+const INDENT: &str = "        ";
+
 /// What becomes of the number of Gaussians, in the words of a forecast.
 pub fn growth(forecast: &Forecast) -> String {
     let last = format_grouped(forecast.gaussians[1]);
@@ -48,9 +53,9 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
             "        {views} views are larger than the frames: steps on them take up to {most} batches\n"
         ));
     }
-    let frames = match plan.frames {
+    let frames = match forecast.frames_at_end {
         None => String::from("Gaussians with their optimizer state"),
-        Some(frames) if !plan.frames_are_named && frames >= plan.pages[1] => {
+        Some(_) if !plan.frames_are_named && forecast.holds_all_pages() => {
             String::from("frames of pages, one for every page")
         }
         Some(frames) => format!("{frames} frames of pages"),
@@ -81,6 +86,35 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
         format_grouped(forecast.steps.into())
     ));
     text
+}
+
+/// The text with lines of at most 80 columns, as far as they have a comma, a semicolon, a colon or a bracket to be broken at; the rest of a line
+/// is indented.
+pub fn folded(text: &str) -> String {
+    let mut lines = Vec::new();
+    for line in text.lines() {
+        let mut rest = line.to_string();
+        while rest.chars().count() > COLUMNS {
+            let Some(at) = break_of(&rest) else { break };
+            let after = format!("{INDENT}{}", rest[at..].trim_start());
+            lines.push(rest[..at].trim_end().to_string());
+            rest = after;
+        }
+        lines.push(rest);
+    }
+    lines.join("\n")
+}
+
+/// The byte at which a line is broken: behind the last mark, or before the last bracket, that the columns hold.
+fn break_of(line: &str) -> Option<usize> {
+    let is_break = |at: usize| {
+        let (before, after) = (&line[..at], &line[at..]);
+        before.len() > INDENT.len()
+            && after.starts_with(' ')
+            && (before.ends_with([',', ';', ':']) || after.starts_with(" ("))
+    };
+    let ends = line.char_indices().take(COLUMNS + 1).map(|(at, _)| at);
+    ends.filter(|&at| is_break(at)).last()
 }
 
 /// The lines about drives.
@@ -141,4 +175,20 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
         format_bytes(budget),
         (budget / frame).max(1),
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_folded_at_their_marks() {
+        let start =
+            "start   41321 Gaussians, SH degree 3, growing to perhaps 146,904 (a guess; --max-gaussians caps them)";
+        let halves = "start   41321 Gaussians, SH degree 3, growing to perhaps 146,904\n        (a guess; --max-gaussians caps them)";
+        assert_eq!(folded(start), halves);
+        assert_eq!(folded(halves), halves);
+        let path = format!("scene   /{}: 21 views", "a".repeat(90));
+        assert_eq!(folded(&path), path, "a path has no place to break it");
+    }
 }

@@ -90,7 +90,8 @@ pub fn estimate(
     let pages = probe.pages as f64;
     let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + blocks_bytes(config, dataset);
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + config.export.memory_bytes();
+    let base = base + blocks_bytes(config, dataset);
     let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
         // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.

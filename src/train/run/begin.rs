@@ -18,7 +18,7 @@ use crate::config::residence::Residence;
 use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
-use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
 use crate::scene::partition::first_fill;
@@ -29,10 +29,11 @@ use crate::train::memory::estimate::list_bytes;
 use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
 use crate::train::preflight::device_memory;
 use crate::train::preflight::drive_space::{StepWrites, check_first_drive, step_writes};
-use crate::train::preflight::forecast::{Forecast, Measured, Reach, mean_pixels, reach};
+use crate::train::preflight::forecast::{Forecast, Measured, Reach, reach};
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
+use crate::train::preflight::results_space::check_drive_of_results;
 use crate::train::start::first_scene::Start;
 use crate::train::start::first_scene::dataset_print;
 use crate::train::start::tiers::{self, Tiers};
@@ -49,22 +50,16 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
     machine::set_up(config)?;
-    if !request.dry_run {
-        out_folder::check(&request.out, request.existing)?;
-    }
+    check_folders(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
+        check_first_drive(config, start.rows)?;
         if !request.quiet {
             crate::say!("{known}");
         }
-        return Ok(RunOutcome {
-            summary: None,
-            exit_code: 0,
-            out: request.out.clone(),
-            keeps_checkpoint: config.keep_checkpoint,
-        });
+        return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
         && remove_uncommitted(spill_dir, false)?
@@ -75,6 +70,15 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let run = RunId::draw();
     let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
     plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// Refuses folders in which the run may not begin, before anything else is read. Changes nothing, so dry runs refuse what runs refuse.
+fn check_folders(request: &RunRequest) -> Result<(), TrainError> {
+    out_folder::check(&request.out, request.existing)?;
+    match request.config.residence().spill_dir() {
+        Some(spill_dir) => Ok(check_usable(spill_dir, false)?),
+        None => Ok(()),
+    }
 }
 
 /// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
@@ -192,10 +196,9 @@ fn plan(
     }
     let probe = Probe::of_run(dataset, trainer, largest, driver);
     let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
-    let pixels = mean_pixels(dataset.train_views().iter().map(|&view| &dataset.views[view].camera));
     let (last, known) = match keeps_first_count(config, dataset) {
         true => (rows, Reach::Kept),
-        false => reach(config, rows, pixels, steps_done),
+        false => reach(config, rows, steps_done),
     };
     let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check(config, &memory)?;
@@ -230,19 +233,18 @@ pub(super) fn plan_and_train(
         let of_device = device_memory::describe(config, forecast.memory_at_end());
         let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
         let plan = describe(request, dataset, &trainer, &plan_text::growth(&forecast), &of_tiers);
+        let plan = plan_text::folded(&plan);
         match request.dry_run {
             // What was asked for goes to standard output.
             true => crate::say!("{plan}"),
             false => eprintln!("{plan}"),
         }
     }
+    if begun.past.is_none() {
+        check_drive_of_results(config, &request.out, &forecast)?;
+    }
     if request.dry_run {
-        return Ok(RunOutcome {
-            summary: None,
-            exit_code: 0,
-            out: request.out.clone(),
-            keeps_checkpoint: config.keep_checkpoint,
-        });
+        return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     out_folder::make_folder(&request.out)?;
@@ -275,7 +277,7 @@ fn spill_dir_flag(request: &RunRequest) -> String {
 fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: &str, tiers: &str) -> String {
     let (config, rows) = (&request.config, trainer.scene.rows());
     let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
-    let size = largest.map_or(String::new(), |c| format!("{}x{}", c.width, c.height));
+    let size = largest.map_or(String::new(), |c| format!("{}x{} pixels", c.width, c.height));
     let results = match request.out.as_os_str().is_empty() {
         true => String::new(),
         false => format!(", results in {}", request.out.display()),

@@ -13,5 +13,6 @@ pub mod page_map;
 pub mod request;
 pub mod restart;
 pub mod resume;
+pub mod resume_plan;
 mod run_folder;
 pub mod training_loop;

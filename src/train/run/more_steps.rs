@@ -5,7 +5,8 @@
 //! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
 //! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]).
 //!
-//! Invariants: 1. the earlier result stays, under the name of its step; 2. nothing is renamed before the scene was found; 3. a
+//! Invariants: 1. the earlier result stays, under the name of its step, and as the result until the new one replaces it; 2. nothing is
+//! named before the scene was found; 3. a
 //! run that is cut off before its first commit goes on from the same PLY when it is asked again.
 
 use super::begin::{first_trainer, plan_and_train};
@@ -15,6 +16,7 @@ use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::whole_file::sync_folder;
 use crate::config::file::TrainConfig;
 use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
@@ -70,7 +72,7 @@ impl Finished<'_> {
         let (sh_degree_start, first_rows) = (start.sh_degree_start, start.rows);
         let past = Past {
             config: with_absolute_paths(config.clone()),
-            metrics_bytes: std::fs::metadata(out.join(METRICS_FILE)).map_or(0, |about| about.len()),
+            metrics_bytes: metrics_until(out, summary.steps),
             step: summary.steps,
             has_changed: false,
             file,
@@ -86,13 +88,48 @@ impl Finished<'_> {
     }
 }
 
-/// Gives the result of `step` in `out` the name of its step; returns its path.
+/// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.
+fn metrics_until(out: &Path, step: u32) -> u64 {
+    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
+    let step_of = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["step"].as_u64();
+    let is_past = |line: &&str| step_of(line).is_some_and(|at| at <= u64::from(step));
+    metrics.split_inclusive('\n').take_while(is_past).map(|line| line.len() as u64).sum()
+}
+
+/// Keeps the result of `step` in `out` under the name of its step as well; returns that path. The result stays where viewers look for it
+/// until the new one replaces it as a whole.
 fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
     let (result, kept) = (out.join(PLY_FILE), out.join(saved_ply_name(step)));
-    match std::fs::rename(&result, &kept) {
-        Ok(()) => Ok(kept),
+    if is_same(&result, &kept) {
         // An earlier attempt was cut off before its first commit.
-        Err(_) if !result.exists() && kept.is_file() => Ok(kept),
-        Err(error) => Err(InputError::io(&result, "keeping the result under the name of its step", &error)),
+        return Ok(kept);
     }
+    let doing = "keeping the result under the name of its step";
+    let failed = |error: std::io::Error| InputError::io(&result, doing, &error);
+    let beside = out.join(format!(".{}.part", saved_ply_name(step)));
+    let _ = std::fs::remove_file(&beside);
+    // A second name costs no space; some file systems have none.
+    if std::fs::hard_link(&result, &beside).is_err()
+        && let Err(error) = std::fs::copy(&result, &beside)
+    {
+        let _ = std::fs::remove_file(&beside);
+        return Err(failed(error));
+    }
+    std::fs::rename(&beside, &kept).map_err(failed)?;
+    // Where folders cannot be synced, the name is durable with the next sync of a file.
+    let _ = sync_folder(out);
+    Ok(kept)
+}
+
+/// Whether both are names of one file.
+#[cfg(unix)]
+fn is_same(a: &Path, b: &Path) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let of = |path: &Path| std::fs::metadata(path).ok().map(|about| (about.dev(), about.ino()));
+    of(a).is_some() && of(a) == of(b)
+}
+
+#[cfg(not(unix))]
+fn is_same(_a: &Path, _b: &Path) -> bool {
+    false
 }

@@ -6,8 +6,10 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, sync_folder};
+use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
+use crate::exchange::sog::is_of_sog;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
@@ -51,6 +53,14 @@ pub(crate) fn lock(out: &Path) -> InputResult<OutLock> {
     }
 }
 
+/// Refuses an output folder in use, without making its lock file.
+///
+/// # Errors
+/// Another process trains into the folder.
+pub(super) fn refuse_in_use(out: &Path) -> InputResult<()> {
+    if out.join(LOCK).is_file() { lock(out).map(drop) } else { Ok(()) }
+}
+
 /// Whether a folder is empty except for the lock file.
 pub fn is_empty(out: &Path) -> bool {
     std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
@@ -71,11 +81,13 @@ pub fn default_out(scene: Option<&Path>) -> PathBuf {
     (1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1))
 }
 
-/// Refuses an output folder in which a run may not begin.
+/// Refuses an output folder in which a run may not begin. Changes nothing, so a dry run asks the same.
 ///
 /// # Errors
-/// The folder is not empty and `existing` refuses it, or its checkpoint belongs to another run.
+/// The folder cannot be made, is not empty and `existing` refuses it, is in use, or its checkpoint belongs to another run.
 pub(crate) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    check_above(out)?;
+    refuse_in_use(out)?;
     match existing {
         Existing::Refuse => Ok(check_new(out)?),
         Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
@@ -86,6 +98,17 @@ pub(crate) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
 /// Identity of the run whose config lies in `out`.
 fn run_in(out: &Path) -> RunId {
     read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
+}
+
+/// Refuses an output folder where a file is, or in whose path one is.
+fn check_above(out: &Path) -> InputResult<()> {
+    match out.ancestors().find(|above| above.exists()) {
+        Some(above) if !above.is_dir() => {
+            let problem = format!("it is no folder and cannot become one: {} is a file", above.display());
+            Err(InputError::new(out, problem, "choose another --out"))
+        }
+        _ => Ok(()),
+    }
 }
 
 fn check_new(out: &Path) -> InputResult<()> {
@@ -154,6 +177,12 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
         // A run that was cut off before its first commit left nothing else; results must stay.
         return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
     }
+    // Before anything is removed: without its config the rest would not be taken for a run's.
+    for (file, _) in &RUN_FILES {
+        if let RunFile::Sog(folder) = file {
+            check_ours(&out.join(folder), is_of_sog)?;
+        }
+    }
     // First, because an active run in the folder makes this fail.
     remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
     Ok(remove_files(out, |_| true)?)
@@ -171,6 +200,7 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
         RunFile::File(name) => remove_file(&out.join(name)),
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
+        RunFile::Sog(folder) => remove_ours(&out.join(folder), is_of_sog),
         RunFile::Pictures(folder) => {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
         }

@@ -10,7 +10,7 @@ use std::path::PathBuf;
 pub struct RunRequest {
     /// Scene folder (or transforms.json).
     pub scene: PathBuf,
-    /// Output folder; may be empty for a dry run.
+    /// Output folder; empty for a forecast, which has no results.
     pub out: PathBuf,
     /// Checked config.
     pub config: TrainConfig,
@@ -33,4 +33,11 @@ pub struct RunOutcome {
     pub out: PathBuf,
     /// The run keeps its checkpoint after its end.
     pub keeps_checkpoint: bool,
+}
+
+impl RunOutcome {
+    /// The outcome of a dry run that was to end in `out`.
+    pub fn of_nothing(out: PathBuf) -> RunOutcome {
+        RunOutcome { summary: None, exit_code: 0, out, keeps_checkpoint: false }
+    }
 }

@@ -99,22 +99,22 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
 }
 
 /// Facts of a run before its checkpoint is opened.
-struct Earlier {
+pub(super) struct Earlier {
     /// Path of config.toml, which may not exist.
-    path: PathBuf,
+    pub path: PathBuf,
     /// Its content; `None` if it is missing.
-    file: Option<(TrainConfig, Resolved)>,
+    pub file: Option<(TrainConfig, Resolved)>,
     /// Its config, from the file or from the checkpoint.
-    config: TrainConfig,
+    pub config: TrainConfig,
     /// Its scene.
-    scene: PathBuf,
+    pub scene: PathBuf,
     /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
-    run: RunId,
+    pub run: RunId,
 }
 
 impl Earlier {
     /// Reads config.toml or, if it is missing, the checkpoint in the output folder or in the given spill directory.
-    fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
+    pub fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
         let path = request.out.join(CONFIG_FILE);
         if path.exists() {
             let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
@@ -163,7 +163,7 @@ impl Earlier {
     }
 
     /// The claim that the run's checkpoint must satisfy.
-    fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
+    pub fn claim<'a>(&self, request: &'a ResumeRequest) -> Claim<'a> {
         let is_named = request.keys.spill_dir.as_ref().is_some_and(|folder| !folder.is_empty());
         Claim { run: self.run, out: &request.out, is_named }
     }
@@ -171,7 +171,7 @@ impl Earlier {
 
 /// The summary of a run that did all of its steps, has no checkpoint any more, and is to do more steps. A run that was to
 /// keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
-fn result_to_continue(
+pub(super) fn result_to_continue(
     request: &ResumeRequest,
     earlier: &Earlier,
     config: &TrainConfig,
@@ -182,7 +182,7 @@ fn result_to_continue(
     (is_gone && earlier.file.is_some()).then_some(summary)
 }
 
-fn read_summary(out: &Path) -> Option<Summary> {
+pub(super) fn read_summary(out: &Path) -> Option<Summary> {
     serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
 }
 
@@ -196,24 +196,70 @@ fn has_results(out: &Path) -> bool {
     has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
+/// Refuses to begin a run again that left results.
+///
+/// # Errors
+/// There are results, which would be replaced.
+pub(super) fn check_restart(out: &Path) -> InputResult<()> {
+    if !has_results(out) {
+        return Ok(());
+    }
+    let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
+                   removes its checkpoint";
+    let remedy = format!(
+        "start a new run from its Gaussians with another --out and --init-ply {}",
+        out.join(PLY_FILE).display()
+    );
+    Err(InputError::new(out, problem, remedy))
+}
+
 /// Restarts a run that was cut off before its first commit, from its config.
 ///
 /// # Errors
 /// The run left results that would be replaced; else as [`run`].
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
-    if has_results(&request.out) {
-        let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
-                       removes its checkpoint";
-        let remedy = format!(
-            "start a new run from its Gaussians with another --out and --init-ply {}",
-            request.out.join(PLY_FILE).display()
-        );
-        return Err(InputError::new(&request.out, problem, remedy).into());
-    }
+    check_restart(&request.out)?;
     let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
     eprintln!("{} was cut off before its first commit: it begins again", out.display());
     let existing = Existing::BeginAgain;
     run(&RunRequest { scene, out, config, dry_run: false, existing, quiet })
+}
+
+/// What a run resumes with.
+pub(super) struct Goal {
+    /// Accepted differences.
+    pub changes: Changes,
+    /// Its scene.
+    pub start: Start,
+    /// Digest of the dataset.
+    pub print: DatasetPrint,
+}
+
+/// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Changes no file.
+///
+/// # Errors
+/// The run has done more steps, its settings or its dataset changed, or its scene is not there.
+pub(super) fn goal(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    config: &mut TrainConfig,
+    state: &RunState,
+) -> Result<Goal, TrainError> {
+    let (file, scene) = (&earlier.path, &earlier.scene);
+    keep_schedule(config, &request.keys, state);
+    check_steps(config, state)?;
+    let mut changes = Changes::of_config(file, state, config)?;
+    changes.check(file, request.accept_changes)?;
+    if !scene.is_dir() {
+        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
+        return Err(InputError::new(scene, "the scene of this run is not there", remedy).into());
+    }
+    let start = Start::look(scene, config, &request.out, host_budget(config))?;
+    let print = dataset_print(&start)?;
+    changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
+    changes.numbers.extend(first_degree_change(&start, state, &print));
+    changes.check(&start.dataset.image_folder, request.accept_changes)?;
+    Ok(Goal { changes, start, print })
 }
 
 /// Resumes from a checkpoint.
@@ -223,23 +269,10 @@ fn resume_from(
     mut config: TrainConfig,
     stored: Stored,
 ) -> Result<RunOutcome, TrainError> {
-    let (file, scene) = (&earlier.path, earlier.scene.clone());
     machine::set_up(&config)?;
     let host_mem = host_budget(&config);
     let state = stored.run_state.clone();
-    keep_schedule(&mut config, &request.keys, &state);
-    check_steps(&config, &state)?;
-    let mut changes = Changes::of_config(file, &state, &config)?;
-    changes.check(file, request.accept_changes)?;
-    if !scene.is_dir() {
-        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
-        return Err(InputError::new(&scene, "the scene of this run is not there", remedy).into());
-    }
-    let start = Start::look(&scene, &config, &request.out, host_mem)?;
-    let print = dataset_print(&start)?;
-    changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
-    changes.numbers.extend(first_degree_change(&start, &state, &print));
-    changes.check(&start.dataset.image_folder, request.accept_changes)?;
+    let Goal { changes, start, print } = goal(request, earlier, &mut config, &state)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
@@ -253,7 +286,7 @@ fn resume_from(
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     trainer.restore(&state);
     let past = Past {
-        config: kept_config(file, &earlier.config, &config)?,
+        config: kept_config(&earlier.path, &earlier.config, &config)?,
         metrics_bytes: state.metrics_bytes,
         step: state.trainer.step,
         has_changed,
@@ -262,7 +295,7 @@ fn resume_from(
     };
     let run = identity_of(earlier.run, &state);
     let begun = Begun { print, sh_degree_start: state.origin.sh_degree_start, past: Some(past), host_mem, driver, run };
-    let (out, quiet) = (request.out.clone(), request.quiet);
+    let (scene, out, quiet) = (earlier.scene.clone(), request.out.clone(), request.quiet);
     let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
     plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
@@ -273,7 +306,7 @@ fn identity_of(run: RunId, state: &RunState) -> RunId {
 }
 
 /// Folder of a run's checkpoint.
-fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
+pub(super) fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
     config.residence().checkpoint_folder(out)
 }
 

@@ -24,8 +24,10 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
+use crate::exchange::sog::TREE_FILE;
 use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SPZ_FILE, SUMMARY_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SOG_FOLDER, SPZ_FILE,
+    SUMMARY_FILE,
 };
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
@@ -148,7 +150,7 @@ pub(super) fn train_into(
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
     let ply = Trainer::ply_path(out);
-    let saved = save_result(dataset, &mut trainer, &ply, config.export);
+    let saved = save_result(request, dataset, &mut trainer, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
@@ -194,22 +196,28 @@ pub(super) fn train_into(
 
 /// Writes the Gaussians at the current step as a PLY and in the format that was asked for, and beside them the way to the dataset's coordinates.
 fn save_result(
+    request: &RunRequest,
     dataset: &Dataset,
     trainer: &mut Trainer,
     ply: &Path,
-    format: ExportFormat,
 ) -> Result<Written, TrainError> {
+    let format = request.config.export;
     let written = trainer.save(dataset, ply)?;
     let meta = trainer.scene_meta(dataset);
     ExportFormat::Ply.write_transform(ply, &meta, written.frame)?;
-    if format == ExportFormat::Spz {
-        let spz = ply.with_file_name(SPZ_FILE);
-        let compressed = trainer.export(dataset, &spz, format)?;
-        format.write_transform(&spz, &meta, compressed.frame)?;
-        if compressed.rows < written.rows {
-            let lost = written.rows - compressed.rows;
-            eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", spz.display());
-        }
+    let other = match format {
+        ExportFormat::Ply => return Ok(written),
+        ExportFormat::Spz => ply.with_file_name(SPZ_FILE),
+        ExportFormat::Sog => ply.with_file_name(SOG_FOLDER).join(TREE_FILE),
+    };
+    let exported = trainer.export(dataset, &other, format)?;
+    format.write_transform(&other, &meta, exported.frame)?;
+    if exported.rows < written.rows {
+        let lost = written.rows - exported.rows;
+        eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", other.display());
+    }
+    if let (Some(levels), false) = (exported.levels, request.quiet) {
+        eprintln!("{}: {levels}", other.display());
     }
     Ok(written)
 }

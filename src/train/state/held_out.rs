@@ -1,7 +1,7 @@
 //! Training views that are held out while the run decides its count.
 //!
-//! Some evenly spread training views are not trained on as long as the scene may grow; the view after each takes its turns
-//! instead. From then on they are training views like all others. The views of the evaluation have no part in this.
+//! Some evenly spread training views are not trained on as long as the scene may grow; in the turn of each, the next view
+//! is trained. From then on they are training views like all others. The views of the evaluation have no part in this.
 //!
 //! Not here: the checks that they serve (`growth_checks`).
 //!

@@ -61,7 +61,7 @@ pub struct Trainer {
     pub(crate) train_views: Vec<usize>,
     /// Training views that the run decides its count by.
     pub(crate) held_out: HeldOut,
-    /// For each view, the number of its camera; empty if the run corrects nothing.
+    /// For each view, the number of its group of equal cameras; empty if the run corrects nothing.
     pub(super) camera_groups: Vec<usize>,
     pub(crate) working: WorkingSet,
     /// Everything that a commit saves and a resume restores, besides the pages.
@@ -179,9 +179,8 @@ impl Trainer {
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let look = self.look(view, camera);
-            let blocks =
-                self.options.robust_pixels.then_some(BlocksBefore { states: &[], are_kept: false, all_count: false });
-            let comparison = Comparison { target: &target, loss: self.options.loss, look, blocks, is_left_out: false };
+            let blocks = self.options.robust_pixels.then_some(BlocksBefore::default());
+            let comparison = Comparison { look, blocks, ..Comparison::new(&target, self.options.loss) };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let began = Instant::now();
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
@@ -274,6 +273,7 @@ impl Trainer {
         let view = self.next_view();
         targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
         self.fit_frames(&dataset.views[view].camera);
+        self.prepare_device()?;
         self.look_ahead(dataset);
         let photo = trace::span("photo");
         let target = targets.get(view)?;
@@ -327,12 +327,17 @@ impl Trainer {
             let mut rows = HostRows::new(renderer);
             return train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most);
         }
-        let tier = match &mut self.device {
-            Some(tier) => tier,
-            none => none.insert(DeviceTier::new(scene, renderer, self.options.steps)?),
-        };
+        let tier = DeviceTier::of_run(&mut self.device, scene, renderer, self.options.steps)?;
         let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most)
+    }
+
+    /// Gives the pages of a run that updates on a device their slots, so that the first plan knows them.
+    fn prepare_device(&mut self) -> Result<(), TrainError> {
+        if self.options.optimizer_on == OptimizerPlace::Device {
+            DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
+        }
+        Ok(())
     }
 
     /// Copies back what is newer on a device than in memory, so that the pages and their histogram are those of the last
@@ -360,7 +365,7 @@ impl Trainer {
     /// As [`Trainer::check_growth`].
     pub(crate) fn log_due_events(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let Some(step) = self.state.step.checked_sub(1) else { return Ok(()) };
-        // An attempt of the coming step has logged them, or an earlier version of the program, right after the step.
+        // A failed attempt of the coming step, or an older program, has logged them already.
         if self.events().events().last().is_some_and(|last| last.step >= step) {
             return Ok(());
         }

@@ -5,9 +5,9 @@
 //! what it needs is a field of [`Comparison`], so that step and rehearsal pass it on unchanged.
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
-//! picture stays where the renderer keeps it, and masks of blocks only read it; 3. the loss, its gradient and the errors that rows are weighed by are those of
-//! the corrected picture; 4. nothing here changes the values of a correction: what was found for them, and
-//! for blocks of the photo, is left for the trainer, which stores it only if the step is taken.
+//! picture stays where the renderer keeps it, and masks of blocks only read it; 3. the loss, its gradient and the errors that
+//! rows are weighed by are those of the corrected picture; 4. nothing here changes the values of a correction or what is known of
+//! blocks: the trainer reads `found` and `found_blocks` after the step and stores them only if the step is taken.
 
 use crate::appearance::AppearanceMode;
 use crate::appearance::fit::Pair;
@@ -28,12 +28,12 @@ pub struct Comparison<'a> {
     pub look: Option<(AppearanceMode, Look)>,
     /// What is known of the blocks of the photo; `None` without masks of blocks.
     pub blocks: Option<BlocksBefore<'a>>,
-    /// The view is compared with its photo, and that is all: there is no gradient.
+    /// Only the loss is measured: the view is not trained on.
     pub is_left_out: bool,
 }
 
 /// The blocks of a photo before a step.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct BlocksBefore<'a> {
     /// The blocks after the last look at them; empty before the first.
     pub states: &'a [BlockState],
@@ -63,7 +63,12 @@ impl Correction {
     }
 }
 
-impl Comparison<'_> {
+impl<'a> Comparison<'a> {
+    /// A view that is trained on, without correction.
+    pub fn new(target: &'a Target, loss: LossOptions) -> Comparison<'a> {
+        Comparison { target, loss, look: None, blocks: None, is_left_out: false }
+    }
+
     /// Corrects the picture that `renderer` has drawn, compares it with the photo, and takes the loss back to the splats.
     ///
     /// # Errors
@@ -100,11 +105,11 @@ impl Comparison<'_> {
     }
 
     /// The photo to compare with: without the blocks that are masked after a look at the picture.
-    fn without_masked_blocks<'a>(
-        &'a self,
+    fn without_masked_blocks<'c>(
+        &'c self,
         renderer: &mut dyn Renderer,
-        correction: &'a mut Correction,
-    ) -> Result<&'a Target, RenderError> {
+        correction: &'c mut Correction,
+    ) -> Result<&'c Target, RenderError> {
         correction.found_blocks = None;
         let Some(BlocksBefore { states, are_kept, all_count }) = self.blocks else { return Ok(self.target) };
         if !are_kept {

@@ -21,6 +21,7 @@ use crate::paging::error::PagingError;
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::frames::table::FrameTable;
 use crate::paging::pinned::PinnedPage;
+use crate::paging::plan::bound::FewestReads;
 use crate::render::pages::{DeviceSlot, PageRenderer, PageRules, SlotPage};
 use crate::render::{RenderError, Renderer};
 use crate::train::error::TrainError;
@@ -48,6 +49,13 @@ pub struct SlotTraffic {
     pub bytes_drained: u64,
     /// Pages of batches that were on the device already.
     pub hits: u64,
+    /// Slots.
+    #[serde(default)]
+    pub slots: u64,
+    /// The fewest bytes that any order of eviction could have copied to that many slots so far ([`FewestReads`]); to compare
+    /// with `bytes_loaded`. Pages that events changed on the host are copied again in any order.
+    #[serde(default)]
+    pub bytes_loaded_fewest: u64,
 }
 
 /// The pages of a run on a device.
@@ -67,6 +75,8 @@ pub struct DeviceTier {
     /// Slots of the batch of a step, and whether they are newer than the frames.
     in_use: BTreeMap<PageNo, (DeviceSlot, bool)>,
     pub(crate) traffic: SlotTraffic,
+    /// Loads that no order of eviction avoids.
+    fewest: FewestReads,
 }
 
 /// The device of a renderer.
@@ -119,9 +129,26 @@ impl DeviceTier {
             leaving: Vec::new(),
             in_use: BTreeMap::new(),
             traffic: SlotTraffic::default(),
+            fewest: FewestReads::default(),
         };
         tier.fit(scene, renderer)?;
         Ok(tier)
+    }
+
+    /// The tier of a run, made if the run has none yet.
+    ///
+    /// # Errors
+    /// As [`DeviceTier::new`].
+    pub fn of_run<'a>(
+        tier: &'a mut Option<DeviceTier>,
+        scene: &PagedScene,
+        renderer: &mut dyn Renderer,
+        steps: u32,
+    ) -> Result<&'a mut DeviceTier, TrainError> {
+        match tier {
+            Some(tier) => Ok(tier),
+            none => Ok(none.insert(DeviceTier::new(scene, renderer, steps)?)),
+        }
     }
 
     /// Slots.
@@ -136,7 +163,7 @@ impl DeviceTier {
 
     /// What was copied so far.
     pub fn traffic(&self) -> SlotTraffic {
-        self.traffic
+        SlotTraffic { slots: self.slots() as u64, bytes_loaded_fewest: self.fewest.bytes(), ..self.traffic }
     }
 
     /// Makes slots for all pages of the scene, as far as the share of the device memory goes.
@@ -295,6 +322,7 @@ impl DeviceTier {
         let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
         self.copy_back(renderer, newer.into_iter())?;
         for page in pages {
+            self.fewest.lose(page);
             if self.slots.state(page).is_some() {
                 self.slots.evict(page);
             }
@@ -311,6 +339,8 @@ impl DeviceTier {
     ) -> Result<Vec<SlotPage>, TrainError> {
         let mut missing = Vec::new();
         let with_rows = || pinned.iter().filter(|page| page.meta.rows > 0);
+        let needed = with_rows().map(|page| (page.page, payload_bytes(page) as u64));
+        self.fewest.step(self.slots.frames_max(), needed);
         for page in with_rows() {
             match self.slots.pin(page.page, true) {
                 Some(in_slot) => drop(self.in_use.insert(page.page, in_slot)),

@@ -105,9 +105,9 @@ pub(crate) fn warn_of_outliers(found: &[usize], step: u32, are_left_out: bool, d
         false => ("contradict the scene", "check them, or leave such views out with --robust-views"),
     };
     eprintln!(
-        "warning: step {step}: the photos of {} views {are}, because they differ from their pictures far more than \
+        "warning: step {step}: the photos of {} {are}, because they differ from their pictures far more than \
          others do (a wrong pose, another place, another exposure); {remedy}: {names}",
-        found.len()
+        if found.len() == 1 { String::from("a view") } else { format!("{} views", found.len()) }
     );
 }
 

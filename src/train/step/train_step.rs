@@ -62,7 +62,7 @@ pub struct StepOutcome {
     pub skipped: Option<Skipped>,
     /// The view was compared with its photo only ([`Comparison::is_left_out`]); nothing was changed.
     pub is_left_out: bool,
-    /// Rows of the view that were drawn; counted only where no row was rewritten.
+    /// Rows of the view that were drawn; 0 in steps that updated rows.
     pub drawn: u64,
 }
 
@@ -118,7 +118,7 @@ struct Passes<'a> {
     backend: &'a mut dyn RowBackend,
     step: u32,
     camera: &'a Camera,
-    /// Batches that are in and not out yet.
+    /// Batches whose rows the renderer has and whose gradients are still due.
     batches: Vec<Batch>,
     /// The pages of the last of them, where they are pinned.
     pinned: Vec<PinnedPage>,
@@ -288,7 +288,7 @@ impl Passes<'_> {
 
     /// Begins reads during the pass out: of the batch before, or of the next steps where there is none.
     fn prefetch_before_last(&mut self) {
-        // While the last batch is being taken out it is not in the list any more, before that it is.
+        // While a batch is taken out, it is no longer in the list.
         let is_out = usize::from(self.outcome.batches != self.batches.len());
         match (self.batches.len() + is_out).checked_sub(2) {
             Some(before) => self.scene.pager.prefetch_batch(&self.batches[before].pages),

@@ -1,4 +1,4 @@
-//! Exports the Gaussians of a generation as a PLY or SPZ, page by page, with the trainer's writers, and the transform beside it.
+//! Exports the Gaussians of a generation as a PLY, SPZ or SOG, page by page, with the trainer's writers, and the transform beside it.
 //!
 //! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
 //! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection
@@ -14,6 +14,7 @@ use crate::config::limits::RunOptions;
 use crate::densify::stats::GradHistogram;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::sink::LEVELS_MAX;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
@@ -45,7 +46,7 @@ const FIXED_BYTES: u64 = 32 << 20;
 pub struct ExportRequest {
     /// Number or name of the generation; `None` for the latest.
     pub generation: Option<String>,
-    /// The file; its ending names the format.
+    /// The file; its name says the format.
     pub out: PathBuf,
     /// Memory, bytes.
     pub host_mem: u64,
@@ -70,8 +71,12 @@ pub struct Exported {
     pub gaussians: u64,
     /// Dropped Gaussians with non-finite values.
     pub skipped: u64,
-    /// Bytes of the file.
+    /// Bytes of the file, or of all files of a folder.
     pub bytes: u64,
+    /// Gaussians by level, the finest first, if the format has levels.
+    pub levels: Option<[u64; LEVELS_MAX]>,
+    /// Gaussians that viewers show beside any level.
+    pub always_shown: u64,
     /// Whether the file holds local coordinates because f32 cannot hold the dataset's.
     pub is_local: bool,
     /// Bytes of pages read.
@@ -91,7 +96,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
     let (_, options) = options_of(&place.folder, &state)?;
-    let mut scene = scene_at(&store, generation, &state, &options, (request.host_mem, 1))?;
+    let mut scene = scene_at(&store, generation, &state, &options, (request.host_mem, 1), format.memory_bytes())?;
     let mut choice = Choice::new(&state, request);
     let pages = choice.pages(&scene);
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
@@ -119,6 +124,8 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
         gaussians: written.rows,
         skipped: written.skipped,
         bytes: written.bytes,
+        levels: written.levels.map(|levels| levels.rows),
+        always_shown: written.levels.map_or(0, |levels| levels.always_shown),
         is_local: written.frame == ExportFrame::Local,
         bytes_read: scene.pager.stats().bytes_read,
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
@@ -139,19 +146,20 @@ fn meta_of(state: &RunState, options: &RunOptions) -> SceneMeta {
     }
 }
 
-/// The scene of a generation, with the frames that 1/`share` of the budget allows.
+/// The scene of a generation, with the frames that 1/`share` of the budget allows beside `others` bytes.
 pub(super) fn scene_at(
     store: &StoreReader,
     generation: u64,
     state: &RunState,
     options: &RunOptions,
     (host_mem, share): (u64, u64),
+    others: u64,
 ) -> Result<PagedScene, TrainError> {
     let pages = store.pages_at(generation)?;
     let frame = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
     // 88 bytes of tables for each step of the schedule.
     let tables = 88 * u64::from(options.rates.steps);
-    let fixed = FIXED_BYTES + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
+    let fixed = FIXED_BYTES + others + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
     let frames = (host_mem / share).saturating_sub(fixed) / (frame * COPIES);
     if frames == 0 {
         let least = format_bytes((fixed + frame * COPIES) * share);

@@ -20,8 +20,10 @@ pub struct GenerationLine {
     pub step: u32,
     /// Held-out PSNR of the last evaluation before it, dB; `None` if unknown.
     pub psnr: Option<f64>,
-    /// Gaussians in its pages.
+    /// Gaussians in its pages. Pages that no view has needed since the last events have not applied them.
     pub gaussians: u64,
+    /// Gaussians at most, once all pages have applied all events.
+    pub gaussians_at_most: u64,
     /// Pages.
     pub pages: u64,
     /// Bytes on the drive that no other kept generation needs.
@@ -62,6 +64,7 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
             step: state.trainer.step,
             psnr,
             gaussians: state.rows,
+            gaussians_at_most: state.rows_bound,
             pages: used.pages,
             bytes_alone: used.bytes_alone,
             bytes: used.bytes,

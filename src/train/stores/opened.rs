@@ -8,7 +8,6 @@ use crate::checkpoint::run_state::RunState;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::page::format::codec::Codec;
 use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::opening::Opened;
 use crate::train::commits::first_commit::MAP_CACHE_BYTES;
@@ -85,10 +84,10 @@ impl Stored {
         self.spill.remove()
     }
 
-    /// Whether all segments exist. A kill during removal leaves a map without segments.
+    /// Whether all segments with kept pages exist. A kill during removal leaves a map without segments.
     pub fn is_whole(&self) -> bool {
         let engine = open_engine(IoEngine::Pread, self.spill.folder(), DEPTH);
         let layout = self.spill.format().layout;
-        engine.is_ok_and(|engine| self.opened.paged_store(engine.store, layout, Codec::Raw).is_ok())
+        engine.is_ok_and(|engine| self.opened.check_segments(&*engine.store, layout).is_ok())
     }
 }

@@ -26,7 +26,7 @@ use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::tool::reading::{Access, StoreReader, WitnessRule};
-use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::stores::opened::Stored;
@@ -98,6 +98,19 @@ pub(crate) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> R
     let Some(stored) = Stored::open(folder, allow_remote)? else { return Ok(None) };
     claim.check(folder, &stored.run_state.origin.run)?;
     Ok(Some(stored))
+}
+
+/// The run state of the checkpoint in `folder`, without a change; `None` if it has no commit.
+///
+/// # Errors
+/// As [`open_own`], but a checkpoint in use is no error.
+pub(crate) fn read_own(folder: &Path, claim: Claim<'_>) -> Result<Option<RunState>, TrainError> {
+    if is_uncommitted(folder)? {
+        return Ok(None);
+    }
+    let state = last_state(folder, Access::Map)?;
+    claim.check(folder, &state.origin.run)?;
+    Ok(Some(state))
 }
 
 /// Reads the run state of the last commit without writing.

@@ -41,7 +41,7 @@ impl StoredStart {
         let generation = store.find(None)?;
         let state = run_state_of(&store, generation)?;
         let (_, options) = options_of(&folder, &state)?;
-        let scene = scene_at(&store, generation, &state, &options, (host_mem, share))?;
+        let scene = scene_at(&store, generation, &state, &options, (host_mem, share), 0)?;
         Ok(StoredStart { folder, scene, state, _store: store })
     }
 

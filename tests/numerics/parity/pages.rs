@@ -421,12 +421,8 @@ const DIVISIONS: &str = r#"
 @group(0) @binding(1) var<storage, read> counts: array<u32>;
 @group(0) @binding(2) var<storage, read_write> quotients: array<f32>;
 @compute @workgroup_size(256)
-fn divide(
-    @builtin(workgroup_id) workgroup: vec3<u32>,
-    @builtin(num_workgroups) workgroups: vec3<u32>,
-    @builtin(local_invocation_index) lane: u32,
-) {
-    let i = linear_index(workgroup, workgroups, lane, 256u);
+fn divide(place: Place) {
+    let i = linear_index(place, 256u);
     if i < arrayLength(&sums) {
         quotients[i] = quotient(sums[i], counts[i]);
     }

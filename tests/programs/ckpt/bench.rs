@@ -100,10 +100,15 @@ impl Bench {
 
     /// The PLY of the uninterrupted run.
     pub fn alone(&self) -> Vec<u8> {
+        std::fs::read(self.run_alone(&[]).join("point_cloud.ply")).unwrap()
+    }
+
+    /// The folder of the uninterrupted run, in memory.
+    pub fn run_alone(&self, more: &[&str]) -> PathBuf {
         let out = self.path("alone");
-        let output = train(&[&[text(&self.scene), "--out", text(&out)], BUSY].concat());
+        let output = train(&[&[text(&self.scene), "--out", text(&out)], &with(more)[..]].concat());
         assert!(output.status.success(), "{}", stderr(&output));
-        std::fs::read(out.join("point_cloud.ply")).unwrap()
+        out
     }
 
     /// A run in progress.

@@ -129,10 +129,57 @@ fn a_run_and_an_export_write_the_same_spz() {
     let transform: Value = serde_json::from_slice(&want[1]).unwrap();
     assert_eq!(transform["up_in_file"], serde_json::json!([0.0, 1.0, 0.0]), "{transform}");
     let said = failed(&["export", text(&out), "--out", text(&bench.path("a.splat"))]);
-    assert!(said.contains("let it end in .ply or .spz") && !bench.path("a.splat").exists(), "{said}");
+    assert!(
+        said.contains("let it end in .ply or .spz, or name a folder's lod-meta.json")
+            && !bench.path("a.splat").exists(),
+        "{said}"
+    );
     // A new start in the folder removes the files of the run before.
     bench.go_on(&[]);
     assert!(std::fs::read(out.join(files[0])).unwrap() != want[0], "the end of the run wrote its own");
+}
+
+/// Every file of a folder of SOGs, with that of the transform beside it.
+fn sog_files(sog: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut found = vec![sog.with_extension("transform.json")];
+    for entry in std::fs::read_dir(sog).unwrap().map(|entry| entry.unwrap().path()) {
+        match entry.is_dir() {
+            true => found.extend(std::fs::read_dir(entry).unwrap().map(|entry| entry.unwrap().path())),
+            false => found.push(entry),
+        }
+    }
+    found.sort();
+    let parent = sog.parent().unwrap();
+    found.into_iter().map(|path| (path.strip_prefix(parent).unwrap().into(), std::fs::read(path).unwrap())).collect()
+}
+
+#[test]
+fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
+    let bench = Bench::new();
+    let sog = "point_cloud_sog";
+    let want = sog_files(&bench.run_alone(&["--export", "sog"]).join(sog));
+    let out = bench.stopped(&["--export", "sog"]);
+    let early = sog_files(&out.join(sog));
+    let said = ckpt(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json"))]);
+    assert!(said.contains("levels of "), "{said}");
+    assert!(sog_files(&bench.path(sog)) == early, "the export is not what the trainer wrote");
+    let said = failed(&["export", text(&out), "--out", "lod-meta.json"]);
+    assert!(said.contains("city/lod-meta.json"), "{said}");
+    let said =
+        failed(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json")), "--host-mem", "90MiB"]);
+    assert!(said.contains("give at least"), "the writer's memory counts: {said}");
+    bench.go_on(&[]);
+    assert!(sog_files(&out.join(sog)) == want, "the resumed run ended with other files");
+    // A new run in the folder removes them, and nothing of others.
+    std::fs::write(out.join(sog).join("mine.txt"), b"").unwrap();
+    let again =
+        |flags: &[&str]| train(&[&[text(&bench.path("scene")), "--out", text(&out), "--overwrite"], flags].concat());
+    let flags = ["--steps", "1", "--quiet", "--device", "cpu"];
+    let said = stderr(&again(&flags));
+    assert!(said.contains("mine.txt"), "{said}");
+    std::fs::remove_file(out.join(sog).join("mine.txt")).unwrap();
+    let output = again(&flags);
+    assert!(output.status.success() && !out.join(sog).exists(), "{}", stderr(&output));
 }
 
 #[test]

@@ -94,13 +94,26 @@ fn more_steps_keep_the_schedule() {
         assert!(ply(&out) == planned, "{place:?}: the scene is another when told before the end");
         let psnr = |out: &Path| summary(out)["test"]["psnr"].as_f64().unwrap();
         let before = psnr(&out);
-        // The checkpoint is gone: the run goes on from its PLY, and its earlier result stays.
+        // The checkpoint is gone: the run goes on from its PLY, which stays in its place until the new one replaces it.
+        let lines = logged(&out).len();
+        let mut child = bench.go_on(&[&SELDOM[..], &["--steps", "100000", "--log-every", "1"]].concat());
+        bench.wait_for_lines(&mut child, lines + 4);
+        assert!(ply(&out) == planned, "{place:?}: a viewer finds no result meanwhile");
+        signal(&mut child, "KILL");
+        ended(child);
+        assert!(ply(&out) == planned);
+        assert!(std::fs::read(out.join("point_cloud_000260.ply")).unwrap() == planned);
         let said = stderr(&ended(bench.go_on(&["--steps", "300"])));
         assert!(said.contains("goes on from its Gaussians") && said.contains("Adam's moments are lost"), "{said}");
         let done = summary(&out);
         assert_eq!((done["steps"].as_u64(), done["finished"].as_bool()), (Some(300), Some(true)), "{said}");
         assert!(std::fs::read(out.join("point_cloud_000260.ply")).unwrap() == planned && ply(&out) != planned);
-        assert!(done["train_seconds"].as_f64().unwrap() > 0.0 && logged(&out).last() == Some(&300));
+        let steps = logged(&out);
+        assert!(done["train_seconds"].as_f64().unwrap() > 0.0 && steps.last() == Some(&300));
+        assert!(
+            steps.windows(2).all(|pair| pair[0] <= pair[1]),
+            "lines of the attempt that was killed stay: {steps:?}"
+        );
         // 40 steps with fresh moments; a start from points is some 5 dB lower.
         assert!(psnr(&out) > before - 1.5, "{} after {before}", psnr(&out));
         std::fs::remove_dir_all(&out).unwrap();

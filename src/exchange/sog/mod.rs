@@ -1,0 +1,27 @@
+//! Streamed SOG, version 1, of SOGs of version 2: a folder that viewers load in parts, near parts in detail and far ones coarsely
+//! (`developer.playcanvas.com`, "The SOG Format" and "The Streamed SOG Format").
+//!
+//! Not here: reading it.
+//!
+//! `lod-meta.json` holds a tree of boxes. A leaf has its rows once in every level, as a range of a SOG: a folder of pictures, whose
+//! pixels are the values of one Gaussian each. The axes are those of a PLY.
+//!
+//! | file | task |
+//! | --- | --- |
+//! | `write` | the sink: groups, leaves, files of each level |
+//! | `order` | neighbours in space next to each other |
+//! | `merge`, `symmetric` | coarser levels |
+//! | `chunk`, `codebook`, `palette` | one SOG: pictures, values that stand for others |
+//! | `tree` | `lod-meta.json` |
+
+mod chunk;
+mod codebook;
+mod merge;
+mod order;
+mod palette;
+mod symmetric;
+mod tree;
+mod write;
+
+pub use tree::TREE_FILE;
+pub use write::{SogWriter, folder_of_tree, is_of_sog, memory_bytes};

@@ -1,0 +1,284 @@
+//! Writes Gaussians to a folder of SOGs with levels of detail.
+//!
+//! Rows are taken in groups, in the order in which they come. A group is put in order of space and cut into leaves; its rows are
+//! one file of the finest level. Each leaf is merged to a fourth, a sixteenth and a sixty-fourth of its rows, which gather in
+//! the open file of their level. Giants, whose boxes would make every leaf near, are kept apart and always shown.
+//!
+//! Invariants: 1. memory is bounded by [`memory_bytes`] for any number of rows; 2. the bytes depend on the rows, their order and
+//! the metadata alone, not on the parts in which rows come; 3. the folder appears as a whole; 4. every name in it is one of ours.
+
+use super::chunk::{META_FILE, PICTURES, write_chunk};
+use super::merge::{MERGE_ROW_BYTES, merged};
+use super::order::{leaves, order};
+use super::symmetric::Symmetric;
+use super::tree::{Leaf, Part, TREE_FILE, text};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_folder::PartFolder;
+use crate::exchange::frames::{ExportRow, ExportRows};
+use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::sink::{GaussianSink, LEVELS_MAX, LevelCounts, Written};
+use crate::scene::columns::Columns;
+use rayon::prelude::*;
+use std::path::{Component, Path, PathBuf};
+
+/// Levels, the finest counted.
+const LEVELS: usize = LEVELS_MAX;
+/// Rows of a level for each row of the next one.
+const COARSER: usize = 4;
+/// Rows of a group, which is a file of the finest level.
+const GROUP_ROWS: usize = 1 << 16;
+/// Most rows of a leaf.
+const LEAF_ROWS: usize = 1 << 13;
+/// Rows at which the open file of a coarser level is full.
+const FULL_ROWS: usize = 1 << 15;
+/// Most giants. Further ones stay in their leaves.
+const GIANTS_MAX: usize = 1 << 16;
+/// Sigma of a giant, over the extent of the cameras.
+const GIANT_RADII: f64 = 0.25;
+/// Sigmas of a Gaussian inside the box of its leaf.
+const BOX_SIGMAS: f64 = 2.0;
+/// Folder of the giants.
+const GIANTS_FOLDER: &str = "env";
+
+/// Most memory that a writer takes beside the rows that it is given, bytes.
+pub fn memory_bytes() -> u64 {
+    let group_leaves = GROUP_ROWS / LEAF_ROWS;
+    let coarser = GROUP_ROWS / 2 + (LEVELS - 1) * (FULL_ROWS + LEAF_ROWS);
+    // A file's harmonics twice, pictures, codebooks.
+    let encoding = GROUP_ROWS * 500;
+    let merging = rayon::current_num_threads().min(group_leaves) * LEAF_ROWS * MERGE_ROW_BYTES;
+    let rows = GROUP_ROWS + coarser + GIANTS_MAX;
+    (rows * size_of::<ExportRow>() + encoding.max(merging) + (4 << 20)) as u64
+}
+
+/// The folder that a path of a `lod-meta.json` names.
+///
+/// # Errors
+/// The path names no folder of its own.
+pub fn folder_of_tree(path: &Path) -> InputResult<&Path> {
+    let folder = path.parent().unwrap_or(Path::new(""));
+    match folder.components().next_back() {
+        Some(Component::Normal(_)) => Ok(folder),
+        _ => {
+            let problem = format!("{TREE_FILE} needs a folder of its own");
+            Err(InputError::new(path, problem, format!("name a new folder: city/{TREE_FILE}")))
+        }
+    }
+}
+
+/// Whether a writer makes a file of this path inside its folder.
+pub fn is_of_sog(inside: &Path) -> bool {
+    let names: Vec<&str> = inside.iter().filter_map(|name| name.to_str()).collect();
+    let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    let is_level = |folder: &str| folder.split_once('_').is_some_and(|(a, b)| is_number(a) && is_number(b));
+    match names[..] {
+        [file] => file == TREE_FILE,
+        [folder, file] => {
+            (folder == GIANTS_FOLDER || is_level(folder)) && (file == META_FILE || PICTURES.contains(&file))
+        }
+        _ => false,
+    }
+}
+
+/// The file of a level that is being filled.
+#[derive(Default)]
+struct OpenFile {
+    rows: Vec<ExportRow>,
+    number: usize,
+}
+
+/// Writes a folder in parts.
+pub struct SogWriter {
+    folder: PartFolder,
+    path: PathBuf,
+    to_file: ExportRows,
+    sh_degree: u8,
+    giant_log_scale: f64,
+    group: Vec<ExportRow>,
+    giants: Vec<ExportRow>,
+    open: [OpenFile; LEVELS],
+    /// Files of each level so far, for their names.
+    files_of: [usize; LEVELS],
+    files: Vec<String>,
+    leaves: Vec<Leaf>,
+    rows: [u64; LEVELS],
+    given: u64,
+}
+
+impl SogWriter {
+    /// Starts the folder `path` of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows:
+    /// both have the same axes.
+    ///
+    /// # Errors
+    /// The disk fails, or `path` names a folder with files of others.
+    pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SogWriter> {
+        let to_file = ExportRows::new(meta);
+        let unit = if to_file.frame() == ExportFrame::Local { meta.scale } else { 1.0 };
+        Ok(SogWriter {
+            folder: PartFolder::create(path, is_of_sog)?,
+            path: path.to_path_buf(),
+            giant_log_scale: libm::log(GIANT_RADII * meta.scene_radius / unit),
+            to_file,
+            sh_degree,
+            group: Vec::new(),
+            giants: Vec::new(),
+            open: std::array::from_fn(|_| OpenFile::default()),
+            files_of: [0; LEVELS],
+            files: Vec::new(),
+            leaves: Vec::new(),
+            rows: [0; LEVELS],
+            given: 0,
+        })
+    }
+
+    fn is_giant(&self, row: &ExportRow) -> bool {
+        let longest = row.log_scales.iter().fold(f32::NEG_INFINITY, |most, &s| most.max(s));
+        f64::from(longest) > self.giant_log_scale
+    }
+
+    /// The number of a new file of a level.
+    fn new_file(&mut self, level: usize) -> usize {
+        self.files.push(format!("{level}_{}/{META_FILE}", self.files_of[level]));
+        self.files_of[level] += 1;
+        self.files.len() - 1
+    }
+
+    /// Writes a file and empties `rows`.
+    fn write_file(&mut self, number: usize, rows: &mut Vec<ExportRow>) -> InputResult<()> {
+        let inside = Path::new(&self.files[number]).parent().unwrap_or(Path::new("")).to_path_buf();
+        write_chunk(&mut self.folder, &inside, rows, self.sh_degree)?;
+        rows.clear();
+        Ok(())
+    }
+
+    /// Makes leaves of the group, and a file of its rows.
+    fn close_group(&mut self) -> InputResult<()> {
+        if self.group.is_empty() {
+            return Ok(());
+        }
+        let positions: Vec<[f64; 3]> = self.group.iter().map(|row| row.position.map(f64::from)).collect();
+        let order = order(&positions);
+        let mut ordered: Vec<ExportRow> = order.iter().map(|&row| self.group[row as usize]).collect();
+        // Allocated again for the next group: rows, their order and what comes of them would be too much at once.
+        self.group = Vec::new();
+        let file = self.new_file(0);
+        let ranges = leaves(ordered.len(), LEAF_ROWS);
+        let coarser: Vec<Vec<Vec<ExportRow>>> =
+            ranges.par_iter().map(|range| coarser_levels(&ordered[range.clone()])).collect();
+        for (range, coarser) in ranges.into_iter().zip(coarser) {
+            let mut parts = vec![Part { file, first: range.start, rows: range.len() }];
+            for (level, rows) in (1..).zip(coarser) {
+                parts.push(self.add(level, rows)?);
+            }
+            parts.iter().zip(&mut self.rows).for_each(|(part, sum)| *sum += part.rows as u64);
+            let (low, high) = box_of(&ordered[range]);
+            self.leaves.push(Leaf { low, high, parts });
+        }
+        self.write_file(file, &mut ordered)
+    }
+
+    /// Adds rows of a leaf to the open file of a level.
+    fn add(&mut self, level: usize, rows: Vec<ExportRow>) -> InputResult<Part> {
+        if self.open[level].rows.is_empty() {
+            self.open[level].number = self.new_file(level);
+        }
+        let open = &mut self.open[level];
+        open.rows.reserve_exact((FULL_ROWS + LEAF_ROWS).saturating_sub(open.rows.len()));
+        let part = Part { file: open.number, first: open.rows.len(), rows: rows.len() };
+        open.rows.extend(rows);
+        if open.rows.len() >= FULL_ROWS {
+            self.close_file(level)?;
+        }
+        Ok(part)
+    }
+
+    fn close_file(&mut self, level: usize) -> InputResult<()> {
+        let mut rows = std::mem::take(&mut self.open[level].rows);
+        if !rows.is_empty() {
+            self.write_file(self.open[level].number, &mut rows)?;
+        }
+        self.open[level].rows = rows;
+        Ok(())
+    }
+}
+
+impl GaussianSink for SogWriter {
+    fn write(&mut self, columns: &Columns) -> InputResult<()> {
+        if columns.sh_degree > self.sh_degree {
+            return Err(InputError::new(&self.path, "rows with more bands than announced", "report this as a bug"));
+        }
+        for row in 0..columns.rows() {
+            self.given += 1;
+            let Some(row) = self.to_file.row(columns, row) else { continue };
+            if self.giants.len() < GIANTS_MAX && self.is_giant(&row) {
+                self.giants.push(row);
+                continue;
+            }
+            // Doubling would end at up to twice as many.
+            if self.group.is_empty() {
+                self.group.reserve_exact(GROUP_ROWS);
+            }
+            self.group.push(row);
+            if self.group.len() == GROUP_ROWS {
+                self.close_group()?;
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(mut self: Box<Self>) -> InputResult<Written> {
+        // A viewer needs a leaf.
+        if self.group.is_empty() && self.leaves.is_empty() {
+            self.group = std::mem::take(&mut self.giants);
+        }
+        if self.group.is_empty() && self.leaves.is_empty() {
+            let problem = format!("none of the {} Gaussians is finite, so there is no row to write", self.given);
+            let remedy = "the training diverged or lost all Gaussians: lower the rates";
+            return Err(InputError::new(&self.path, problem, remedy));
+        }
+        self.close_group()?;
+        for level in 1..LEVELS {
+            self.close_file(level)?;
+        }
+        let giants = self.giants.len() as u64;
+        if giants > 0 {
+            write_chunk(&mut self.folder, Path::new(GIANTS_FOLDER), &self.giants, self.sh_degree)?;
+        }
+        let environment = format!("{GIANTS_FOLDER}/{META_FILE}");
+        let tree = text(&mut self.leaves, &self.files, (giants > 0).then_some(&environment), LEVELS);
+        self.folder.write(Path::new(TREE_FILE), tree.as_bytes())?;
+        let (bytes, rows) = (self.folder.bytes(), self.rows[0] + giants);
+        self.folder.finish()?;
+        Ok(Written {
+            frame: self.to_file.frame(),
+            rows,
+            skipped: self.given - rows,
+            bytes,
+            levels: Some(LevelCounts { rows: self.rows, always_shown: giants }),
+        })
+    }
+}
+
+/// The rows of a leaf in the levels after the finest.
+fn coarser_levels(rows: &[ExportRow]) -> Vec<Vec<ExportRow>> {
+    let mut levels: Vec<Vec<ExportRow>> = Vec::with_capacity(LEVELS - 1);
+    for _ in 1..LEVELS {
+        let finer = levels.last().map_or(rows, Vec::as_slice);
+        levels.push(merged(finer, finer.len().div_ceil(COARSER)));
+    }
+    levels
+}
+
+fn box_of(rows: &[ExportRow]) -> ([f64; 3], [f64; 3]) {
+    let mut bound = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+    for row in rows {
+        let variances = row.log_scales.map(|s| libm::exp(2.0 * f64::from(s)));
+        let spread = Symmetric::turned(row.quat.map(f64::from), variances).diagonal();
+        for i in 0..3 {
+            let (at, reach) = (f64::from(row.position[i]), BOX_SIGMAS * libm::sqrt(spread[i].max(0.0)));
+            bound.0[i] = bound.0[i].min(at - reach);
+            bound.1[i] = bound.1[i].max(at + reach);
+        }
+    }
+    bound
+}
