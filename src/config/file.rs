@@ -174,6 +174,10 @@ config_keys! {
         /// Train without the views whose photo contradicts the scene (see the log and the report), as long as it does: wrong
         /// poses, photos of another place. Such views are named with and without this key
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
+        /// Train without the parts of photos that show what the scene does not, as long as they do: cars, people, shadows that
+        /// moved. Masked are blocks of a 64th of the photo's longer side, at most a quarter of a photo, from a tenth of the
+        /// run on (step 500 at the latest). Masks of your own remain better: see masks/
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }

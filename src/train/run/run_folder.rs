@@ -295,6 +295,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         outlier_views: Vec::new(),
+        masked_share: trainer.masked_share(),
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
         tiers: trainer.tier_traffic(),
