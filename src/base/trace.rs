@@ -72,17 +72,17 @@ pub fn start(path: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Ends the trace; nothing without one.
+/// Ends the trace; nothing without one. A trace without a span leaves no file: the run was refused, and its next attempt may take the name.
 ///
 /// # Errors
 /// A part of the trace could not be written.
 pub fn finish() -> InputResult<()> {
     IS_ON.store(false, Ordering::Release);
     let Some(mut trace) = sink().take() else { return Ok(()) };
-    let end = if trace.is_first { "[]\n" } else { "\n]\n" };
     let written = match trace.failed.take() {
         Some(error) => Err(error),
-        None => trace.file.write_all(end.as_bytes()).and_then(|()| trace.file.flush()),
+        None if trace.is_first => std::fs::remove_file(&trace.path),
+        None => trace.file.write_all(b"\n]\n").and_then(|()| trace.file.flush()),
     };
     written.map_err(|error| InputError::io(&trace.path, "writing the trace", &error))
 }
@@ -157,7 +157,7 @@ mod tests {
 
     /// One test, because a process has one trace.
     #[test]
-    fn a_trace_is_json_also_when_it_is_empty_or_cut_off() {
+    fn a_trace_is_json_and_an_empty_one_leaves_no_file() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trace.json");
         drop(span("before the trace"));
@@ -180,7 +180,7 @@ mod tests {
         assert!(error.contains("exists already") && std::fs::read(&path).unwrap() == whole, "{error}");
         start(&empty).unwrap();
         finish().unwrap();
-        assert_eq!(std::fs::read_to_string(&empty).unwrap(), "[]\n");
+        assert!(!empty.exists(), "a run that was refused leaves no trace");
         let error = start(&folder.path().join("none/trace.json")).unwrap_err().to_string();
         assert!(error.contains("none") && error.contains("remedy: check the path"), "{error}");
     }

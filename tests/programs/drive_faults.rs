@@ -35,7 +35,7 @@ use gsscale::train::run::training_loop::LoopOutputs;
 use gsscale::train::start::first_scene::Start;
 use gsscale::train::start::first_scene::dataset_print;
 use gsscale::train::state::trainer::Trainer;
-use std::io::{ErrorKind, Read};
+use std::io::{ErrorKind, Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
@@ -205,6 +205,7 @@ impl World {
             progress: &mut progress,
             stop: &stop,
             checkpoint: Some(&mut checkpoint),
+            live: None,
         };
         if let Err(error) = trainer.run(&dataset, &targets, &mut outputs) {
             self.after_failure(out, &mut trainer, &dataset, &checkpoint, &error);
@@ -563,13 +564,28 @@ fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
 fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
     let folder = TempDir::new().unwrap();
     let scene = make_scene(folder.path());
-    let Some(drive) = Small::mount(&folder.path().join("results"), 32 << 10) else { return };
+    let Some(drive) = Small::mount(&folder.path().join("results"), 4 << 20) else { return };
     let (out, spill) = (drive.0.join("out"), folder.path().join("spill"));
-    let more = ["--commit-every", "0.02", "--disk-full-wait", "0.2", "--log-every", "1", "--quiet"];
-    let all = [&args(&scene, &out, &spill)[..], &more].concat();
-    // A repeated flag is refused.
-    let at = all.iter().position(|arg| *arg == "--log-every").unwrap();
-    let output = train(&[&all[..at], &all[at + 2..]].concat());
+    let mut flags = args(&scene, &out, &spill);
+    flags.extend(["--commit-every", "0.02", "--disk-full-wait", "0.2", "--quiet"]);
+    for (usual, here) in [("7", "1"), ("60", "300")] {
+        let at = flags.iter().position(|arg| *arg == usual).unwrap();
+        flags[at] = here;
+    }
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
+    let command = command.args(&flags);
+    let child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let began = Instant::now();
+    let commits = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["commits"].as_u64();
+    let metrics = || std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
+    while !metrics().lines().filter_map(commits).any(|commits| commits > 0) {
+        assert!(began.elapsed() < Duration::from_secs(120), "the run does not commit");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    // A drive that is full at the beginning is refused.
+    let mut other = std::fs::File::create(drive.0.join("other")).unwrap();
+    while other.write_all(&[0; 4096]).is_ok() {}
+    let output = child.wait_with_output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(said.contains(&format!("the drive of {} is full", out.display())), "{said}");

@@ -212,7 +212,8 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     // Enough steps for some 900 GiB.
     let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
     let output = train(&[&[text(&scene)][..], &flags, &more].concat());
-    let said = told(&output);
+    // Long lines are folded.
+    let said = told(&output).replace("\n        ", " ");
     assert!(output.status.success(), "{said}");
     let told =
         said.split("without commits, ").nth(1).and_then(|rest| rest.split(" % of the rated").next()).expect(&said);

@@ -105,16 +105,19 @@ pub fn folded(text: &str) -> String {
     lines.join("\n")
 }
 
-/// The byte at which a line is broken: behind the last mark, or before the last bracket, that the columns hold.
+/// The byte at which a line is broken: behind the last mark, or before the last bracket, that the columns hold; inside brackets only
+/// where there is no other place.
 fn break_of(line: &str) -> Option<usize> {
-    let is_break = |at: usize| {
-        let (before, after) = (&line[..at], &line[at..]);
+    let is_break = |at: &usize| {
+        let (before, after) = line.split_at(*at);
         before.len() > INDENT.len()
             && after.starts_with(' ')
             && (before.ends_with([',', ';', ':']) || after.starts_with(" ("))
     };
+    let is_inside = |at: &usize| line[..*at].matches('(').count() > line[..*at].matches(')').count();
     let ends = line.char_indices().take(COLUMNS + 1).map(|(at, _)| at);
-    ends.filter(|&at| is_break(at)).last()
+    let breaks: Vec<usize> = ends.filter(is_break).collect();
+    breaks.iter().rfind(|at| !is_inside(at)).or(breaks.last()).copied()
 }
 
 /// The lines about drives.
