@@ -31,7 +31,7 @@
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
-//! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose |
+//! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
 //! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |

@@ -8,6 +8,7 @@ use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::progress::Count;
@@ -17,6 +18,7 @@ use gsscale::train::run::request::{RunOutcome, RunRequest};
 use gsscale::train::run::restart::go_on;
 use gsscale::train::run::resume::{ResumeRequest, resume};
 use gsscale::train::run::resume_plan::describe_resume;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -78,6 +80,10 @@ struct Args {
     /// open: uploads, submissions, waits, read-backs, pages, events
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
+    /// Show the run while it trains, on a page with its curves and a picture from a camera that you move: a port of this machine
+    /// (8080), or an address (0.0.0.0:8080 lets the network see it)
+    #[arg(long, value_name = "ADDRESS", value_parser = parse_address)]
+    serve: Option<SocketAddr>,
     #[command(flatten)]
     keys: TrainOverrides,
 }
@@ -118,10 +124,20 @@ fn list_devices() {
     gsscale::say!("cpu: the CPU renderer");
 }
 
+/// Starts the page of the run and says where it is.
+fn begin_live(address: Option<SocketAddr>) -> InputResult<Option<Live>> {
+    let live = address.map(Live::begin).transpose()?;
+    if let Some(live) = &live {
+        eprintln!("live page: http://{}/", live.address());
+    }
+    Ok(live)
+}
+
 fn start(args: Args) -> Result<RunOutcome, TrainError> {
+    let live = begin_live(args.serve.filter(|_| !args.dry_run))?;
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
-        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet };
+        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet, live };
         if args.dry_run {
             gsscale::say!("{}", describe_resume(&request)?);
             return Ok(RunOutcome::of_nothing(request.out));
@@ -151,8 +167,8 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
     // What the run was started with is in its config.
     let (keys, accept_changes) = (TrainOverrides::default(), false);
-    let again = ResumeRequest { out: out.clone(), keys, scene: None, accept_changes, quiet };
-    go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet }), &again, args.restarts)
+    let again = ResumeRequest { out: out.clone(), keys, scene: None, accept_changes, quiet, live: live.clone() };
+    go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet, live }), &again, args.restarts)
 }
 
 /// Config of the demo: enough steps for a good picture within minutes on two cores.

@@ -5,13 +5,14 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 5 had neither outliers nor checks of growth, version 4 no appearance
-//! either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
+//! [`crate::page::format::encoding`] writes them. Version 6 had no blocks of photos, version 5 neither outliers nor checks of
+//! growth, version 4 no appearance either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
 //! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
+use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
@@ -19,10 +20,12 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 6;
-/// The version before outliers and checks of growth: the same values without these two, the last of the list.
+pub const VERSION: u32 = 7;
+/// The version before blocks of photos: the same values without these, the last of the list.
+const WITHOUT_BLOCKS: u32 = 6;
+/// The version before outliers and checks of growth: the same values without these two and what came later.
 const WITHOUT_OUTLIERS: u32 = 5;
-/// The version before appearance: the same values without appearance, outliers and checks of growth.
+/// The version before appearance: the same values without appearance and what came later.
 const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
@@ -112,6 +115,8 @@ pub struct TrainerState {
     pub outliers: ViewOutliers,
     /// What a run that decides its count knows of it.
     pub growth: GrowthState,
+    /// What is known of the blocks of photos that show what the scene does not.
+    pub blocks: BlockOutliers,
 }
 
 impl TrainerState {
@@ -123,6 +128,9 @@ impl TrainerState {
         }
         if !self.outliers.is_as_large_as(&fresh.outliers) {
             self.outliers = fresh.outliers;
+        }
+        if !self.blocks.is_as_large_as(&fresh.blocks) {
+            self.blocks = fresh.blocks;
         }
         self
     }
@@ -149,6 +157,18 @@ pub struct RunState {
     pub metrics_bytes: u64,
     /// Traffic between the tiers so far.
     pub traffic: PagerStats,
+}
+
+/// The values at the end that a state of an earlier version lacks, as those of a run without.
+fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
+    let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
+    let blocks = encoding::to_bytes(&BlockOutliers::default())?;
+    let before = match version {
+        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth))?,
+        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth))?,
+        _ => Vec::new(),
+    };
+    Ok([before, blocks].concat())
 }
 
 /// Why bytes are not the state of a run.
@@ -201,14 +221,8 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
-            WITHOUT_OUTLIERS => {
-                let none = encoding::to_bytes(&(ViewOutliers::default(), GrowthState::default()))?;
-                RunState::decode(&[body, &none].concat())?
-            }
-            WITHOUT_APPEARANCE => {
-                let none = (AppearanceState::default(), ViewOutliers::default(), GrowthState::default());
-                let none = encoding::to_bytes(&none)?;
-                RunState::decode(&[body, &none].concat())?
+            WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
+                RunState::decode(&[body, &lacking_in(version)?].concat())?
             }
             other => return Err(RunStateError::Version(other)),
         };
@@ -221,12 +235,12 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
         ))
     }
 
@@ -236,7 +250,7 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -249,6 +263,7 @@ impl RunState {
             appearance,
             outliers,
             growth,
+            blocks,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -294,8 +309,9 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, growth, .. } = &self.trainer;
-        appearance.check().and_then(|()| outliers.check()).and_then(|()| growth.check(step)).or_else(refuse)
+        let TrainerState { appearance, outliers, growth, blocks, .. } = &self.trainer;
+        let of_photos = appearance.check().and_then(|()| outliers.check()).and_then(|()| blocks.check());
+        of_photos.and_then(|()| growth.check(step)).or_else(refuse)
     }
 }
 
@@ -305,7 +321,19 @@ mod tests {
     use super::*;
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
+    use crate::outliers::blocks::look;
     use crate::scene::events::RoundThresholds;
+    use crate::scene::image::Target;
+
+    /// Three photos, the last of which was looked at: black, while its picture is black but for one white block.
+    fn looked_at() -> BlockOutliers {
+        let photo = Target { width: 8, height: 32, rgb: vec![0; 3 * 256], mask: None };
+        let picture: Vec<f32> = (0..3 * 256).map(|i| f32::from(u8::from(i % 256 / 8 < 4 && i % 8 < 4))).collect();
+        let mut blocks = BlockOutliers::new(3);
+        blocks.learn(2, look(&[], &picture, &photo).unwrap());
+        assert!(blocks.masked_share() == Some(1.0 / 16.0));
+        blocks
+    }
 
     fn sample() -> RunState {
         let thresholds =
@@ -351,6 +379,7 @@ mod tests {
                         GrowthCheck { step: 8, gaussians: 10, lost: -0.5, pays_from: 0.5, allowed: 10 },
                     ],
                 },
+                blocks: looked_at(),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -381,12 +410,11 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_5 = TrainerState { outliers: outliers.clone(), growth: growth.clone(), ..state.trainer.clone() };
+        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..state.trainer.clone() };
+        let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        let lacking_5 = encoding::to_bytes(&(outliers.clone(), growth.clone())).unwrap();
-        let lacking_4 = encoding::to_bytes(&(AppearanceState::default(), outliers, growth)).unwrap();
-        for (version, trainer, lacking) in [(WITHOUT_OUTLIERS, of_5, lacking_5), (WITHOUT_APPEARANCE, of_4, lacking_4)]
-        {
+        for (version, trainer) in [(WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)] {
+            let lacking = lacking_in(version).unwrap();
             let without = RunState { trainer, ..state.clone() };
             let mut bytes = without.to_bytes().unwrap();
             assert!(bytes.ends_with(&lacking));

@@ -114,9 +114,9 @@ config_keys! {
         /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
         /// run keeps its first value
         [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
-        /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr where they are not given:
-        /// run-length (by --steps; the classic values from 30,000 steps on) or classic (their defaults below). A
-        /// resumed run keeps its values
+        /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
+        /// also of --scales-lr and --shn-lr, where they are not given: run-length (by --steps; the classic values from
+        /// 30,000 steps on) or classic (their defaults below). A resumed run keeps its values
         schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
         seed: u64 = 42 => Numbers;
@@ -174,6 +174,10 @@ config_keys! {
         /// Train without the views whose photo contradicts the scene (see the log and the report), as long as it does: wrong
         /// poses, photos of another place. Such views are named with and without this key
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
+        /// Train without the parts of photos that show what the scene does not, as long as they do: cars, people, shadows that
+        /// moved. Masked are blocks of a 64th of the photo's longer side, at most a quarter of a photo, from a tenth of the
+        /// run on (step 500 at the latest). Masks of your own remain better: see masks/
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }

@@ -68,6 +68,8 @@ pub struct RunOptions {
     pub appearance: AppearanceMode,
     /// Whether views that contradict the scene are left out.
     pub robust_views: bool,
+    /// Whether blocks of photos that contradict the scene are masked.
+    pub robust_pixels: bool,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
@@ -124,6 +126,7 @@ impl RunOptions {
             color_correct: config.color_correct.0,
             appearance: config.appearance,
             robust_views: config.robust_views,
+            robust_pixels: config.robust_pixels,
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),

@@ -28,7 +28,7 @@ impl TrainConfig {
     /// Sets the keys of the schedule that are not in `given` (names of fields) by `--schedule` and `--steps`.
     fn follow_length(&mut self, given: &BTreeSet<String>) {
         let lengths = match self.schedule {
-            Schedule::RunLength => Lengths::of_steps(self.steps),
+            Schedule::RunLength => Lengths::of_run(self.steps, self.strategy),
             Schedule::Classic => Lengths::CLASSIC,
         };
         let is_open = |field: &str| !given.contains(field);
@@ -47,12 +47,19 @@ impl TrainConfig {
         if is_open("means_lr") {
             self.means_lr = lengths.means_lr;
         }
+        if is_open("scales_lr") {
+            self.scales_lr = lengths.scales_lr;
+        }
+        if is_open("shn_lr") {
+            self.shn_lr = lengths.shn_lr;
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::densify::strategy::StrategyName;
 
     fn of_flags(keys: &TrainOverrides) -> TrainConfig {
         TrainConfig::of_new_run(None, keys).unwrap_or_default()
@@ -66,6 +73,22 @@ mod tests {
         let short = TrainOverrides { steps: Some(3000), ..classic };
         assert_eq!(of_flags(&short), TrainConfig { steps: 3000, ..want });
         assert_eq!(of_flags(&TrainOverrides::default()), TrainConfig::default(), "30,000 steps are the default");
+    }
+
+    #[test]
+    fn the_strategy_long_axis_has_faster_rates_in_short_runs() {
+        let long =
+            TrainOverrides { steps: Some(3000), strategy: Some(StrategyName::LongAxis), ..TrainOverrides::default() };
+        let rates = |keys: &TrainOverrides| {
+            let TrainConfig { scales_lr, shn_lr, .. } = of_flags(keys);
+            [scales_lr, shn_lr]
+        };
+        let TrainConfig { scales_lr, shn_lr, .. } = TrainConfig::default();
+        assert_eq!(rates(&long), [3.0 * scales_lr, 3.0 * shn_lr]);
+        assert_eq!(rates(&TrainOverrides { scales_lr: Some(1e-3), ..long.clone() }), [1e-3, 3.0 * shn_lr]);
+        let same = [scales_lr, shn_lr];
+        assert_eq!(rates(&TrainOverrides { schedule: Some(Schedule::Classic), ..long.clone() }), same);
+        assert_eq!(rates(&TrainOverrides { strategy: None, ..long }), same);
     }
 
     #[test]

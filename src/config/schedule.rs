@@ -12,20 +12,23 @@
 //! | `refine-every` | a thirtieth of the steps, at least 10 | 3,000 steps |
 //! | `refine-stop` | four fifths of the steps | 18,750 steps |
 //! | `means-lr` | times the square root of 30,000 / steps, at most times 3 | 30,000 steps |
+//! | `scales-lr` and `shn-lr`, with the strategy `long-axis` | times the same factor | 30,000 steps |
 //!
-//! The factor of the rate has a reason: a value whose gradients have changing signs moves like a random walk under
+//! The factor of the rates has a reason: a value whose gradients have changing signs moves like a random walk under
 //! Adam, as far as its rate times the square root of the steps. The factor keeps this distance. The limit of 3 is the
-//! factor that was measured at 3,000 steps. `reset-every` stays as it is, because opacities take a number of steps to
-//! recover, not a share; `refine-stop` ends resets too, and none comes shortly before the end of a run
+//! largest factor that was measured (`benches/RESULTS.md`). `reset-every` stays as it is, because opacities take a number
+//! of steps to recover, not a share; `refine-stop` ends resets too, and none comes shortly before the end of a run
 //! ([`crate::densify::default`]).
 //!
 //! Not here: which keys are given ([`super::new_run`]).
 //!
 //! Invariants: 1. at 30,000 steps and more every value is the classic one; 2. no value jumps between lengths.
 
+use crate::densify::strategy::StrategyName;
+
 /// Steps for which the classic values were made.
 const CLASSIC_STEPS: u32 = 30_000;
-/// Largest factor of the learning rate of positions.
+/// Largest factor of a learning rate.
 const RATE_FACTOR_MOST: f64 = 3.0;
 /// Fewest steps between rounds that follow from the number of steps.
 const REFINE_EVERY_LEAST: u32 = 10;
@@ -52,23 +55,37 @@ pub struct Lengths {
     pub refine_stop: u32,
     /// Learning rate of positions, times the scene scale.
     pub means_lr: f64,
+    /// Learning rate of log-scales.
+    pub scales_lr: f64,
+    /// Learning rate of the higher SH bands.
+    pub shn_lr: f64,
 }
 
 impl Lengths {
     /// The values for 30,000 steps.
-    pub const CLASSIC: Lengths =
-        Lengths { sh_every: 1000, refine_start: 500, refine_every: 100, refine_stop: 15_000, means_lr: 1.6e-4 };
+    pub const CLASSIC: Lengths = Lengths {
+        sh_every: 1000,
+        refine_start: 500,
+        refine_every: 100,
+        refine_stop: 15_000,
+        means_lr: 1.6e-4,
+        scales_lr: 5e-3,
+        shn_lr: 2.5e-3 / 20.0,
+    };
 
-    /// The values of a run of this many steps.
-    pub fn of_steps(steps: u32) -> Lengths {
+    /// The values of a run of this many steps with this strategy.
+    pub fn of_run(steps: u32, strategy: StrategyName) -> Lengths {
         let classic = Lengths::CLASSIC;
         let factor = (f64::from(CLASSIC_STEPS) / f64::from(steps.max(1))).sqrt().clamp(1.0, RATE_FACTOR_MOST);
+        let of_strategy = if strategy == StrategyName::LongAxis { factor } else { 1.0 };
         Lengths {
             sh_every: (steps / 10).clamp(1, classic.sh_every),
             refine_start: (steps / 6).min(classic.refine_start),
             refine_every: (steps / 30).clamp(REFINE_EVERY_LEAST, classic.refine_every),
             refine_stop: (u64::from(steps) * 4 / 5).min(u64::from(classic.refine_stop)) as u32,
             means_lr: classic.means_lr * factor,
+            scales_lr: classic.scales_lr * of_strategy,
+            shn_lr: classic.shn_lr * of_strategy,
         }
     }
 }
@@ -80,7 +97,9 @@ mod tests {
     #[test]
     fn long_runs_keep_the_classic_values_and_short_runs_follow_their_length() {
         for steps in [30_000, 30_001, 200_000, u32::MAX] {
-            assert_eq!(Lengths::of_steps(steps), Lengths::CLASSIC);
+            for strategy in [StrategyName::Default, StrategyName::LongAxis, StrategyName::None] {
+                assert_eq!(Lengths::of_run(steps, strategy), Lengths::CLASSIC);
+            }
         }
         let of = |sh_every, refine_start, refine_every, refine_stop| Lengths {
             sh_every,
@@ -88,18 +107,25 @@ mod tests {
             refine_every,
             refine_stop,
             means_lr: 3.0 * 1.6e-4,
+            ..Lengths::CLASSIC
         };
-        assert_eq!(Lengths::of_steps(3000), of(300, 500, 100, 2400));
-        assert_eq!(Lengths::of_steps(300), of(30, 50, 10, 240));
+        for (steps, want) in [(3000, of(300, 500, 100, 2400)), (300, of(30, 50, 10, 240))] {
+            assert_eq!(Lengths::of_run(steps, StrategyName::Default), want);
+            let faster = Lengths { scales_lr: 3.0 * want.scales_lr, shn_lr: 3.0 * want.shn_lr, ..want };
+            assert_eq!(Lengths::of_run(steps, StrategyName::LongAxis), faster);
+        }
     }
 
     #[test]
     fn nothing_jumps_between_lengths() {
-        let mut last = Lengths::of_steps(1);
+        let mut last = Lengths::of_run(1, StrategyName::LongAxis);
         for steps in (2..32_000).step_by(37) {
-            let now = Lengths::of_steps(steps);
+            let now = Lengths::of_run(steps, StrategyName::LongAxis);
             // 37 steps more move no length by more than that, and no rate by more than 1 %.
-            assert!(now.means_lr <= last.means_lr && now.means_lr > 0.99 * last.means_lr, "{steps}");
+            let rates = |of: &Lengths| [of.means_lr, of.scales_lr, of.shn_lr];
+            for (now, last) in rates(&now).into_iter().zip(rates(&last)) {
+                assert!(now <= last && now > 0.99 * last, "{steps}");
+            }
             for (now, last) in [
                 (now.sh_every, last.sh_every),
                 (now.refine_start, last.refine_start),

@@ -1,5 +1,6 @@
 //! Outliers: what in the photos contradicts the rest of the scene.
 //!
+//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks.
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
 //! Invariants: 1. every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
@@ -8,4 +9,6 @@
 //!
 //! Not here: which step leaves out what (`train`), and the bytes of a commit (`checkpoint`).
 
+pub mod blocks;
+pub mod residuals;
 pub mod views;

@@ -47,7 +47,7 @@ pub enum RunFile {
     SavedPlys,
     /// A folder of event files; other files in it are not ours.
     Events(&'static str),
-    /// A folder that `exchange::sog` writes; with files of others in it, it stays and a run fails.
+    /// A folder that `exchange::sog` writes. With files of others in it nothing of a run is removed.
     Sog(&'static str),
     /// A folder tree of PNG files; other files in it are not ours.
     Pictures(&'static str),

@@ -49,6 +49,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     }
     add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
     add_outliers(&mut page, &summary);
+    add_masked_share(&mut page, &summary);
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, folder, progress)?;
     page.heading("Config");
@@ -302,6 +303,18 @@ fn add_outliers(page: &mut Page, summary: &Value) {
             ("", &|view| Cell::text(state(view))),
         ],
     );
+}
+
+/// How much of the photos is masked because it shows what the scene does not, if the run masks such blocks.
+fn add_masked_share(page: &mut Page, summary: &Value) {
+    let Some(share) = summary["masked_share"].as_f64() else { return };
+    page.heading("Parts of photos that contradict the scene");
+    page.paragraph(&format!(
+        "At the end, {:.1} % of the area of the training photos did not count (--robust-pixels), because it differs from the \
+         pictures as cars, people or shadows that moved do. Much more than such things take suggests wrong poses or changing \
+         exposures.",
+        100.0 * share
+    ));
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

@@ -21,6 +21,11 @@ impl PageBounds {
     /// Bounds without rows: no view sees them.
     pub const EMPTY: PageBounds = PageBounds { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3], sigma_max: 0.0 };
 
+    /// Centre of the box, local frame.
+    pub fn centre(&self) -> [f32; 3] {
+        std::array::from_fn(|i| 0.5 * (self.lo[i] + self.hi[i]))
+    }
+
     /// Whether the page has no rows.
     pub fn is_empty(&self) -> bool {
         self.lo[0] > self.hi[0]

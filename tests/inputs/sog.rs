@@ -131,7 +131,7 @@ fn tree(sog: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(sog.join("lod-meta.json")).unwrap()).unwrap()
 }
 
-/// The part of a row at `step` distances.
+/// Half of the distance between the values of a codebook around `value`.
 fn half_gap(book: &[f64], value: f64) -> f64 {
     let above = book.partition_point(|&v| v < value).clamp(1, book.len() - 1);
     0.5 * (book[above] - book[above - 1])
@@ -211,14 +211,20 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-/// Leaves: least and largest corner, and file, offset and count in each level.
-fn leaves(node: &Value, found: &mut Vec<([Vec<f64>; 2], Vec<[usize; 3]>)>) {
-    let bound = ["min", "max"].map(|corner| numbers(&node["bound"][corner]));
+struct Leaf {
+    low: Vec<f64>,
+    high: Vec<f64>,
+    /// File, offset and count in each level.
+    parts: Vec<[usize; 3]>,
+}
+
+fn leaves(node: &Value, found: &mut Vec<Leaf>) {
+    let [low, high] = ["min", "max"].map(|corner| numbers(&node["bound"][corner]));
     if let Some(children) = node["children"].as_array() {
         for child in children {
             for i in 0..3 {
-                assert!(child["bound"]["min"][i].as_f64().unwrap() >= bound[0][i]);
-                assert!(child["bound"]["max"][i].as_f64().unwrap() <= bound[1][i]);
+                assert!(child["bound"]["min"][i].as_f64().unwrap() >= low[i]);
+                assert!(child["bound"]["max"][i].as_f64().unwrap() <= high[i]);
             }
             leaves(child, found);
         }
@@ -229,7 +235,7 @@ fn leaves(node: &Value, found: &mut Vec<([Vec<f64>; 2], Vec<[usize; 3]>)>) {
         let lod = &lods[&level.to_string()];
         ["file", "offset", "count"].map(|key| lod[key].as_u64().unwrap() as usize)
     };
-    found.push((bound, (0..lods.len()).map(part).collect()));
+    found.push(Leaf { low, high, parts: (0..lods.len()).map(part).collect() });
 }
 
 fn part_of(columns: &Columns, rows: std::ops::Range<usize>) -> Columns {
@@ -265,7 +271,7 @@ fn leaves_cover_every_level_and_bytes_do_not_depend_on_parts_or_threads() {
     leaves(&tree["tree"], &mut found);
     let mut taken: Vec<Vec<(usize, usize)>> = vec![Vec::new(); chunks.len()];
     let mut counts = vec![0; tree["lodLevels"].as_u64().unwrap() as usize];
-    for ([low, high], parts) in &found {
+    for Leaf { low, high, parts } in &found {
         assert_eq!(parts.len(), counts.len());
         for (level, &[file, first, rows]) in parts.iter().enumerate() {
             assert!(names[file].starts_with(&format!("{level}_")) && rows > 0);
@@ -295,7 +301,7 @@ fn leaves_cover_every_level_and_bytes_do_not_depend_on_parts_or_threads() {
 }
 
 /// Merging keeps the weighted means and colours of a leaf, where opacities are not cut.
-fn check_levels(found: &[([Vec<f64>; 2], Vec<[usize; 3]>)], chunks: &[Chunk]) {
+fn check_levels(found: &[Leaf], chunks: &[Chunk]) {
     let sums = |&[file, first, rows]: &[usize; 3]| {
         let mut sums = [0.0; 7];
         for row in &chunks[file].rows[first..first + rows] {
@@ -307,7 +313,7 @@ fn check_levels(found: &[([Vec<f64>; 2], Vec<[usize; 3]>)], chunks: &[Chunk]) {
         }
         sums
     };
-    for ([low, high], parts) in found {
+    for Leaf { low, high, parts } in found {
         let levels: Vec<[f64; 7]> = parts.iter().map(sums).collect();
         for level in &levels[1..] {
             for i in 1..7 {

@@ -205,6 +205,7 @@ impl World {
             progress: &mut progress,
             stop: &stop,
             checkpoint: Some(&mut checkpoint),
+            live: None,
         };
         if let Err(error) = trainer.run(&dataset, &targets, &mut outputs) {
             self.after_failure(out, &mut trainer, &dataset, &checkpoint, &error);

@@ -34,6 +34,7 @@ mod real_scenes;
 mod report;
 #[cfg(unix)]
 mod resume;
+mod serve;
 mod sweeps;
 mod tiers;
 mod train;

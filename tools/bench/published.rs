@@ -209,6 +209,7 @@ fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<
         dry_run: args.dry_run,
         existing: if args.overwrite { Existing::Overwrite } else { Existing::Refuse },
         quiet: args.quiet,
+        live: None,
     })?;
     if outcome.exit_code == 0 {
         return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));

@@ -12,6 +12,8 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::load_options;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
 use gsscale::dataset::loader::Dataset;
+use gsscale::densify::long_axis::GrowthScore;
+use gsscale::densify::strategy::StrategyName;
 use gsscale::render::color_correct::ColorCorrect;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::successful_run;
@@ -56,11 +58,11 @@ const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
     ("poses005", Disturbance::PoseNoise { share: 0.0005 }, None),
     ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(leave_out_views)),
     ("jpeg20", Disturbance::Jpeg { quality: 20 }, None),
-    ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, None),
+    ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, Some(mask_blocks)),
     ("boxes-masked", Disturbance::Boxes { count: 20, are_masked: true }, None),
     ("third", Disturbance::FewPhotos { one_in: 3 }, None),
-    ("points10", Disturbance::FewPoints { one_in: 10 }, None),
-    ("points-random", Disturbance::RandomPoints, None),
+    ("points10", Disturbance::FewPoints { one_in: 10 }, Some(grow_from_few)),
+    ("points-random", Disturbance::RandomPoints, Some(grow_from_few)),
     ("blurred10", Disturbance::Blurred { one_in: 10 }, Some(leave_out_views)),
 ];
 
@@ -76,9 +78,20 @@ fn leave_out_views(config: &mut TrainConfig) {
     config.robust_views = true;
 }
 
+fn mask_blocks(config: &mut TrainConfig) {
+    config.robust_pixels = true;
+}
+
+/// Growth where the error is large, and positions that move ten times as fast.
+fn grow_from_few(config: &mut TrainConfig) {
+    (config.strategy, config.growth_score) = (StrategyName::LongAxis, GrowthScore::Mixed);
+    config.means_lr *= 10.0;
+}
+
 fn all_remedies(config: &mut TrainConfig) {
     correct_exposure(config);
     leave_out_views(config);
+    mask_blocks(config);
 }
 
 /// Disturbs a scene in the ways of real captures, trains each with and without remedies, and charts the decibels lost.

@@ -39,17 +39,18 @@ fn halve(positions: &[[f64; 3]], rows: &mut [u32]) {
 /// Ranges of at most `most` rows that cover `rows` rows in their order.
 pub fn leaves(rows: usize, most: usize) -> Vec<Range<usize>> {
     let mut found = Vec::new();
-    let mut open = vec![0..rows];
-    while let Some(range) = open.pop() {
-        if range.len() <= most {
-            found.push(range);
-        } else {
-            let middle = range.start + middle(range.len());
-            open.push(middle..range.end);
-            open.push(range.start..middle);
-        }
-    }
+    cut(0..rows, most, &mut found);
     found
+}
+
+fn cut(range: Range<usize>, most: usize, found: &mut Vec<Range<usize>>) {
+    if range.len() <= most {
+        found.push(range);
+        return;
+    }
+    let middle = range.start + middle(range.len());
+    cut(range.start..middle, most, found);
+    cut(middle..range.end, most, found);
 }
 
 fn middle(rows: usize) -> usize {

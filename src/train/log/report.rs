@@ -195,6 +195,10 @@ pub struct Summary {
     /// Training views whose photo contradicts the scene, by name.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub outlier_views: Vec<OutlierView>,
+    /// Share of the blocks of training photos that are masked because they show what the scene does not; absent without
+    /// `--robust-pixels`.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub masked_share: Option<f64>,
     /// Costs of the steps alone.
     #[serde(flatten)]
     pub costs: StepCosts,

@@ -25,7 +25,7 @@ use crate::train::memory::largest_view::largest_view;
 use crate::train::start::first_scene::Start;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::batch::HostRows;
-use crate::train::step::comparison::Comparison;
+use crate::train::step::comparison::{BlocksBefore, Comparison};
 use crate::train::step::pages::{PageRules, PagedScene};
 use crate::train::step::train_step::train_step;
 use crate::train::step::working_set::WorkingSet;
@@ -163,7 +163,8 @@ impl World<'_> {
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let mode = options.appearance;
         let look = mode.is_on().then(|| (mode, Look { lens: Lens::of(&camera), ..Look::default() }));
-        let comparison = Comparison { look, ..Comparison::new(&target, options.loss) };
+        let blocks = options.robust_pixels.then_some(BlocksBefore::default());
+        let comparison = Comparison { look, blocks, ..Comparison::new(&target, options.loss) };
         let mut step = |number| {
             let (what, how) = ((number, &camera), (&render, &comparison));
             let began = Instant::now();

@@ -302,7 +302,7 @@ mod tests {
             (1000, 7_395, 256_525),
         ] {
             let mut run = TrainConfig { steps, ..TrainConfig::default() };
-            let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_steps(steps);
+            let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, run.strategy);
             (run.refine_start, run.refine_every, run.refine_stop) = (refine_start, refine_every, refine_stop);
             let (guessed, _) = reach(&run, first, 0);
             let factor = guessed as f64 / f64::from(reached);

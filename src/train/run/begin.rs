@@ -178,8 +178,15 @@ pub(crate) fn begin(
 /// Those of a dry run.
 pub fn forecast(scene: &Path, config: &TrainConfig) -> Result<Option<Forecast>, TrainError> {
     let (scene, config) = (scene.to_path_buf(), config.clone());
-    let request =
-        RunRequest { scene, out: PathBuf::new(), config, dry_run: true, existing: Existing::Refuse, quiet: true };
+    let request = RunRequest {
+        scene,
+        out: PathBuf::new(),
+        config,
+        dry_run: true,
+        existing: Existing::Refuse,
+        quiet: true,
+        live: None,
+    };
     let host_mem = host_budget(&request.config);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {

@@ -6,6 +6,7 @@ mod appearance_file;
 pub mod begin;
 mod changes;
 pub mod costs;
+pub mod live;
 mod more_steps;
 pub mod out_folder;
 mod outgrown;

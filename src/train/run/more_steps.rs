@@ -18,6 +18,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::sync_folder;
 use crate::config::file::TrainConfig;
+use crate::report::live::Live;
 use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
@@ -44,6 +45,8 @@ pub(super) struct Finished<'a> {
     pub summary: &'a Summary,
     /// Print only warnings and errors.
     pub quiet: bool,
+    /// The page that shows the run while it trains.
+    pub live: Option<Live>,
 }
 
 impl Finished<'_> {
@@ -52,7 +55,7 @@ impl Finished<'_> {
     /// # Errors
     /// The scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
     pub fn go_on(self) -> Result<RunOutcome, TrainError> {
-        let Finished { out, scene, file, run, summary, quiet, .. } = self;
+        let Finished { out, scene, file, run, summary, quiet, live, .. } = self;
         machine::set_up(&self.config)?;
         if !scene.exists() {
             let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
@@ -79,7 +82,7 @@ impl Finished<'_> {
             first_rows,
         };
         let (scene, out) = (scene.to_path_buf(), out.to_path_buf());
-        let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
+        let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet, live };
         clear_spill_dir(&request.config)?;
         let mut first = first_trainer(&request, start, host_mem)?;
         first.trainer.begin_after(summary.steps, summary.train_seconds);

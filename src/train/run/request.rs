@@ -2,6 +2,7 @@
 
 use super::out_folder::Existing;
 use crate::config::file::TrainConfig;
+use crate::report::live::Live;
 use crate::train::log::report::Summary;
 use std::path::PathBuf;
 
@@ -20,6 +21,8 @@ pub struct RunRequest {
     pub existing: Existing,
     /// Print only warnings and errors.
     pub quiet: bool,
+    /// The page that shows the run while it trains.
+    pub live: Option<Live>,
 }
 
 /// How a run ended.

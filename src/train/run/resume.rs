@@ -27,6 +27,7 @@ use crate::page::tool::reading::Access;
 use crate::page::tool::uncommitted::is_uncommitted;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
+use crate::report::live::Live;
 use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::error::TrainError;
@@ -61,6 +62,8 @@ pub struct ResumeRequest {
     pub accept_changes: bool,
     /// Print only warnings and errors.
     pub quiet: bool,
+    /// The page that shows the run while it trains.
+    pub live: Option<Live>,
 }
 
 /// Resumes a run and trains to its end.
@@ -82,7 +85,8 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         drop(lock);
         keep_rates(&mut config, &request.keys, &earlier.config);
         let (out, scene, quiet) = (request.out.as_path(), earlier.scene.as_path(), request.quiet);
-        return Finished { out, scene, config, file: earlier.file, run: earlier.run, summary: &summary, quiet }.go_on();
+        let (file, run, live) = (earlier.file, earlier.run, request.live.clone());
+        return Finished { out, scene, config, file, run, summary: &summary, quiet, live }.go_on();
     }
     let is_in_output = config.residence().spill_dir().is_none();
     let found = open_own(&folder, earlier.claim(request), is_in_output);
@@ -224,7 +228,7 @@ fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> R
     let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
     eprintln!("{} was cut off before its first commit: it begins again", out.display());
     let existing = Existing::BeginAgain;
-    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet })
+    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet, live: request.live.clone() })
 }
 
 /// What a run resumes with.
@@ -298,7 +302,15 @@ fn resume_from(
     let run = identity_of(earlier.run, &state);
     let begun = Begun { print, sh_degree_start: state.origin.sh_degree_start, past: Some(past), host_mem, driver, run };
     let (scene, out, quiet) = (earlier.scene.clone(), request.out.clone(), request.quiet);
-    let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet };
+    let request = RunRequest {
+        scene,
+        out,
+        config,
+        dry_run: false,
+        existing: Existing::BeginAgain,
+        quiet,
+        live: request.live.clone(),
+    };
     plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
 

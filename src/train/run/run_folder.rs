@@ -8,6 +8,7 @@
 use super::appearance_file::write_appearance;
 use super::changes::with_absolute_paths;
 use super::costs::Meter;
+use super::live::LivePage;
 use super::out_folder;
 use super::page_map::write_page_map;
 use super::request::{RunOutcome, RunRequest};
@@ -143,10 +144,14 @@ pub(super) fn train_into(
         }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let live = request.live.clone().map(|live| {
+        live.set_metrics(out.join(METRICS_FILE));
+        LivePage::new(live)
+    });
     let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     metrics.start_clock(trainer.train_seconds());
-    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint };
+    let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint, live };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
     let ply = Trainer::ply_path(out);
@@ -290,6 +295,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         outlier_views: Vec::new(),
+        masked_share: trainer.masked_share(),
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
         tiers: trainer.tier_traffic(),

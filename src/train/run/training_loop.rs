@@ -14,6 +14,7 @@ use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{Progress, Shown};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::run::live::LivePage;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::train_step::StepOutcome;
@@ -31,6 +32,8 @@ pub struct LoopOutputs<'a> {
     pub stop: &'a StopFlag,
     /// The run's checkpoint, if it has one.
     pub checkpoint: Option<&'a mut Checkpoint>,
+    /// The page that shows the run while it trains, if the user asked for it.
+    pub live: Option<LivePage>,
 }
 
 impl Trainer {
@@ -77,6 +80,9 @@ impl Trainer {
                 written.or_else(|error| self.make_space(outputs, error))?;
             }
             outputs.progress.step(done, Shown { gaussians: self.scene.rows(), psnr });
+            if let Some(live) = &mut outputs.live {
+                self.show_live(dataset, live, psnr);
+            }
             if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
                 let done = checkpoint.between_steps(self, outputs.metrics);
                 done.or_else(|error| self.make_space(outputs, error))?;

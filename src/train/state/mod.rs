@@ -6,4 +6,5 @@ mod growth_checks;
 pub(crate) mod held_out;
 mod leave_out;
 mod look_ahead;
+mod photos;
 pub mod trainer;

@@ -10,9 +10,6 @@
 
 use super::eval::{EvalRequest, evaluate};
 use super::held_out::HeldOut;
-use crate::appearance::AppearanceMode;
-use crate::appearance::model::CHANNEL_VALUES;
-use crate::appearance::picture::Look;
 use crate::appearance::state::{AppearanceState, camera_groups};
 use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
@@ -22,6 +19,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::RowCount;
 use crate::optim::method::{Method, OptimizerPlace};
+use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::view_sizes::ViewSizes;
@@ -32,15 +30,15 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use crate::schedule::order::{Order, ViewOrder};
 use crate::train::error::TrainError;
-use crate::train::log::report::{OutlierView, TestMetrics, TierTraffic};
+use crate::train::log::report::{TestMetrics, TierTraffic};
 use crate::train::memory::budget::HostBudget;
 use crate::train::step::batch::HostRows;
-use crate::train::step::comparison::Comparison;
+use crate::train::step::comparison::{BlocksBefore, Comparison};
 use crate::train::step::dense::settle_all;
 use crate::train::step::device_rows::DeviceRows;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::pages::PagedScene;
-use crate::train::step::soundness::{Idle, note_soundness, warn_of_outliers};
+use crate::train::step::soundness::{Idle, note_soundness};
 use crate::train::step::train_step::{StepOutcome, train_step};
 use crate::train::step::view::rehearse;
 use crate::train::step::working_set::WorkingSet;
@@ -64,7 +62,7 @@ pub struct Trainer {
     /// Training views that the run decides its count by.
     pub(crate) held_out: HeldOut,
     /// For each view, the number of its group of equal cameras; empty if the run corrects nothing.
-    camera_groups: Vec<usize>,
+    pub(super) camera_groups: Vec<usize>,
     pub(crate) working: WorkingSet,
     /// Everything that a commit saves and a resume restores, besides the pages.
     pub(crate) state: TrainerState,
@@ -148,6 +146,7 @@ impl Trainer {
             state: TrainerState {
                 appearance: AppearanceState::new(&camera_groups),
                 outliers: ViewOutliers::new(dataset.views.len()),
+                blocks: BlockOutliers::new(dataset.views.len()),
                 ..TrainerState::default()
             },
             camera_groups,
@@ -180,7 +179,8 @@ impl Trainer {
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let look = self.look(view, camera);
-            let comparison = Comparison { look, ..Comparison::new(&target, self.options.loss) };
+            let blocks = self.options.robust_pixels.then_some(BlocksBefore::default());
+            let comparison = Comparison { look, blocks, ..Comparison::new(&target, self.options.loss) };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let began = Instant::now();
             let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
@@ -213,53 +213,6 @@ impl Trainer {
     /// Bytes held for one view: rows of the working set; renderer and picture.
     pub fn view_bytes(&self) -> [u64; 2] {
         [self.working.bytes() as u64, self.renderer.host_bytes() + self.working.correction.bytes()]
-    }
-
-    /// The correction of a view as it is now; `None` if the run corrects nothing.
-    fn look(&self, view: usize, camera: &Camera) -> Option<(AppearanceMode, Look)> {
-        let mode = self.options.appearance;
-        let of_view = (view, self.camera_groups.get(view).copied()?);
-        mode.is_on().then(|| (mode, self.state.appearance.look(mode, of_view, camera)))
-    }
-
-    /// Stores what a step that was taken has found for the photo of its view.
-    fn learn_appearance(&mut self, view: usize, outcome: &StepOutcome) {
-        let found = self.working.correction.found.take();
-        if let (Some(found), None, Some(&group)) = (found, outcome.skipped, self.camera_groups.get(view)) {
-            self.state.appearance.learn(self.options.appearance, (view, group), &found);
-        }
-    }
-
-    /// Notes the error of the view of the last step, and after an epoch names the views that have become outliers.
-    fn judge_views(&mut self, view: usize, outcome: &StepOutcome, target: &Target, dataset: &Dataset) {
-        self.state.outliers.measure(view, outcome.loss.mse, target);
-        let (step, views) = (self.state.step, self.train_views.len() as u32);
-        if step.is_multiple_of(views) {
-            let found = self.state.outliers.end_epoch(step / views - 1);
-            warn_of_outliers(&found, step, self.options.robust_views, dataset);
-        }
-    }
-
-    /// The views whose photo contradicts the scene, by name.
-    pub fn outlier_views(&self, dataset: &Dataset) -> Vec<OutlierView> {
-        let of_view = |view: usize| OutlierView {
-            name: dataset.views[view].name.clone(),
-            unexplained: self.state.outliers.unexplained(view),
-            is_left_out: self.options.robust_views,
-        };
-        self.state.outliers.named().map(of_view).collect()
-    }
-
-    /// The values of photos and cameras; empty if the run corrects nothing.
-    pub fn appearance(&self) -> &AppearanceState {
-        &self.state.appearance
-    }
-
-    /// The cameras whose vignetting the run trains, each with its values by channel.
-    pub fn cameras_of<'a>(&self, dataset: &'a Dataset) -> Vec<(&'a Camera, [[f64; CHANNEL_VALUES]; 3])> {
-        let trained = self.state.appearance.cameras.iter().enumerate().filter(|(_, camera)| camera.sightings > 0);
-        let first = |group| self.camera_groups.iter().position(|of| *of == group);
-        trained.filter_map(|(group, values)| Some((&dataset.views[first(group)?].camera, values.falloff))).collect()
     }
 
     /// The options.
@@ -329,7 +282,9 @@ impl Trainer {
         let render = self.render_options();
         let look = self.look(view, &dataset.views[view].camera);
         let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
-        let comparison = Comparison { target: &target, loss: self.options.loss, look, is_left_out };
+        let states = self.state.blocks.of_view(view).to_vec();
+        let blocks = if is_left_out { None } else { self.blocks_before(&states) };
+        let comparison = Comparison { target: &target, loss: self.options.loss, look, blocks, is_left_out };
         let next = self.coming_views(2).get(1).map(|&view| &dataset.views[view].camera);
         let stepped = loop {
             let stepped = self.attempt(&dataset.views[view].camera, next, (&render, &comparison));
@@ -351,6 +306,7 @@ impl Trainer {
             self.is_torn = false;
         }
         self.learn_appearance(view, &outcome);
+        self.learn_blocks(view, &outcome);
         self.state.step += 1;
         self.judge_views(view, &outcome, &target, dataset);
         self.state.train_seconds += started.elapsed().as_secs_f64();

@@ -8,6 +8,7 @@ use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
 use gsscale::densify::growth::{GrowthCheck, GrowthState};
 use gsscale::densify::stats::GradHistogram;
+use gsscale::outliers::blocks::BlockOutliers;
 use gsscale::outliers::views::ViewOutliers;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::Place;
@@ -238,6 +239,7 @@ fn sample() -> RunState {
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
             appearance: AppearanceState::new(&[0, 0]),
             outliers: ViewOutliers::new(2),
+            blocks: BlockOutliers::new(2),
             growth: GrowthState {
                 first: 7,
                 checks: vec![GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 }],

@@ -1,9 +1,7 @@
-//! A run that leaves out wrong views goes on with what it knows of them.
+//! A run that leaves out wrong views, or masks blocks of photos, goes on with what it knows of them.
 
 use super::bench::{Bench, Place, ended, ply, refused, signal, succeeded};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-
-const ROBUST: &[&str] = &["--robust-views"];
 
 /// A city whose views share much, so that a photo in a wrong place is noticed within a few epochs. Two photos change places.
 fn swapped() -> Bench {
@@ -18,27 +16,40 @@ fn swapped() -> Bench {
     bench
 }
 
-#[test]
-fn a_run_without_wrong_views_resumes_without_them() {
-    let bench = swapped();
-    let alone = bench.alone(ROBUST);
+/// Runs that end in several ways and places, and resume, give the bytes of a run that nobody disturbed. The flag lasts.
+fn resumes_alike(bench: &Bench, flag: &str) -> Vec<u8> {
+    let name = flag.trim_start_matches("--");
+    let alone = bench.alone(&[flag]);
     let out = bench.path("out");
-    for (place, name, commits) in
+    for (place, signal_name, commits) in
         [(Place::Memory, "KILL", "0.02"), (Place::Spill(alone.fewest / 2), "INT", "0"), (Place::Memory, "INT", "0")]
     {
-        let mut child = bench.begin(place, &[ROBUST, &["--commit-every", commits]].concat());
+        let mut child = bench.begin(place, &[flag, "--commit-every", commits]);
         bench.wait_for_lines(&mut child, 14);
-        signal(&mut child, name);
+        signal(&mut child, signal_name);
         ended(child);
-        if name == "INT" {
-            let said = refused(bench.go_on(&["--robust-views=false"]));
-            assert!(said.contains("robust-views was true and is false"), "{said}");
+        if signal_name == "INT" {
+            let said = refused(bench.go_on(&[&format!("{flag}=false")]));
+            assert!(said.contains(&format!("{name} was true and is false")), "{said}");
         }
         succeeded(bench.go_on(&[]));
-        assert!(ply(&out) == alone.ply, "{place:?}, {name}: the resumed run gives another scene");
+        assert!(ply(&out) == alone.ply, "{place:?}, {signal_name}: the resumed run gives another scene");
         std::fs::remove_dir_all(&out).unwrap();
     }
+    alone.ply
+}
+
+#[test]
+fn a_run_without_wrong_views_resumes_without_them() {
+    let robust = resumes_alike(&swapped(), "--robust-views");
     // What is left out matters: with everything, the scene is another.
     let with = swapped();
-    assert!(with.alone(&[]).ply != alone.ply, "no view was left out, so the test shows nothing");
+    assert!(with.alone(&[]).ply != robust, "no view was left out, so the test shows nothing");
+}
+
+#[test]
+fn a_run_that_masks_blocks_resumes_with_its_masks() {
+    // A photo in a wrong place differs in its blocks too.
+    let robust = resumes_alike(&swapped(), "--robust-pixels");
+    assert!(swapped().alone(&[]).ply != robust, "no block was masked, so the test shows nothing");
 }

@@ -1,0 +1,332 @@
+//! Transient objects: which blocks of a photo show what the scene does not.
+//!
+//! A car that drove on stands on one photo only. All other photos of its place agree on the road below, so the picture shows
+//! the road, and the colours of photo and picture differ there over a whole area. Fine detail that the scene has not learnt
+//! yet differs too, but less in the mean over an area, and where the photo is rich in contrast. So a photo is cut into
+//! blocks ([`super::residuals`]). The residual of a block is the difference between the mean colours of photo and picture; its
+//! score is the running mean of its residuals over the contrast of the photo around it.
+//!
+//! At each visit of a view, median and median absolute deviation of its scores say what is usual in this view. A block far
+//! above is masked; so is a block half as far above that touches one or was masked before. Blocks that are masked are still
+//! measured: such a block returns when the scene, taught by the other photos, comes to show it.
+//!
+//! Invariants: 1. running means are fixed-point numbers, and a mask follows from them, the photo and the mask before; 2. at most
+//! a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its size.
+
+use super::residuals::{BlockGrid, NONE, PER_UNIT, contrasts, residuals};
+use crate::scene::image::Target;
+use serde::{Deserialize, Serialize};
+use std::cmp::Reverse;
+
+/// One block in so many is masked at most.
+const MASKED_MOST: usize = 4;
+/// A score is far above the others from so many standard deviations on, as the median absolute deviation estimates them, and
+/// from this score on.
+const DEVIATIONS: f64 = 4.0;
+const SCORE_LEAST: f64 = 0.7;
+/// The share of the way to this limit that is enough beside a block beyond it, and for a block that was masked before.
+const NEAR: f64 = 0.5;
+/// The residual that a masked block has at least, of values in 0..1: six grey levels.
+const RESIDUAL_LEAST: f64 = 0.025;
+/// The contrast that counts where there is less: plain areas of photos are noisy too.
+const CONTRAST_LEAST: f64 = 0.03;
+/// Median absolute deviation of a normal distribution, in standard deviations.
+const MAD_OF_NORMAL: f64 = 0.674_489_75;
+/// Blocks are looked at from one over so much of a run on, and from this step on at the latest.
+const FIRST_LOOK: u32 = 10;
+const FIRST_LOOK_LATEST: u32 = 500;
+/// Steps after an opacity reset in which pictures are too dark to be looked at.
+pub const STEPS_AFTER_RESET: u32 = 500;
+
+/// The step from which blocks are looked at in a run of so many steps: pictures have the mean colours of the scene by then.
+pub fn first_look_at_blocks(steps: u32) -> u32 {
+    (steps / FIRST_LOOK).min(FIRST_LOOK_LATEST)
+}
+
+/// Whether all blocks count at a step, masked or not, in a run of so many steps on so many views: in every other epoch of the
+/// first half. What few photos show is far off at first and would stay so under a mask. When it counts, its residual
+/// falls, and it returns; the residual of what has moved is back at the next visit, since all other photos contradict it.
+pub fn do_all_blocks_count(step: u32, steps: u32, views: usize) -> bool {
+    step < steps / 2 && (step as usize / views.max(1)).is_multiple_of(2)
+}
+
+/// What is known of a block: twice its running mean, plus one if it is masked.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BlockState(u16);
+
+impl BlockState {
+    fn new(mean: u16, is_masked: bool) -> BlockState {
+        BlockState(mean << 1 | u16::from(is_masked))
+    }
+
+    /// [`NONE`] for a block without used pixels.
+    fn mean(self) -> u16 {
+        self.0 >> 1
+    }
+
+    fn is_masked(self) -> bool {
+        self.0 & 1 == 1
+    }
+}
+
+/// The running means after another look, from the states before.
+fn running(before: &[BlockState], now: Vec<u16>) -> Vec<u16> {
+    // Photos of another size have other blocks.
+    if before.len() != now.len() {
+        return now;
+    }
+    let mean = |(before, now): (&BlockState, u16)| match before.mean() {
+        NONE => now,
+        _ if now == NONE => now,
+        before => ((u32::from(before) + u32::from(now)).div_ceil(2)) as u16,
+    };
+    before.iter().zip(now).map(mean).collect()
+}
+
+/// The residual that a running mean stands for; `None` for a block without used pixels.
+fn residual(mean: u16) -> Option<f64> {
+    (mean != NONE).then(|| f64::from(mean) / f64::from(PER_UNIT))
+}
+
+/// The scores of blocks; 0 for those without used pixels.
+fn scores(means: &[u16], photo: &Target, grid: &BlockGrid) -> Vec<f64> {
+    let pairs = means.iter().zip(contrasts(photo, grid));
+    pairs.map(|(&mean, contrast)| residual(mean).unwrap_or(0.0) / (contrast + CONTRAST_LEAST)).collect()
+}
+
+/// The limits for the scores of a view: far above the others, and half as far. `None` if no block has used pixels.
+fn limits(means: &[u16], scores: &[f64]) -> Option<[f64; 2]> {
+    let used = means.iter().zip(scores).filter(|(mean, _)| **mean != NONE);
+    let mut used: Vec<f64> = used.map(|(_, &score)| score).collect();
+    let middle = median(&mut used)?;
+    used.iter_mut().for_each(|score| *score = (*score - middle).abs());
+    let above = (DEVIATIONS * median(&mut used)? / MAD_OF_NORMAL).max(SCORE_LEAST - middle);
+    Some([middle + above, middle + NEAR * above])
+}
+
+/// The value in the middle; the lower of two; `None` without values.
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len().checked_sub(1)? / 2;
+    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+}
+
+/// The blocks of a view after a look at its picture `[3][height][width]`, from the blocks after the look before, if there was
+/// one; `None` if the picture says nothing.
+///
+/// # Panics
+/// Picture and photo differ in size.
+pub fn look(before: &[BlockState], picture: &[f32], photo: &Target) -> Option<Vec<BlockState>> {
+    let grid = BlockGrid::of(photo.width, photo.height);
+    let means = running(before, residuals(picture, photo, &grid)?);
+    let scores = scores(&means, photo, &grid);
+    let [far, near] = limits(&means, &scores)?;
+    let is_masked = |&block: &usize| {
+        let was_masked = before.len() == means.len() && before[block].is_masked();
+        let touches = || grid.neighbours(block).any(|beside| scores[beside] > far);
+        residual(means[block]).is_some_and(|residual| residual >= RESIDUAL_LEAST)
+            && (scores[block] > far || (scores[block] > near && (was_masked || touches())))
+    };
+    let mut masked: Vec<usize> = (0..means.len()).filter(is_masked).collect();
+    let most = means.iter().filter(|&&mean| mean != NONE).count() / MASKED_MOST;
+    if masked.len() > most {
+        // Scores are positive here, so their bits are in the order of their values.
+        masked.sort_unstable_by_key(|&block| (Reverse(scores[block].to_bits()), block));
+        masked.truncate(most);
+    }
+    let mut states: Vec<BlockState> = means.iter().map(|&mean| BlockState::new(mean, false)).collect();
+    masked.iter().for_each(|&block| states[block] = BlockState::new(means[block], true));
+    Some(states)
+}
+
+/// Writes the photo without its masked blocks into `masked`, whose memory is used again.
+pub fn mask(states: &[BlockState], photo: &Target, masked: &mut Target) {
+    let grid = BlockGrid::of(photo.width, photo.height);
+    (masked.width, masked.height) = (photo.width, photo.height);
+    masked.rgb.clone_from(&photo.rgb);
+    let mask = masked.mask.get_or_insert_default();
+    match &photo.mask {
+        Some(of_photo) => mask.clone_from(of_photo),
+        None => {
+            mask.clear();
+            mask.resize(photo.pixels(), u8::MAX);
+        }
+    }
+    if states.len() != grid.blocks() {
+        return;
+    }
+    for (block, _) in states.iter().enumerate().filter(|(_, state)| state.is_masked()) {
+        let (columns, rows) = grid.pixels(block);
+        rows.for_each(|y| mask[y * photo.width as usize..][columns.clone()].fill(0));
+    }
+}
+
+/// The blocks of all views of a dataset.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct BlockOutliers {
+    /// By view; empty for a view that was not looked at yet.
+    views: Vec<Vec<BlockState>>,
+}
+
+impl BlockOutliers {
+    /// Of `views` views, of which nothing is known.
+    pub fn new(views: usize) -> BlockOutliers {
+        BlockOutliers { views: vec![Vec::new(); views] }
+    }
+
+    /// Bytes that the blocks of a photo of this size take.
+    pub fn bytes_of_view(width: u32, height: u32) -> u64 {
+        (size_of::<Vec<BlockState>>() + size_of::<BlockState>() * BlockGrid::of(width, height).blocks()) as u64
+    }
+
+    /// Whether it knows as many views as `other`.
+    pub fn is_as_large_as(&self, other: &BlockOutliers) -> bool {
+        self.views.len() == other.views.len()
+    }
+
+    /// The blocks of a view; empty before the first look.
+    pub fn of_view(&self, view: usize) -> &[BlockState] {
+        self.views.get(view).map_or(&[], Vec::as_slice)
+    }
+
+    /// Stores the blocks of a view after a look.
+    pub fn learn(&mut self, view: usize, states: Vec<BlockState>) {
+        if let Some(of_view) = self.views.get_mut(view) {
+            *of_view = states;
+        }
+    }
+
+    /// Share of the blocks of all views looked at that are masked; `None` before the first look.
+    pub fn masked_share(&self) -> Option<f64> {
+        let blocks = self.views.iter().flatten().count();
+        let masked = self.views.iter().flatten().filter(|state| state.is_masked()).count();
+        (blocks > 0).then(|| masked as f64 / blocks as f64)
+    }
+
+    /// Checks values from a file.
+    ///
+    /// # Errors
+    /// Names what no run can have written.
+    pub fn check(&self) -> Result<(), &'static str> {
+        let is_possible = |view: &Vec<BlockState>| {
+            let masked = || view.iter().filter(|state| state.is_masked());
+            view.len() <= BlockGrid::BLOCKS_MOST
+                && masked().count() <= view.len() / MASKED_MOST
+                && masked().all(|state| state.mean() != NONE)
+        };
+        if self.views.iter().all(is_possible) { Ok(()) } else { Err("the blocks of a photo are invalid") }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    const WIDTH: usize = 64;
+    const HEIGHT: usize = 48;
+
+    /// A photo whose brightness rises from left to right, with a bright square of 12 pixels where asked, on which `picture` shows
+    /// the same without the square, and with errors of single pixels.
+    fn scene(square: Option<(usize, usize)>) -> (Target, Vec<f32>) {
+        let value = |x: usize, y: usize| 60 + x + y % 3;
+        let mut photo = Target { width: WIDTH as u32, height: HEIGHT as u32, rgb: Vec::new(), mask: None };
+        let mut picture = vec![0.0; 3 * WIDTH * HEIGHT];
+        for (x, y) in (0..HEIGHT).flat_map(|y| (0..WIDTH).map(move |x| (x, y))) {
+            let is_inside =
+                square.is_some_and(|(left, top)| (left..left + 12).contains(&x) && (top..top + 12).contains(&y));
+            photo.rgb.extend([if is_inside { 230 } else { value(x, y) as u8 }; 3]);
+            let error = if (x + y) % 2 == 0 { 0.06 } else { -0.05 };
+            (0..3).for_each(|c| picture[c * WIDTH * HEIGHT + y * WIDTH + x] = value(x, y) as f32 / 255.0 + error);
+        }
+        (photo, picture)
+    }
+
+    fn masked_pixels(states: &[BlockState], photo: &Target) -> Vec<usize> {
+        let mut masked = Target::default();
+        mask(states, photo, &mut masked);
+        assert_eq!(masked.rgb, photo.rgb);
+        (0..photo.pixels()).filter(|&i| masked.mask.as_ref().unwrap()[i] == 0).collect()
+    }
+
+    #[test]
+    fn an_object_on_one_photo_is_masked_whole_and_fine_errors_are_not() {
+        let (photo, picture) = scene(None);
+        let states = look(&[], &picture, &photo).unwrap();
+        assert_eq!(masked_pixels(&states, &photo), [0; 0]);
+        let (photo, picture) = scene(Some((20, 16)));
+        let states = look(&[], &picture, &photo).unwrap();
+        let inside: Vec<usize> = (16..28).flat_map(|y| (20..32).map(move |x| y * WIDTH + x)).collect();
+        assert_eq!(masked_pixels(&states, &photo), inside);
+    }
+
+    #[test]
+    fn a_block_returns_when_the_picture_comes_to_show_it() {
+        let (photo, picture) = scene(Some((20, 16)));
+        let mut states = look(&[], &picture, &photo).unwrap();
+        let right: Vec<f32> =
+            (0..3).flat_map(|c| photo.rgb.iter().skip(c).step_by(3)).map(|&byte| f32::from(byte) / 255.0).collect();
+        let looks = (1..9).find(|_| {
+            states = look(&states, &right, &photo).unwrap();
+            masked_pixels(&states, &photo).is_empty()
+        });
+        assert!(looks.is_some_and(|looks| looks > 1), "{looks:?}: one look is not enough");
+    }
+
+    #[test]
+    fn pixels_under_a_mask_stay_masked_and_say_nothing() {
+        let (mut photo, picture) = scene(Some((20, 16)));
+        let mut of_user = vec![u8::MAX; photo.pixels()];
+        (16..28).for_each(|y| of_user[y * WIDTH + 20..][..12].fill(0));
+        photo.mask = Some(of_user.clone());
+        let states = look(&[], &picture, &photo).unwrap();
+        let mut masked = Target::default();
+        mask(&states, &photo, &mut masked);
+        assert_eq!(masked.mask.unwrap(), of_user);
+        photo.mask = Some(vec![0; photo.pixels()]);
+        assert_eq!(look(&[], &picture, &photo), None);
+    }
+
+    #[test]
+    fn at_most_a_quarter_is_masked_the_worst_first() {
+        let (photo, mut picture) = scene(None);
+        // The right half differs, more towards the right.
+        for (i, value) in picture.iter_mut().enumerate().filter(|(i, _)| i % WIDTH >= WIDTH / 2) {
+            *value = 0.7 + (i % WIDTH) as f32 / 256.0;
+        }
+        let blocks = BlockGrid::of(photo.width, photo.height).blocks();
+        let states = look(&[], &picture, &photo).unwrap();
+        assert!(states.iter().filter(|state| state.is_masked()).count() <= blocks / MASKED_MOST);
+    }
+
+    #[test]
+    fn pictures_that_are_no_numbers_and_photos_of_another_size_say_nothing() {
+        let (photo, mut picture) = scene(Some((20, 16)));
+        let first = look(&[], &picture, &photo).unwrap();
+        assert_eq!(look(&first[1..], &picture, &photo), Some(first.clone()), "blocks of another size are forgotten");
+        assert_eq!(masked_pixels(&first[1..], &photo), [0; 0]);
+        picture[5] = f32::NAN;
+        assert_eq!(look(&first, &picture, &photo), None);
+    }
+
+    #[test]
+    fn blocks_are_bounded_and_impossible_ones_refused() {
+        for (width, height) in [(1, 1), (4000, 3000), (20_000, 20_000), (64, 65), (160, 112)] {
+            let blocks = BlockGrid::of(width, height).blocks();
+            assert!((1..=BlockGrid::BLOCKS_MOST).contains(&blocks), "{width}x{height}: {blocks}");
+        }
+        assert_eq!(BlockOutliers::bytes_of_view(160, 112), 24 + 2 * 40 * 28);
+        let of = |states: Vec<BlockState>| BlockOutliers { views: vec![Vec::new(), states] }.check();
+        let (free, masked) = (BlockState::new(5, false), BlockState::new(9, true));
+        assert_eq!(of(vec![free, free, masked, free]), Ok(()));
+        assert!(of(vec![free, masked, masked, free]).is_err());
+        assert!(of(vec![free, free, free, BlockState::new(NONE, true)]).is_err());
+        assert!(of(vec![free; BlockGrid::BLOCKS_MOST + 1]).is_err());
+    }
+
+    #[test]
+    fn looks_begin_within_a_tenth_of_the_run() {
+        assert_eq!([9, 1500, 30_000].map(first_look_at_blocks), [0, 150, 500]);
+        let all_count: Vec<u32> = (0..12).filter(|&step| do_all_blocks_count(step, 12, 2)).collect();
+        assert_eq!(all_count, [0, 1, 4, 5]);
+    }
+}

@@ -1,0 +1,243 @@
+//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that one moves.
+//!
+//! The run and the server share a [`Live`]: the server notes which picture the page wants, the run draws the latest wish between two
+//! steps and leaves the PNG. Curves are read from the run's `metrics.jsonl`, so the run does no work for them.
+//!
+//! Not here: drawing, and how often the run does it (`train::run::live`).
+//!
+//! Invariants: 1. nothing that a page sends changes a result: it can only ask for pictures; 2. the server reads one file, that of the
+//! metrics; 3. a page that is gone costs the run at most one picture.
+
+#[cfg(feature = "serve")]
+mod server;
+
+use crate::base::error::{InputError, InputResult};
+use serde::{Deserialize, Serialize};
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Widest picture, pixels.
+pub const WIDTH_MOST: u32 = 1280;
+
+/// A camera that moves around what a training view looks at.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Orbit {
+    /// Number of the training view where the camera starts.
+    pub view: u32,
+    /// Turn around the direction that points up, degrees.
+    pub turn: f32,
+    /// Turn around the horizontal, degrees.
+    pub tilt: f32,
+    /// Distance to the pivot, over that of the view.
+    pub distance: f32,
+    /// Width of the picture, pixels.
+    pub width: u32,
+}
+
+impl Default for Orbit {
+    fn default() -> Orbit {
+        Orbit { view: 0, turn: 0.0, tilt: 0.0, distance: 1.0, width: 640 }
+    }
+}
+
+impl Orbit {
+    /// The nearest orbit that can be drawn; numbers that are not finite become those of the default.
+    pub fn bounded(self) -> Orbit {
+        let or = |value: f32, default: f32| if value.is_finite() { value } else { default };
+        Orbit {
+            turn: or(self.turn, 0.0) % 360.0,
+            tilt: or(self.tilt, 0.0).clamp(-180.0, 180.0),
+            distance: or(self.distance, 1.0).clamp(0.01, 100.0),
+            width: self.width.clamp(16, WIDTH_MOST),
+            ..self
+        }
+    }
+}
+
+/// How far the run is.
+#[derive(Debug, Clone, Default, Serialize)]
+pub struct Status {
+    /// Steps done.
+    pub step: u32,
+    /// Steps of the run.
+    pub steps: u32,
+    /// Gaussians in the pages.
+    pub gaussians: u64,
+    /// PSNR of the last step's view, dB.
+    pub psnr: f64,
+    /// Training views, for [`Orbit::view`].
+    pub views: u32,
+    /// Percent of the time that pictures may take.
+    pub picture_percent: u32,
+}
+
+/// A wish for a picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
+pub struct Ticket(u64);
+
+#[derive(Debug, Default)]
+struct State {
+    /// The file of the metrics, once the run has one.
+    metrics: Option<PathBuf>,
+    status: Status,
+    last: Ticket,
+    wanted: Option<(Ticket, Orbit)>,
+    /// The last picture as PNG, or why it could not be drawn.
+    drawn: Option<(Ticket, Result<Vec<u8>, String>)>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    address: SocketAddr,
+    state: Mutex<State>,
+    has_drawn: Condvar,
+}
+
+/// What a run and the server of its page share.
+#[derive(Debug, Clone)]
+pub struct Live(Arc<Shared>);
+
+impl Live {
+    /// Starts the server of a page at `address`; port 0 takes a free one.
+    ///
+    /// # Errors
+    /// The address cannot be used, or the program was built without the feature `serve`.
+    pub fn begin(address: SocketAddr) -> InputResult<Live> {
+        let remedy = "choose another port, or leave --serve out";
+        let fail = |e: std::io::Error| InputError::new("--serve", format!("{address} cannot be served: {e}"), remedy);
+        let listener = std::net::TcpListener::bind(address).map_err(fail)?;
+        listener.set_nonblocking(true).map_err(fail)?;
+        let address = listener.local_addr().map_err(fail)?;
+        let live = Live(Arc::new(Shared { address, state: Mutex::default(), has_drawn: Condvar::new() }));
+        live.serve(listener)?;
+        Ok(live)
+    }
+
+    #[cfg(feature = "serve")]
+    fn serve(&self, listener: std::net::TcpListener) -> InputResult<()> {
+        server::spawn(self.clone(), listener)
+            .map_err(|e| InputError::new("--serve", format!("the server cannot start: {e}"), "leave --serve out"))
+    }
+
+    #[cfg(not(feature = "serve"))]
+    fn serve(&self, _: std::net::TcpListener) -> InputResult<()> {
+        let problem = "this program was built without the feature serve";
+        Err(InputError::new("--serve", problem, "build it with the default features, or leave --serve out"))
+    }
+
+    /// Where the page is.
+    pub fn address(&self) -> SocketAddr {
+        self.0.address
+    }
+
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Names the file of the run's metrics.
+    pub fn set_metrics(&self, metrics: PathBuf) {
+        self.state().metrics = Some(metrics);
+    }
+
+    /// Says how far the run is.
+    pub fn set_status(&self, status: Status) {
+        self.state().status = status;
+    }
+
+    /// The latest picture that a page wants and nobody has drawn.
+    pub fn wanted(&self) -> Option<(Ticket, Orbit)> {
+        self.state().wanted
+    }
+
+    /// Leaves the picture of a wish as PNG, or why there is none. Older wishes are answered with it too.
+    pub fn show(&self, ticket: Ticket, picture: Result<Vec<u8>, String>) {
+        let mut state = self.state();
+        if state.wanted.is_some_and(|(wanted, _)| wanted <= ticket) {
+            state.wanted = None;
+        }
+        state.drawn = Some((ticket, picture));
+        self.0.has_drawn.notify_all();
+    }
+
+    /// Asks for a picture and waits for it. `None` if the run draws none within `patience`.
+    pub fn ask(&self, orbit: Orbit, patience: Duration) -> Option<Result<Vec<u8>, String>> {
+        let mut state = self.state();
+        let ticket = Ticket(state.last.0 + 1);
+        (state.last, state.wanted) = (ticket, Some((ticket, orbit.bounded())));
+        let end = Instant::now() + patience;
+        loop {
+            if let Some((drawn, picture)) = &state.drawn
+                && *drawn >= ticket
+            {
+                return Some(picture.clone());
+            }
+            let rest = end.checked_duration_since(Instant::now())?;
+            state = self.0.has_drawn.wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+/// The address that `text` names: `HOST:PORT`, or a port of this machine alone.
+///
+/// # Errors
+/// As text, for a command line.
+pub fn parse_address(text: &str) -> Result<SocketAddr, String> {
+    let port = text.strip_prefix(':').unwrap_or(text).parse::<u16>();
+    let full = port.map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
+    full.or_else(|_| text.parse()).map_err(|_| String::from("use a port (8080), or an address with one (0.0.0.0:8080)"))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_port_alone_is_one_of_this_machine() {
+        for text in ["8080", ":8080", "127.0.0.1:8080"] {
+            assert_eq!(parse_address(text).unwrap(), SocketAddr::from(([127, 0, 0, 1], 8080)), "{text}");
+        }
+        assert!(parse_address("0.0.0.0:80").is_ok() && parse_address("[::1]:80").is_ok());
+        for text in ["", "70000", "localhost", "1.2.3.4"] {
+            assert!(parse_address(text).unwrap_err().contains("8080"), "{text}");
+        }
+    }
+
+    #[test]
+    fn orbits_that_cannot_be_drawn_become_those_that_can() {
+        let absurd = Orbit { view: 9, turn: f32::NAN, tilt: 1e9, distance: f32::INFINITY, width: 1 << 30 };
+        assert_eq!(absurd.bounded(), Orbit { view: 9, turn: 0.0, tilt: 180.0, distance: 1.0, width: WIDTH_MOST });
+    }
+
+    #[test]
+    fn the_latest_wish_answers_the_older_ones() {
+        let shared = Shared {
+            address: SocketAddr::from(([127, 0, 0, 1], 0)),
+            state: Mutex::default(),
+            has_drawn: Condvar::new(),
+        };
+        let live = Live(Arc::new(shared));
+        assert_eq!(live.ask(Orbit::default(), Duration::ZERO), None, "nobody draws");
+        let later = Orbit { turn: 30.0, ..Orbit::default() };
+        assert_eq!(live.ask(later, Duration::ZERO), None);
+        let (ticket, orbit) = live.wanted().unwrap();
+        assert_eq!((ticket, orbit), (Ticket(2), later));
+        live.show(ticket, Ok(vec![1]));
+        assert_eq!(live.wanted(), None);
+        let drawer = live.clone();
+        let drawing = std::thread::spawn(move || {
+            let (ticket, _) = loop {
+                match drawer.wanted() {
+                    Some(wanted) => break wanted,
+                    None => std::thread::yield_now(),
+                }
+            };
+            drawer.show(ticket, Err("no".into()));
+        });
+        assert_eq!(live.ask(later, Duration::from_secs(60)), Some(Err("no".into())), "not the older picture");
+        drawing.join().unwrap();
+    }
+}

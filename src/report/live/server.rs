@@ -1,0 +1,107 @@
+//! The server of the live page: four addresses, all of them to read.
+//!
+//! | address | answer |
+//! | --- | --- |
+//! | `/` | the page |
+//! | `/status` | [`super::Status`] as JSON |
+//! | `/metrics?from=BYTE` | the run's metrics.jsonl from that byte on, whole lines |
+//! | `/picture?view=..&turn=..&tilt=..&distance=..&width=..` | a PNG of [`super::Orbit`] |
+
+use super::{Live, Orbit};
+use axum::Router;
+use axum::extract::{Query, State};
+use axum::http::{StatusCode, header};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use serde::Deserialize;
+use std::io::{Read, Seek, SeekFrom};
+use std::net::TcpListener;
+use std::path::Path;
+use std::time::Duration;
+
+/// How long a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Most bytes of metrics in one answer.
+const METRICS_BYTES: u64 = 4 << 20;
+
+/// Serves on a thread of its own for as long as the process lives.
+pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().max_blocking_threads(8).build()?;
+    let app = Router::new()
+        .route("/", get(async || Html(include_str!("page.html"))))
+        .route("/status", get(status))
+        .route("/metrics", get(metrics))
+        .route("/picture", get(picture))
+        .with_state(live);
+    std::thread::Builder::new().name("live page".into()).spawn(move || {
+        let served = runtime.block_on(async {
+            let listener = tokio::net::TcpListener::from_std(listener)?;
+            axum::serve(listener, app).await
+        });
+        if let Err(error) = served {
+            eprintln!("warning: the live page is gone: {error}");
+        }
+    })?;
+    Ok(())
+}
+
+/// JSON that no cache keeps.
+fn fresh(kind: &'static str, body: Vec<u8>) -> Response {
+    ([(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-store")], body).into_response()
+}
+
+async fn status(State(live): State<Live>) -> Response {
+    let status = live.state().status.clone();
+    fresh("application/json", serde_json::to_vec(&status).unwrap_or_default())
+}
+
+#[derive(Deserialize)]
+struct From {
+    #[serde(default)]
+    from: u64,
+}
+
+async fn metrics(State(live): State<Live>, Query(From { from }): Query<From>) -> Response {
+    let file = live.state().metrics.clone();
+    let lines = file.map_or(Ok(Vec::new()), |file| lines_from(&file, from));
+    match lines {
+        Ok(lines) => fresh("application/jsonl", lines),
+        Err(error) => (StatusCode::SERVICE_UNAVAILABLE, error.to_string()).into_response(),
+    }
+}
+
+/// The whole lines of a file from a byte on, at most [`METRICS_BYTES`].
+fn lines_from(file: &Path, from: u64) -> std::io::Result<Vec<u8>> {
+    let mut file = std::fs::File::open(file)?;
+    file.seek(SeekFrom::Start(from))?;
+    let mut lines = Vec::new();
+    file.take(METRICS_BYTES).read_to_end(&mut lines)?;
+    let end = lines.iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1);
+    lines.truncate(end);
+    Ok(lines)
+}
+
+async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Response {
+    let asked = tokio::task::spawn_blocking(move || live.ask(orbit, PATIENCE)).await;
+    match asked {
+        Ok(Some(Ok(png))) => fresh("image/png", png),
+        Ok(Some(Err(why))) => (StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
+        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time; it may be busy").into_response(),
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn metrics_end_with_a_whole_line() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "{}\n{\"a\":1}\n{\"b").unwrap();
+        assert_eq!(lines_from(file.path(), 0).unwrap(), b"{}\n{\"a\":1}\n");
+        assert_eq!(lines_from(file.path(), 3).unwrap(), b"{\"a\":1}\n");
+        assert_eq!(lines_from(file.path(), 1000).unwrap(), b"");
+        assert!(lines_from(Path::new("nowhere/metrics.jsonl"), 0).is_err());
+    }
+}

@@ -1,0 +1,172 @@
+//! Pictures for the live page of a run ([`crate::report::live`]), drawn between steps.
+//!
+//! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
+//! most [`PICTURE_PERCENT`] of the time, after the first; 3. a picture that cannot be drawn is an answer to the page, never the end
+//! of the run.
+
+use crate::base::trace;
+use crate::dataset::loader::Dataset;
+use crate::report::live::{Live, Orbit, Status};
+use crate::scene::camera::Camera;
+use crate::scene::image::Image;
+use crate::train::error::TrainError;
+use crate::train::state::trainer::Trainer;
+use crate::train::step::view::draw;
+use glam::{Mat3, Vec3};
+use image::ExtendedColorType;
+use image::codecs::png::{CompressionType, FilterType, PngEncoder};
+use image::{ImageEncoder, ImageError};
+use std::time::{Duration, Instant};
+
+/// Percent of a run's time that pictures may take.
+const PICTURE_PERCENT: u32 = 5;
+/// Time between two reports of the status.
+const STATUS_EVERY: Duration = Duration::from_millis(200);
+
+/// The live page of a run, and what it has cost.
+#[derive(Debug)]
+pub struct LivePage {
+    live: Live,
+    began: Instant,
+    /// Time that pictures took.
+    spent: Duration,
+    told: Option<Instant>,
+}
+
+impl LivePage {
+    /// No time is spent yet.
+    pub fn new(live: Live) -> LivePage {
+        LivePage { live, began: Instant::now(), spent: Duration::ZERO, told: None }
+    }
+
+    /// Whether the share of pictures allows another one.
+    fn may_draw(&self) -> bool {
+        100 * self.spent <= PICTURE_PERCENT * self.began.elapsed()
+    }
+}
+
+impl Trainer {
+    /// Tells the page how far the run is, and draws the picture that it wants.
+    pub(super) fn show_live(&mut self, dataset: &Dataset, page: &mut LivePage, psnr: f64) {
+        if page.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
+            page.told = Some(Instant::now());
+            page.live.set_status(Status {
+                step: self.steps_done(),
+                steps: self.options.steps,
+                gaussians: self.scene.rows(),
+                psnr,
+                views: dataset.train_views().len() as u32,
+                picture_percent: PICTURE_PERCENT,
+            });
+        }
+        let Some((ticket, orbit)) = page.live.wanted().filter(|_| page.may_draw()) else { return };
+        let started = Instant::now();
+        let _span = trace::span("live picture");
+        let picture = match self.live_picture(dataset, orbit) {
+            Ok(image) => png(image).map_err(|e| format!("the picture cannot be written: {e}")),
+            Err(error) => Err(format!("the picture cannot be drawn: {error}")),
+        };
+        page.live.show(ticket, picture);
+        page.spent += started.elapsed();
+    }
+
+    /// The scene after the last step, from an orbit.
+    fn live_picture(&mut self, dataset: &Dataset, orbit: Orbit) -> Result<&Image, TrainError> {
+        self.drain()?;
+        let views = dataset.train_views();
+        let view = views[orbit.view as usize % views.len().max(1)];
+        let base = &dataset.views[view].camera;
+        let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
+        let camera = orbit_camera(base, pivot, self.options.up, orbit);
+        let render = self.render_options();
+        let now = (&mut self.scene, self.state.step, &mut self.working);
+        draw(now, &mut *self.renderer, &camera, &render)?;
+        Ok(self.renderer.image()?)
+    }
+
+    /// Median depth of the pages that a camera sees, local units; `None` if none is before it.
+    fn median_depth(&self, camera: &Camera) -> Option<f32> {
+        let index = self.scene.pager.index();
+        let [_, _, axis] = camera.viewmat;
+        let depth = |centre: [f32; 3]| axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2] + axis[3];
+        let pages = self.scene.pager.pages_of_view(camera);
+        let mut depths: Vec<f32> = pages.iter().map(|page| depth(index[page.index()].bounds.centre())).collect();
+        depths.retain(|depth| depth.is_finite() && *depth > camera.near_plane);
+        depths.sort_unstable_by(f32::total_cmp);
+        depths.get(depths.len() / 2).copied()
+    }
+}
+
+/// The camera of an orbit around the point `pivot` before `base`, with `up` as the direction that points up if it is known.
+fn orbit_camera(base: &Camera, pivot: f32, up: Option<[f64; 3]>, orbit: Orbit) -> Camera {
+    let row = |i: usize| Vec3::new(base.viewmat[i][0], base.viewmat[i][1], base.viewmat[i][2]);
+    let (right, down, forward) = (row(0), row(1), row(2));
+    let up = up.map_or(-down, |up| Vec3::from(up.map(|x| x as f32)));
+    let turn = Mat3::from_axis_angle(up.try_normalize().unwrap_or(-down), orbit.turn.to_radians())
+        * Mat3::from_axis_angle(right, orbit.tilt.to_radians());
+    let centre = Vec3::from(base.centre());
+    let pivot_point = centre + pivot * forward;
+    let centre = pivot_point - orbit.distance * pivot * (turn * forward);
+    let axes = [right, down, forward].map(|axis| turn * axis);
+    let viewmat = axes.map(|axis| [axis.x, axis.y, axis.z, -axis.dot(centre)]);
+    let scale = (orbit.width as f32 / base.width as f32).min(1.0);
+    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
+    Camera {
+        viewmat,
+        fx: base.fx * scale,
+        fy: base.fy * scale,
+        cx: base.cx * scale,
+        cy: base.cy * scale,
+        width: side(base.width),
+        height: side(base.height),
+        ..*base
+    }
+}
+
+fn png(image: &Image) -> Result<Vec<u8>, ImageError> {
+    let mut bytes = Vec::new();
+    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive).write_image(
+        &image.to_rgb8(),
+        image.width,
+        image.height,
+        ExtendedColorType::Rgb8,
+    )?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn base() -> Camera {
+        let viewmat = [[1.0, 0.0, 0.0, -3.0], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, -1.0]];
+        let (near_plane, far_plane) = (0.01, 1000.0);
+        Camera { viewmat, fx: 90.0, fy: 80.0, cx: 60.0, cy: 40.0, width: 120, height: 80, near_plane, far_plane }
+    }
+
+    /// Coordinates of a world point before the camera.
+    fn seen(camera: &Camera, point: [f32; 3]) -> [f32; 3] {
+        camera.viewmat.map(|row| row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3])
+    }
+
+    #[test]
+    fn an_orbit_at_rest_is_the_view_and_the_pivot_stays_before_every_other() {
+        let still = Orbit { width: 120, ..Orbit::default() };
+        let at_rest = orbit_camera(&base(), 4.0, None, still);
+        for (row, of_base) in at_rest.viewmat.iter().zip(&base().viewmat) {
+            // Rounding of sums of a few numbers below 10.
+            assert!(row.iter().zip(of_base).all(|(a, b)| (a - b).abs() < 1e-5), "{at_rest:?}");
+        }
+        let pivot = [3.0, -2.0, 5.0];
+        for (turn, tilt, distance) in [(90.0, 0.0, 1.0), (10.0, 70.0, 0.5), (-200.0, -30.0, 3.0)] {
+            let orbit = Orbit { turn, tilt, distance, width: 60, ..still };
+            let camera = orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), orbit);
+            let [x, y, z] = seen(&camera, pivot);
+            assert!(x.abs() < 1e-4 && y.abs() < 1e-4 && (z - 4.0 * distance).abs() < 1e-4, "{orbit:?}: {x} {y} {z}");
+            assert_eq!((camera.width, camera.height, camera.fx, camera.cy), (60, 40, 45.0, 20.0));
+        }
+        // A turn to the right by a quarter, seen from above: the camera stands left of the pivot and looks along +x.
+        let camera = orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), Orbit { turn: 90.0, ..still });
+        assert!((camera.viewmat[2][0].abs() - 1.0).abs() < 1e-5, "{camera:?}");
+    }
+}

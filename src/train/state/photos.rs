@@ -1,0 +1,94 @@
+//! What a run knows of its photos: their exposures and colours, which of them contradict the scene, and which blocks of them
+//! do. Steps read it before they compare a picture, and add to it afterwards.
+//!
+//! Not here: the values themselves ([`crate::appearance`], [`crate::outliers`]).
+//!
+//! Invariants: 1. a step that was skipped teaches nothing about exposures, colours and blocks; 2. all that is known lies in
+//! [`crate::checkpoint::run_state::TrainerState`], so a resumed run knows the same.
+
+use super::trainer::Trainer;
+use crate::appearance::AppearanceMode;
+use crate::appearance::model::CHANNEL_VALUES;
+use crate::appearance::picture::Look;
+use crate::appearance::state::AppearanceState;
+use crate::dataset::loader::Dataset;
+use crate::outliers::blocks::{BlockState, STEPS_AFTER_RESET, do_all_blocks_count, first_look_at_blocks};
+use crate::scene::camera::Camera;
+use crate::scene::events::{Event, EventKind};
+use crate::scene::image::Target;
+use crate::train::log::report::OutlierView;
+use crate::train::step::comparison::BlocksBefore;
+use crate::train::step::soundness::warn_of_outliers;
+use crate::train::step::train_step::StepOutcome;
+
+impl Trainer {
+    /// The correction of a view as it is now; `None` if the run corrects nothing.
+    pub(super) fn look(&self, view: usize, camera: &Camera) -> Option<(AppearanceMode, Look)> {
+        let mode = self.options.appearance;
+        let of_view = (view, self.camera_groups.get(view).copied()?);
+        mode.is_on().then(|| (mode, self.state.appearance.look(mode, of_view, camera)))
+    }
+
+    /// Stores what a step that was taken has found for the photo of its view.
+    pub(super) fn learn_appearance(&mut self, view: usize, outcome: &StepOutcome) {
+        let found = self.working.correction.found.take();
+        if let (Some(found), None, Some(&group)) = (found, outcome.skipped, self.camera_groups.get(view)) {
+            self.state.appearance.learn(self.options.appearance, (view, group), &found);
+        }
+    }
+
+    /// The blocks of a photo whose `states` the last look left, where blocks are masked at this step.
+    pub(super) fn blocks_before<'a>(&self, states: &'a [BlockState]) -> Option<BlocksBefore<'a>> {
+        let step = self.state.step;
+        let is_begun = !states.is_empty() || step >= first_look_at_blocks(self.options.steps);
+        let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
+        let reset = self.events().events().iter().rev().find(is_reset);
+        let are_kept = reset.is_some_and(|reset| step - reset.step <= STEPS_AFTER_RESET);
+        let all_count = do_all_blocks_count(step, self.options.steps, self.train_views.len());
+        (self.options.robust_pixels && is_begun).then_some(BlocksBefore { states, are_kept, all_count })
+    }
+
+    /// Stores what a step that was taken has found of the blocks of its photo.
+    pub(super) fn learn_blocks(&mut self, view: usize, outcome: &StepOutcome) {
+        if let (Some(found), None) = (self.working.correction.found_blocks.take(), outcome.skipped) {
+            self.state.blocks.learn(view, found);
+        }
+    }
+
+    /// Notes the error of the view of the last step, and after an epoch names the views that have become outliers.
+    pub(super) fn judge_views(&mut self, view: usize, outcome: &StepOutcome, target: &Target, dataset: &Dataset) {
+        self.state.outliers.measure(view, outcome.loss.mse, target);
+        let (step, views) = (self.state.step, self.train_views.len() as u32);
+        if step.is_multiple_of(views) {
+            let found = self.state.outliers.end_epoch(step / views - 1);
+            warn_of_outliers(&found, step, self.options.robust_views, dataset);
+        }
+    }
+
+    /// The views whose photo contradicts the scene, by name.
+    pub fn outlier_views(&self, dataset: &Dataset) -> Vec<OutlierView> {
+        let of_view = |view: usize| OutlierView {
+            name: dataset.views[view].name.clone(),
+            unexplained: self.state.outliers.unexplained(view),
+            is_left_out: self.options.robust_views,
+        };
+        self.state.outliers.named().map(of_view).collect()
+    }
+
+    /// The values of photos and cameras; empty if the run corrects nothing.
+    pub fn appearance(&self) -> &AppearanceState {
+        &self.state.appearance
+    }
+
+    /// The cameras whose vignetting the run trains, each with its values by channel.
+    pub fn cameras_of<'a>(&self, dataset: &'a Dataset) -> Vec<(&'a Camera, [[f64; CHANNEL_VALUES]; 3])> {
+        let trained = self.state.appearance.cameras.iter().enumerate().filter(|(_, camera)| camera.sightings > 0);
+        let first = |group| self.camera_groups.iter().position(|of| *of == group);
+        trained.filter_map(|(group, values)| Some((&dataset.views[first(group)?].camera, values.falloff))).collect()
+    }
+
+    /// Share of the blocks of the photos looked at that are masked; `None` without `--robust-pixels`.
+    pub fn masked_share(&self) -> Option<f64> {
+        self.state.blocks.masked_share()
+    }
+}
