@@ -235,7 +235,7 @@ mod tests {
             let is_inside =
                 square.is_some_and(|(left, top)| (left..left + 12).contains(&x) && (top..top + 12).contains(&y));
             photo.rgb.extend([if is_inside { 230 } else { value(x, y) as u8 }; 3]);
-            let error = if (x + y) % 2 == 0 { 0.06 } else { -0.05 };
+            let error = if (x + y).is_multiple_of(2) { 0.06 } else { -0.05 };
             (0..3).for_each(|c| picture[c * WIDTH * HEIGHT + y * WIDTH + x] = value(x, y) as f32 / 255.0 + error);
         }
         (photo, picture)

@@ -140,7 +140,7 @@ mod tests {
         // A fine pattern about .4, which is 102 / 255, in the first block; .9 in the red of the second.
         let value = |i: usize| match (i / 24, i % 6) {
             (0, 4..) => 0.9,
-            (_, x) if (x + i / 6) % 2 == 0 => 0.5,
+            (_, x) if (x + i / 6).is_multiple_of(2) => 0.5,
             _ => 0.3,
         };
         let picture: Vec<f32> = (0..72).map(value).collect();

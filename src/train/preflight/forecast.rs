@@ -263,6 +263,7 @@ mod tests {
     use super::*;
     use crate::base::units::GIB;
     use crate::config::schedule::Lengths;
+    use crate::densify::strategy::StrategyName;
 
     fn config() -> TrainConfig {
         TrainConfig { steps: 3000, refine_start: 500, refine_every: 100, refine_stop: 2500, ..TrainConfig::default() }
@@ -302,7 +303,7 @@ mod tests {
             (1000, 7_395, 256_525),
         ] {
             let mut run = TrainConfig { steps, ..TrainConfig::default() };
-            let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, run.strategy);
+            let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, StrategyName::Default);
             (run.refine_start, run.refine_every, run.refine_stop) = (refine_start, refine_every, refine_stop);
             let (guessed, _) = reach(&run, first, 0);
             let factor = guessed as f64 / f64::from(reached);
