@@ -163,7 +163,7 @@ fn links_and_files_and_missing_parents_are_refused() {
     assert!(error(&parent.path().join("dangling")).contains("is a symbolic link"));
     assert!(error(&file).contains("is not a folder"));
     // A missing mount must not become a folder on the drive below.
-    assert!(error(&parent.path().join("nowhere/spill")).contains("creating the spill directory failed"));
+    assert!(error(&parent.path().join("nowhere/spill")).contains("make that folder first"));
     assert!(contents(&real).is_empty() && !parent.path().join("nowhere").exists());
 }
 

@@ -61,10 +61,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         }
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
-    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
-        && remove_uncommitted(spill_dir, false)?
-    {
-        eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+    if !request.dry_run {
+        clear_spill_dir(config)?;
     }
     let FirstTrainer { dataset, trainer, tiers, print, driver } = first_trainer(request, start, host_mem)?;
     let run = RunId::draw();
@@ -79,6 +77,16 @@ fn check_folders(request: &RunRequest) -> Result<(), TrainError> {
         Some(spill_dir) => Ok(check_usable(spill_dir, false)?),
         None => Ok(()),
     }
+}
+
+/// Removes what a run that was cut off before its first commit left in the spill directory.
+pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
+    if let Some(spill_dir) = config.residence().spill_dir()
+        && remove_uncommitted(spill_dir, false)?
+    {
+        eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+    }
+    Ok(())
 }
 
 /// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them

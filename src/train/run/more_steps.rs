@@ -9,7 +9,7 @@
 //! named before the scene was found; 3. a
 //! run that is cut off before its first commit goes on from the same PLY when it is asked again.
 
-use super::begin::{first_trainer, plan_and_train};
+use super::begin::{clear_spill_dir, first_trainer, plan_and_train};
 use super::changes::with_absolute_paths;
 use super::out_folder::Existing;
 use super::request::{RunOutcome, RunRequest};
@@ -83,6 +83,7 @@ impl Finished<'_> {
         };
         let (scene, out) = (scene.to_path_buf(), out.to_path_buf());
         let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet, live };
+        clear_spill_dir(&request.config)?;
         let mut first = first_trainer(&request, start, host_mem)?;
         first.trainer.begin_after(summary.steps, summary.train_seconds);
         let (print, driver) = (first.print, first.driver);

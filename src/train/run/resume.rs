@@ -24,6 +24,7 @@ use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
+use crate::page::tool::uncommitted::is_uncommitted;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::live::Live;
@@ -182,8 +183,9 @@ pub(super) fn result_to_continue(
     folder: &Path,
 ) -> Option<Summary> {
     let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps)?;
-    let is_gone = !SpillDir::exists_in(folder) && !earlier.config.keep_checkpoint;
-    (is_gone && earlier.file.is_some()).then_some(summary)
+    // An attempt to go on that was killed before its first commit leaves a store without one.
+    let is_gone = !SpillDir::exists_in(folder) || is_uncommitted(folder).is_ok_and(|is_empty| is_empty);
+    (is_gone && !earlier.config.keep_checkpoint && earlier.file.is_some()).then_some(summary)
 }
 
 pub(super) fn read_summary(out: &Path) -> Option<Summary> {
