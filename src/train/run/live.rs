@@ -1,7 +1,7 @@
 //! Pictures for the live page of a run ([`crate::report::live`]), drawn between steps.
 //!
 //! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
-//! most [`PICTURE_PERCENT`] of the time, after the first; 3. a picture that cannot be drawn is an answer to the page, never the end
+//! most `PICTURE_PERCENT` of the time, after the first; 3. a picture that cannot be drawn is an answer to the page, never the end
 //! of the run.
 
 use crate::base::trace;
