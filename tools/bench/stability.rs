@@ -85,7 +85,7 @@ fn mask_blocks(config: &mut TrainConfig) {
 /// Growth where the error is large, and positions that move ten times as fast.
 fn grow_from_few(config: &mut TrainConfig) {
     (config.strategy, config.growth_score) = (StrategyName::LongAxis, GrowthScore::Mixed);
-    config.means_lr *= 10.0;
+    config.means_lr = 1.6e-3;
 }
 
 fn all_remedies(config: &mut TrainConfig) {
