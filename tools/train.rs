@@ -96,7 +96,8 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let quiet = args.quiet;
-    let outcome = begin_trace(args.trace.as_deref()).and_then(|()| start(args));
+    let trace = args.trace.as_deref().filter(|_| !args.dry_run);
+    let outcome = begin_trace(trace).and_then(|()| start(args));
     if let Err(error) = trace::finish() {
         eprintln!("warning: {error}");
     }

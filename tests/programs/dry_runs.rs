@@ -57,7 +57,8 @@ fn a_dry_run_refuses_what_the_run_refuses() {
         }
         assert_eq!(stderr(&dry), stderr(&run), "{flags:?}");
     }
-    let allowed = short(&scene, &["--out", text(&first), "--overwrite", "--dry-run"]);
+    let trace = folder.path().join("trace.json");
+    let allowed = short(&scene, &["--out", text(&first), "--overwrite", "--dry-run", "--trace", text(&trace)]);
     assert!(allowed.status.success(), "{}", stderr(&allowed));
     assert_eq!(files(folder.path()), before, "nothing may change");
 }

@@ -214,7 +214,7 @@ fn an_interrupt_finishes_the_step_and_writes_the_scene() {
     assert_eq!(summary["finished"], false);
     assert!(summary["steps"].as_u64().unwrap() > 0);
     // There are held-out photos, but none was evaluated: neither stderr nor the report claims otherwise.
-    assert!(stderr(&output).contains("of training; not evaluated"), "{}", stderr(&output));
+    assert!(stderr(&output).contains("quality     not evaluated"), "{}", stderr(&output));
     let report = std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(!report.contains("held-out"));
     assert!(report.contains("of 1,000,000 steps. To go on: gsscale-train --resume"));
