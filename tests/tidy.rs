@@ -77,6 +77,7 @@ const UNSAFE_FILES: &[&str] = &[
 ];
 
 const FUNCTION_LINES_MAX: usize = 80;
+const README_WORDS_MAX: usize = 1300;
 
 fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
     let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
@@ -278,6 +279,13 @@ fn files_that_comments_name_exist() {
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert_eq!(named_files("let a; // see `b/c.rs`, d.wgsl.\nlet e = \"f.rs\";"), ["b/c.rs", "d.wgsl"]);
+}
+
+#[test]
+fn readme_stays_short() {
+    let readme = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("README.md")).unwrap();
+    let words = readme.split_whitespace().count();
+    assert!(words <= README_WORDS_MAX, "README.md has {words} words, of at most {README_WORDS_MAX}");
 }
 
 /// Functions are found by their closing brace at the indentation of their `fn`, which rustfmt guarantees.

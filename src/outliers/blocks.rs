@@ -13,40 +13,40 @@
 //! Invariants: 1. running means are fixed-point numbers, and a mask follows from them, the photo and the mask before; 2. at most
 //! a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its size.
 
-use super::residuals::{BlockGrid, NONE, PER_UNIT, contrasts, residuals};
+use super::residuals::{BlockGrid, NO_PIXELS, PER_UNIT, contrasts, residuals};
 use crate::scene::image::Target;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
 
-/// One block in so many is masked at most.
+/// At most one block in four is masked.
 const MASKED_MOST: usize = 4;
-/// A score is far above the others from so many standard deviations on, as the median absolute deviation estimates them, and
-/// from this score on.
+/// A score is far above the others if it exceeds the median of its view by this many standard deviations (estimated from the
+/// median absolute deviation), and [`SCORE_LEAST`].
 const DEVIATIONS: f64 = 4.0;
 const SCORE_LEAST: f64 = 0.7;
-/// The share of the way to this limit that is enough beside a block beyond it, and for a block that was masked before.
+/// Blocks beside a masked block, and blocks that were masked before, need this share of that distance from the median.
 const NEAR: f64 = 0.5;
-/// The residual that a masked block has at least, of values in 0..1: six grey levels.
+/// Blocks with a smaller residual are not masked (values in 0..1): six grey levels.
 const RESIDUAL_LEAST: f64 = 0.025;
-/// The contrast that counts where there is less: plain areas of photos are noisy too.
+/// Added to the contrast, since plain areas of photos are noisy too.
 const CONTRAST_LEAST: f64 = 0.03;
 /// Median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.674_489_75;
-/// Blocks are looked at from one over so much of a run on, and from this step on at the latest.
-const FIRST_LOOK: u32 = 10;
+/// Blocks are judged after a tenth of the run, at the latest after [`FIRST_LOOK_LATEST`] steps.
+const FIRST_LOOK_PART: u32 = 10;
 const FIRST_LOOK_LATEST: u32 = 500;
 /// Steps after an opacity reset in which pictures are too dark to be looked at.
 pub const STEPS_AFTER_RESET: u32 = 500;
 
-/// The step from which blocks are looked at in a run of so many steps: pictures have the mean colours of the scene by then.
+/// The first step that judges blocks, in a run of `steps` steps: pictures have the mean colours of the scene by then.
 pub fn first_look_at_blocks(steps: u32) -> u32 {
-    (steps / FIRST_LOOK).min(FIRST_LOOK_LATEST)
+    (steps / FIRST_LOOK_PART).min(FIRST_LOOK_LATEST)
 }
 
-/// Whether all blocks count at a step, masked or not, in a run of so many steps on so many views: in every other epoch of the
-/// first half. What few photos show is far off at first and would stay so under a mask. When it counts, its residual
-/// falls, and it returns; the residual of what has moved is back at the next visit, since all other photos contradict it.
-pub fn do_all_blocks_count(step: u32, steps: u32, views: usize) -> bool {
+/// Whether masked blocks count in the loss at `step` too: in every other epoch of the first half of a run of `steps` steps on `views`
+/// views. What few photos show is far off at first, and a mask would keep it so. When it counts, its residual falls and the
+/// mask ends. The residual of what has moved is back at the next visit, since all other photos contradict it.
+pub fn counts_masked_blocks(step: u32, steps: u32, views: usize) -> bool {
     step < steps / 2 && (step as usize / views.max(1)).is_multiple_of(2)
 }
 
@@ -59,7 +59,7 @@ impl BlockState {
         BlockState(mean << 1 | u16::from(is_masked))
     }
 
-    /// [`NONE`] for a block without used pixels.
+    /// [`NO_PIXELS`] for a block without used pixels.
     fn mean(self) -> u16 {
         self.0 >> 1
     }
@@ -70,14 +70,14 @@ impl BlockState {
 }
 
 /// The running means after another look, from the states before.
-fn running(before: &[BlockState], now: Vec<u16>) -> Vec<u16> {
+fn running_means(before: &[BlockState], now: Vec<u16>) -> Vec<u16> {
     // Photos of another size have other blocks.
     if before.len() != now.len() {
         return now;
     }
     let mean = |(before, now): (&BlockState, u16)| match before.mean() {
-        NONE => now,
-        _ if now == NONE => now,
+        NO_PIXELS => now,
+        _ if now == NO_PIXELS => now,
         before => ((u32::from(before) + u32::from(now)).div_ceil(2)) as u16,
     };
     before.iter().zip(now).map(mean).collect()
@@ -85,7 +85,7 @@ fn running(before: &[BlockState], now: Vec<u16>) -> Vec<u16> {
 
 /// The residual that a running mean stands for; `None` for a block without used pixels.
 fn residual(mean: u16) -> Option<f64> {
-    (mean != NONE).then(|| f64::from(mean) / f64::from(PER_UNIT))
+    (mean != NO_PIXELS).then(|| f64::from(mean) / f64::from(PER_UNIT))
 }
 
 /// The scores of blocks; 0 for those without used pixels.
@@ -96,7 +96,7 @@ fn scores(means: &[u16], photo: &Target, grid: &BlockGrid) -> Vec<f64> {
 
 /// The limits for the scores of a view: far above the others, and half as far. `None` if no block has used pixels.
 fn limits(means: &[u16], scores: &[f64]) -> Option<[f64; 2]> {
-    let used = means.iter().zip(scores).filter(|(mean, _)| **mean != NONE);
+    let used = means.iter().zip(scores).filter(|(mean, _)| **mean != NO_PIXELS);
     let mut used: Vec<f64> = used.map(|(_, &score)| score).collect();
     let middle = median(&mut used)?;
     used.iter_mut().for_each(|score| *score = (*score - middle).abs());
@@ -117,7 +117,7 @@ fn median(values: &mut [f64]) -> Option<f64> {
 /// Picture and photo differ in size.
 pub fn look(before: &[BlockState], picture: &[f32], photo: &Target) -> Option<Vec<BlockState>> {
     let grid = BlockGrid::of(photo.width, photo.height);
-    let means = running(before, residuals(picture, photo, &grid)?);
+    let means = running_means(before, residuals(picture, photo, &grid)?);
     let scores = scores(&means, photo, &grid);
     let [far, near] = limits(&means, &scores)?;
     let is_masked = |&block: &usize| {
@@ -127,7 +127,7 @@ pub fn look(before: &[BlockState], picture: &[f32], photo: &Target) -> Option<Ve
             && (scores[block] > far || (scores[block] > near && (was_masked || touches())))
     };
     let mut masked: Vec<usize> = (0..means.len()).filter(is_masked).collect();
-    let most = means.iter().filter(|&&mean| mean != NONE).count() / MASKED_MOST;
+    let most = means.iter().filter(|&&mean| mean != NO_PIXELS).count() / MASKED_MOST;
     if masked.len() > most {
         // Scores are positive here, so their bits are in the order of their values.
         masked.sort_unstable_by_key(|&block| (Reverse(scores[block].to_bits()), block));
@@ -211,7 +211,7 @@ impl BlockOutliers {
             let masked = || view.iter().filter(|state| state.is_masked());
             view.len() <= BlockGrid::BLOCKS_MOST
                 && masked().count() <= view.len() / MASKED_MOST
-                && masked().all(|state| state.mean() != NONE)
+                && masked().all(|state| state.mean() != NO_PIXELS)
         };
         if self.views.iter().all(is_possible) { Ok(()) } else { Err("the blocks of a photo are invalid") }
     }
@@ -319,14 +319,14 @@ mod tests {
         let (free, masked) = (BlockState::new(5, false), BlockState::new(9, true));
         assert_eq!(of(vec![free, free, masked, free]), Ok(()));
         assert!(of(vec![free, masked, masked, free]).is_err());
-        assert!(of(vec![free, free, free, BlockState::new(NONE, true)]).is_err());
+        assert!(of(vec![free, free, free, BlockState::new(NO_PIXELS, true)]).is_err());
         assert!(of(vec![free; BlockGrid::BLOCKS_MOST + 1]).is_err());
     }
 
     #[test]
     fn looks_begin_within_a_tenth_of_the_run() {
         assert_eq!([9, 1500, 30_000].map(first_look_at_blocks), [0, 150, 500]);
-        let all_count: Vec<u32> = (0..12).filter(|&step| do_all_blocks_count(step, 12, 2)).collect();
+        let all_count: Vec<u32> = (0..12).filter(|&step| counts_masked_blocks(step, 12, 2)).collect();
         assert_eq!(all_count, [0, 1, 4, 5]);
     }
 }

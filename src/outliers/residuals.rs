@@ -14,7 +14,7 @@ const SIDE_LEAST: usize = 4;
 /// Fixed-point numbers per unit of a residual, of values in 0..1.
 pub(super) const PER_UNIT: f32 = 16_384.0;
 /// The residual of a block without used pixels.
-pub(super) const NONE: u16 = u16::MAX >> 1;
+pub(super) const NO_PIXELS: u16 = u16::MAX >> 1;
 
 /// How a photo is cut into square blocks; those at the right and lower border are cut off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -96,14 +96,14 @@ impl BlockGrid {
             }
         }
         if count == 0 {
-            return Some(NONE);
+            return Some(NO_PIXELS);
         }
         let mean = sums.iter().map(|sum| sum.abs()).sum::<f32>() / (3 * count) as f32;
         mean.is_finite().then(|| (mean * PER_UNIT).round() as u16)
     }
 }
 
-/// The residuals of all blocks; [`NONE`] for a block without used pixels. `None` if a used pixel is NaN.
+/// The residuals of all blocks; [`NO_PIXELS`] for a block without used pixels. `None` if a used pixel is NaN.
 ///
 /// # Panics
 /// Picture and photo differ in size.
@@ -146,7 +146,7 @@ mod tests {
         let picture: Vec<f32> = (0..72).map(value).collect();
         assert_eq!(residuals(&picture, &photo, &grid), Some(vec![0, (PER_UNIT / 6.0).round() as u16]));
         photo.mask = Some((0..24).map(|i| if i % 6 >= 4 { 0 } else { 255 }).collect());
-        assert_eq!(residuals(&picture, &photo, &grid), Some(vec![0, NONE]));
+        assert_eq!(residuals(&picture, &photo, &grid), Some(vec![0, NO_PIXELS]));
         let broken: Vec<f32> = picture.iter().map(|value| if *value == 0.3 { f32::NAN } else { *value }).collect();
         assert_eq!(residuals(&broken, &photo, &grid), None);
     }

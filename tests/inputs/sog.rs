@@ -2,6 +2,7 @@
 //! `developer.playcanvas.com`): by a reader of the tests' own.
 
 use super::ply::scene;
+use super::support::ExportedRow as Row;
 use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::meta::{ExportFrame, SceneMeta};
 use gsscale::exchange::ply::{PlyContent, read_ply};
@@ -11,18 +12,6 @@ use gsscale::scene::rotation::Rotation;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-
-/// A Gaussian of a chunk.
-#[derive(Clone)]
-struct Row {
-    position: [f64; 3],
-    alpha: f64,
-    sh0: [f64; 3],
-    log_scales: [f64; 3],
-    /// w first.
-    quat: [f64; 4],
-    sh_n: Vec<f64>,
-}
 
 /// A chunk, with what its values are rounded to.
 struct Chunk {

@@ -1,6 +1,7 @@
 //! SPZ files, read as its specification says (`github.com/nianticlabs/spz`): by a reader of the tests' own.
 
 use super::ply::scene;
+use super::support::ExportedRow as Row;
 use flate2::read::GzDecoder;
 use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::meta::{ExportFrame, SceneMeta};
@@ -9,17 +10,6 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rotation::Rotation;
 use std::io::Read;
 use std::path::Path;
-
-/// A Gaussian of a file, in the axes of a PLY.
-struct Row {
-    position: [f64; 3],
-    alpha: f64,
-    sh0: [f64; 3],
-    log_scales: [f64; 3],
-    /// w first.
-    quat: [f64; 4],
-    sh_n: Vec<f64>,
-}
 
 /// Signs of the harmonics under half a turn about x: those of the polynomials y, z, x, xy, yz and so on.
 const SIGNS: [f64; 15] = [-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];

@@ -35,9 +35,14 @@ fn begin(args: &[&str]) -> Served {
 impl Served {
     /// Status line, headers and body of an answer.
     fn get(&self, path: &str) -> (String, Vec<u8>) {
+        self.get_as(path, &self.address.to_string())
+    }
+
+    /// The same, of a browser that knows the page by this name.
+    fn get_as(&self, path: &str, host: &str) -> (String, Vec<u8>) {
         let mut stream = TcpStream::connect(self.address).unwrap();
         stream.set_read_timeout(Some(Duration::from_secs(120))).unwrap();
-        write!(stream, "GET {path} HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n", self.address).unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: {host}\r\nConnection: close\r\n\r\n").unwrap();
         let mut answer = Vec::new();
         stream.read_to_end(&mut answer).unwrap();
         let end = answer.windows(4).position(|four| four == b"\r\n\r\n").unwrap();
@@ -101,6 +106,9 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
     served.picture("view=4000000000&turn=1e30&tilt=-1e30&distance=0&width=1");
     assert!(served.get("/picture?turn=left").0.starts_with("HTTP/1.1 400"));
     assert!(served.get("/../config.toml").0.starts_with("HTTP/1.1 404"), "nothing but the page is served");
+
+    let rebound = served.get_as("/status", "evil.example").0;
+    assert!(rebound.starts_with("HTTP/1.1 403"), "a name of another site: {rebound}");
 
     let status = served.json("/status");
     assert!(status["step"].as_u64().unwrap() > 0 && status["steps"] == 1500, "{status}");

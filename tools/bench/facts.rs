@@ -54,7 +54,7 @@ impl Facts {
         let gaussians = columns.rows() as u64;
         Ok(Facts {
             gaussians,
-            growth: growth(gaussians, config),
+            growth: growth(gaussians, cameras.iter().map(|camera| camera.pixels() as u64).sum(), config),
             pages: scene.pager.index().len() as u64,
             largest_view: views.most() as u64,
             views,
@@ -94,8 +94,8 @@ impl Facts {
     }
 }
 
-fn growth(gaussians: u64, config: &TrainConfig) -> f64 {
-    match reach(config, gaussians, 0) {
+fn growth(gaussians: u64, pixels: u64, config: &TrainConfig) -> f64 {
+    match reach(config, gaussians, pixels, 0) {
         (_, Reach::Constant) => 1.0,
         (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,
     }

@@ -9,13 +9,14 @@
 
 use super::{Live, Orbit};
 use axum::Router;
-use axum::extract::{Query, State};
+use axum::extract::{Query, Request, State};
 use axum::http::{StatusCode, header};
+use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use serde::Deserialize;
 use std::io::{Read, Seek, SeekFrom};
-use std::net::TcpListener;
+use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::path::Path;
 use std::time::Duration;
 
@@ -32,6 +33,7 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
         .route("/status", get(status))
         .route("/metrics", get(metrics))
         .route("/picture", get(picture))
+        .layer(from_fn_with_state(live.clone(), check_host))
         .with_state(live);
     std::thread::Builder::new().name("live page".into()).spawn(move || {
         let served = runtime.block_on(async {
@@ -45,7 +47,24 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
     Ok(())
 }
 
-/// JSON that no cache keeps.
+/// Refuses requests for a name that is not this machine's, to a page on the loopback: a page of another site would otherwise read it
+/// by giving its own name the address of the loopback (DNS rebinding).
+async fn check_host(State(live): State<Live>, request: Request, next: Next) -> Response {
+    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
+    match is_own_host(live.address(), host) {
+        true => next.run(request).await,
+        false => (StatusCode::FORBIDDEN, "this page has another address").into_response(),
+    }
+}
+
+/// Whether `host`, with or without a port, may name a page at `address`: any name if the network sees the page.
+fn is_own_host(address: SocketAddr, host: &str) -> bool {
+    // An IPv6 address stands in brackets.
+    let name = host.rsplit_once(':').filter(|_| !host.ends_with(']')).map_or(host, |(name, _)| name);
+    !address.ip().is_loopback() || name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
+}
+
+/// An answer that no cache keeps.
 fn fresh(kind: &'static str, body: Vec<u8>) -> Response {
     ([(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-store")], body).into_response()
 }
@@ -94,6 +113,18 @@ async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Respon
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_page_on_the_loopback_answers_to_its_own_names_alone() {
+        let [loopback, network] = [[127, 0, 0, 1], [0, 0, 0, 0]].map(|ip| SocketAddr::from((ip, 8080)));
+        for host in ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "[::1]"] {
+            assert!(is_own_host(loopback, host), "{host}");
+        }
+        for host in ["evil.example:8080", "evil.example", "", "127.0.0.1.evil.example"] {
+            assert!(!is_own_host(loopback, host), "{host}");
+        }
+        assert!(is_own_host(network, "my-machine:8080"));
+    }
 
     #[test]
     fn metrics_end_with_a_whole_line() {

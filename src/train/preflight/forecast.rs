@@ -60,8 +60,9 @@ pub enum Reach {
     Decided,
 }
 
-/// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known.
-pub fn reach(config: &TrainConfig, rows: u64, steps_done: u32) -> (u64, Reach) {
+/// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known. A guess is at most a
+/// Gaussian for each of the `pixels` of the training photos: what has no pixel of its own has no gradient that splits it for long.
+pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32) -> (u64, Reach) {
     let last = config.refine_stop.min(config.steps);
     let first = config.refine_start.max(steps_done);
     // Rounds come at the multiples of their distance between the two, without these.
@@ -71,7 +72,7 @@ pub fn reach(config: &TrainConfig, rows: u64, steps_done: u32) -> (u64, Reach) {
         _ if !config.strategy.grows() || rounds == 0 => (rows, Reach::Constant),
         0 => {
             let reach = if limits::growth_rule(config).is_some() { Reach::Decided } else { Reach::Guess };
-            (guess(rows, rounds, every), reach)
+            (guess(rows, rounds, every).min(pixels.max(rows)), reach)
         }
         _ => (rows_at_most(config, rows), Reach::Cap),
     }
@@ -265,6 +266,9 @@ mod tests {
     use crate::config::schedule::Lengths;
     use crate::densify::strategy::StrategyName;
 
+    /// Pixels of photos that limit no guess.
+    const PIXELS: u64 = 1 << 40;
+
     fn config() -> TrainConfig {
         TrainConfig { steps: 3000, refine_start: 500, refine_every: 100, refine_stop: 2500, ..TrainConfig::default() }
     }
@@ -272,10 +276,14 @@ mod tests {
     #[test]
     fn a_scene_reaches_its_cap_or_a_guess() {
         let capped = TrainConfig { max_gaussians: 5000, ..config() };
-        assert_eq!(reach(&capped, 1000, 0), (5000, Reach::Cap));
-        assert_eq!(reach(&capped, 7000, 0), (7000, Reach::Cap));
+        assert_eq!(reach(&capped, 1000, PIXELS, 0), (5000, Reach::Cap));
+        assert_eq!(reach(&capped, 7000, PIXELS, 0), (7000, Reach::Cap));
         // After the last round nothing grows.
-        assert_eq!(reach(&capped, 1000, 2450), (1000, Reach::Constant));
+        assert_eq!(reach(&capped, 1000, PIXELS, 2450), (1000, Reach::Constant));
+        // Small photos cannot hold what rounds would add; a scene with more Gaussians than that keeps its number.
+        let long = TrainConfig { steps: 1_000_000, refine_stop: 15_000, ..config() };
+        assert_eq!(reach(&long, 400, 14 * 96 * 64, 0), (14 * 96 * 64, Reach::Guess));
+        assert_eq!(reach(&long, 400, 100, 0), (400, Reach::Guess));
     }
 
     /// Runs without a cap: "Gaussians without a cap" in `benches/RESULTS.md`.
@@ -305,12 +313,12 @@ mod tests {
             let mut run = TrainConfig { steps, ..TrainConfig::default() };
             let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, StrategyName::Default);
             (run.refine_start, run.refine_every, run.refine_stop) = (refine_start, refine_every, refine_stop);
-            let (guessed, _) = reach(&run, first, 0);
+            let (guessed, _) = reach(&run, first, PIXELS, 0);
             let factor = guessed as f64 / f64::from(reached);
             assert!((0.55..1.45).contains(&factor), "{steps} steps from {first}: {guessed}, reached {reached}");
         }
         // Nineteen rounds: after 600, 700, ... 2400 steps; nine of them after 1,500.
-        let added = |done: u32| reach(&config(), 100_000, done).0 - 100_000;
+        let added = |done: u32| reach(&config(), 100_000, PIXELS, done).0 - 100_000;
         assert!((added(0) as f64 / 19.0 - added(1500) as f64 / 9.0).abs() < 1.0);
     }
 

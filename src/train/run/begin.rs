@@ -211,9 +211,10 @@ fn plan(
     }
     let probe = Probe::of_run(dataset, trainer, largest, driver);
     let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
+    let pixels = dataset.train_views().iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
     let (last, known) = match keeps_first_count(config, dataset) {
         true => (rows, Reach::Kept),
-        false => reach(config, rows, steps_done),
+        false => reach(config, rows, pixels, steps_done),
     };
     let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check(config, &memory)?;

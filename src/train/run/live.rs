@@ -135,6 +135,7 @@ fn png(image: &Image) -> Result<Vec<u8>, ImageError> {
 }
 
 #[cfg(test)]
+#[allow(clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
@@ -147,6 +148,19 @@ mod tests {
     /// Coordinates of a world point before the camera.
     fn seen(camera: &Camera, point: [f32; 3]) -> [f32; 3] {
         camera.viewmat.map(|row| row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3])
+    }
+
+    #[test]
+    fn pictures_take_their_share_of_the_time_and_the_first_is_free() {
+        let live = Live::begin(std::net::SocketAddr::from(([127, 0, 0, 1], 0))).expect("a free port");
+        let page = |spent: u64, seconds: u64| LivePage {
+            live: live.clone(),
+            began: Instant::now().checked_sub(Duration::from_secs(seconds)).expect("the machine runs for minutes"),
+            spent: Duration::from_secs(spent),
+            told: None,
+        };
+        assert!(page(0, 0).may_draw());
+        assert!(page(4, 100).may_draw() && !page(6, 100).may_draw());
     }
 
     #[test]

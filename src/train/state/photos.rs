@@ -12,7 +12,7 @@ use crate::appearance::model::CHANNEL_VALUES;
 use crate::appearance::picture::Look;
 use crate::appearance::state::AppearanceState;
 use crate::dataset::loader::Dataset;
-use crate::outliers::blocks::{BlockState, STEPS_AFTER_RESET, do_all_blocks_count, first_look_at_blocks};
+use crate::outliers::blocks::{BlockState, STEPS_AFTER_RESET, counts_masked_blocks, first_look_at_blocks};
 use crate::scene::camera::Camera;
 use crate::scene::events::{Event, EventKind};
 use crate::scene::image::Target;
@@ -44,7 +44,7 @@ impl Trainer {
         let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
         let reset = self.events().events().iter().rev().find(is_reset);
         let are_kept = reset.is_some_and(|reset| step - reset.step <= STEPS_AFTER_RESET);
-        let all_count = do_all_blocks_count(step, self.options.steps, self.train_views.len());
+        let all_count = counts_masked_blocks(step, self.options.steps, self.train_views.len());
         (self.options.robust_pixels && is_begun).then_some(BlocksBefore { states, are_kept, all_count })
     }
 
