@@ -1,6 +1,7 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
 // camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
-// `bounds` finds the bounds of a page after its update. The twin of src/kernels/gather.rs.
+// `bounds` finds the bounds of a page after its update. Where the host does not wait for the numbers of rows, `place` finds where
+// the list of each page begins, and `pad` fills the room behind the last row. The twin of src/kernels/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
 // file, so that one compiled formula decides what is seen, drawn, updated and bounded.
@@ -49,14 +50,16 @@ struct GatherUniforms {
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
 /// `[missed steps]`: sums of this step.
 @group(0) @binding(4) var<storage, read> recent: array<f32>;
-/// `[page]`: rows that the camera may draw.
+/// `[page]`: rows that the camera may draw; behind them their sum, after `place`.
 @group(0) @binding(5) var<storage, read_write> counts: array<u32>;
 /// At `first_row` of a page on: the rows that the camera may draw, ascending.
 @group(0) @binding(6) var<storage, read_write> found: array<u32>;
-/// Listed rows of the batch: number of the page, number of the row in it.
+/// Listed rows of the batch: number of the page, or UNLISTED, and number of the row in it.
 @group(0) @binding(7) var<storage, read_write> rows: array<vec2<u32>>;
 @group(0) @binding(8) var<storage, read_write> out: array<f32>;
 @group(0) @binding(9) var<storage, read_write> results: array<PageResult>;
+/// The pages, for `place`.
+@group(0) @binding(10) var<storage, read_write> placed: array<DevicePage>;
 
 /// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
 /// is twice the CPU's, for devices that divide and take roots less exactly.
@@ -67,6 +70,8 @@ const SIGMA_SLACK: f32 = 4e-6;
 const SIGMA_MOST: f32 = 1e30;
 const REACH_SLACK: f32 = 1.0001;
 const EPSILON: f32 = 1.1920929e-7;
+/// Opacity, before activation, of entries without a row.
+const HIDDEN_LOGIT: f32 = -100.0;
 
 var<workgroup> parts: array<array<f32, 256>, 7>;
 
@@ -180,6 +185,37 @@ fn cull(place: SubgroupPlace) {
     }
 }
 
+/// One workgroup, for the pages of all slabs: where the listed rows of each page begin, and how many there are.
+@compute @workgroup_size(256)
+fn place(place: SubgroupPlace) {
+    var before = 0u;
+    for (var first = 0u; first < u.page_count; first += 256u) {
+        let p = first + place.lane;
+        var count = 0u;
+        if p < u.page_count {
+            count = counts[p];
+        }
+        let scanned = workgroup_scan(count, place);
+        if p < u.page_count {
+            placed[p].first_listed = before + scanned.before;
+        }
+        before += scanned.total;
+        workgroupBarrier();
+    }
+    if place.lane == 0u {
+        counts[u.page_count] = before;
+    }
+}
+
+/// One invocation for each row that the list has room for.
+@compute @workgroup_size(256)
+fn pad(place: Place) {
+    let i = linear_index(place, 256u);
+    if i < u.row_count && i >= counts[u.page_count] {
+        rows[i] = vec2<u32>(UNLISTED, 0u);
+    }
+}
+
 /// One workgroup for each page, of any slab.
 @compute @workgroup_size(256)
 fn list(place: Place) {
@@ -187,7 +223,9 @@ fn list(place: Place) {
     if p >= u.page_count {
         return;
     }
-    for (var i = place.lane; i < counts[p]; i += 256u) {
+    // The list may have less room than rows; the gate of the step is closed then.
+    let room = arrayLength(&rows) - min(pages[p].first_listed, arrayLength(&rows));
+    for (var i = place.lane; i < min(counts[p], room); i += 256u) {
         rows[pages[p].first_listed + i] = vec2<u32>(p, found[pages[p].first_row + i]);
     }
 }
@@ -201,6 +239,11 @@ fn gather(place: Place) {
     }
     let row = i / u.width;
     let listed = rows[row];
+    if listed.x == UNLISTED {
+        // Transparent, so no stage draws it.
+        out[i] = select(0.0, HIDDEN_LOGIT, u.column == OPACITIES);
+        return;
+    }
     let page = pages[listed.x];
     if page.slab == u.slab {
         out[i] = element(page, u.column, listed.y, u.first_element + i - row * u.width, u.now, u.rate);

@@ -2,7 +2,8 @@
 // finds whether the gradients of a row are usable, column by column; `step` rewrites a column of the rows whose gradients
 // all are; `finish` counts, stamps and collects statistics. The twin of src/kernels/update.rs.
 //
-// Values come from the stage "gather" at the same step. A row is rewritten as a whole or not at all.
+// Values come from the stage "gather" at the same step. A row is rewritten as a whole or not at all. Nothing is written behind a
+// closed gate (gate.wgsl).
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
 #import "shared/deferred.wgsl"
@@ -35,7 +36,7 @@ struct UpdateUniforms {
 @group(0) @binding(1) var<storage, read> pages: array<DevicePage>;
 @group(0) @binding(2) var<storage, read_write> slab: array<u32>;
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
-/// Number of the page, number of the row in it.
+/// Number of the page, or UNLISTED, and number of the row in it.
 @group(0) @binding(4) var<storage, read> rows: array<vec2<u32>>;
 @group(0) @binding(5) var<storage, read> values: array<f32>;
 /// Gradients of a column, bits of floats.
@@ -48,6 +49,8 @@ struct UpdateUniforms {
 @group(0) @binding(9) var<storage, read_write> results: array<atomic<u32>>;
 /// Change of the number of rows by bin of the mean growth score, modulo 2^32.
 @group(0) @binding(10) var<storage, read_write> bins: array<atomic<u32>>;
+/// One word: 0 while the gate is open.
+@group(0) @binding(11) var<storage, read> gate: array<u32>;
 
 /// Bits of 1e18, the largest usable gradient (src/base/math.rs).
 const LARGEST_GRAD: u32 = 0x5d5e0b6bu;
@@ -86,11 +89,14 @@ fn decay_at(steps: u32) -> u32 {
 @compute @workgroup_size(256)
 fn step(place: Place) {
     let i = linear_index(place, 256u);
-    if i >= u.row_count * u.width {
+    if i >= u.row_count * u.width || gate[0] != 0u {
         return;
     }
     let row = i / u.width;
     let listed = rows[row];
+    if listed.x == UNLISTED {
+        return;
+    }
     let page = pages[listed.x];
     if page.slab != u.slab || !is_usable(largest[row]) {
         return;
@@ -151,10 +157,13 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>) {
 @compute @workgroup_size(256)
 fn finish(place: Place) {
     let i = linear_index(place, 256u);
-    if i >= u.row_count {
+    if i >= u.row_count || gate[0] != 0u {
         return;
     }
     let listed = rows[i];
+    if listed.x == UNLISTED {
+        return;
+    }
     let page = pages[listed.x];
     if page.slab != u.slab {
         return;

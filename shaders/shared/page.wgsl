@@ -35,6 +35,9 @@ struct PageResult {
     pad: u32,
 }
 
+/// Number of the page of an entry without a row, behind the listed rows.
+const UNLISTED: u32 = 0xffffffffu;
+
 /// Columns in storage order, and the tables of each.
 const MEANS: u32 = 0u;
 const QUATS: u32 = 1u;

@@ -1,9 +1,11 @@
-//! Uploads through reused staging memory: two sets, so that one is filled while the device reads the other.
+//! Uploads through reused staging memory: two sets, so that one is filled while the device reads the other; more where the host
+//! records a step while the device works on another.
 //!
 //! Invariants: (1) a chunk is written only while it is mapped, and unmapped before the commands that read it are
 //! submitted; (2) a set is refilled only after its submission has finished; (3) a set takes at most a 64th of the budget or
 //! one smallest chunk: when a set is full, the recorder submits what it has recorded.
 
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -25,6 +27,9 @@ const SET_CHUNKS: usize = 8;
 pub fn staging_bytes(bytes: u64) -> u64 {
     2 * bytes.next_multiple_of(CHUNK_BYTES_MAX).clamp(CHUNK_BYTES_MAX, SET_CHUNKS as u64 * CHUNK_BYTES_MAX)
 }
+
+/// Sets of a host that records one step while the device works on another: three submissions of a step bring uploads.
+const SETS_IN_FLIGHT: usize = 6;
 
 /// Bytes that one thread copies at a time: longer copies between host and mapped memory run on all threads.
 pub(super) const COPY_PART: usize = 256 << 10;
@@ -63,7 +68,7 @@ struct Set {
     submission: Option<wgpu::SubmissionIndex>,
 }
 
-/// Both sets; the first one is being filled.
+/// The sets; the first one is being filled, and the next one is the longest submitted.
 #[derive(Debug)]
 pub(super) struct Belt {
     driver: Arc<Driver>,
@@ -71,7 +76,9 @@ pub(super) struct Belt {
     chunk_bytes: u64,
     /// Most staging buffers in one set.
     set_chunks: usize,
-    sets: [Set; 2],
+    sets: VecDeque<Set>,
+    /// The most sets.
+    sets_most: usize,
 }
 
 impl Belt {
@@ -79,7 +86,27 @@ impl Belt {
     pub(super) fn new(driver: Arc<Driver>, pool: Arc<Pool>, budget: u64) -> Belt {
         let share = (budget / SET_SHARE).clamp(CHUNK_BYTES_MIN, CHUNK_BYTES_MAX);
         let set_chunks = (budget / SET_SHARE / share).clamp(1, SET_CHUNKS as u64) as usize;
-        Belt { driver, pool, chunk_bytes: share / MAP_ALIGNMENT * MAP_ALIGNMENT, set_chunks, sets: Default::default() }
+        let (chunk_bytes, sets) =
+            (share / MAP_ALIGNMENT * MAP_ALIGNMENT, VecDeque::from([Set::default(), Set::default()]));
+        Belt { driver, pool, chunk_bytes, set_chunks, sets_most: sets.len(), sets }
+    }
+
+    /// Lets the belt take more sets, as memory allows, instead of waiting for the device.
+    pub(super) fn allow_steps_in_flight(&mut self) {
+        self.sets_most = SETS_IN_FLIGHT;
+    }
+
+    /// Makes the first set ready: waits for its submission, or puts another set before it.
+    fn ready(&mut self) -> GpuResult<()> {
+        if self.sets.len() < self.sets_most && self.sets[0].is_busy() {
+            let mut set = Set::default();
+            match set.chunk_with_room(&self.pool, self.chunk_bytes, self.set_chunks) {
+                Ok(_) => self.sets.push_front(set),
+                Err(error) if error.lacks_room() => {}
+                Err(error) => return Err(error),
+            }
+        }
+        self.sets[0].wait(&self.driver)
     }
 
     /// Stages as much of `bytes` as fits and records its copy to `target` at `offset`; returns the number of bytes
@@ -91,7 +118,7 @@ impl Belt {
         offset: u64,
         bytes: &[u8],
     ) -> GpuResult<usize> {
-        self.sets[0].wait(&self.driver)?;
+        self.ready()?;
         let mut done = 0;
         while done < bytes.len() {
             let Some(chunk) = self.sets[0].chunk_with_room(&self.pool, self.chunk_bytes, self.set_chunks)? else {
@@ -129,12 +156,17 @@ impl Belt {
         }
         if any {
             self.sets[0].submission = Some(submission.clone());
-            self.sets.swap(0, 1);
+            self.sets.rotate_left(1);
         }
     }
 }
 
 impl Set {
+    /// Whether the device has not read the last content of this set, as far as is known.
+    fn is_busy(&self) -> bool {
+        self.submission.is_some() && self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) == PENDING)
+    }
+
     /// Waits until the device has read the last content of this set.
     fn wait(&mut self, driver: &Driver) -> GpuResult<()> {
         let Some(submission) = self.submission.take() else { return Ok(()) };

@@ -166,6 +166,12 @@ impl Gpu {
         })
     }
 
+    /// Lets uploads take more staging memory, within the budget, instead of waiting for the device: for a host that records one step
+    /// while the device works on another.
+    pub fn allow_steps_in_flight(&self) {
+        lock(&self.belt).allow_steps_in_flight();
+    }
+
     /// The adapter.
     pub fn summary(&self) -> &AdapterSummary {
         &self.summary

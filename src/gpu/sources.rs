@@ -37,6 +37,7 @@ macro_rules! sources {
 }
 
 sources![
+    "gate.wgsl",
     "gather.wgsl",
     "image_loss.wgsl",
     "isect_emit.wgsl",

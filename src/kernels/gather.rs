@@ -1,8 +1,10 @@
 //! Stage "gather": the rows of pages, as they are now, from the words of their payloads. The twin of
-//! `shaders/gather.wgsl`, in which the four functions are entry points.
+//! `shaders/gather.wgsl`, in which the functions are entry points.
 //!
 //! [`cull`] lists the rows of each page that the camera may draw, [`list`] packs the lists in the order of the pages,
-//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update.
+//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the host does
+//! not wait for the numbers of rows, [`place`] finds where the list of each page begins; a list has room for more rows than there
+//! are then, and entries without a row ([`UNLISTED`]) are transparent.
 //!
 //! One workgroup of a device finds the bounds of a page, by minima and maxima in its own memory. Bounds therefore need no
 //! atomic operations on floats in the form of ordered integers.
@@ -28,6 +30,11 @@ const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
 const SIGMA_SLACK: f32 = 4e-6;
 const SIGMA_MOST: f32 = 1e30;
 const REACH_SLACK: f32 = 1.0001;
+
+/// Number of the page of an entry without a row, behind the listed rows.
+pub const UNLISTED: u32 = u32::MAX;
+/// Opacity, before activation, of entries without a row.
+const HIDDEN_LOGIT: f32 = -100.0;
 
 /// What the stage reads: the pages of a batch, the slab that is bound, and the optimizer's numbers.
 #[derive(Debug, Clone, Copy)]
@@ -106,10 +113,19 @@ pub fn cull(input: &GatherInput<'_>, counts: &mut [u32], found: &mut [u32]) {
     }
 }
 
-/// Packs the lists of [`cull`], of all slabs: number of the page, number of the row in it.
+/// Finds where the listed rows of each page begin; returns how many there are.
+pub fn place(pages: &mut [DevicePage], counts: &[u32]) -> u32 {
+    pages.iter_mut().zip(counts).fold(0, |listed, (page, count)| {
+        page.first_listed = listed;
+        listed + count
+    })
+}
+
+/// Packs the lists of [`cull`], of all slabs: number of the page, number of the row in it. Rows without room are left out.
 pub fn list(pages: &[DevicePage], counts: &[u32], found: &[u32], rows: &mut [[u32; 2]]) {
     for (p, page) in pages.iter().enumerate() {
-        for i in 0..counts[p] {
+        let room = rows.len().saturating_sub(page.first_listed as usize);
+        for i in (0..counts[p]).take(room) {
             rows[(page.first_listed + i) as usize] = [p as u32, found[(page.first_row + i) as usize]];
         }
     }
@@ -120,6 +136,10 @@ pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
     let GatherUniforms { column, width, first_element, now, rate, .. } = *input.uniforms;
     let column = Column::ALL[column as usize];
     for (listed, out) in rows.iter().zip(out.chunks_exact_mut(width as usize)) {
+        if listed[0] == UNLISTED {
+            out.fill(if column == Column::Opacities { HIDDEN_LOGIT } else { 0.0 });
+            continue;
+        }
         let page = &input.pages[listed[0] as usize];
         if input.is_bound(page) {
             for (e, out) in out.iter_mut().enumerate() {

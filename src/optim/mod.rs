@@ -12,6 +12,7 @@ pub(crate) mod lanes;
 pub mod method;
 pub mod moments;
 mod numbers;
+pub mod one_step;
 pub mod rates;
 mod row_kernels;
 mod row_vectors;

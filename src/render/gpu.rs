@@ -53,6 +53,7 @@ use super::gpu_gradients::Scratch;
 use super::gpu_loss::LossStage;
 use super::gpu_pages::{DevicePages, PagesView};
 use super::gpu_ranges::RangeStages;
+use super::gpu_recorded::{InFlight, Recorded};
 use super::gpu_rows::{DeviceColumns, HostRows, RowSource, RowStages, SplatRows};
 use super::gpu_segments::{self, Segment};
 use super::gpu_tiles::TileStages;
@@ -68,6 +69,7 @@ use crate::kernels::uniforms::pack_target;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::image::{Image, Target};
+use std::collections::VecDeque;
 
 /// Renders views on a GPU.
 #[derive(Debug)]
@@ -78,7 +80,7 @@ pub struct GpuRenderer {
     pub(super) ranges: RangeStages,
     pub(super) loss: LossStage,
     pub(super) sequence: Sequence,
-    rows_in: Option<RowsIn>,
+    pub(super) rows_in: Option<RowsIn>,
     pub(super) view: Option<View>,
     /// The pages of a run, if this device holds them.
     pub(super) pages: Option<Box<DevicePages>>,
@@ -92,6 +94,10 @@ pub struct GpuRenderer {
     pub(super) scratch: Scratch,
     packed_target: Vec<u32>,
     pub(super) frames_rerecorded: u64,
+    /// A step that is recorded without waiting, while it is recorded.
+    pub(super) records: Option<Recorded>,
+    /// Steps that are recorded and not finished, the first first.
+    pub(super) in_flight: VecDeque<InFlight>,
     /// Whether the next views collect weights of rows, and whether this view does.
     weighs_next: bool,
     pub(super) weighs: bool,
@@ -120,6 +126,8 @@ impl GpuRenderer {
             scratch: Scratch::default(),
             packed_target: Vec::new(),
             frames_rerecorded: 0,
+            records: None,
+            in_flight: VecDeque::new(),
             weighs_next: false,
             weighs: false,
         })
@@ -221,7 +229,7 @@ impl GpuRenderer {
 }
 
 /// Submits rows, projection and depth sort of a view of one batch; records the colours. Does not wait.
-fn submit_whole(
+pub(super) fn submit_whole(
     (gpu, stages, tiles): (&Gpu, &RowStages, &TileStages),
     rows: &mut dyn RowSource,
     view: &ViewOptions,

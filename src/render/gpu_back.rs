@@ -34,6 +34,7 @@ impl GpuRenderer {
             self.loss.errors(&mut recorder, size, &loss.plan, [&rgb, &photo, &errors.view()])?;
         }
         let sums = match sums {
+            Some(sums) if self.records.is_some() => LossSums::OnDevice(sums),
             Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
             None => LossSums::Empty,
         };
@@ -176,8 +177,10 @@ impl GpuRenderer {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         };
         let sums = match std::mem::replace(&mut loss.sums, LossSums::Empty) {
-            // The wait above has computed stale sums again.
-            LossSums::Stale => return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" }),
+            // The wait above has computed stale sums again, and a step that is recorded without waiting reads none.
+            LossSums::Stale | LossSums::OnDevice(_) => {
+                return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
+            }
             LossSums::Empty => [0.0; 4],
             LossSums::Pending(readback) => {
                 let mut sums = [0.0f32; 4];

@@ -14,9 +14,9 @@ use super::gpu_pages::{DevicePages, PageRows, UpdateBuffers};
 use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
 use super::gpu_segments::{Segment, gradients_of, in_chunks};
 use super::gpu_view::{Unusable, View};
-use super::pages::{DeviceSlot, PageRenderer, PageRules, SlotPage};
+use super::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepDone, StepJob};
 use super::{RenderError, RowBatches};
-use crate::gpu::{Buffer, GpuResult};
+use crate::gpu::{Buffer, GpuResult, Recorder};
 use crate::kernels::page_words::PageResult;
 use crate::scene::optimizer_numbers::StepNumbers;
 
@@ -63,7 +63,7 @@ impl GpuRenderer {
     }
 
     /// Memory of the update of `rows` rows: gradients, and the largest of each row.
-    fn update_room(&self, rows: u32, sh_degree: u8) -> GpuResult<(RowGradients, Buffer)> {
+    pub(super) fn update_room(&self, rows: u32, sh_degree: u8) -> GpuResult<(RowGradients, Buffer)> {
         let grads = RowGradients::new(&self.gpu, rows, sh_degree, false)?;
         Ok((grads, self.gpu.buffer("largest gradients", 4 * u64::from(rows))?))
     }
@@ -74,6 +74,22 @@ impl GpuRenderer {
         &self,
         view: &View,
         source: &PageRows<'_>,
+        place: (&Segment, usize, &std::ops::Range<usize>),
+        values: &DeviceColumns,
+        room: &(RowGradients, Buffer),
+        how: (&Buffer, bool),
+    ) -> GpuResult<()> {
+        let mut recorder = self.gpu.begin("update");
+        self.record_update_chunk(&mut recorder, view, source, place, values, room, how)?;
+        self.gpu.submit(recorder).map(|_| ())
+    }
+
+    /// Records the same.
+    pub(super) fn record_update_chunk(
+        &self,
+        recorder: &mut Recorder<'_>,
+        view: &View,
+        source: &PageRows<'_>,
         (segment, at, part): (&Segment, usize, &std::ops::Range<usize>),
         values: &DeviceColumns,
         (grads, largest): &(RowGradients, Buffer),
@@ -81,12 +97,10 @@ impl GpuRenderer {
     ) -> GpuResult<()> {
         let out = RowsOut { gpu: &self.gpu, stages: &self.rows, view: &view.of, weighs: false };
         let splats = [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, at as u64));
-        let mut recorder = self.gpu.begin("update");
-        out.record(&mut recorder, values, splats, grads)?;
+        out.record(recorder, values, splats, grads)?;
         let RowGradients { columns: grads, footprints } = grads;
         let buffers = UpdateBuffers { values, grads, footprints, largest, results, collects };
-        source.pages().update(&self.gpu, &mut recorder, source, part, &buffers)?;
-        self.gpu.submit(recorder).map(|_| ())
+        source.pages().update(&self.gpu, recorder, source, part, &buffers)
     }
 
     /// First row, in the view, of a batch of pages.
@@ -229,5 +243,34 @@ impl PageRenderer for GpuRenderer {
 
     fn take_bins(&mut self) -> Result<Vec<u32>, RenderError> {
         Ok(self.held()?.take_bins(&self.gpu)?)
+    }
+
+    fn record_picture(&mut self, job: &StepJob<'_>) -> Result<bool, RenderError> {
+        if job.pages.is_empty() || job.rows_room == 0 {
+            return Ok(false);
+        }
+        let asked = job.options.sh_degree;
+        match job.pages.iter().find(|page| page.layout.sh_degree != asked) {
+            Some(page) => Err(RenderError::ShDegree { asked, stored: page.layout.sh_degree }),
+            None => self.record_rows(job),
+        }
+    }
+
+    fn record_update(&mut self, update: &RecordedUpdate<'_>) -> Result<bool, RenderError> {
+        self.record_rest(update)
+    }
+
+    fn finish_step(&mut self) -> Result<StepDone, RenderError> {
+        self.finish_first()
+    }
+
+    fn open_gate(&mut self) -> Result<(), RenderError> {
+        if !self.in_flight.is_empty() {
+            return Err(RenderError::OutOfOrder { call: "open_gate", needs: "finish_step of every step in flight" });
+        }
+        let mut recorder = self.gpu.begin("gate");
+        recorder.clear(&self.held()?.gate.view())?;
+        self.gpu.submit(recorder)?;
+        Ok(())
     }
 }

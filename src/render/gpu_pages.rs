@@ -4,7 +4,7 @@
 //! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. Columns
 //! are gathered and updated one by one: an invocation for each float, and few bindings.
 //!
-//! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`).
+//! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`), steps that are recorded without waiting (`gpu_recorded`).
 //!
 //! Invariants: 1. a dispatch binds windows of columns, so no binding is too large; floats are independent, so the result has the
 //! same bits for any windows; 2. an update of a chunk is submitted at once, so a chunk is updated as a whole or not at all.
@@ -24,7 +24,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 /// Invocations per workgroup.
-const WORKGROUP: u32 = 256;
+pub(super) const WORKGROUP: u32 = 256;
 /// Bins of mean growth scores: the upper halves of floats that are not negative.
 const BINS: u64 = 1 << 15;
 /// Bytes of a listed row: number of the page, number of the row.
@@ -44,14 +44,17 @@ fn parts() -> impl Iterator<Item = Part> {
 
 /// The compiled stages.
 #[derive(Debug)]
-struct Stages {
-    cull: Arc<Pipeline>,
-    list: Arc<Pipeline>,
+pub(super) struct Stages {
+    pub(super) cull: Arc<Pipeline>,
+    pub(super) place: Arc<Pipeline>,
+    pub(super) pad: Arc<Pipeline>,
+    pub(super) list: Arc<Pipeline>,
     gather: Arc<Pipeline>,
     bounds: Arc<Pipeline>,
     judge: Arc<Pipeline>,
     step: Arc<Pipeline>,
     finish: Arc<Pipeline>,
+    pub(super) decide: Arc<Pipeline>,
 }
 
 /// The pages of a run on a device.
@@ -59,10 +62,12 @@ struct Stages {
 pub struct DevicePages {
     /// The slots.
     pub slots: Slots,
-    stages: Stages,
+    pub(super) stages: Stages,
     rules: PageRules,
     tables: Buffer,
     bins: Buffer,
+    /// One word: 0 while steps may change rows.
+    pub(super) gate: Buffer,
 }
 
 /// What the stages of one view share.
@@ -78,19 +83,19 @@ pub struct PagesView {
 /// The listed rows of a batch.
 #[derive(Debug)]
 pub struct PageBatch {
-    /// First listed row of each page.
-    first_listed: Vec<u32>,
-    /// Listed rows.
+    /// First listed row of each page; empty where only the device knows.
+    pub(super) first_listed: Vec<u32>,
+    /// Listed rows, or those that the list has room for.
     pub rows: u32,
     /// `[rows]`: number of the page, number of the row in it.
-    listed: Buffer,
+    pub(super) listed: Buffer,
 }
 
 /// Pages of a batch in their slots.
 #[derive(Debug)]
 pub struct PageTable {
-    pages: Vec<DevicePage>,
-    on_device: Buffer,
+    pub(super) pages: Vec<DevicePage>,
+    pub(super) on_device: Buffer,
 }
 
 impl PageTable {
@@ -109,18 +114,22 @@ impl DevicePages {
         let of = |shader: &str, entry: &str| gpu.pipeline(shader, entry, &[]);
         let stages = Stages {
             cull: of("gather.wgsl", "cull")?,
+            place: of("gather.wgsl", "place")?,
+            pad: of("gather.wgsl", "pad")?,
             list: of("gather.wgsl", "list")?,
             gather: of("gather.wgsl", "gather")?,
             bounds: of("gather.wgsl", "bounds")?,
             judge: of("update.wgsl", "judge")?,
             step: of("update.wgsl", "step")?,
             finish: of("update.wgsl", "finish")?,
+            decide: of("gate.wgsl", "decide")?,
         };
         let mut recorder = gpu.begin("pages");
         let tables = recorder.buffer_with("optimizer tables", DeferredTables::new(&rules.numbers).words())?;
         let bins = recorder.buffer_zeroed("bins", 4 * BINS)?;
+        let gate = recorder.buffer_zeroed("gate", 4)?;
         gpu.submit(recorder)?;
-        Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins })
+        Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins, gate })
     }
 
     /// Begins a view at a step.
@@ -129,12 +138,26 @@ impl DevicePages {
     /// The device failed, or has no memory.
     pub fn begin(&self, gpu: &Gpu, camera: &Camera, step: &StepNumbers) -> GpuResult<PagesView> {
         let mut recorder = gpu.begin("gather");
-        let recent = recorder.buffer_with("recent", step.recent.as_flattened())?;
+        let view = self.begin_in(&mut recorder, camera, step)?;
         gpu.submit(recorder)?;
+        Ok(view)
+    }
+
+    /// As [`DevicePages::begin`], recorded.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub(super) fn begin_in(
+        &self,
+        recorder: &mut Recorder<'_>,
+        camera: &Camera,
+        step: &StepNumbers,
+    ) -> GpuResult<PagesView> {
+        let recent = recorder.buffer_with("recent", step.recent.as_flattened())?;
         Ok(PagesView { camera: *camera, step: step.clone(), recent, batches: Vec::new() })
     }
 
-    fn uniforms(&self, view: &PagesView, pages: usize) -> GatherUniforms {
+    pub(super) fn uniforms(&self, view: &PagesView, pages: usize) -> GatherUniforms {
         GatherUniforms::new(&view.camera, &self.rules.numbers, view.step.now, &self.rules.splits, pages as u32)
     }
 
@@ -155,15 +178,20 @@ impl DevicePages {
         Ok(PageTable { pages: entries, on_device })
     }
 
-    /// Lists the rows of the pages that the camera may draw. Waits for their numbers.
+    /// Records the cull of the pages. Returns their table, their counts with a word for the sum, and the rows that were found.
     ///
     /// # Errors
     /// The device failed, or has no memory.
-    pub fn list(&self, gpu: &Gpu, view: &PagesView, pages: &[SlotPage]) -> GpuResult<(PageBatch, PageTable)> {
-        let mut recorder = gpu.begin("gather");
-        let table = self.table(&mut recorder, pages, &[])?;
+    pub(super) fn cull(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        view: &PagesView,
+        pages: &[SlotPage],
+    ) -> GpuResult<(PageTable, [Buffer; 2])> {
+        let table = self.table(recorder, pages, &[])?;
         let rows: u64 = table.pages.iter().map(|page| u64::from(page.rows)).sum();
-        let counts = gpu.buffer("counts", 4 * pages.len() as u64)?;
+        let counts = gpu.buffer("counts", 4 * (pages.len() as u64 + 1))?;
         let found = gpu.buffer("found", 4 * rows)?;
         let uniforms = self.uniforms(view, pages.len());
         let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
@@ -173,8 +201,21 @@ impl DevicePages {
             let views = [uniform, table.on_device.view(), slab, tables, recent, counts.view(), found.view()];
             recorder.dispatch("gather", &self.stages.cull, &views, groups)?;
         }
-        let read = recorder.read_back("gather", &counts.view())?;
+        Ok((table, [counts, found]))
+    }
+
+    /// Lists the rows of the pages that the camera may draw. Waits for their numbers.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn list(&self, gpu: &Gpu, view: &PagesView, pages: &[SlotPage]) -> GpuResult<(PageBatch, PageTable)> {
+        let mut recorder = gpu.begin("gather");
+        let (table, [counts, found]) = self.cull(gpu, &mut recorder, view, pages)?;
+        let uniforms = self.uniforms(view, pages.len());
+        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        let read = recorder.read_back("gather", &counts.slice(0, 4 * pages.len() as u64))?;
         gpu.submit(recorder)?;
+        drop(table);
         let mut of_pages = vec![0u32; pages.len()];
         read.copy_to(&mut of_pages)?;
         let (mut first_listed, mut listed) = (Vec::with_capacity(pages.len()), 0);
@@ -229,14 +270,14 @@ impl DevicePages {
                 for (((values, _), (grads, _)), (column, width, first)) in columns {
                     let uniform = recorder.uniform(&uniforms.of_column(&view.step, column, width, first))?;
                     let [values, grads] = [values, grads].map(|buffer| window.of(buffer, 4 * width as u64));
-                    let own = [values, grads, largest.clone()];
+                    let own = [values, grads, largest.clone(), self.gate.view()];
                     let views: Vec<BufferView> = [uniform].into_iter().chain(of_slab.clone()).chain(own).collect();
                     let groups = groups_1d(window.rows * width as u32, WORKGROUP);
                     recorder.dispatch("update", &self.stages.step, &views, groups)?;
                 }
                 let [pages, slab, _, rows] = of_slab;
                 let footprints = window.of(buffers.footprints, footprint_bytes(false));
-                let own = [largest.clone(), footprints, buffers.results.view(), self.bins.view()];
+                let own = [largest.clone(), footprints, buffers.results.view(), self.bins.view(), self.gate.view()];
                 let views: Vec<BufferView> =
                     [recorder.uniform(&uniforms)?, pages, slab, rows].into_iter().chain(own).collect();
                 recorder.dispatch("update", &self.stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
@@ -250,8 +291,21 @@ impl DevicePages {
     /// # Errors
     /// The device failed, or has no memory.
     pub fn results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Vec<PageResult>> {
-        let PageRows { view, table, .. } = *source;
         let mut recorder = gpu.begin("update");
+        self.bounds(&mut recorder, source, results)?;
+        let read = recorder.read_back("update", &results.view())?;
+        gpu.submit(recorder)?;
+        let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); source.table.pages.len()];
+        read.copy_to(&mut results)?;
+        Ok(results)
+    }
+
+    /// Records the bounds of the pages of a batch.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub(super) fn bounds(&self, recorder: &mut Recorder<'_>, source: &PageRows<'_>, results: &Buffer) -> GpuResult<()> {
+        let PageRows { view, table, .. } = *source;
         let uniforms = self.uniforms(view, table.pages.len());
         let groups = groups_1d(table.pages.len() as u32 * WORKGROUP, WORKGROUP);
         for slab in table.slabs() {
@@ -260,11 +314,7 @@ impl DevicePages {
             let views = [uniform, table.on_device.view(), slab, tables, recent, results.view()];
             recorder.dispatch("update", &self.stages.bounds, &views, groups)?;
         }
-        let read = recorder.read_back("update", &results.view())?;
-        gpu.submit(recorder)?;
-        let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); table.pages.len()];
-        read.copy_to(&mut results)?;
-        Ok(results)
+        Ok(())
     }
 
     /// Takes the bins and clears them. Waits.

@@ -92,7 +92,11 @@ impl GpuRenderer {
             let unread = DemandState::Known(Demand { isects: 0, list_max: 0 });
             let demand = match std::mem::replace(&mut lists.demand, unread) {
                 DemandState::Known(demand) => demand,
-                DemandState::Pending(readback) => readback.wait()?,
+                DemandState::Pending(readback) => {
+                    let demand = readback.wait()?;
+                    self.tiles.note(demand);
+                    demand
+                }
             };
             lists.demand = DemandState::Known(demand);
             let fits = self.tiles.fits(&lists.frame, demand);

@@ -15,8 +15,8 @@ use crate::gpu::{BufferView, Gpu, GpuError, GpuResult, Pipeline, Recorder, group
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
-    DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_FIRST, SEGMENT_FWD,
-    SEGMENT_LAST, SORT_BLOCK, ScanUniforms, SortUniforms, grid_words, range_words,
+    DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_BWD, SEGMENT_FIRST,
+    SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, ScanUniforms, SortUniforms, grid_words, range_words,
 };
 use std::sync::Arc;
 
@@ -26,6 +26,9 @@ const WORKGROUP: u32 = crate::gpu::WORKGROUP;
 const CAPACITY_MIN: u32 = 1 << 16;
 /// Most intersections of a view: sums saturate at 2^32 - 1, and the index of a folded dispatch may exceed the count.
 const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
+
+/// Capacities of frames whose demand nobody waits for are multiples of this: few sizes of buffers.
+const LIST_STEP: u32 = 1 << 10;
 
 /// The compiled tile stages, forward and backward.
 #[derive(Debug)]
@@ -59,6 +62,8 @@ pub struct TileStages {
     pub(super) pipelines: Pipelines,
     /// Sizes of the next frame.
     room: FrameRoom,
+    /// The most that a frame has needed so far; `None` before the first.
+    seen: Option<Demand>,
     /// Size of the largest binding, 32-bit words.
     binding_words: u32,
 }
@@ -86,7 +91,12 @@ impl TileStages {
             weighing: None,
         };
         let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
-        Ok(TileStages { pipelines, room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD }, binding_words })
+        Ok(TileStages {
+            pipelines,
+            room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD },
+            seen: None,
+            binding_words,
+        })
     }
 
     /// Compiles what the backward pass needs to collect weights.
@@ -103,6 +113,22 @@ impl TileStages {
     /// Sizes of the next frame of a whole view, as earlier frames needed them.
     pub fn room(&self) -> FrameRoom {
         self.room
+    }
+
+    /// Notes what a frame needed.
+    pub(super) fn note(&mut self, demand: Demand) {
+        let Demand { isects, list_max } = self.seen.unwrap_or(demand);
+        self.seen = Some(Demand { isects: isects.max(demand.isects), list_max: list_max.max(demand.list_max) });
+    }
+
+    /// Sizes of a frame whose demand nobody waits for: a quarter more than any frame has needed, and no more than the next frame
+    /// would have; `None` before the first frame.
+    pub(super) fn room_by_demand(&self) -> Option<FrameRoom> {
+        let more = |seen: u32, step: u32| seen.saturating_add(seen / 4).max(1).checked_next_multiple_of(step);
+        self.seen.map(|Demand { isects, list_max }| FrameRoom {
+            capacity: more(isects, LIST_STEP).unwrap_or(u32::MAX).min(self.room.capacity),
+            list_max: more(list_max, SEGMENT_BWD).unwrap_or(u32::MAX).min(self.room.list_max),
+        })
     }
 
     /// Sets the capacity of the next frame. The capacity grows on demand.
@@ -295,12 +321,29 @@ impl TileStages {
         blend: Blend,
         pixels: &Pixels,
     ) -> GpuResult<(Frame, DemandReadback)> {
-        let frame = self.lists(gpu, recorder, splats, ranks, blend, TileRange::all(blend.grid), self.room)?;
-        self.blend(recorder, splats, &frame, pixels)?;
+        let frame = self.frame_of(gpu, recorder, splats, ranks, (blend, self.room), pixels)?;
         let last = words(ranks.rows);
         let total = recorder.read_back("scan", &ranks.offsets.slice(last, 4))?;
         let longest = recorder.read_back("isect_offsets", &frame.longest.slice(0, 4))?;
         Ok((frame, DemandReadback { total, longest }))
+    }
+
+    /// As [`TileStages::frame`], with buffers of the sizes `room`, and without reading the demand.
+    ///
+    /// # Errors
+    /// Device memory is exhausted.
+    pub(super) fn frame_of(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        splats: &BufferView,
+        ranks: &Ranks,
+        (blend, room): (Blend, FrameRoom),
+        pixels: &Pixels,
+    ) -> GpuResult<Frame> {
+        let frame = self.lists(gpu, recorder, splats, ranks, blend, TileRange::all(blend.grid), room)?;
+        self.blend(recorder, splats, &frame, pixels)?;
+        Ok(frame)
     }
 
     /// Records the blending of the tiles of a frame.

@@ -219,6 +219,20 @@ impl TileStages {
         segments: &[Segment],
         blend: Blend,
     ) -> GpuResult<Readback> {
+        let unusable = self.unusable(recorder, segments, blend)?;
+        recorder.read_back("rasterize_bwd", &unusable.view())
+    }
+
+    /// Records the same count; returns its buffer.
+    ///
+    /// # Errors
+    /// A segment has no gradients, or device memory is exhausted.
+    pub(super) fn unusable(
+        &self,
+        recorder: &mut Recorder<'_>,
+        segments: &[Segment],
+        blend: Blend,
+    ) -> GpuResult<Buffer> {
         let unusable = recorder.buffer_zeroed("unusable rows", 4)?;
         for segment in segments {
             let mut uniform = raster_uniforms(&blend, TileRange::all(blend.grid), 0, SEGMENT_BWD, 0);
@@ -227,7 +241,7 @@ impl TileStages {
             let groups = groups_1d(segment.rows, crate::gpu::WORKGROUP);
             recorder.dispatch("rasterize_bwd", &self.pipelines.count_unusable, &views, groups)?;
         }
-        recorder.read_back("rasterize_bwd", &unusable.view())
+        Ok(unusable)
     }
 }
 

@@ -158,6 +158,8 @@ pub(super) enum LossSums {
     Stale,
     /// The picture has no pixels.
     Empty,
+    /// They stay on the device, for the gate of a step that is recorded without waiting.
+    OnDevice(Buffer),
     /// The readback is pending.
     Pending(Readback),
     /// The host has read the sums.

@@ -30,6 +30,8 @@ mod gpu_range_plan;
 #[cfg(feature = "gpu")]
 mod gpu_ranges;
 #[cfg(feature = "gpu")]
+mod gpu_recorded;
+#[cfg(feature = "gpu")]
 pub mod gpu_rows;
 #[cfg(feature = "gpu")]
 mod gpu_segments;

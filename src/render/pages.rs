@@ -6,9 +6,11 @@
 //! Invariants: 1. a slot holds the payload of one page byte for byte; 2. the result of a step does not depend on slots,
 //! batches or the room for them.
 
-use super::{RenderError, Renderer};
+use super::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::kernels::page_words::PageResult;
 use crate::kernels::uniforms_pages::SplitNumbers;
+use crate::scene::camera::Camera;
+use crate::scene::image::Target;
 use crate::scene::optimizer_numbers::{RunNumbers, StepNumbers};
 use crate::scene::page_layout::PageLayout;
 
@@ -34,6 +36,53 @@ pub struct PageRules {
     pub numbers: RunNumbers,
     /// Limits within which rows may split.
     pub splits: SplitNumbers,
+}
+
+/// A step that is recorded without waiting, up to its picture.
+#[derive(Debug, Clone, Copy)]
+pub struct StepJob<'a> {
+    /// The pages of the view, in their slots.
+    pub pages: &'a [SlotPage],
+    /// The optimizer's numbers of the step.
+    pub numbers: &'a StepNumbers,
+    /// The view.
+    pub camera: &'a Camera,
+    /// How it is drawn.
+    pub options: &'a RenderOptions,
+    /// Rows that the view lists at most, or so many as the caller foretells: the step is not taken if it lists more.
+    pub rows_room: u32,
+    /// The same for intersections, beside what the renderer foretells; tests inject lists without room by it.
+    pub isects_most: u32,
+}
+
+/// The rest of a recorded step.
+#[derive(Debug, Clone, Copy)]
+pub struct RecordedUpdate<'a> {
+    /// The photo.
+    pub target: &'a Target,
+    /// The loss.
+    pub loss: &'a LossOptions,
+    /// Whether statistics are collected.
+    pub collects: bool,
+    /// The step is not taken if more than one row in so many has unusable gradients.
+    pub rows_per_unusable: u32,
+    /// The step is not taken, whatever it finds: an injected fault.
+    pub closes: bool,
+}
+
+/// What a recorded step did.
+#[derive(Debug, Clone)]
+pub struct StepDone {
+    /// Why the step, and every step behind it, changed nothing: bits of [`crate::kernels::gate`]; 0 for a step that was taken.
+    pub closed: u32,
+    /// Listed rows.
+    pub rows: u32,
+    /// Rows with unusable gradients.
+    pub unusable: u32,
+    /// Loss of the view.
+    pub loss: LossValue,
+    /// What the update did to each page.
+    pub pages: Vec<PageResult>,
 }
 
 /// Stages on pages, in place of those on rows:
@@ -119,4 +168,30 @@ pub trait PageRenderer: Renderer {
     /// # Errors
     /// The device failed.
     fn take_bins(&mut self) -> Result<Vec<u32>, RenderError>;
+
+    /// Records a step of one batch up to its picture, without waiting. False where memory is short or the sizes of its lists cannot be
+    /// foretold yet: the step has to take the stages above.
+    ///
+    /// # Errors
+    /// The device failed, or holds no pages; the pages are stored with another SH degree than the view asks for.
+    fn record_picture(&mut self, job: &StepJob<'_>) -> Result<bool, RenderError>;
+
+    /// Records loss, gradients and update of the step whose picture was recorded last, without waiting; the step is in flight then. The
+    /// update changes nothing if the gate is closed by this step or an earlier one. False, and no step, where memory is short.
+    ///
+    /// # Errors
+    /// The device failed: pages may be updated then. There is no recorded picture.
+    fn record_update(&mut self, update: &RecordedUpdate<'_>) -> Result<bool, RenderError>;
+
+    /// Waits for the first step in flight.
+    ///
+    /// # Errors
+    /// The device failed, or no step is in flight.
+    fn finish_step(&mut self) -> Result<StepDone, RenderError>;
+
+    /// Opens the gate again, once every step in flight is finished.
+    ///
+    /// # Errors
+    /// The device failed, or a step is in flight.
+    fn open_gate(&mut self) -> Result<(), RenderError>;
 }

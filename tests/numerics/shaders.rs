@@ -3,7 +3,7 @@
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
 use gsscale::kernels::uniforms::{LossUniforms, RowsUniforms};
-use gsscale::kernels::{constants, page_words, uniforms_pages, uniforms_tiles};
+use gsscale::kernels::{constants, gate, page_words, uniforms_pages, uniforms_tiles};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
@@ -16,6 +16,8 @@ const LAYOUTS: &[&[StructLayout]] = &[
         page_words::PageResult::LAYOUT,
         uniforms_pages::GatherUniforms::LAYOUT,
         uniforms_pages::UpdateUniforms::LAYOUT,
+        gate::GateUniforms::LAYOUT,
+        gate::StepVerdict::LAYOUT,
     ],
     &[
         uniforms_tiles::ScanUniforms::LAYOUT,

@@ -194,6 +194,12 @@ impl Checkpoint {
         self.tolerate_full_drive(result)
     }
 
+    /// Whether [`Checkpoint::between_steps`] may have something to do now.
+    pub fn is_due(&self, trainer: &Trainer) -> bool {
+        let is_begun = self.name.is_some() || self.beside.is_some();
+        is_begun || self.is_time() || (self.may_be_early() && self.space_is_short(trainer))
+    }
+
     /// Whether an early commit for free slots is allowed. The time limit prevents a commit at every step, since slots
     /// kept by names stay taken.
     fn may_be_early(&self) -> bool {

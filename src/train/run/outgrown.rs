@@ -13,6 +13,12 @@ use crate::train::memory::staging::PLAN_BYTES;
 use crate::train::state::trainer::Trainer;
 
 impl Trainer {
+    /// Whether a scene in memory no longer fits into its budget.
+    pub(super) fn is_outgrown(&self) -> bool {
+        let budget = self.budget.filter(|_| self.is_in_memory());
+        budget.is_some_and(|budget| !budget.holds_all(&self.scene, self.view_memory().at_last))
+    }
+
     /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can
     /// be evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay
     /// in memory while the machine has it.
@@ -20,11 +26,8 @@ impl Trainer {
     /// # Errors
     /// The commit failed for a reason other than space.
     pub(super) fn start_paging_if_outgrown(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
-        let Some(budget) = self.budget.filter(|_| self.is_in_memory()) else { return Ok(()) };
+        let Some(budget) = self.budget.filter(|_| self.is_outgrown()) else { return Ok(()) };
         let view = self.view_memory();
-        if budget.holds_all(&self.scene, view.at_last) {
-            return Ok(());
-        }
         let needed = self.scene.pager.stats().pinned_max;
         let frames = budget.frames(&self.scene, view, needed);
         let is_tight = budget.frames_at_most(&self.scene, view) < needed;

@@ -47,11 +47,15 @@ impl Trainer {
         targets: &TargetCache,
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<(), TrainError> {
-        while self.state.step < self.options.steps && outputs.stop.exit_code().is_none() {
+        // A step in flight is always finished.
+        while self.state.step < self.options.steps && (outputs.stop.exit_code().is_none() || self.is_ahead()) {
             if !self.log_due_events_with_space(dataset, targets, outputs)? {
                 break;
             }
-            self.start_paging_if_outgrown(outputs)?;
+            if !self.is_ahead() {
+                self.start_paging_if_outgrown(outputs)?;
+            }
+            self.goes_ahead = self.nothing_follows_next_step(outputs);
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             self.check_statistics(outputs)?;
@@ -83,7 +87,7 @@ impl Trainer {
             if let Some(live) = &mut outputs.live {
                 self.show_live(dataset, live, psnr);
             }
-            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| !self.is_ahead()) {
                 let done = checkpoint.between_steps(self, outputs.metrics);
                 done.or_else(|error| self.make_space(outputs, error))?;
             }
@@ -91,6 +95,15 @@ impl Trainer {
         self.commit_last(outputs)?;
         outputs.progress.finish();
         Ok(())
+    }
+
+    /// Whether the loop leaves the scene alone between the next step and the one after it.
+    fn nothing_follows_next_step(&self, outputs: &LoopOutputs<'_>) -> bool {
+        let (done, options) = (self.state.step + 1, &self.options);
+        let due = |every: u32| every > 0 && done.is_multiple_of(every);
+        let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;
+        let is_due = outputs.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self));
+        !is_wanted && !is_due && outputs.live.is_none() && outputs.stop.exit_code().is_none() && !self.is_outgrown()
     }
 
     /// The metrics of the last step, without an evaluation.

@@ -20,6 +20,8 @@ impl Trainer {
         let pages = self.scene.pager.index().len();
         let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.slots() < pages);
         let has_plan = !self.is_in_memory() || is_on_device_in_part;
+        // The step in flight has begun already.
+        let first = usize::from(self.is_ahead());
         if !has_plan || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
             return;
         }
@@ -28,8 +30,9 @@ impl Trainer {
         }
         // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
-        let cameras: Vec<&Camera> = self.coming_views(count).iter().map(|&view| &dataset.views[view].camera).collect();
-        self.scene.pager.look_ahead(self.state.step, &cameras);
+        let cameras: Vec<&Camera> =
+            self.coming_views(count).iter().skip(first).map(|&view| &dataset.views[view].camera).collect();
+        self.scene.pager.look_ahead(self.state.step + first as u32, &cameras);
     }
 
     /// Indices in `dataset.views` of the views of the coming steps, at most `count`.

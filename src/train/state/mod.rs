@@ -4,6 +4,7 @@
 pub mod eval;
 mod growth_checks;
 pub(crate) mod held_out;
+mod in_flight;
 mod leave_out;
 mod look_ahead;
 mod photos;

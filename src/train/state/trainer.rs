@@ -35,7 +35,6 @@ use crate::train::memory::budget::HostBudget;
 use crate::train::step::batch::HostRows;
 use crate::train::step::comparison::{BlocksBefore, Comparison};
 use crate::train::step::dense::settle_all;
-use crate::train::step::device_rows::DeviceRows;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::pages::PagedScene;
 use crate::train::step::soundness::{Idle, note_soundness};
@@ -77,7 +76,13 @@ pub struct Trainer {
     /// The largest share of the rows in its pages that a view has drawn so far.
     pub(crate) visible_share: f64,
     /// The steps since a row was last rewritten.
-    idle: Idle,
+    pub(super) idle: Idle,
+    /// The caller does nothing with the scene between the step that it takes and the next one, which may be recorded ahead.
+    pub(crate) goes_ahead: bool,
+    /// What kept a step from being recorded ahead.
+    pub(super) ahead_failed: Option<TrainError>,
+    /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
+    pub(super) rows_of_views: Vec<u32>,
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -156,6 +161,9 @@ impl Trainer {
             whole_rows: 0,
             visible_share: 0.0,
             idle: Idle::default(),
+            goes_ahead: false,
+            ahead_failed: None,
+            rows_of_views: Vec::new(),
         }
     }
 
@@ -272,7 +280,9 @@ impl Trainer {
         self.log_due_events(dataset, targets)?;
         let view = self.next_view();
         targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
-        self.fit_frames(&dataset.views[view].camera);
+        if !self.is_ahead() {
+            self.fit_frames(&dataset.views[view].camera);
+        }
         self.prepare_device()?;
         self.look_ahead(dataset);
         let photo = trace::span("photo");
@@ -285,9 +295,8 @@ impl Trainer {
         let states = self.state.blocks.of_view(view).to_vec();
         let blocks = if is_left_out { None } else { self.blocks_before(&states) };
         let comparison = Comparison { target: &target, loss: self.options.loss, look, blocks, is_left_out };
-        let next = self.coming_views(2).get(1).map(|&view| &dataset.views[view].camera);
         let stepped = loop {
-            let stepped = self.attempt(&dataset.views[view].camera, next, (&render, &comparison));
+            let stepped = self.attempt((dataset, targets), view, (&render, &comparison));
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
@@ -297,6 +306,7 @@ impl Trainer {
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
         self.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
+        self.note_rows_of(view, outcome.rows);
         note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
         self.idle.note(&outcome, (self.state.step, self.scene.rows()), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
@@ -313,23 +323,21 @@ impl Trainer {
         Ok(outcome)
     }
 
-    /// Attempts a step on a view; the next step draws `next`.
+    /// Attempts a step on a view.
     fn attempt(
         &mut self,
-        camera: &Camera,
-        next: Option<&Camera>,
+        inputs: (&Dataset, &TargetCache),
+        view: usize,
         how: (&RenderOptions, &Comparison<'_>),
     ) -> Result<StepOutcome, TrainError> {
-        let (step, renderer) = (self.state.step, &mut *self.renderer);
-        let (collects, pages_most) = (self.options.strategy.collects(step), self.pages_most);
-        let (scene, working) = (&mut self.scene, &mut self.working);
-        if self.options.optimizer_on == OptimizerPlace::Host {
-            let mut rows = HostRows::new(renderer);
-            return train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most);
+        if self.options.optimizer_on == OptimizerPlace::Device {
+            return self.step_on_device(inputs, view, how.1);
         }
-        let tier = DeviceTier::of_run(&mut self.device, scene, renderer, self.options.steps)?;
-        let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
-        train_step(scene, working, &mut rows, (step, camera), how, collects, pages_most)
+        let (step, camera) = (self.state.step, &inputs.0.views[view].camera);
+        let collects = self.options.strategy.collects(step);
+        let mut rows = HostRows::new(&mut *self.renderer);
+        let (scene, working) = (&mut self.scene, &mut self.working);
+        train_step(scene, working, &mut rows, (step, camera), how, collects, self.pages_most)
     }
 
     /// Gives the pages of a run that updates on a device their slots, so that the first plan knows them.

@@ -42,7 +42,7 @@ impl DeviceTier {
         renderer: &mut dyn Renderer,
         (step, camera): (u32, &Camera),
     ) -> Result<(), TrainError> {
-        let of_view = scene.pager.pages_of_view(camera);
+        let of_view = self.pages_behind(scene, camera, step.saturating_sub(1));
         let is_missing = |page: &PageNo| self.slots.state(*page).is_none() && layout_ahead(scene, *page).is_some();
         self.coming = of_view.iter().copied().filter(is_missing).collect();
         if self.slots.free_frames() >= self.coming.len() {

@@ -76,7 +76,7 @@ impl RowBackend for DeviceRows<'_> {
         at: AtStep<'_>,
         _: &mut WorkingSet,
     ) -> Result<usize, TrainError> {
-        let pages = self.tier.load(scene, self.renderer, pinned)?;
+        let pages = self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
         let step = scene.rules.adam.at(at.step).numbers();
         Ok(device_of(self.renderer)?.pages_in(&pages, &step)?)
     }
@@ -94,7 +94,7 @@ impl RowBackend for DeviceRows<'_> {
         _: &mut WorkingSet,
     ) -> Result<(), TrainError> {
         if is_again {
-            self.tier.load(scene, self.renderer, pinned)?;
+            self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
         }
         device_of(self.renderer)?.pages_out(batch)?;
         match self.next.filter(|_| batch == 0) {

@@ -5,17 +5,19 @@
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
+//! Not here: steps in flight (`device_flights`); copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
 //! it, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
 
+use super::device_flights::Flights;
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
 use crate::base::trace;
 use crate::kernels::uniforms_pages::SplitNumbers;
 use crate::optim::bounds::SplitLimits;
+use crate::optim::one_step::OneStep;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::frames::evict::EvictPolicy;
@@ -75,6 +77,8 @@ pub struct DeviceTier {
     /// Slots of the batch of a step, and whether they are newer than the frames.
     in_use: BTreeMap<PageNo, (DeviceSlot, bool)>,
     pub(crate) traffic: SlotTraffic,
+    /// Steps in flight.
+    pub(super) flights: Flights,
     /// Loads that no order of eviction avoids.
     fewest: FewestReads,
 }
@@ -116,6 +120,7 @@ impl DeviceTier {
         let numbers = numbers.ok_or(TrainError::Render(RenderError::NoPages { backend: name }))?;
         let SplitLimits { grow_grad2d, split_scale, reach } = *scene.rules.splits();
         let splits = SplitNumbers { grow_grad2d, split_scale, reach };
+        let flights = Flights::new(OneStep::new(&numbers, scene.rules.splits()));
         let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;
         device.hold_pages(&PageRules { payload_bytes, numbers, splits })?;
@@ -129,6 +134,7 @@ impl DeviceTier {
             leaving: Vec::new(),
             in_use: BTreeMap::new(),
             traffic: SlotTraffic::default(),
+            flights,
             fewest: FewestReads::default(),
         };
         tier.fit(scene, renderer)?;
@@ -208,9 +214,10 @@ impl DeviceTier {
     ) -> Result<Vec<PinnedPage>, TrainError> {
         let (own, others): (Vec<PageNo>, Vec<PageNo>) = pages.iter().partition(|page| self.held.contains_key(page));
         // As many frames again as the batch has pages: for pages that split, and for reads ahead.
-        let most = scene.pager.frames_max().saturating_sub(others.len() + pages.len()).max(own.len());
+        let in_flight = self.flights.pages();
+        let most = scene.pager.frames_max().saturating_sub(in_flight + others.len() + pages.len()).max(own.len());
         self.drain_to(scene, renderer, most, pages)?;
-        scene.pager.set_held(self.held.len() - own.len());
+        scene.pager.set_held(in_flight + self.held.len() - own.len());
         let mut pinned = pin(scene, &others)?;
         pinned.extend(own.iter().filter_map(|page| self.held.remove(page)));
         pinned.sort_unstable_by_key(|page| page.meta.id);
@@ -295,6 +302,9 @@ impl DeviceTier {
     /// # Errors
     /// The device failed; the pages that are still held exist there alone.
     pub fn drain(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        if self.in_flight() > 0 {
+            return Err(RenderError::OutOfOrder { call: "drain", needs: "finish of every step in flight" }.into());
+        }
         self.finish_leaving(scene, renderer)?;
         self.drain_to(scene, renderer, 0, &[])?;
         self.take_bins(scene, renderer)
@@ -335,19 +345,26 @@ impl DeviceTier {
         &mut self,
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
-        pinned: &[PinnedPage],
+        pinned: &[&PinnedPage],
     ) -> Result<Vec<SlotPage>, TrainError> {
-        let mut missing = Vec::new();
-        let with_rows = || pinned.iter().filter(|page| page.meta.rows > 0);
+        let (mut missing, mut hits) = (Vec::new(), 0);
+        let with_rows = || pinned.iter().copied().filter(|page| page.meta.rows > 0);
         let needed = with_rows().map(|page| (page.page, payload_bytes(page) as u64));
         self.fewest.step(self.slots.frames_max(), needed);
         for page in with_rows() {
-            match self.slots.pin(page.page, true) {
-                Some(in_slot) => drop(self.in_use.insert(page.page, in_slot)),
-                None => missing.push(page),
+            // A step in flight may have pinned the slot already.
+            if !self.in_use.contains_key(&page.page) {
+                match self.slots.pin(page.page, true) {
+                    Some(in_slot) => drop(self.in_use.insert(page.page, in_slot)),
+                    None => {
+                        missing.push(page);
+                        continue;
+                    }
+                }
             }
+            hits += 1;
         }
-        self.traffic.hits += self.in_use.len() as u64;
+        self.traffic.hits += hits;
         self.make_room(scene, renderer, missing.len())?;
         let mut copies = Vec::new();
         for page in missing {
@@ -448,8 +465,10 @@ impl DeviceTier {
 
     /// Takes the pages of a batch back: those that are newer on the device stay pinned in the pager.
     pub(super) fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
-        for (page, (slot, is_newer)) in std::mem::take(&mut self.in_use) {
-            self.slots.unpin(page, slot, is_newer);
+        for page in &pinned {
+            if let Some((slot, is_newer)) = self.in_use.remove(&page.page) {
+                self.slots.unpin(page.page, slot, is_newer);
+            }
         }
         let (held, others): (Vec<_>, Vec<_>) = pinned.into_iter().partition(|page| self.slots.is_dirty(page.page));
         for page in held {

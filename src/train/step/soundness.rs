@@ -112,6 +112,11 @@ pub(crate) fn warn_of_outliers(found: &[usize], step: u32, are_left_out: bool, d
 }
 
 impl Idle {
+    /// Whether the last step changed rows.
+    pub fn is_busy(&self) -> bool {
+        self.steps == 0
+    }
+
     /// Counts steps that change no row.
     ///
     /// # Errors

@@ -25,7 +25,7 @@ use crate::train::error::TrainError;
 use std::collections::VecDeque;
 
 /// More than one row in so many with unusable gradients skip a step.
-const ROWS_PER_UNUSABLE: u64 = 10_000;
+pub(super) const ROWS_PER_UNUSABLE: u64 = 10_000;
 
 /// Whether so many of the rows of a view are too many to go on without them.
 fn are_too_many(unusable: u64, rows: usize) -> bool {

@@ -137,10 +137,7 @@ fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let (tables, recent) = (&tables, &step.recent[..]);
     let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
     gather::cull(&input, &mut counts, &mut found);
-    let mut listed = 0;
-    for (page, count) in pages.iter_mut().zip(&counts) {
-        (page.first_listed, listed) = (listed, listed + count);
-    }
+    let listed = gather::place(&mut pages, &counts);
     let mut list = vec![[0; 2]; listed as usize];
     gather::list(&pages, &counts, &found, &mut list);
     let mut values = Vec::new();

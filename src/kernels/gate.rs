@@ -1,0 +1,81 @@
+//! Stage "gate": whether a step that was recorded without waiting may change rows. The twin of `shaders/gate.wgsl`.
+//!
+//! A device works on a step behind the gate while the host records the next one. A step may change rows only if all earlier steps
+//! did, its lists had room, its loss is finite, and few of its rows have unusable gradients.
+//!
+//! Invariants: 1. a gate that is closed stays closed until the host opens it; 2. a step without a reason to close the gate is one
+//! that the host would have taken after waiting for all of its numbers.
+
+crate::wgsl_struct! {
+    /// Uniform of `gate.wgsl`.
+    pub struct GateUniforms {
+        /// Listed rows that the buffers of the step hold.
+        pub rows_room: u32,
+        /// Intersections that they hold.
+        pub isects_room: u32,
+        /// Entries of one tile's list that the recorded blending covers.
+        pub list_room: u32,
+        /// More than one row in so many with unusable gradients closes the gate.
+        pub rows_per_unusable: u32,
+        /// Word of the counts with the number of listed rows.
+        pub rows_at: u32,
+        /// Word of the offsets with the number of intersections.
+        pub isects_at: u32,
+        /// 1 if the loss has sums.
+        pub has_loss: u32,
+        /// Unused.
+        pub pad: u32,
+    }
+
+    /// What the host reads of a step: `StepVerdict` in `shaders/gate.wgsl`.
+    pub struct StepVerdict {
+        /// Bits of the reasons for which the gate is closed; 0 for a step that was taken.
+        pub closed: u32,
+        /// Listed rows.
+        pub rows: u32,
+        /// Intersections, saturated.
+        pub isects: u32,
+        /// Longest list of a tile.
+        pub list_max: u32,
+        /// Rows with unusable gradients.
+        pub unusable: u32,
+        /// The sums of the loss, bits of floats.
+        pub sums: [u32; 4],
+        /// Unused.
+        pub pad0: u32,
+        /// Unused.
+        pub pad1: u32,
+        /// Unused.
+        pub pad2: u32,
+    }
+}
+
+/// An earlier step closed the gate.
+pub const BY_EARLIER: u32 = 1;
+/// More rows are listed than there is room for.
+pub const ROWS: u32 = 2;
+/// There are more intersections than there is room for.
+pub const ISECTS: u32 = 4;
+/// A tile's list is longer than the recorded blending.
+pub const LIST: u32 = 8;
+/// The loss is not finite.
+pub const LOSS: u32 = 16;
+/// Too many rows have unusable gradients.
+pub const GRADIENTS: u32 = 32;
+
+/// Decides about a step whose numbers are those of `measured` (its `closed` is not read), behind a gate of the bits `gate`.
+pub fn decide(u: &GateUniforms, gate: u32, measured: &StepVerdict) -> StepVerdict {
+    let is_no_number = |bits: u32| !f32::from_bits(bits).is_finite();
+    let reasons = [
+        (BY_EARLIER, gate != 0),
+        (ROWS, measured.rows > u.rows_room),
+        (ISECTS, measured.isects > u.isects_room),
+        (LIST, measured.list_max > u.list_room),
+        (GRADIENTS, measured.unusable > measured.rows / u.rows_per_unusable.max(1)),
+        // The sum of squared differences, the second, is reported and not trained on.
+        (LOSS, u.has_loss != 0 && (is_no_number(measured.sums[0]) || is_no_number(measured.sums[2]))),
+    ];
+    let closed = reasons.iter().filter(|(_, holds)| *holds).fold(0, |bits, (reason, _)| bits | reason);
+    let sums = if u.has_loss != 0 { measured.sums } else { [0; 4] };
+    StepVerdict { closed, sums, ..*measured }
+}

@@ -1,0 +1,363 @@
+//! Steps in flight: steps on the pages of a device that are recorded as a whole without waiting, so that the host records the next step
+//! while the device computes this one.
+//!
+//! ```text
+//! host    record s │ record s+1 │ wait for s, its bounds │ record s+2 │ wait for s+1 ...
+//! device           │ s ........................ │ s+1 ........................ │ s+2 ...
+//! ```
+//!
+//! The gate on the device (`kernels::gate`) lets a step write only if its lists had room and its numbers are sound. A step that is not
+//! taken, and the step behind it, have changed nothing; they are given up, and the first is taken again by waiting for each of its
+//! numbers ([`super::train_step`]), which repairs lists and decides what is skipped.
+//!
+//! # Where the pipeline drains
+//! A step is recorded while another is in flight only where nothing that the host decides by the other's outcome lies between:
+//!
+//! | what | who holds back |
+//! | --- | --- |
+//! | a round, a reset, a raise or a check of growth follows the other step: it reads bins that the device counts, and pages apply it on the host | the trainer |
+//! | evaluation, a saved file, a commit, the live page, a stop, a scene that outgrows its memory | the loop |
+//! | a step was unsound or changed no row: further ones may end the run | the trainer |
+//! | corrections of pictures, masks of blocks, views that may be left out | the trainer |
+//! | a page of the view has events to apply | this file |
+//! | pages of the view have no slot and no slot is free, or there are too few frames for two views | this file |
+//! | memory for the step is short, or its view is several batches | the renderer; this file tries again some steps later |
+//!
+//! The pages of a step behind another are listed by bounds that are as wide as the other step can make them
+//! ([`crate::optim::one_step`]). So the list has all pages that the exact bounds name; a page too many has no row in view and stays as it
+//! is. Whoever finishes the other step looks whether that held.
+//!
+//! Invariants: 1. the bytes of the result are those of a run that waits; 2. at most [`STEPS_IN_FLIGHT`] steps are in flight; 3. a page of a
+//! step in flight is pinned in its slot and in its frame, and is neither held nor released; 4. a step that was not taken leaves pages,
+//! statistics and bounds as they were.
+
+use super::device_tier::{DeviceTier, device_of};
+use super::pages::PagedScene;
+use super::step_faults::{StepFault, StepFaults, steps_in_flight};
+use super::train_step::{ROWS_PER_UNUSABLE, StepOutcome};
+use crate::base::error::InputError;
+use crate::base::ids::PageNo;
+use crate::optim::one_step::OneStep;
+use crate::paging::pinned::PinnedPage;
+use crate::render::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
+use crate::render::{LossOptions, RenderError, RenderOptions, Renderer};
+use crate::scene::camera::Camera;
+use crate::scene::frustum::Frustum;
+use crate::scene::image::Target;
+use crate::train::error::TrainError;
+use std::collections::{BTreeMap, VecDeque};
+
+/// The most steps in flight.
+pub const STEPS_IN_FLIGHT: usize = 2;
+/// Steps after one that lacked memory in which none is recorded.
+const STEPS_WITHOUT: u32 = 16;
+/// Rows beside the likely ones that a list has room for.
+const ROWS_MORE: u64 = 256;
+
+/// A step to record.
+#[derive(Debug, Clone, Copy)]
+pub struct StepToRecord<'a> {
+    /// 0-based step.
+    pub step: u32,
+    /// Its camera.
+    pub camera: &'a Camera,
+    /// Step and camera after it.
+    pub next: Option<(u32, &'a Camera)>,
+    /// How the view is drawn.
+    pub render: &'a RenderOptions,
+    /// Its photo.
+    pub target: &'a Target,
+    /// The loss.
+    pub loss: &'a LossOptions,
+    /// Whether the step collects statistics.
+    pub collects: bool,
+    /// Rows that the view listed last; 0 if that is not known.
+    pub rows_before: u32,
+    /// The largest share of the rows in its pages that a view has listed so far.
+    pub share: f64,
+    /// The most pages of a batch.
+    pub pages_most: usize,
+}
+
+/// A step that is recorded and not finished.
+#[derive(Debug)]
+struct Flight {
+    camera: Camera,
+    /// Its pages, ascending by id.
+    pages: Vec<PageNo>,
+}
+
+impl StepToRecord<'_> {
+    /// Room for the rows of the view, of `in_pages` rows in its pages: an eighth more than the view, or any view, has listed.
+    fn rows_room(&self, in_pages: u64) -> u32 {
+        let likely = match self.rows_before {
+            0 => (in_pages as f64 * self.share) as u64,
+            rows => u64::from(rows),
+        };
+        (likely + likely / 8 + ROWS_MORE).min(in_pages).min(u64::from(u32::MAX / 2)) as u32
+    }
+}
+
+/// The steps in flight and their pages.
+#[derive(Debug)]
+pub(super) struct Flights {
+    steps: VecDeque<Flight>,
+    /// Each page with the number of steps in flight that use it.
+    pages: BTreeMap<PageNo, (PinnedPage, usize)>,
+    /// No step before this one is recorded.
+    not_before: u32,
+    /// The most steps in flight.
+    most: usize,
+    one_step: OneStep,
+    faults: StepFaults,
+}
+
+impl Flights {
+    /// No step in flight yet, for a run whose updates move bounds by at most `one_step`.
+    pub fn new(one_step: OneStep) -> Flights {
+        let (most, faults) = (steps_in_flight(STEPS_IN_FLIGHT), StepFaults::from_environment());
+        Flights { steps: VecDeque::new(), pages: BTreeMap::new(), not_before: 0, most, one_step, faults }
+    }
+
+    /// Pages that steps in flight have pinned.
+    pub fn pages(&self) -> usize {
+        self.pages.len()
+    }
+}
+
+/// An error after which pages that exist on the device alone may be changed.
+fn torn(error: impl Into<TrainError>) -> TrainError {
+    match error.into() {
+        torn @ TrainError::Torn { .. } => torn,
+        error => TrainError::Torn { source: Box::new(error) },
+    }
+}
+
+impl DeviceTier {
+    /// Steps in flight.
+    pub fn in_flight(&self) -> usize {
+        self.flights.steps.len()
+    }
+
+    /// Whether one more step may be in flight.
+    pub fn may_record(&self) -> bool {
+        self.in_flight() < self.flights.most
+    }
+
+    /// The pages that `camera` may need once the steps in flight are done, by bounds as wide as one of these, taken after `now` steps,
+    /// can make them; ascending by id.
+    pub(super) fn pages_behind(&self, scene: &PagedScene, camera: &Camera, now: u32) -> Vec<PageNo> {
+        let mut pages = scene.pager.pages_of_view(camera);
+        if self.flights.pages.is_empty() {
+            return pages;
+        }
+        let (planes, index) = (Frustum::new(camera).planes(), scene.pager.index());
+        let widened = |page: &PageNo| self.flights.one_step.widened(&index[page.index()].bounds, now);
+        let known: std::collections::BTreeSet<PageNo> = pages.iter().copied().collect();
+        let others = self.flights.pages.keys().filter(|page| !known.contains(page));
+        pages.extend(others.filter(|page| planes.may_meet(&widened(page))));
+        pages.sort_unstable_by_key(|page| index[page.index()].id);
+        pages
+    }
+
+    /// Whether the step can be recorded now, with these pages.
+    fn is_recordable(&self, scene: &PagedScene, pages: &[PageNo], step: &StepToRecord<'_>) -> bool {
+        let index = scene.pager.index();
+        let is_behind = |page: &PageNo| scene.rules.is_behind(&index[page.index()]);
+        let most = step.pages_most.min(scene.pager.pages_per_batch(pages.len())).min(self.slots());
+        if step.step < self.flights.not_before || pages.is_empty() || pages.len() > most || pages.iter().any(is_behind)
+        {
+            return false;
+        }
+        let others = self.flights.pages.keys().filter(|page| !pages.contains(page)).count();
+        let missing = pages.iter().filter(|page| self.slots.state(**page).is_none()).count();
+        // A step behind another one must not wait: frames for both and as many again, and free slots.
+        self.flights.steps.is_empty()
+            || (scene.pager.frames_max() >= 2 * (others + pages.len()) && self.slots.free_frames() >= missing)
+    }
+
+    /// Records a step on the pages of a device, without waiting for anything that the device computes. False, with nothing changed, where
+    /// that cannot be done now.
+    ///
+    /// # Errors
+    /// Pages could not be had, with nothing changed; the device failed ([`TrainError::Torn`]).
+    pub fn record(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        step: &StepToRecord<'_>,
+    ) -> Result<bool, TrainError> {
+        let pages = self.pages_behind(scene, step.camera, step.step.saturating_sub(1));
+        if !self.is_recordable(scene, &pages, step) {
+            return Ok(false);
+        }
+        renderer.weigh_rows(false)?;
+        scene.pager.begin_view(step.step, step.camera)?;
+        self.begin_step(scene, renderer, step.step)?;
+        self.pin_flight(scene, renderer, step.step, &pages)?;
+        scene.pager.prefetch(step.step);
+        match self.record_pinned(scene, renderer, &pages, step) {
+            Ok(true) => {
+                self.flights.steps.push_back(Flight { camera: *step.camera, pages });
+                scene.pager.prefetch(step.step);
+                Ok(true)
+            }
+            Ok(false) => {
+                self.release_flight(scene, &pages);
+                self.flights.not_before = step.step.saturating_add(STEPS_WITHOUT);
+                Ok(false)
+            }
+            Err(error) => {
+                self.release_flight(scene, &pages);
+                Err(torn(error))
+            }
+        }
+    }
+
+    /// Pins the pages of a step, as [`DeviceTier::pin`]; those that another step in flight uses are pinned already.
+    fn pin_flight(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        step: u32,
+        pages: &[PageNo],
+    ) -> Result<(), TrainError> {
+        let new: Vec<PageNo> = pages.iter().copied().filter(|page| !self.flights.pages.contains_key(page)).collect();
+        let pinned = self.pin(scene, renderer, &new, |scene, others| scene.pager.pin_batch(step, others))?;
+        self.flights.pages.extend(pinned.into_iter().map(|page| (page.page, (page, 0))));
+        for page in pages {
+            if let Some((_, users)) = self.flights.pages.get_mut(page) {
+                *users += 1;
+            }
+        }
+        Ok(())
+    }
+
+    fn record_pinned(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        pages: &[PageNo],
+        step: &StepToRecord<'_>,
+    ) -> Result<bool, TrainError> {
+        let flying = std::mem::take(&mut self.flights.pages);
+        let pinned: Vec<&PinnedPage> = pages.iter().filter_map(|page| flying.get(page)).map(|(page, _)| page).collect();
+        let in_slots = self.load(scene, renderer, &pinned);
+        self.flights.pages = flying;
+        let in_slots: Vec<SlotPage> = in_slots?;
+        let rows_in_pages: u64 = in_slots.iter().map(|page| page.layout.rows as u64).sum();
+        let strikes = |fault: StepFault| self.flights.faults.strikes(fault, step.step);
+        let (rows_room, closes) = (step.rows_room(rows_in_pages), strikes(StepFault::Closed));
+        let job = StepJob {
+            pages: &in_slots,
+            numbers: &scene.rules.adam.at(step.step).numbers(),
+            camera: step.camera,
+            options: step.render,
+            rows_room: if strikes(StepFault::Rows) { 1 } else { rows_room },
+            isects_most: if strikes(StepFault::Isects) { 1 } else { u32::MAX },
+        };
+        if !device_of(renderer)?.record_picture(&job)? {
+            return Ok(false);
+        }
+        scene.pager.prefetch(step.step);
+        if let Some(next) = step.next {
+            self.begin_ahead(scene, renderer, next)?;
+        }
+        let StepToRecord { target, loss, collects, .. } = *step;
+        let rows_per_unusable = ROWS_PER_UNUSABLE as u32;
+        let update = RecordedUpdate { target, loss, collects, rows_per_unusable, closes };
+        if !device_of(renderer)?.record_update(&update)? {
+            return Ok(false);
+        }
+        if let Some((next, _)) = step.next {
+            self.load_ahead(scene, renderer, next)?;
+        }
+        Ok(true)
+    }
+
+    /// Waits for the first step in flight and takes over what it did to its pages. `None` if the step was not taken: then no step is in
+    /// flight any more, and nothing has changed.
+    ///
+    /// # Errors
+    /// The device failed ([`TrainError::Torn`]).
+    pub fn finish(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+    ) -> Result<Option<StepOutcome>, TrainError> {
+        let done = device_of(renderer)?.finish_step().map_err(torn)?;
+        let needs = RenderError::OutOfOrder { call: "finish", needs: "record" };
+        let flight = self.flights.steps.pop_front().ok_or_else(|| torn(needs))?;
+        if done.closed != 0 {
+            self.release_flight(scene, &flight.pages);
+            self.give_up(scene, renderer).map_err(torn)?;
+            return Ok(None);
+        }
+        let outcome = self.take_over(scene, &flight, &done);
+        self.release_flight(scene, &flight.pages);
+        self.check_list_behind(scene)?;
+        Ok(Some(outcome))
+    }
+
+    /// Gives up the steps in flight behind one that was not taken, and opens the gate.
+    fn give_up(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        while let Some(behind) = self.flights.steps.pop_front() {
+            let done = device_of(renderer)?.finish_step()?;
+            self.release_flight(scene, &behind.pages);
+            if done.closed == 0 {
+                let problem = "a step was taken behind one that was not";
+                return Err(InputError::new("the device", problem, "report this as a bug").into());
+            }
+        }
+        Ok(device_of(renderer)?.open_gate()?)
+    }
+
+    /// Notes what a step did to its pages.
+    fn take_over(&mut self, scene: &mut PagedScene, flight: &Flight, done: &StepDone) -> StepOutcome {
+        let mut outcome = StepOutcome {
+            loss: done.loss,
+            rows: done.rows as usize,
+            pages: flight.pages.len(),
+            batches: 1,
+            ..StepOutcome::default()
+        };
+        for (page, result) in flight.pages.iter().zip(&done.pages) {
+            let Some((pinned, _)) = self.flights.pages.get_mut(page) else { continue };
+            outcome.rows_pinned += pinned.meta.rows as usize;
+            outcome.updated += u64::from(result.updated);
+            outcome.rows_skipped += u64::from(result.skipped);
+            outcome.drawn += u64::from(result.drawn);
+            if let Some(bounds) = result.bounds() {
+                (pinned.meta.bounds, pinned.dirty) = (bounds, true);
+                scene.pager.note_meta(pinned);
+                self.changed(*page);
+            }
+        }
+        outcome.drawn = if outcome.updated == 0 { outcome.drawn } else { 0 };
+        outcome
+    }
+
+    /// A step in flight ends: pages that no other one uses are held, or released.
+    fn release_flight(&mut self, scene: &mut PagedScene, pages: &[PageNo]) {
+        let mut done = Vec::new();
+        for page in pages {
+            let Some((_, users)) = self.flights.pages.get_mut(page) else { continue };
+            *users -= 1;
+            if *users == 0 {
+                done.extend(self.flights.pages.remove(page).map(|(pinned, _)| pinned));
+            }
+        }
+        self.release(scene, done);
+    }
+
+    /// Fails if the step in flight behind the one that has ended lacks a page that its view needs.
+    fn check_list_behind(&self, scene: &PagedScene) -> Result<(), TrainError> {
+        let Some(behind) = self.flights.steps.front() else { return Ok(()) };
+        let needed = scene.pager.pages_of_view(&behind.camera);
+        if needed.iter().all(|page| behind.pages.contains(page)) {
+            return Ok(());
+        }
+        let problem = "a step moved the bounds of a page farther than an update can";
+        Err(torn(InputError::new("the pages on the device", problem, "report this as a bug")))
+    }
+}
