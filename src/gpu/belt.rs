@@ -127,7 +127,13 @@ impl Belt {
             let room = usize::try_from(self.chunk_bytes - chunk.used).unwrap_or(0);
             let n = room.min(bytes.len() - done);
             let end = chunk.used + n as u64;
-            self.driver.cross(n as u64, || fill(&chunk.raw, chunk.used, &bytes[done..done + n]))?;
+            let filled = self.driver.cross(n as u64, || fill(&chunk.raw, chunk.used, &bytes[done..done + n]));
+            if let Err(error) = filled {
+                // A lost device may refuse its memory before it reports the loss.
+                self.driver.wait("upload", None)?;
+                self.driver.faults.check()?;
+                return Err(error);
+            }
             encoder.copy_buffer_to_buffer(&chunk.raw, chunk.used, target, offset + done as u64, n as u64);
             chunk.used = end.next_multiple_of(MAP_ALIGNMENT).min(self.chunk_bytes);
             done += n;

@@ -2,7 +2,7 @@
 //!
 //! Not here: the picture and its validity (`gpu_picture`), loss and gradients (`gpu_back`), the recording of each stage (`gpu_rows`,
 //! `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`), the
-//! picture in ranges of tiles (`gpu_ranges`), the device and its memory (`crate::gpu`).
+//! picture in ranges of tiles (`gpu_ranges`), steps without waits (`gpu_recorded`), the device and its memory (`crate::gpu`).
 //!
 //! # Memory
 //! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
@@ -41,7 +41,9 @@
 //! All of this holds while the host has the rows. A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some
 //! 50 KB of tables and uniforms, and the payloads that it lacks; it downloads 52 bytes a page, and the payloads of pages that leave their
 //! slots. It waits for the number of listed rows, the two counts, and the results of the pages. For a view of one batch,
-//! payloads of the next view go up while it computes gradients, and payloads that leave come down behind the picture (`train`).
+//! payloads of the next view go up while it computes gradients, and payloads that leave come down behind the picture (`train`). A step
+//! that is recorded without waiting (`gpu_recorded`) has three submissions and two read-backs, which the host waits for once it has
+//! submitted the next step.
 //!
 //! Invariants: 1. of views, the device holds the rows, lists and picture of the last one only; 2. the same input gives the same
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded

@@ -91,7 +91,13 @@ pub struct StepDone {
 /// begin_view ──> pages_in (each batch) ──> picture ─ ─ > picture_back ──> pages_out (each batch) ──> update_pages
 /// ```
 ///
-/// `loss_value` and `unusable_splats` may follow the first `pages_out`, before anything is updated.
+/// `loss_value` and `unusable_splats` may follow the first `pages_out`, before anything is updated. A step of one batch may be recorded
+/// without any wait instead:
+///
+/// ```text
+/// record_picture ──> record_update ─ ─ ─ ─ ─ > finish_step
+///                         └──> record_picture ──> record_update ─ ─ > finish_step
+/// ```
 pub trait PageRenderer: Renderer {
     /// Prepares the device for pages of a run. Slots that exist are given up.
     ///

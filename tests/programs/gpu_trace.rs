@@ -101,9 +101,10 @@ fn payloads_of_the_next_step_go_up_before_the_gradients_of_this_one_are_waited_f
     for step in 0..59 {
         let Some(up) = of_step(step, "load ahead", "") else { continue };
         ahead += 1;
-        let waited =
-            of_step(step, "wait", "rasterize_bwd").into_iter().chain(of_step(step, "read back", "rasterize_bwd"));
-        let first = waited.fold(f64::MAX, f64::min);
+        // A step that was recorded without waiting is waited for at its gate.
+        let waits =
+            ["rasterize_bwd", "gate"].map(|what| [of_step(step, "wait", what), of_step(step, "read back", what)]);
+        let first = waits.into_iter().flatten().flatten().fold(f64::MAX, f64::min);
         assert!(
             up < first && first < f64::MAX,
             "step {step}: payloads go up at {up} us, gradients are there at {first} us"

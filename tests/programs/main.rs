@@ -18,6 +18,7 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod gpu_flights;
 mod gpu_pages;
 mod gpu_trace;
 mod gpu_train;

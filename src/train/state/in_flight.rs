@@ -41,8 +41,8 @@ impl Trainer {
         }
         if self.is_ahead() {
             self.record_next(dataset, targets)?;
-            let _span = trace::span("finish step");
             let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
+            let _span = trace::span("finish step").with("in_flight", tier.in_flight() as u64);
             if let Some(outcome) = tier.finish(&mut self.scene, &mut *self.renderer)? {
                 return Ok(outcome);
             }
@@ -84,7 +84,6 @@ impl Trainer {
         if !tier.may_record() {
             return Ok(false);
         }
-        let _span = trace::span("record step").with("recorded", u64::from(step));
         tier.record(&mut self.scene, &mut *self.renderer, &to_record)
     }
 

@@ -37,6 +37,7 @@ use super::step_faults::{StepFault, StepFaults, steps_in_flight};
 use super::train_step::{ROWS_PER_UNUSABLE, StepOutcome};
 use crate::base::error::InputError;
 use crate::base::ids::PageNo;
+use crate::base::trace;
 use crate::optim::one_step::OneStep;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
@@ -45,7 +46,7 @@ use crate::scene::camera::Camera;
 use crate::scene::frustum::Frustum;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// The most steps in flight.
 pub const STEPS_IN_FLIGHT: usize = 2;
@@ -153,7 +154,7 @@ impl DeviceTier {
         }
         let (planes, index) = (Frustum::new(camera).planes(), scene.pager.index());
         let widened = |page: &PageNo| self.flights.one_step.widened(&index[page.index()].bounds, now);
-        let known: std::collections::BTreeSet<PageNo> = pages.iter().copied().collect();
+        let known: BTreeSet<PageNo> = pages.iter().copied().collect();
         let others = self.flights.pages.keys().filter(|page| !known.contains(page));
         pages.extend(others.filter(|page| planes.may_meet(&widened(page))));
         pages.sort_unstable_by_key(|page| index[page.index()].id);
@@ -240,6 +241,7 @@ impl DeviceTier {
         pages: &[PageNo],
         step: &StepToRecord<'_>,
     ) -> Result<bool, TrainError> {
+        let _span = trace::span("record step").with("recorded", u64::from(step.step));
         let flying = std::mem::take(&mut self.flights.pages);
         let pinned: Vec<&PinnedPage> = pages.iter().filter_map(|page| flying.get(page)).map(|(page, _)| page).collect();
         let in_slots = self.load(scene, renderer, &pinned);
@@ -301,6 +303,7 @@ impl DeviceTier {
 
     /// Gives up the steps in flight behind one that was not taken, and opens the gate.
     fn give_up(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+        let _span = trace::span("give up").with("behind", self.in_flight() as u64);
         while let Some(behind) = self.flights.steps.pop_front() {
             let done = device_of(renderer)?.finish_step()?;
             self.release_flight(scene, &behind.pages);

@@ -1,7 +1,8 @@
 //! Gather and update on a device that holds the pages ([`DeviceTier`]): what crosses the bus in a step are the payloads of
 //! the pages that the device lacks, one table of the optimizer, and some 50 bytes a page back.
 //!
-//! Not here: which page lies in which slot (`device_tier`), the stages (`render`).
+//! Not here: which page lies in which slot (`device_tier`), steps that are recorded without waiting (`device_flights`), the stages
+//! (`render`).
 //!
 //! Invariant: an update that failed is [`TrainError::Torn`]: pages that exist on the device alone may be changed.
 

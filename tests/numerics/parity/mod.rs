@@ -2,6 +2,7 @@
 //! does not add to the next. The best adapter is used; in CI a software adapter.
 
 mod frame;
+mod gate;
 mod loss;
 mod pages;
 mod ranges;

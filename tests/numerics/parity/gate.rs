@@ -1,0 +1,137 @@
+//! gate, and the parts of gather that a step without waits needs: the device decides and lists as the twins do.
+
+use crate::support::gpu::open;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::gpu::{Buffer, Gpu, GpuOptions, groups_1d};
+use gsscale::kernels::gate::{self, GateUniforms, StepVerdict};
+use gsscale::kernels::gather;
+use gsscale::kernels::page_words::DevicePage;
+use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers};
+use gsscale::optim::adam::AdamConfig;
+use gsscale::optim::deferred::DeferredAdam;
+use gsscale::optim::rates::Rates;
+use gsscale::scene::camera::Camera;
+use gsscale::scene::page_layout::PageLayout;
+
+/// A step within all limits, and its limits.
+fn sound() -> (GateUniforms, StepVerdict) {
+    let u = GateUniforms {
+        rows_room: 40_000,
+        isects_room: 1 << 20,
+        list_room: 8192,
+        rows_per_unusable: 10_000,
+        rows_at: 3,
+        isects_at: 5,
+        has_loss: 1,
+        pad: 0,
+    };
+    let sums = [12.5f32, 3.0, -8.0, 1.0].map(f32::to_bits);
+    let (rows, isects, list_max, unusable) = (39_999, 1 << 20, 8000, 3);
+    (u, StepVerdict { closed: 0, rows, isects, list_max, unusable, sums, pad0: 0, pad1: 0, pad2: 0 })
+}
+
+fn cases() -> Vec<(GateUniforms, u32, StepVerdict, u32)> {
+    let (u, v) = sound();
+    let bad = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY].map(f32::to_bits);
+    let with = |i: usize, bits: u32| {
+        let mut sums = v.sums;
+        sums[i] = bits;
+        StepVerdict { sums, ..v }
+    };
+    let mut all = vec![
+        (u, 0, v, 0),
+        (u, gate::LOSS, v, gate::BY_EARLIER),
+        (u, 0, StepVerdict { rows: 40_001, ..v }, gate::ROWS),
+        (u, 0, StepVerdict { isects: u32::MAX, ..v }, gate::ISECTS),
+        (u, 0, StepVerdict { list_max: 8193, ..v }, gate::LIST),
+        (u, 0, StepVerdict { unusable: 4, ..v }, gate::GRADIENTS),
+        (u, 0, StepVerdict { rows: 9_999, unusable: 1, ..v }, gate::GRADIENTS),
+        (u, 0, StepVerdict { rows: 9_999, unusable: 0, ..v }, 0),
+        (u, 0, with(1, bad[1]), 0),
+        (GateUniforms { has_loss: 0, ..u }, 0, with(0, bad[0]), 0),
+        (u, 1, StepVerdict { rows: 40_001, ..with(2, bad[0]) }, gate::BY_EARLIER | gate::ROWS | gate::LOSS),
+    ];
+    all.extend(bad.iter().flat_map(|&bits| [0, 2].map(|i| (u, 0, with(i, bits), gate::LOSS))));
+    all
+}
+
+fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer) -> Vec<T> {
+    let mut recorder = gpu.begin("parity");
+    let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
+    gpu.submit(recorder).unwrap();
+    bytes.to_vec().unwrap()
+}
+
+#[test]
+fn a_gate_closes_for_every_reason_and_stays_closed() {
+    let gpu = open(&GpuOptions::default());
+    for (i, (u, before, measured, closed)) in cases().into_iter().enumerate() {
+        let want = gate::decide(&u, before, &measured);
+        assert_eq!(want.closed, closed, "case {i}");
+        let Some(gpu) = &gpu else { continue };
+        let mut recorder = gpu.begin("gate");
+        let mut counts = [0; 4];
+        counts[u.rows_at as usize] = measured.rows;
+        let mut offsets = [0; 6];
+        offsets[u.isects_at as usize] = measured.isects;
+        let inputs: [&[u32]; 6] =
+            [&counts, &offsets, &[measured.list_max], &[measured.unusable], &measured.sums, &[before]];
+        let buffers = inputs.map(|words| recorder.buffer_with("input", words).unwrap());
+        let verdict = recorder.buffer_zeroed("verdict", size_of::<StepVerdict>() as u64).unwrap();
+        let uniform = recorder.uniform(&u).unwrap();
+        let views: Vec<_> =
+            [uniform].into_iter().chain(buffers.iter().map(Buffer::view)).chain([verdict.view()]).collect();
+        let pipeline = gpu.pipeline("gate.wgsl", "decide", &[]).unwrap();
+        recorder.dispatch("gate", &pipeline, &views, groups_1d(1, 1)).unwrap();
+        gpu.submit(recorder).unwrap();
+        assert_eq!(read::<StepVerdict>(gpu, &verdict), [want], "case {i}");
+        assert_eq!(read::<u32>(gpu, &buffers[5]), [closed], "case {i}: the gate");
+    }
+}
+
+/// Few and many pages, lists with room, without, and with none to spare.
+#[test]
+fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
+    let Some(gpu) = open(&GpuOptions::default()) else { return };
+    let adam = DeferredAdam::new(Rates::new(1.0, 10), AdamConfig::default(), gsscale::base::simd::SimdPath::best());
+    let camera = Camera {
+        viewmat: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0]],
+        fx: 70.0,
+        fy: 60.0,
+        cx: 33.0,
+        cy: 22.0,
+        width: 65,
+        height: 47,
+        near_plane: 0.01,
+        far_plane: 1e10,
+    };
+    let splits = SplitNumbers { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
+    let layout = PageLayout { rows: 40, sh_degree: 0 };
+    for (count, room) in [(1u32, 64u32), (700, 16_000), (700, 9000), (256, 1)] {
+        let mut draws = Stream::new(3, Purpose::Test, u64::from(count), 0);
+        let mut pages: Vec<DevicePage> = (0..count).map(|p| DevicePage::new(layout, 0, 0, 40 * p)).collect();
+        let counts: Vec<u32> = (0..count).map(|_| draws.below(41) as u32).collect();
+        let found: Vec<u32> = (0..40 * count).map(|_| draws.below(40) as u32).collect();
+        let mut recorder = gpu.begin("gather");
+        let table = recorder.buffer_with("pages", &pages).unwrap();
+        let [on_device, found_there] =
+            [[&counts[..], &[0]].concat(), found.clone()].map(|words| recorder.buffer_with("words", &words).unwrap());
+        let listed = recorder.buffer_with("listed", &vec![[7u32; 2]; room as usize]).unwrap();
+        let uniforms = GatherUniforms::new(&camera, &adam.numbers(10).unwrap(), 1, &splits, count);
+        let uniform = recorder.uniform(&GatherUniforms { row_count: room, ..uniforms }).unwrap();
+        let [place, pad, list] = ["place", "pad", "list"].map(|entry| gpu.pipeline("gather.wgsl", entry, &[]).unwrap());
+        let views = [uniform.clone(), on_device.view(), table.view()];
+        recorder.dispatch("gather", &place, &views, groups_1d(1, 1)).unwrap();
+        let views = [uniform.clone(), on_device.view(), listed.view()];
+        recorder.dispatch("gather", &pad, &views, groups_1d(room, 256)).unwrap();
+        let views = [uniform, table.view(), on_device.view(), found_there.view(), listed.view()];
+        recorder.dispatch("gather", &list, &views, groups_1d(count * 256, 256)).unwrap();
+        gpu.submit(recorder).unwrap();
+        let mut want = vec![[gather::UNLISTED, 0]; room as usize];
+        let total = gather::place(&mut pages, &counts);
+        gather::list(&pages, &counts, &found, &mut want);
+        let got: Vec<[u32; 2]> = read(&gpu, &listed);
+        assert!(got == want, "{count} pages, {total} rows, room for {room}");
+        assert_eq!(read::<u32>(&gpu, &on_device)[count as usize], total);
+    }
+}
