@@ -8,6 +8,7 @@ use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::densify::strategy::StrategyName;
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
@@ -146,11 +147,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         return go_on(resume(&request), &request, args.restarts);
     }
     let config = match (&args.config, args.demo) {
-        (None, true) => {
-            let mut config = demo_config();
-            args.keys.apply(&mut config);
-            config
-        }
+        (None, true) => demo_config(&args.keys)?,
         (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
@@ -172,18 +169,17 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet, live }), &again, args.restarts)
 }
 
-/// Config of the demo: enough steps for a good picture within minutes on two cores.
-fn demo_config() -> TrainConfig {
-    TrainConfig {
-        steps: 4000,
-        sh_every: 500,
-        refine_start: 300,
-        refine_stop: 2500,
-        reset_every: 1500,
-        max_gaussians: 150_000,
-        eval_every: 1000,
-        ..TrainConfig::default()
-    }
+/// Config of the demo where `keys` leave it open: enough steps for a good picture within minutes on two cores, and enough Gaussians for
+/// the drive to be used.
+fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
+    let keys = TrainOverrides {
+        steps: keys.steps.or(Some(4000)),
+        max_gaussians: keys.max_gaussians.or(Some(150_000)),
+        strategy: keys.strategy.or(Some(StrategyName::LongAxis)),
+        eval_every: keys.eval_every.or(Some(1000)),
+        ..keys.clone()
+    };
+    TrainConfig::of_new_run(None, &keys)
 }
 
 /// Refuses an output folder of a demo that holds more than the city of an earlier demo.
