@@ -74,15 +74,15 @@ struct Args {
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
-    /// Go on from the last commit, in this process, up to N times when the GPU is lost
+    /// If the GPU is lost, go on from the last commit in this process, up to N times
     #[arg(long, value_name = "N", default_value_t = 3)]
     restarts: u32,
-    /// Write what the host did in every step to this file, as trace events that Perfetto (ui.perfetto.dev) and chrome://tracing
-    /// open: uploads, submissions, waits, read-backs, pages, events
+    /// Write a trace of the host's work in every step (uploads, submissions, waits, read-backs, pages, events) to this file.
+    /// Perfetto (ui.perfetto.dev) and chrome://tracing open it
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Show the run while it trains, on a page with its curves and a picture from a camera that you move: a port of this machine
-    /// (8080), or an address (0.0.0.0:8080 lets the network see it)
+    /// Serve a live page of the run, with its curves and a picture from a camera that you move. ADDRESS is a port of this
+    /// machine (8080), or an address with a port (0.0.0.0:8080 lets the network see the page)
     #[arg(long, value_name = "ADDRESS", value_parser = parse_address)]
     serve: Option<SocketAddr>,
     #[command(flatten)]
