@@ -25,7 +25,7 @@ fn pictures(width: u32, height: u32) -> (Image, Target) {
 /// Median wall and CPU milliseconds, and the bits of the loss.
 fn median_ms(width: u32, height: u32, simd: SimdPath, time: Duration) -> (f64, f64, u64) {
     let (image, target) = pictures(width, height);
-    let options = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd };
+    let options = LossOptions::new(0.2, SsimPadding::Valid, simd);
     let (mut loss, mut v_rgb) = (ImageLoss::new(), Vec::new());
     let mut bits = 0;
     let t = steady_time(time, || {

@@ -58,8 +58,8 @@
 //! 4. `train/run/changes.rs`, `BEFORE_ITS_TIME`: the value that means "as before the key existed", if there is one. Otherwise a run
 //!    of an older program resumes only with `--accept-changes`.
 //! 5. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
-//!    file again, also after a change of a help text. `tests/programs/cli.rs` lists the words of all enumerations. The lists
-//!    below lead here wherever they add a key or a word.
+//!    file again, also after a change of a help text. Tests read the words of enumerations from
+//!    [`config::choice::choices`]. The lists below lead here wherever they add a key or a word.
 //!
 //! **A setting that one backend lacks**
 //! 1. `render/mod.rs`: a method of [`render::Renderer`]. The backend that lacks the setting returns an error with its remedy.
@@ -71,27 +71,33 @@
 //! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
 //!    strategy from the keys.
 //!
-//! **A loss term, or another correction of the picture than [`appearance`]**
-//! 1. `train/step/comparison.rs`: the one place between picture and gradient, for training and for the rehearsal before the first step. It works on the
-//!    CPU and on devices through [`render::Renderer::picture_mut`] and [`render::Renderer::picture_gradient`]. What
-//!    it needs is a field of [`train::step::comparison::Comparison`].
-//! 2. `train/state/trainer.rs` and `train/preflight/first_look.rs`: fill that field, for steps and for the first rehearsal.
-//!    What it finds is a field of [`train::step::comparison::Correction`], which the step reads afterwards.
-//! 3. `train/step/train_step.rs`, after each `loss_value`: adds the term to the loss that is logged.
-//! 4. The weight is a config key; parameters that are trained are a resumable value, which `Trainer::learn_appearance` changes after a
-//!    step that was not skipped. The term itself is a function in `render/`; a correction is a file in `appearance/`. If it has parameters
-//!    of photos, `train/state/growth_checks.rs` corrects the held-out photos as well.
-//! 5. A term of the picture and the photo alone, for the CPU only or where its time matters: instead the stage itself,
-//!    `kernels/image_loss.rs`, its options in `LossOptions`, and `image_loss.wgsl` among the shaders. Masked pixels do not count.
+//! **A loss term**
+//! 1. A file in `render/`: the term as a function of picture and photo, and its gradient. Masked pixels do not count.
+//!    `render/mod.rs` names the file.
+//! 2. `train/step/comparison.rs`: the one place between picture and gradient, for training and for the rehearsal before the
+//!    first step. It works on the CPU and on devices through [`render::Renderer::picture_mut`] and
+//!    [`render::Renderer::picture_gradient`].
+//! 3. `kernels/image_loss.rs`: the weight of the term is a field of [`kernels::image_loss::LossOptions`], which reaches step and
+//!    rehearsal as [`train::step::comparison::Comparison::loss`]. The weight is a config key; `config/limits.rs` fills the field.
+//! 4. `train/step/train_step.rs`, `read_loss`: adds the term to the loss that is logged.
+//! 5. Where the time of the term matters: instead of 1 and 2 the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl`
+//!    among the shaders.
+//!
+//! **Parameters of photos, or another correction of the picture than [`appearance`]**
+//! 1. A file in `appearance/`: the correction and its derivatives. `train/step/comparison.rs` applies it. What it needs is a
+//!    field of [`train::step::comparison::Comparison`]; what it finds is a field of
+//!    [`train::step::comparison::Correction`], which the step reads afterwards.
+//! 2. `train/state/trainer.rs` and `train/preflight/first_look.rs`: fill the field, for steps and for the first rehearsal.
+//! 3. Parameters that are trained are a resumable value, which `Trainer::learn_appearance` changes after a step that was not
+//!    skipped. `train/state/growth_checks.rs` corrects the held-out photos as well.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
 //!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
-//! 2. `exchange/format.rs`: the ending, the sink, the transform. `config/choice.rs`: the word of `--export`. `gsscale-ckpt
-//!    export` follows; its help names the formats (`tools/ckpt/export.rs`). The PLY remains: resumes, `gsscale-eval` and more steps read it.
-//! 3. `report/run_files.rs`: the name in a run's folder, so that `--overwrite` removes the file. `train/run/run_folder.rs`,
-//!    `save_result`: the run writes it.
+//! 2. `exchange/format.rs`: the ending, the sink, the transform, the name in a run's folder, and how `--overwrite` removes it.
+//!    Runs and `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
+//! 3. `config/choice.rs`: the word of `--export`. `config/file.rs`: the help of the key.
 //!
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
@@ -103,7 +109,7 @@
 //! **An eviction order**
 //! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], a place in `ALL`, its key of the order,
 //!    and whether the order ignores the plan. Runs, look-ahead and simulations share it.
-//!    `last_use` is the number of steps begun at the last pin; 0 for a page that was read ahead and not used yet.
+//!    `last_use` is the number of steps begun at the last pin, in runs and simulations; 0 for a page that was read ahead and not used yet.
 //! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 //! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 

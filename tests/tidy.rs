@@ -1,4 +1,4 @@
-//! House rules that the compiler does not hold: which layer may name which, how long functions are, where `unsafe`
+//! House rules that the compiler does not hold: which layer may name which, how long functions and files are, where `unsafe`
 //! may stand, and that no marker of unfinished work is left.
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
@@ -77,6 +77,7 @@ const UNSAFE_FILES: &[&str] = &[
 ];
 
 const FUNCTION_LINES_MAX: usize = 80;
+const FILE_LINES_MAX: usize = 500;
 const README_WORDS_MAX: usize = 1300;
 
 fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
@@ -279,6 +280,35 @@ fn files_that_comments_name_exist() {
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
     assert_eq!(named_files("let a; // see `b/c.rs`, d.wgsl.\nlet e = \"f.rs\";"), ["b/c.rs", "d.wgsl"]);
+}
+
+/// Cargo.toml switches the tests of some programs off, to build less. A test in one of these would never run.
+#[test]
+fn programs_whose_tests_are_off_have_none() {
+    let manifest = std::fs::read_to_string(Path::new(env!("CARGO_MANIFEST_DIR")).join("Cargo.toml")).unwrap();
+    let programs = manifest.split("[[bin]]").skip(1).filter(|section| section.contains("test = false"));
+    let stems: Vec<&str> = programs.map(|section| section.split("path = \"").nth(1).unwrap()).collect();
+    let stems: Vec<&str> = stems.iter().map(|rest| rest.split(".rs\"").next().unwrap()).collect();
+    assert!(stems.contains(&"tools/train"), "{stems:?}");
+    let is_off = |name: &str| {
+        let of = |stem: &&str| name.strip_prefix(*stem).is_some_and(|rest| rest.starts_with(['.', '/']));
+        stems.iter().any(of)
+    };
+    let files = rust_files(&["tools"]).into_iter();
+    let wrong: Vec<String> =
+        files.filter(|(name, text)| is_off(name) && text.contains("#[test]")).map(|(name, _)| name).collect();
+    assert!(wrong.is_empty(), "remove `test = false` from the programs of these: {wrong:?}");
+}
+
+#[test]
+fn files_stay_readable() {
+    let files = rust_files(&["src", "tools"]).into_iter();
+    let long: Vec<String> = files
+        .map(|(name, text)| (name, text.lines().count()))
+        .filter(|(_, lines)| *lines > FILE_LINES_MAX)
+        .map(|(name, lines)| format!("{name}: {lines} lines"))
+        .collect();
+    assert!(long.is_empty(), "files over {FILE_LINES_MAX} lines; split them by idea:\n{}", long.join("\n"));
 }
 
 #[test]

@@ -8,6 +8,7 @@ use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::densify::strategy::StrategyName;
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
@@ -73,15 +74,15 @@ struct Args {
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
-    /// Go on from the last commit, in this process, up to N times when the GPU is lost
+    /// If the GPU is lost, go on from the last commit in this process, up to N times
     #[arg(long, value_name = "N", default_value_t = 3)]
     restarts: u32,
-    /// Write what the host did in every step to this file, as trace events that Perfetto (ui.perfetto.dev) and chrome://tracing
-    /// open: uploads, submissions, waits, read-backs, pages, events
+    /// Write a trace of the host's work in every step (uploads, submissions, waits, read-backs, pages, events) to this file.
+    /// Perfetto (ui.perfetto.dev) and chrome://tracing open it
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
-    /// Show the run while it trains, on a page with its curves and a picture from a camera that you move: a port of this machine
-    /// (8080), or an address (0.0.0.0:8080 lets the network see it)
+    /// Serve a live page of the run, with its curves and a picture from a camera that you move. ADDRESS is a port of this
+    /// machine (8080), or an address with a port (0.0.0.0:8080 lets the network see the page)
     #[arg(long, value_name = "ADDRESS", value_parser = parse_address)]
     serve: Option<SocketAddr>,
     #[command(flatten)]
@@ -146,11 +147,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         return go_on(resume(&request), &request, args.restarts);
     }
     let config = match (&args.config, args.demo) {
-        (None, true) => {
-            let mut config = demo_config();
-            args.keys.apply(&mut config);
-            config
-        }
+        (None, true) => demo_config(&args.keys)?,
         (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
@@ -172,18 +169,17 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet, live }), &again, args.restarts)
 }
 
-/// Config of the demo: enough steps for a good picture within minutes on two cores.
-fn demo_config() -> TrainConfig {
-    TrainConfig {
-        steps: 4000,
-        sh_every: 500,
-        refine_start: 300,
-        refine_stop: 2500,
-        reset_every: 1500,
-        max_gaussians: 150_000,
-        eval_every: 1000,
-        ..TrainConfig::default()
-    }
+/// Config of the demo where `keys` leave it open: enough steps for a good picture within minutes on two cores, and enough Gaussians for
+/// the drive to be used.
+fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
+    let keys = TrainOverrides {
+        steps: keys.steps.or(Some(4000)),
+        max_gaussians: keys.max_gaussians.or(Some(150_000)),
+        strategy: keys.strategy.or(Some(StrategyName::LongAxis)),
+        eval_every: keys.eval_every.or(Some(1000)),
+        ..keys.clone()
+    };
+    TrainConfig::of_new_run(None, &keys)
 }
 
 /// Refuses an output folder of a demo that holds more than the city of an earlier demo.

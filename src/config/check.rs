@@ -68,7 +68,7 @@ impl TrainConfig {
         }
         let needs = [
             (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
-            (self.optimizer == Method::Deferred, "it knows the deferred form alone", "use --optimizer deferred"),
+            (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
             (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
         ];
         match needs.iter().find(|(holds, ..)| !holds) {

@@ -2,7 +2,8 @@
 //! command line parses a value once; later code never compares text.
 //!
 //! Invariants: 1. a value is written as the word from which it is read; 2. file and flag refuse an unknown word with
-//! the same message; 3. this file holds no defaults and no meanings.
+//! the same message; 3. this file holds no defaults and no meanings; 4. [`choices`] lists every such key: tests of words go
+//! through the list, so that a new key or word is named here alone.
 
 use super::schedule::Schedule;
 use crate::appearance::AppearanceMode;
@@ -76,8 +77,13 @@ pub enum LogFormat {
     Tensorboard,
 }
 
-/// Implements [`Choice`], reading and writing for enums whose values have one word each. Values after `hidden` are
-/// written but never read.
+/// Every key whose value is a word, with the words that a user may write.
+pub fn choices() -> impl Iterator<Item = (&'static str, &'static [&'static str])> {
+    CHOICES.iter().chain(OPEN_CHOICES).copied()
+}
+
+/// Implements [`Choice`], reading and writing for enums whose values have one word each, and lists them. Values after
+/// `hidden` are written but never read.
 macro_rules! choices {
     ($($key:literal: $type:ident { $($value:ident = $word:literal),+ } $(hidden { $($other:ident = $other_word:literal),+ })?)+) => { $(
         impl Choice for $type {
@@ -95,7 +101,15 @@ macro_rules! choices {
         }
 
         reading_and_writing!($type);
-    )+ };
+    )+
+
+        const CHOICES: &[(&str, &[&str])] = &[$(($key, <$type as Choice>::WORDS)),+];
+
+        #[cfg(test)]
+        fn check_choices() {
+            $(tests::check::<$type>();)+
+        }
+    };
 }
 
 /// Reading and writing in config files, and parsing of flags, of a type that implements [`Choice`].
@@ -141,7 +155,7 @@ choices! {
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
 
-/// Implements [`Choice`] for optional choices, with their word for `None`.
+/// Implements [`Choice`] for optional choices, with their word for `None`, and lists them.
 macro_rules! open_choices {
     ($($key:literal: $type:ident, $none:literal in [$($word:expr),+], $from:expr, $to:expr;)+) => { $(
         impl Choice for Chosen<$type> {
@@ -156,7 +170,15 @@ macro_rules! open_choices {
                 self.0.map_or(Cow::Borrowed($none), |value| Cow::Owned($to(value)))
             }
         }
-    )+ };
+    )+
+
+        const OPEN_CHOICES: &[(&str, &[&str])] = &[$(($key, <Chosen<$type> as Choice>::WORDS)),+];
+
+        #[cfg(test)]
+        fn check_open_choices() {
+            $(tests::check::<Chosen<$type>>();)+
+        }
+    };
 }
 
 /// The word for zstd. It says why the codec is refused where it is missing.
@@ -286,7 +308,7 @@ mod tests {
     use super::*;
     use crate::config::file::{KEYS, TrainConfig};
 
-    fn check<T: Choice + PartialEq + std::fmt::Debug>() {
+    pub(super) fn check<T: Choice + PartialEq + std::fmt::Debug>() {
         assert!(KEYS.iter().any(|key| key.name() == T::KEY), "{} is no key", T::KEY);
         for word in T::WORDS {
             let word = word.replace(":N", ":3").replace(":LEVEL", ":19");
@@ -302,26 +324,8 @@ mod tests {
 
     #[test]
     fn every_word_is_written_as_it_is_read() {
-        check::<IoEngine>();
-        check::<EvictPolicy>();
-        check::<Transfers>();
-        check::<SsimPadding>();
-        check::<Method>();
-        check::<Moments>();
-        check::<StrategyName>();
-        check::<Schedule>();
-        check::<Quality>();
-        check::<GrowthScore>();
-        check::<AppearanceMode>();
-        check::<LogFormat>();
-        check::<SsimVariant>();
-        check::<ExportFormat>();
-        check::<ExportFrame>();
-        check::<Chosen<Order>>();
-        check::<Chosen<Codec>>();
-        check::<Chosen<SimdPath>>();
-        check::<Chosen<OptimizerPlace>>();
-        check::<Chosen<ColorCorrect>>();
+        check_choices();
+        check_open_choices();
         let problem = parse_choice::<Transfers>("x").unwrap_err();
         assert_eq!(problem, "unknown --transfers 'x': use overlap, ahead or demand");
         // An engine that only tests and dry runs open.

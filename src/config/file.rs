@@ -171,30 +171,30 @@ config_keys! {
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
         appearance: AppearanceMode = AppearanceMode::Off => Numbers;
-        /// Train without the views whose photo contradicts the scene (see the log and the report), as long as it does: wrong
-        /// poses, photos of another place. Such views are named with and without this key
+        /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
+        /// The log and the report name such views with and without this key
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
-        /// Train without the parts of photos that show what the scene does not, as long as they do: cars, people, shadows that
-        /// moved. Masked are blocks of a 64th of the photo's longer side, at most a quarter of a photo, from a tenth of the
-        /// run on (step 500 at the latest). Masks of your own remain better: see masks/
+        /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
+        /// side of a masked block is a 64th of the photo's longer side. At most a quarter of a photo is masked, from a tenth
+        /// of the run on (step 500 at the latest). Masks of your own work better: see --masks
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
         /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians, or
-        /// at the number that the run decides without, remove what weighs least), or none
+        /// at the number that --quality decides, remove the Gaussians that contribute least), or none
         strategy: StrategyName = StrategyName::Default => Numbers;
         /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
         /// most squared error (error), or the largest geometric mean of both (mixed)
         growth_score: GrowthScore = GrowthScore::Gradient => Numbers;
         /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers;
-        /// Of --strategy long-axis without --max-gaussians: draft (few Gaussians), normal or archive (many). During the first
-        /// half of the run, at most 1,700 steps, some training photos are held out, and the scene grows as far as they show that
-        /// more pay
+        /// Of --strategy long-axis without --max-gaussians: draft (few Gaussians), normal or archive (many). The run holds out
+        /// some training photos during its first half (at most 1,700 steps). The scene grows as long as more Gaussians bring
+        /// these photos enough decibels
         quality: Quality = Quality::Normal => Numbers;
-        /// Most Gaussians; 0 = no cap, or with --strategy long-axis, as many as pay
+        /// Most Gaussians; 0 = no cap; with --strategy long-axis 0 = as --quality decides
         [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;

@@ -1,14 +1,17 @@
-//! The formats of exported Gaussians, and the way from a format to its sink.
+//! The formats of exported Gaussians: their names, the way from a format to its sink, and what a run keeps of them.
+//!
+//! Invariant: everything that follows from a format is a `match` in this file, so that the compiler lists what a new format needs.
 
 use super::meta::{ExportFrame, SceneMeta};
 use super::ply::PlyWriter;
 use super::sink::GaussianSink;
-use super::sog::{SogWriter, TREE_FILE, folder_of_tree, memory_bytes};
+use super::sog::{SogWriter, TREE_FILE, folder_of_tree, is_of_sog, memory_bytes};
 use super::spz::{SPZ_UP, SpzWriter};
-use super::transform::write_transform;
+use super::transform::{transform_path, write_transform};
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::scene::rotation::VIEWER_UP;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// A format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -22,6 +25,12 @@ pub enum ExportFormat {
 }
 
 impl ExportFormat {
+    /// All formats.
+    pub const ALL: [ExportFormat; 3] = [ExportFormat::Ply, ExportFormat::Spz, ExportFormat::Sog];
+
+    /// How a file name says the format, for help and remedies.
+    pub const NAMES: &str = ".ply, .spz, or lod-meta.json in a folder of its own (SOG with levels of detail)";
+
     /// The format that a file name says, by its ending or as a whole.
     ///
     /// # Errors
@@ -34,7 +43,7 @@ impl ExportFormat {
             () if is("spz") => Ok(ExportFormat::Spz),
             () if path.file_name().is_some_and(|name| name == TREE_FILE) => Ok(ExportFormat::Sog),
             () => {
-                let remedy = format!("let it end in .ply or .spz, or name a folder's {TREE_FILE}");
+                let remedy = format!("use {}", ExportFormat::NAMES);
                 Err(InputError::new(path, "this file name names no format", remedy))
             }
         }
@@ -43,6 +52,53 @@ impl ExportFormat {
     /// Most memory that its sink takes beside the rows that it is given, bytes; a few MiB count as none.
     pub fn memory_bytes(self) -> u64 {
         if self == ExportFormat::Sog { memory_bytes() } else { 0 }
+    }
+
+    /// The export that a run writes beside its PLY; `None` for the PLY itself.
+    pub fn beside(self, ply: &Path) -> Option<PathBuf> {
+        match self {
+            ExportFormat::Ply => None,
+            ExportFormat::Spz => Some(ply.with_extension("spz")),
+            ExportFormat::Sog => {
+                let mut folder = ply.file_stem().unwrap_or_default().to_os_string();
+                folder.push("_sog");
+                Some(ply.with_file_name(folder).join(TREE_FILE))
+            }
+        }
+    }
+
+    /// Refuses to remove an export in this file: a folder that holds files of others, all of which stay.
+    ///
+    /// # Errors
+    /// There is such a folder, or the folder cannot be listed.
+    pub fn check_removable(self, file: &Path) -> InputResult<()> {
+        match self {
+            ExportFormat::Ply | ExportFormat::Spz => Ok(()),
+            ExportFormat::Sog => check_ours(folder_of_tree(file)?, is_of_sog),
+        }
+    }
+
+    /// Removes an export in this file and the transform beside it, if they exist.
+    ///
+    /// # Errors
+    /// As [`ExportFormat::check_removable`], or the drive fails.
+    pub fn remove(self, file: &Path) -> InputResult<()> {
+        let remove_file = |path: &Path| match std::fs::remove_file(path) {
+            Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
+            _ => Ok(()),
+        };
+        let named = match self {
+            ExportFormat::Ply | ExportFormat::Spz => {
+                remove_file(file)?;
+                file
+            }
+            ExportFormat::Sog => {
+                let folder = folder_of_tree(file)?;
+                remove_ours(folder, is_of_sog)?;
+                folder
+            }
+        };
+        remove_file(&transform_path(named))
     }
 
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`.

@@ -52,6 +52,13 @@ pub struct LossOptions {
     pub simd: SimdPath,
 }
 
+impl LossOptions {
+    /// The loss of these parts alone, without the further terms that a config may add.
+    pub fn new(ssim_lambda: f32, padding: SsimPadding, simd: SimdPath) -> LossOptions {
+        LossOptions { ssim_lambda, padding, simd }
+    }
+}
+
 /// Loss of one image and its parts.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LossValue {

@@ -2,6 +2,7 @@
 
 pub mod constants;
 pub mod deferred;
+pub mod fold;
 pub mod gate;
 pub mod gather;
 pub mod image_loss;

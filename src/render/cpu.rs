@@ -12,6 +12,7 @@ use super::sequence::{Sequence, ViewOptions};
 use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
 use crate::base::room;
 use crate::base::simd::SimdPath;
+use crate::kernels::fold::{FoldPart, FootprintGradients, Partial, WeightPartial, fold_rows, fold_weights};
 use crate::kernels::image_loss::{ImageLoss, ImagePair};
 use crate::kernels::isect_emit::{count, emit, number_isects};
 use crate::kernels::isect_offsets::isect_offsets;
@@ -19,9 +20,7 @@ use crate::kernels::project_bwd::project_bwd;
 use crate::kernels::project_fwd::{Projected, project_fwd};
 use crate::kernels::radix_sort::DepthSort;
 use crate::kernels::raster::Lists;
-use crate::kernels::rasterize_bwd::{
-    FoldPart, FootprintGradients, Partial, Upstream, Weighing, WeightPartial, fold_rows, fold_weights, rasterize_bwd,
-};
+use crate::kernels::rasterize_bwd::{Upstream, Weighing, rasterize_bwd};
 use crate::kernels::rasterize_fwd::{Raster, rasterize_fwd, untile};
 use crate::kernels::scan::scan;
 use crate::kernels::sh_bwd::sh_bwd;

@@ -15,14 +15,6 @@ pub const SUMMARY_FILE: &str = "summary.json";
 pub const PLY_FILE: &str = "point_cloud.ply";
 /// The way from the coordinates of the Gaussians to those of the dataset, and back.
 pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
-/// The Gaussians at the end, compressed (`--export spz`).
-pub const SPZ_FILE: &str = "point_cloud.spz";
-/// The way from its coordinates to those of the dataset, and back.
-pub const SPZ_TRANSFORM_FILE: &str = "point_cloud.spz.transform.json";
-/// Folder of the Gaussians at the end, in parts and levels of detail (`--export sog`).
-pub const SOG_FOLDER: &str = "point_cloud_sog";
-/// The way from their coordinates to those of the dataset, and back.
-pub const SOG_TRANSFORM_FILE: &str = "point_cloud_sog.transform.json";
 /// The page for people.
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
@@ -47,8 +39,9 @@ pub enum RunFile {
     SavedPlys,
     /// A folder of event files; other files in it are not ours.
     Events(&'static str),
-    /// A folder that `exchange::sog` writes. With files of others in it nothing of a run is removed.
-    Sog(&'static str),
+    /// What `--export` writes beside [`PLY_FILE`], in any format. Nothing of a run is removed where a folder of an export holds
+    /// files of others.
+    Exports,
     /// A folder tree of PNG files; other files in it are not ours.
     Pictures(&'static str),
 }
@@ -67,17 +60,14 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 18] = [
+pub const RUN_FILES: [(RunFile, Tells); 15] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
     (RunFile::File(SUMMARY_FILE), Tells::Result),
     (RunFile::File(PLY_FILE), Tells::Result),
     (RunFile::File(TRANSFORM_FILE), Tells::Result),
-    (RunFile::File(SPZ_FILE), Tells::Result),
-    (RunFile::File(SPZ_TRANSFORM_FILE), Tells::Result),
-    (RunFile::Sog(SOG_FOLDER), Tells::Result),
-    (RunFile::File(SOG_TRANSFORM_FILE), Tells::Result),
+    (RunFile::Exports, Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),

@@ -212,18 +212,19 @@ fn read_json(text_of_file: &str) -> (f64, String) {
     (peak as f64 / text_of_file.len() as f64, said)
 }
 
-/// The bound of `dataset::transforms`, plus the memory of the program without a scene, some 20 MiB, over a file of 24
-/// MiB.
-const JSON_MULTIPLE: f64 = 16.0 + 1.0;
+/// Length of the files.
+const JSON_BYTES: usize = 12 << 20;
+/// The bound of `dataset::transforms`, plus the memory of the program without a scene, some 20 MiB.
+const JSON_MULTIPLE: f64 = 16.0 + (20 << 20) as f64 / JSON_BYTES as f64;
 
 #[test]
 fn transforms_are_read_within_a_multiple_of_their_size() {
-    const BYTES: usize = 24 << 20;
-    let list = |item: &str| vec![item; BYTES / (item.len() + 1)].join(",");
+    let list = |item: &str| vec![item; JSON_BYTES / (item.len() + 1)].join(",");
     let matrix = "[[1,0,0,0],[0,1,0,0],[0,0,1,0]]";
     let frame = |name: &str| format!("{{\"file_path\":\"{name}\",\"transform_matrix\":{matrix}}}");
-    let names = |item: fn(usize) -> String| (0..BYTES / 9).map(item).collect::<Vec<_>>().join(",");
-    let frames = (0..BYTES / frame("000000").len()).map(|i| frame(&format!("{i:x}"))).collect::<Vec<_>>().join(",");
+    let names = |item: fn(usize) -> String| (0..JSON_BYTES / 9).map(item).collect::<Vec<_>>().join(",");
+    let frames =
+        (0..JSON_BYTES / frame("000000").len()).map(|i| frame(&format!("{i:x}"))).collect::<Vec<_>>().join(",");
     let cases = [
         ("empty frames", format!("{{\"frames\":[{}]}}", list("{}")), "frames[0].file_path"),
         ("numbers for frames", format!("{{\"frames\":[{}]}}", list("0")), "not an object"),

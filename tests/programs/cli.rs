@@ -2,6 +2,7 @@
 //! names the file, the place and the remedy, with a non-zero exit code, and without an output folder.
 
 use crate::support::scenes::{TextModel, city, stderr, summary, text, train};
+use gsscale::config::choice::choices;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
@@ -320,28 +321,10 @@ fn unknown_words_are_refused_with_the_words_that_are_known() {
     let (folder, scene, _) = small();
     let help = train(&["--help"]);
     let help = String::from_utf8_lossy(&help.stdout).split_whitespace().collect::<Vec<_>>().join(" ");
-    for (key, words, listed) in [
-        ("view-order", "auto, shuffle, groups:N or tour", "auto, shuffle, groups:N, tour"),
-        ("ssim-padding", "valid or same", "valid, same"),
-        ("optimizer", "deferred, dense or sparse", "deferred, dense, sparse"),
-        ("moments", "f32 or bf16", "f32, bf16"),
-        ("schedule", "run-length or classic", "run-length, classic"),
-        ("strategy", "default, long-axis or none", "default, long-axis, none"),
-        ("quality", "draft, normal or archive", "draft, normal, archive"),
-        ("growth-score", "gradient, error or mixed", "gradient, error, mixed"),
-        ("appearance", "off, exposure or full", "off, exposure, full"),
-        ("log", "json or tensorboard", "json, tensorboard"),
-        ("ssim-variant", "same, valid or reflect", "same, valid, reflect"),
-        ("color-correct", "off, affine or quadratic", "off, affine, quadratic"),
-        ("export", "ply, spz or sog", "ply, spz, sog"),
-        ("export-frame", "dataset or local", "dataset, local"),
-        ("io", "auto, uring, mmap or pread", "auto, uring, mmap, pread"),
-        ("spill-codec", "raw, halves, zstd:LEVEL or auto", "raw, halves, zstd:LEVEL, auto"),
-        ("evict", "belady or lru", "belady, lru"),
-        ("transfers", "overlap, ahead or demand", "overlap, ahead, demand"),
-        ("simd", "auto, avx512, avx2 or baseline", "auto, avx512, avx2, baseline"),
-    ] {
-        let sentence = format!("unknown --{key} 'memory': use {words}");
+    let mut enumerations = 0;
+    for (key, words) in choices() {
+        let (last, first) = words.split_last().unwrap();
+        let sentence = format!("unknown --{key} 'memory': use {} or {last}", first.join(", "));
         let out = folder.path().join("refused");
         let output = train(&[text(&scene), "--out", text(&out), &format!("--{key}"), "memory"]);
         let said = stderr(&output);
@@ -351,8 +334,13 @@ fn unknown_words_are_refused_with_the_words_that_are_known() {
         let file = folder.path().join("unknown.toml");
         std::fs::write(&file, format!("{key} = \"memory\"\n")).unwrap();
         refuses(&folder, &scene, &["--config", text(&file)], &["unknown.toml", &sentence]);
-        assert!(help.contains(&format!("[possible values: {listed}]")), "--help does not list the words of --{key}");
+        let listed = format!("[possible values: {}]", words.join(", "));
+        assert!(help.contains(&listed), "--help does not list the words of --{key}");
+        enumerations += 1;
     }
+    // Every enumeration of --help has its words from the list: nothing else is refused in another way.
+    let booleans = help.matches("[possible values: true, false]").count();
+    assert_eq!(help.matches("[possible values: ").count(), booleans + enumerations);
     let output = train(&[text(&scene), "--out", text(&folder.path().join("refused")), "--device", " "]);
     assert!(stderr(&output).contains("unknown --device ' ': use auto, gpu, cpu"), "{}", stderr(&output));
 }

@@ -9,14 +9,14 @@ use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// Rounds, resets, raises and a cap within 70 steps.
+/// Rounds, resets, raises and a cap within 54 steps.
 const GROWING: &[&str] = &[
     "--device",
     "gpu",
     "--optimizer-on",
     "device",
     "--steps",
-    "70",
+    "54",
     "--refine-start",
     "9",
     "--refine-every",
@@ -119,7 +119,7 @@ fn a_run_that_is_killed_with_pages_newer_on_the_device_ends_with_the_same_bytes(
     let of_run = [text(&scene), "--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0.05"];
     let mut child = begin(&[&of_run[..], GROWING].concat());
     let mut kills = 0;
-    for steps in [12, 33, 51] {
+    for steps in [12, 28, 44] {
         let began = Instant::now();
         let is_there = |out: &Path| out.join("metrics.jsonl").exists() && losses_so_far(out) >= steps;
         while !is_there(&out) && child.try_wait().unwrap().is_none() {

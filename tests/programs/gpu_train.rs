@@ -132,7 +132,7 @@ fn little_device_memory_trains_the_same_scene() {
     let output = train(&args);
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("--device-mem: 200 KiB are too little") && said.contains("give at least"), "{said}");
+    assert!(said.contains("--device-mem: 200 KiB is not enough") && said.contains("give at least"), "{said}");
     assert!(!none.join("point_cloud.ply").exists(), "nothing was trained");
     // The least that the message names is enough.
     let (_, least) = said.split_once("give at least ").unwrap();

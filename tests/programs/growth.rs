@@ -64,7 +64,7 @@ fn a_scene_with_too_few_views_to_decide_by_keeps_its_count() {
         (stderr(&output), summary(&out), std::fs::read(out.join("point_cloud.ply")).unwrap())
     };
     let (said, kept, ply) = run(&[]);
-    let warned = said.lines().find(|line| line.starts_with("warning: the scene keeps the number of Gaussians"));
+    let warned = said.lines().find(|line| line.starts_with("warning: the run keeps the number of Gaussians"));
     assert!(
         warned.is_some_and(|line| line.contains("11 training photos") && line.contains("--max-gaussians")),
         "{said}"

@@ -51,7 +51,7 @@ fn swapped_photos_are_named_and_no_others_and_leaving_them_out_helps() {
     let swapped = disturbed(&scene, &folder.path().join("swapped"), &SWAPPED);
     assert_eq!((clean.wrong.len(), swapped.wrong.len()), (0, 4));
     let [a, b, c, d] = ["a", "b", "c", "d"].map(|name| folder.path().join(name));
-    let steps = ["--steps", "900", "--schedule", "run-length", "--max-gaussians", "8000", "--device", "cpu"];
+    let steps = ["--steps", "600", "--schedule", "run-length", "--max-gaussians", "8000", "--device", "cpu"];
     let robust = [&steps[..], &["--robust-views"]].concat();
     run(&clean, &a, &steps);
     run(&clean, &b, &robust);

@@ -64,7 +64,7 @@ fn frames_engines_and_threads_change_no_bit() {
     let Some(scene) = real_scene("seneca") else { return };
     let folder = TempDir::new().unwrap();
     let is_full = std::env::var_os("GSSCALE_PAGING_FULL").is_some();
-    let steps = if is_full { "600" } else { "200" };
+    let steps = if is_full { "600" } else { "120" };
     let events = if is_full { EVENTS } else { MORE_EVENTS };
     let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], COMMON, events].concat();
     let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };

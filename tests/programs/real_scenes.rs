@@ -9,10 +9,11 @@ fn a_real_scene_trains_to_a_known_quality() {
     let Some(scene) = real_scene("sheffield_cross_395") else { return };
     let folder = TempDir::new().unwrap();
     let out = folder.path().join("run");
-    let output = train(&[text(&scene), "--out", text(&out), "--steps", "500", "--strategy", "none", "--quiet"]);
+    let output = train(&[text(&scene), "--out", text(&out), "--steps", "300", "--strategy", "none", "--quiet"]);
     assert!(output.status.success(), "{}", stderr(&output));
-    // The best other system reached 24.06 dB after 500 of its 2,000 steps. A faulty gradient costs more than a decibel.
-    assert!(psnr(&out) > 24.0, "{} dB", psnr(&out));
+    // 23.61 dB. A faulty gradient costs more than a decibel. (After 500 steps a run has more than 24.06 dB, which the best other
+    // system reached after 500 of its 2,000.)
+    assert!(psnr(&out) > 23.4, "{} dB", psnr(&out));
     let summary = summary(&out);
     assert_eq!(summary["test"]["views"], 22);
     assert_eq!(summary["gaussians"], 41_321);

@@ -86,9 +86,9 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
     let folder = TempDir::new().unwrap();
     let scene = wide_city(folder.path(), 6000);
     let [alone, watched, spill] = ["alone", "watched", "pages"].map(|name| folder.path().join(name));
-    // Rounds grow the scene while pictures are drawn, and there are fewer frames than pages. The last 1,600 steps are time that a
+    // Rounds grow the scene while pictures are drawn, and there are fewer frames than pages. The last 700 steps are time that a
     // slow machine may need for its answers.
-    let args = "--steps 2500 --refine-start 100 --refine-every 100 --max-gaussians 7000 --page-rows 32 --log-every 10 --device cpu";
+    let args = "--steps 1600 --refine-start 100 --refine-every 100 --max-gaussians 7000 --page-rows 32 --log-every 10 --device cpu";
     let args: Vec<&str> = args.split(' ').collect();
     let output = train(&[&[text(&scene), "--out", text(&alone)], &args[..]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
@@ -112,7 +112,7 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
     assert!(rebound.starts_with("HTTP/1.1 403"), "a name of another site: {rebound}");
 
     let status = served.json("/status");
-    assert!(status["step"].as_u64().unwrap() > 0 && status["steps"] == 2500, "{status}");
+    assert!(status["step"].as_u64().unwrap() > 0 && status["steps"] == 1600, "{status}");
     assert!(status["gaussians"].as_u64().unwrap() >= 6000 && status["views"].as_u64().unwrap() > 3, "{status}");
     let (_, lines) = served.get("/metrics?from=0");
     let lines = String::from_utf8(lines).unwrap();

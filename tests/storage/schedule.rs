@@ -3,7 +3,8 @@
 
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::paging::frames::evict::EvictPolicy;
+use gsscale::paging::frames::evict::{EvictPolicy, NEVER};
+use gsscale::paging::frames::table::FrameTable;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::{Plan, USE_BYTES};
 
@@ -105,6 +106,42 @@ fn least_recent_use_is_what_a_queue_does() {
         assert_eq!(reads(&steps, 12, EvictPolicy::LeastRecentlyUsed, |_, _| None), want);
         // Without knowledge of the future the planned cache does the same.
         assert_eq!(reads(&steps, 12, EvictPolicy::FarthestNextUse, |_, _| None), want);
+    }
+}
+
+/// A simulation and the frame table of a run evict the same pages also where steps walk their views in several batches:
+/// both count the last use of a page in steps.
+#[test]
+fn a_simulation_and_a_run_have_the_same_clock_of_last_uses() {
+    let mut draws = Stream::new(5, Purpose::Test, 50, 0);
+    for _ in 0..40 {
+        let frames = 6 + draws.below(8) as usize;
+        let mut cache = CacheModel::new(frames, EvictPolicy::LeastRecentlyUsed);
+        let mut table: FrameTable<()> = FrameTable::new(frames, EvictPolicy::LeastRecentlyUsed);
+        let (mut change, mut batch, mut evictions) = (StepChange::default(), 0, 0);
+        for step in 0..40 {
+            table.begin_step(step);
+            for pages in steps(&mut draws, 1 + step as usize % 3, 30, 1, 3) {
+                cache.batch(batch, step, &pages, |_| None, &mut change).unwrap();
+                batch += 1;
+                let held: Vec<PageNo> = pages.iter().copied().filter(|&p| table.pin(p, true).is_some()).collect();
+                let mut evicted = Vec::new();
+                for &page in pages.iter().filter(|p| !held.contains(p)) {
+                    if !table.has_free() {
+                        let victim = table.victim().unwrap().page;
+                        table.evict(victim);
+                        evicted.push(victim);
+                    }
+                    table.begin_load(page, NEVER, || ()).unwrap();
+                    table.finish_load(page, ());
+                    table.pin(page, true).unwrap();
+                }
+                assert_eq!(change.evict, evicted, "batch {batch} of step {step}");
+                pages.iter().for_each(|&page| table.unpin(page, (), false));
+                evictions += evicted.len();
+            }
+        }
+        assert!(evictions > 40, "these cases evict too little");
     }
 }
 

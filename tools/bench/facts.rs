@@ -95,7 +95,7 @@ impl Facts {
 }
 
 fn growth(gaussians: u64, pixels: u64, config: &TrainConfig) -> f64 {
-    match reach(config, gaussians, pixels, 0) {
+    match reach(config, gaussians, pixels, 0, &[]) {
         (_, Reach::Constant) => 1.0,
         (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,
     }

@@ -2,6 +2,7 @@
 
 use gsscale::base::units::format_bytes;
 use gsscale::config::values::ByteSize;
+use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::sink::LevelCounts;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{ExportRequest, export, find_store};
@@ -26,9 +27,7 @@ and --sh-degree the file is the one that gsscale-train would have written after 
 pub struct Args {
     /// A run's output folder, or a spill directory
     dir: PathBuf,
-    /// The file to write; its name says the format: .ply, .spz, or lod-meta.json in a folder of its own (SOG with
-    /// levels of detail)
-    #[arg(long, short, value_name = "FILE")]
+    #[arg(long, short, value_name = "FILE", help = format!("The file to write; its name says the format: {}", ExportFormat::NAMES))]
     out: PathBuf,
     /// Number or name of a generation [default: the latest]
     #[arg(long, value_name = "GEN|NAME")]

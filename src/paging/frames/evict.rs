@@ -47,7 +47,7 @@ pub struct Candidate {
     pub page: PageNo,
     /// The next planned step that needs the page, or [`NEVER`].
     pub next_use: u32,
-    /// The time of the page's last use; smaller is older. The owner of the order chooses the clock.
+    /// Number of steps begun at the last use, in runs and in simulations; 0: no use yet. Smaller is older.
     pub last_use: u32,
 }
 

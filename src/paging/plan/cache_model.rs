@@ -32,7 +32,7 @@ pub struct StepChange {
     pub admit: Vec<PageNo>,
     /// Pages evicted. Free frames serve the first pages of `admit`; the evicted pages make room for the rest, in order.
     pub evict: Vec<PageNo>,
-    /// The step that last needed each evicted page.
+    /// The step that last needed each evicted page, by [`CacheModel::batch`]'s clock.
     pub last_uses: Vec<u32>,
 }
 
@@ -64,15 +64,17 @@ pub struct CacheModel {
     reads_ahead: bool,
     /// Frames without a page.
     free: usize,
-    /// Pages that the last step needed, without order.
+    /// Pages that the last batch needed, without order.
     present: Vec<PageNo>,
-    /// Pages in memory that the last step did not need.
+    /// Pages in memory that the last batch did not need.
     idle: EvictOrder,
-    /// By page: 1 + the last step that needed the page; 0 for a page that no step needed. This is also the clock of last
-    /// uses: pages that were in memory before the first step have 0.
+    /// By page: 1 + the last batch that needed the page; 0 for a page that no batch needed.
     needed_by: Vec<u32>,
-    /// The step that needed the pages of `present`.
-    last_step: u32,
+    /// The batch that needed the pages of `present`.
+    last_batch: u32,
+    /// Number of steps begun: the last use of the pages of `present`. The frame table of a run has the same clock. Pages that
+    /// were in memory before the first step have 0.
+    clock: u32,
 }
 
 impl CacheModel {
@@ -85,7 +87,8 @@ impl CacheModel {
             present: Vec::new(),
             idle: EvictOrder::new(policy),
             needed_by: Vec::new(),
-            last_step: 0,
+            last_batch: 0,
+            clock: 0,
         }
     }
 
@@ -109,7 +112,7 @@ impl CacheModel {
         self.needed_by.fill(0);
         present.for_each(|page| self.add_present(page, step));
         idle.for_each(|candidate| self.idle.insert(candidate));
-        (self.free, self.last_step) = (free, step);
+        (self.free, self.last_batch, self.clock) = (free, step, step.saturating_add(1));
         self.frames = free.saturating_add(self.present.len() + self.idle.len());
     }
 
@@ -135,6 +138,22 @@ impl CacheModel {
         next_use: impl Fn(PageNo) -> Option<u32>,
         change: &mut StepChange,
     ) -> Result<(), TooFewFrames> {
+        self.batch(step, step, pages, next_use, change)
+    }
+
+    /// As [`CacheModel::step`], for one batch of `step`. Batches are counted over all steps, and next uses are numbers of
+    /// batches. Last uses are numbers of steps, as in a run: all batches of a step use their pages at the same time.
+    ///
+    /// # Errors
+    /// There are fewer frames than pages; nothing has changed then.
+    pub fn batch(
+        &mut self,
+        batch: u32,
+        step: u32,
+        pages: &[PageNo],
+        next_use: impl Fn(PageNo) -> Option<u32>,
+        change: &mut StepChange,
+    ) -> Result<(), TooFewFrames> {
         if pages.len() > self.frames {
             return Err(TooFewFrames { step, needed: pages.len(), frames: self.frames });
         }
@@ -147,16 +166,16 @@ impl CacheModel {
                 change.admit.push(page);
             }
         }
-        pages.iter().for_each(|&page| self.add_present(page, step));
-        past.retain(|page| self.needed_by[page.index()] != step + 1);
-        // The pages of the step before are evicted last by a cache that reads ahead.
+        pages.iter().for_each(|&page| self.add_present(page, batch));
+        past.retain(|page| self.needed_by[page.index()] != batch + 1);
+        // The pages of the batch before are evicted last by a cache that reads ahead.
         if !self.reads_ahead {
             self.add_idle(&mut past, &next_use);
         }
         let free = self.free.min(change.admit.len());
         self.free -= free;
         for _ in free..change.admit.len() {
-            let far = self.first_exact(&next_use).filter(|page| self.may_go(page, step, past.is_empty()));
+            let far = self.first_exact(&next_use).filter(|page| self.may_go(page, batch, past.is_empty()));
             if far.is_none() {
                 self.add_idle(&mut past, &next_use);
             }
@@ -166,7 +185,7 @@ impl CacheModel {
             change.last_uses.push(victim.last_use.saturating_sub(1));
         }
         self.add_idle(&mut past, &next_use);
-        self.last_step = step;
+        (self.last_batch, self.clock) = (batch, step.saturating_add(1));
         Ok(())
     }
 
@@ -187,10 +206,10 @@ impl CacheModel {
         Ok(planned)
     }
 
-    /// Whether a page may be evicted while the step before `step` still computes. With `is_last`, no other page can go.
-    fn may_go(&self, victim: &Candidate, step: u32, is_last: bool) -> bool {
+    /// Whether a page may be evicted while the batch before `batch` still computes. With `is_last`, no other page can go.
+    fn may_go(&self, victim: &Candidate, batch: u32, is_last: bool) -> bool {
         let ignores_plan = self.idle.policy().ignores_plan();
-        is_last || ignores_plan || victim.next_use > step.saturating_add(FAR_STEPS)
+        is_last || ignores_plan || victim.next_use > batch.saturating_add(FAR_STEPS)
     }
 
     /// The page that is evicted first by the next uses as they are known now. What became known since a page entered the
@@ -206,23 +225,23 @@ impl CacheModel {
         }
     }
 
-    /// Moves pages of the last step to the pages that can be evicted.
+    /// Moves pages of the last batch to the pages that can be evicted.
     fn add_idle(&mut self, past: &mut Vec<PageNo>, next_use: impl Fn(PageNo) -> Option<u32>) {
-        let last_use = self.last_step + 1;
+        let last_use = self.clock;
         for page in past.drain(..) {
             self.idle.insert(Candidate { page, next_use: next_use(page).unwrap_or(NEVER), last_use });
         }
     }
 
     fn is_present(&self, page: PageNo) -> bool {
-        !self.idle.contains(page) && self.needed_by.get(page.index()).is_some_and(|&step| step == self.last_step + 1)
+        !self.idle.contains(page) && self.needed_by.get(page.index()).is_some_and(|&batch| batch == self.last_batch + 1)
     }
 
-    fn add_present(&mut self, page: PageNo, step: u32) {
+    fn add_present(&mut self, page: PageNo, batch: u32) {
         if self.needed_by.len() <= page.index() {
             self.needed_by.resize(page.index() + 1, 0);
         }
-        self.needed_by[page.index()] = step + 1;
+        self.needed_by[page.index()] = batch + 1;
         self.present.push(page);
     }
 }

@@ -87,7 +87,7 @@ pub fn replay(
     options: &ReplayOptions,
 ) -> Result<Replay, TooFewFrames> {
     let mut coming = Coming::new(views, order, options);
-    // The unit of the plan and of the model is a batch. A step that fits is one batch.
+    // The plan and the model count batches. A step that fits is one batch.
     let mut plan = Plan::new(0, options.plan_bytes);
     let cache = CacheModel::new(options.frames, options.policy);
     let mut cache = if options.reads_ahead { cache.reading_ahead() } else { cache };
@@ -102,12 +102,11 @@ pub fn replay(
     while coming.extend(&mut plan, batch) {
         let step = coming.step_of(batch);
         let pages = plan.pages(batch);
-        cache.step(batch, pages, |page| plan.next_use(page, batch + 1), &mut change)?;
+        cache.batch(batch, step, pages, |page| plan.next_use(page, batch + 1), &mut change)?;
         // As long as there are frames without a page nothing leaves, so that each of these is read for the first time.
         let first = change.admit.len().min(frames_left);
         frames_left -= first;
         for last_use in &change.last_uses {
-            let last_use = coming.step_of(*last_use);
             let free_from = (last_use + 1).max(step.saturating_sub(STEPS_AHEAD)).min(step);
             frames_freed[free_from as usize] += 1;
         }

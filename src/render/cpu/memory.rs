@@ -17,7 +17,7 @@
 //! nothing once a view of their size was rendered.
 
 use super::CpuRenderer;
-use crate::kernels::rasterize_bwd::{FootprintGradients, Partial, WeightPartial};
+use crate::kernels::fold::{FootprintGradients, Partial, WeightPartial};
 use crate::kernels::splats::Packed;
 #[cfg(test)]
 use crate::kernels::splats::{Span, Splat};

@@ -63,7 +63,7 @@ pub(crate) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 3]) -> Input
         return Ok(());
     }
     let problem = format!(
-        "{} are too little: pictures and splats of the largest view{} take {}{}",
+        "{} is not enough: pictures and splats of the largest view{} take {}{}",
         format_bytes(budget),
         if holds_pages(config) { ", and as much for pages," } else { "" },
         format_bytes(least_of(config, &now)),
@@ -102,7 +102,7 @@ pub(crate) fn refusal(
         return error;
     }
     let problem = format!(
-        "{} are too little: a view of up to {} Gaussians in {} pixels takes more even in the smallest parts",
+        "{} is not enough: a view of up to {} Gaussians in {} pixels takes more even in the smallest parts",
         format_bytes(config.device_mem.0),
         largest.rows,
         largest.pixels

@@ -100,7 +100,7 @@ pub(super) fn frames_of_budget(
     let of_a_page = 2 * need.frame_bytes + page_working(config) + memory.copies.min(need.frame_bytes);
     let Some(left) = budget.checked_sub(beside).filter(|left| *left >= of_a_page) else {
         let problem = format!(
-            "{} are too little: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a view {}",
+            "{} is not enough: pixels and splats of one view, photos, staging and tables take {}, and the smallest batch of a view {}",
             format_bytes(budget),
             format_bytes(beside),
             format_bytes(of_a_page)

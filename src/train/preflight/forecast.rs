@@ -14,6 +14,7 @@ use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour}
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::residence::Residence;
+use crate::densify::growth::GrowthCheck;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::state::row_bytes;
@@ -28,6 +29,9 @@ const ROUND_STEPS: f64 = 33.0;
 const ROUND_POWER: f64 = 0.4;
 /// Most Gaussians that a round adds, as a share of those that are there: what the first rounds of a scene of few points add.
 const ADDED_MOST: f64 = 0.6;
+/// Gaussians that a run decides for, over the first ones: 1.0 on seneca and brighton, 2.8 on sheffield_cross, see "A count that the
+/// program decides" in `benches/RESULTS.md`.
+const DECIDED: f64 = 2.0;
 /// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power of
 /// their number.
 pub const STEP_GROWTH: f64 = 0.54;
@@ -62,19 +66,30 @@ pub enum Reach {
 
 /// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known. A guess is at most a
 /// Gaussian for each of the `pixels` of the training photos: what has no pixel of its own has no gradient that splits it for long.
-pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32) -> (u64, Reach) {
+/// A run that decides its count rarely changes it after the first of its `checks`.
+pub fn reach(
+    config: &TrainConfig,
+    rows: u64,
+    pixels: u64,
+    steps_done: u32,
+    checks: &[GrowthCheck],
+) -> (u64, Reach) {
     let last = config.refine_stop.min(config.steps);
     let first = config.refine_start.max(steps_done);
     // Rounds come at the multiples of their distance between the two, without these.
     let every = config.refine_every.max(1);
     let rounds = (last.saturating_sub(1) / every).saturating_sub(first / every);
-    match config.max_gaussians {
-        _ if !config.strategy.grows() || rounds == 0 => (rows, Reach::Constant),
-        0 => {
-            let reach = if limits::growth_rule(config).is_some() { Reach::Decided } else { Reach::Guess };
-            (guess(rows, rounds, every).min(pixels.max(rows)), reach)
-        }
-        _ => (rows_at_most(config, rows), Reach::Cap),
+    if !config.strategy.grows() || rounds == 0 {
+        return (rows, Reach::Constant);
+    }
+    if config.max_gaussians > 0 {
+        return (rows_at_most(config, rows), Reach::Cap);
+    }
+    let guess = guess(rows, rounds, every).min(pixels.max(rows));
+    match (limits::growth_rule(config), checks.last()) {
+        (None, _) => (guess, Reach::Guess),
+        (Some(_), None) => (guess.min((DECIDED * rows as f64) as u64), Reach::Decided),
+        (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
 }
 
@@ -270,20 +285,37 @@ mod tests {
     const PIXELS: u64 = 1 << 40;
 
     fn config() -> TrainConfig {
-        TrainConfig { steps: 3000, refine_start: 500, refine_every: 100, refine_stop: 2500, ..TrainConfig::default() }
+        TrainConfig {
+            steps: 3000,
+            refine_start: 500,
+            refine_every: 100,
+            refine_stop: 2500,
+            strategy: StrategyName::Default,
+            ..TrainConfig::default()
+        }
     }
 
     #[test]
     fn a_scene_reaches_its_cap_or_a_guess() {
         let capped = TrainConfig { max_gaussians: 5000, ..config() };
-        assert_eq!(reach(&capped, 1000, PIXELS, 0), (5000, Reach::Cap));
-        assert_eq!(reach(&capped, 7000, PIXELS, 0), (7000, Reach::Cap));
+        assert_eq!(reach(&capped, 1000, PIXELS, 0, &[]), (5000, Reach::Cap));
+        assert_eq!(reach(&capped, 7000, PIXELS, 0, &[]), (7000, Reach::Cap));
         // After the last round nothing grows.
-        assert_eq!(reach(&capped, 1000, PIXELS, 2450), (1000, Reach::Constant));
+        assert_eq!(reach(&capped, 1000, PIXELS, 2450, &[]), (1000, Reach::Constant));
         // Small photos cannot hold what rounds would add; a scene with more Gaussians than that keeps its number.
         let long = TrainConfig { steps: 1_000_000, refine_stop: 15_000, ..config() };
-        assert_eq!(reach(&long, 400, 14 * 96 * 64, 0), (14 * 96 * 64, Reach::Guess));
-        assert_eq!(reach(&long, 400, 100, 0), (400, Reach::Guess));
+        assert_eq!(reach(&long, 400, 14 * 96 * 64, 0, &[]), (14 * 96 * 64, Reach::Guess));
+        assert_eq!(reach(&long, 400, 100, 0, &[]), (400, Reach::Guess));
+    }
+
+    #[test]
+    fn a_run_that_decides_its_count_forecasts_a_small_one_until_it_has_decided() {
+        let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
+        assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (82_642, Reach::Decided));
+        assert_eq!(reach(&decides, 41_321, 50_000, 0, &[]), (50_000, Reach::Decided), "no more than pixels");
+        let check = GrowthCheck { step: 1001, gaussians: 41_000, lost: 0.4, pays_from: 0.1, allowed: 165_284 };
+        assert_eq!(reach(&decides, 60_000, PIXELS, 1001, &[check]), (165_284, Reach::Decided));
+        assert_eq!(reach(&TrainConfig { max_gaussians: 9, ..decides }, 5, PIXELS, 0, &[]), (9, Reach::Cap));
     }
 
     /// Runs without a cap: "Gaussians without a cap" in `benches/RESULTS.md`.
@@ -310,15 +342,15 @@ mod tests {
             (1000, 59_927, 433_958),
             (1000, 7_395, 256_525),
         ] {
-            let mut run = TrainConfig { steps, ..TrainConfig::default() };
+            let mut run = TrainConfig { steps, ..config() };
             let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, StrategyName::Default);
             (run.refine_start, run.refine_every, run.refine_stop) = (refine_start, refine_every, refine_stop);
-            let (guessed, _) = reach(&run, first, PIXELS, 0);
+            let (guessed, _) = reach(&run, first, PIXELS, 0, &[]);
             let factor = guessed as f64 / f64::from(reached);
             assert!((0.55..1.45).contains(&factor), "{steps} steps from {first}: {guessed}, reached {reached}");
         }
         // Nineteen rounds: after 600, 700, ... 2400 steps; nine of them after 1,500.
-        let added = |done: u32| reach(&config(), 100_000, PIXELS, done).0 - 100_000;
+        let added = |done: u32| reach(&config(), 100_000, PIXELS, done, &[]).0 - 100_000;
         assert!((added(0) as f64 / 19.0 - added(1500) as f64 / 9.0).abs() < 1.0);
     }
 

@@ -258,7 +258,7 @@ fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>
     let Some(budget) = host_mem else { return Ok(()) };
     if start.total() > budget {
         let problem = format!(
-            "{} are too little: the scene needs about {} of memory ({} for Gaussians)",
+            "{} is not enough: the scene needs about {} of memory ({} for Gaussians)",
             format_bytes(budget),
             format_bytes(start.total()),
             format_bytes(start.frames)

@@ -214,7 +214,7 @@ fn plan(
     let pixels = dataset.train_views().iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
     let (last, known) = match keeps_first_count(config, dataset) {
         true => (rows, Reach::Kept),
-        false => reach(config, rows, pixels, steps_done),
+        false => reach(config, rows, pixels, steps_done, trainer.growth()),
     };
     let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check(config, &memory)?;

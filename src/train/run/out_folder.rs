@@ -6,10 +6,9 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, sync_folder};
-use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
-use crate::exchange::sog::is_of_sog;
+use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
@@ -178,11 +177,7 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
         return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
     }
     // Before anything is removed: without its config the rest would not be taken for a run's.
-    for (file, _) in &RUN_FILES {
-        if let RunFile::Sog(folder) = file {
-            check_ours(&out.join(folder), is_of_sog)?;
-        }
-    }
+    exports(out).try_for_each(|(format, file)| format.check_removable(&file))?;
     // First, because an active run in the folder makes this fail.
     remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
     Ok(remove_files(out, |_| true)?)
@@ -200,11 +195,17 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
         RunFile::File(name) => remove_file(&out.join(name)),
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
-        RunFile::Sog(folder) => remove_ours(&out.join(folder), is_of_sog),
+        RunFile::Exports => exports(out).try_for_each(|(format, file)| format.remove(&file)),
         RunFile::Pictures(folder) => {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
         }
     })
+}
+
+/// The exports that a run can have written beside its PLY.
+fn exports(out: &Path) -> impl Iterator<Item = (ExportFormat, PathBuf)> {
+    let ply = out.join(PLY_FILE);
+    ExportFormat::ALL.into_iter().filter_map(move |format| Some((format, format.beside(&ply)?)))
 }
 
 fn remove_file(path: &Path) -> InputResult<()> {
@@ -244,6 +245,8 @@ pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::config::choice::{Choice, parse_choice};
+    use crate::exchange::meta::{ExportFrame, SceneMeta};
     use crate::exchange::tensorboard::EventFile;
 
     #[test]
@@ -269,5 +272,22 @@ mod tests {
         make(out, Existing::Overwrite).unwrap();
         assert!(!events.exists());
         assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
+    }
+
+    /// For every word of `--export`, so that no format can be left out.
+    #[test]
+    fn exports_of_an_earlier_run_go_in_every_format() {
+        for word in ExportFormat::WORDS {
+            let folder = tempfile::tempdir().unwrap();
+            let out = folder.path();
+            let format = parse_choice::<ExportFormat>(word).unwrap();
+            let file = format.beside(&out.join(PLY_FILE)).unwrap_or_else(|| out.join(PLY_FILE));
+            std::fs::create_dir_all(folder_of(&file)).unwrap();
+            std::fs::write(&file, "of the earlier run").unwrap();
+            format.write_transform(&file, &SceneMeta::default(), ExportFrame::Dataset).unwrap();
+            std::fs::write(out.join(CONFIG_FILE), "").unwrap();
+            make(out, Existing::Overwrite).unwrap();
+            assert!(is_empty(out), "{word}: {:?}", std::fs::read_dir(out).unwrap().collect::<Vec<_>>());
+        }
     }
 }

@@ -25,10 +25,8 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
-use crate::exchange::sog::TREE_FILE;
 use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SOG_FOLDER, SPZ_FILE,
-    SUMMARY_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
 };
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
@@ -210,11 +208,7 @@ fn save_result(
     let written = trainer.save(dataset, ply)?;
     let meta = trainer.scene_meta(dataset);
     ExportFormat::Ply.write_transform(ply, &meta, written.frame)?;
-    let other = match format {
-        ExportFormat::Ply => return Ok(written),
-        ExportFormat::Spz => ply.with_file_name(SPZ_FILE),
-        ExportFormat::Sog => ply.with_file_name(SOG_FOLDER).join(TREE_FILE),
-    };
+    let Some(other) = format.beside(ply) else { return Ok(written) };
     let exported = trainer.export(dataset, &other, format)?;
     format.write_transform(&other, &meta, exported.frame)?;
     if exported.rows < written.rows {

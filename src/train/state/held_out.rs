@@ -69,8 +69,8 @@ pub(crate) fn keeps_first_count(config: &TrainConfig, dataset: &Dataset) -> bool
 /// What such a run says about it.
 pub(crate) fn too_few_to_decide(dataset: &Dataset) -> String {
     format!(
-        "the scene keeps the number of Gaussians that it starts with: {} training photos are too few to hold some out and decide \
-         by them how many more pay ({TRAIN_VIEWS_LEAST} are enough); --max-gaussians names another number",
+        "the run keeps the number of Gaussians with which it starts: {} training photos are too few to hold some out and to decide \
+         the number by them ({TRAIN_VIEWS_LEAST} are enough); --max-gaussians sets another number",
         dataset.train_views().len()
     )
 }

@@ -213,9 +213,15 @@ impl Passes<'_> {
     /// Ends the step of a view that is left out: its pages stay as they are.
     fn leave_out(&mut self) -> Result<(), TrainError> {
         self.outcome.is_left_out = true;
-        self.outcome.loss = self.backend.renderer().loss_value()?;
+        self.read_loss()?;
         let pages = self.batches.drain(..).flat_map(|batch| batch.pages);
         self.scene.pager.set_use_in_step(self.step, pages, UseInStep::Done);
+        Ok(())
+    }
+
+    /// Waits for the loss of the step. A second loss term is added to it here.
+    fn read_loss(&mut self) -> Result<(), TrainError> {
+        self.outcome.loss = self.backend.renderer().loss_value()?;
         Ok(())
     }
 
@@ -252,7 +258,7 @@ impl Passes<'_> {
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
         drop(span);
         if is_first {
-            self.outcome.loss = self.backend.renderer().loss_value()?;
+            self.read_loss()?;
             self.outcome.skipped = self.why_skipped()?;
         }
         self.prefetch_before_last();

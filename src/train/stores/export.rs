@@ -163,7 +163,7 @@ pub(super) fn scene_at(
     let frames = (host_mem / share).saturating_sub(fixed) / (frame * COPIES);
     if frames == 0 {
         let least = format_bytes((fixed + frame * COPIES) * share);
-        let problem = format!("{} are too little for this store", format_bytes(host_mem));
+        let problem = format!("{} is not enough for this store", format_bytes(host_mem));
         return Err(InputError::new("--host-mem", problem, format!("give at least {least}")).into());
     }
     let config = PagerConfig {

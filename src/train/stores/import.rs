@@ -170,7 +170,7 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
     let pages = 20 * capacity_bytes(request.page_rows as usize, 3) as u64;
     let least = FIXED_BYTES + pages + 16 * MIB;
     if request.host_mem < least {
-        let problem = format!("{} are too little", format_bytes(request.host_mem));
+        let problem = format!("{} is not enough", format_bytes(request.host_mem));
         return Err(InputError::new("--host-mem", problem, format!("give at least {}", format_bytes(least))));
     }
     Ok((request.host_mem - FIXED_BYTES - pages) as usize)

@@ -16,7 +16,7 @@ fn supported_paths() -> impl Iterator<Item = SimdPath> {
 }
 
 fn options(ssim_lambda: f32, padding: SsimPadding, simd: SimdPath) -> LossOptions {
-    LossOptions { ssim_lambda, padding, simd }
+    LossOptions::new(ssim_lambda, padding, simd)
 }
 
 /// `[H, W, 3]` to `[3, H, W]`.

@@ -19,7 +19,7 @@ fn devices() -> impl Iterator<Item = Gpu> {
 }
 
 fn options(ssim_lambda: f32, padding: SsimPadding) -> LossOptions {
-    LossOptions { ssim_lambda, padding, simd: SimdPath::best() }
+    LossOptions::new(ssim_lambda, padding, SimdPath::best())
 }
 
 /// A smooth photo and a picture that resembles it, with noise.
