@@ -21,12 +21,11 @@ use super::gpu_loss::value;
 use super::gpu_pages::{DevicePages, PageBatch, PageTable, PagesView, WORKGROUP};
 use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
 use super::gpu_segments::Segment;
-use super::gpu_view::{DemandState, Lists, LossSums, View, WholeLists, blend_of};
+use super::gpu_view::{DemandState, InFlight, Lists, LossSums, Recorded, View, WholeLists, blend_of};
 use super::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
 use super::{RenderError, Renderer, RowBatches};
 use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder, groups_1d};
 use crate::kernels::gate::{GateUniforms, StepVerdict};
-use crate::kernels::image_loss::LossPlan;
 use crate::kernels::page_words::PageResult;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
@@ -36,25 +35,7 @@ use bytemuck::Zeroable;
 /// Bytes of a listed row: number of the page, number of the row.
 const LISTED_BYTES: u64 = 8;
 
-/// A step while it is recorded.
-#[derive(Debug)]
-pub(super) struct Recorded {
-    table: PageTable,
-    /// Listed rows of each page, then of all.
-    counts: Buffer,
-    room: FrameRoom,
-}
-
-/// A step that is submitted and not finished.
-#[derive(Debug)]
-pub(super) struct InFlight {
-    verdict: Readback,
-    results: Readback,
-    pages: usize,
-    plan: LossPlan,
-}
-
-/// Nothing of a step was submitted that changes rows: memory is short, or a list has no foretold size.
+/// `None` where memory is short.
 fn unless_short<T>(done: Result<T, RenderError>) -> Result<Option<T>, RenderError> {
     match done {
         Ok(done) => Ok(Some(done)),

@@ -1,9 +1,10 @@
-//! What a device holds of the current view, between the stages.
+//! What a device holds of the current view, between the stages, and of steps that are recorded without waiting.
 //!
 //! Not here: the stages.
 
 use super::device_needs::ViewSizes;
-use super::gpu_frame::{Blend, Demand, DemandReadback, Frame, Pixels, Ranks};
+use super::gpu_frame::{Blend, Demand, DemandReadback, Frame, FrameRoom, Pixels, Ranks};
+use super::gpu_pages::PageTable;
 use super::gpu_range_plan::PlannedRange;
 use super::gpu_rows::DeviceColumns;
 use super::gpu_segments::Segment;
@@ -137,6 +138,29 @@ impl View {
 pub(super) fn blend_of(ViewOptions { camera, options }: &ViewOptions) -> Blend {
     let grid = Grid::new(camera.width, camera.height);
     Blend { grid, background: options.background, max_alpha: options.max_alpha }
+}
+
+/// A step while it is recorded.
+#[derive(Debug)]
+pub(super) struct Recorded {
+    /// The pages of the step in their slots.
+    pub table: PageTable,
+    /// Listed rows of each page, then of all.
+    pub counts: Buffer,
+    /// Sizes of its lists.
+    pub room: FrameRoom,
+}
+
+/// A step that is submitted and not finished.
+#[derive(Debug)]
+pub(super) struct InFlight {
+    /// What the gate decided.
+    pub verdict: Readback,
+    /// What the update did to each page.
+    pub results: Readback,
+    /// How many pages.
+    pub pages: usize,
+    pub plan: LossPlan,
 }
 
 /// A loss that was submitted.
