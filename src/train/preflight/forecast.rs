@@ -67,13 +67,7 @@ pub enum Reach {
 /// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known. A guess is at most a
 /// Gaussian for each of the `pixels` of the training photos: what has no pixel of its own has no gradient that splits it for long.
 /// A run that decides its count rarely changes it after the first of its `checks`.
-pub fn reach(
-    config: &TrainConfig,
-    rows: u64,
-    pixels: u64,
-    steps_done: u32,
-    checks: &[GrowthCheck],
-) -> (u64, Reach) {
+pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32, checks: &[GrowthCheck]) -> (u64, Reach) {
     let last = config.refine_stop.min(config.steps);
     let first = config.refine_start.max(steps_done);
     // Rounds come at the multiples of their distance between the two, without these.
