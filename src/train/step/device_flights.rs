@@ -27,18 +27,18 @@
 //! ([`crate::optim::one_step`]). So the list has all pages that the exact bounds name; a page too many has no row in view and stays as it
 //! is. Whoever finishes the other step looks whether that held.
 //!
-//! Invariants: 1. the bytes of the result are those of a run that waits; 2. at most [`STEPS_IN_FLIGHT`] steps are in flight; 3. a page of a
+//! Invariants: 1. the bytes of the result are those of a run that waits; 2. at most two steps are in flight; 3. a page of a
 //! step in flight is pinned in its slot and in its frame, and is neither held nor released; 4. a step that was not taken leaves pages,
 //! statistics and bounds as they were.
 
 use super::device_tier::{DeviceTier, device_of};
+use super::flights::Flight;
 use super::pages::PagedScene;
-use super::step_faults::{StepFault, StepFaults, steps_in_flight};
+use super::step_faults::StepFault;
 use super::train_step::{ROWS_PER_UNUSABLE, StepOutcome};
 use crate::base::error::InputError;
 use crate::base::ids::PageNo;
 use crate::base::trace;
-use crate::optim::one_step::OneStep;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
 use crate::render::{LossOptions, RenderError, RenderOptions, Renderer};
@@ -46,10 +46,8 @@ use crate::scene::camera::Camera;
 use crate::scene::frustum::Frustum;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
-use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::collections::BTreeSet;
 
-/// The most steps in flight.
-pub const STEPS_IN_FLIGHT: usize = 2;
 /// Steps after one that lacked memory in which none is recorded.
 const STEPS_WITHOUT: u32 = 16;
 /// Rows beside the likely ones that a list has room for.
@@ -80,14 +78,6 @@ pub struct StepToRecord<'a> {
     pub pages_most: usize,
 }
 
-/// A step that is recorded and not finished.
-#[derive(Debug)]
-struct Flight {
-    camera: Camera,
-    /// Its pages, ascending by id.
-    pages: Vec<PageNo>,
-}
-
 impl StepToRecord<'_> {
     /// Room for the rows of the view, of `in_pages` rows in its pages: an eighth more than the view, or any view, has listed.
     fn rows_room(&self, in_pages: u64) -> u32 {
@@ -96,33 +86,6 @@ impl StepToRecord<'_> {
             rows => u64::from(rows),
         };
         (likely + likely / 8 + ROWS_MORE).min(in_pages).min(u64::from(u32::MAX / 2)) as u32
-    }
-}
-
-/// The steps in flight and their pages.
-#[derive(Debug)]
-pub(super) struct Flights {
-    steps: VecDeque<Flight>,
-    /// Each page with the number of steps in flight that use it.
-    pages: BTreeMap<PageNo, (PinnedPage, usize)>,
-    /// No step before this one is recorded.
-    not_before: u32,
-    /// The most steps in flight.
-    most: usize,
-    one_step: OneStep,
-    faults: StepFaults,
-}
-
-impl Flights {
-    /// No step in flight yet, for a run whose updates move bounds by at most `one_step`.
-    pub fn new(one_step: OneStep) -> Flights {
-        let (most, faults) = (steps_in_flight(STEPS_IN_FLIGHT), StepFaults::from_environment());
-        Flights { steps: VecDeque::new(), pages: BTreeMap::new(), not_before: 0, most, one_step, faults }
-    }
-
-    /// Pages that steps in flight have pinned.
-    pub fn pages(&self) -> usize {
-        self.pages.len()
     }
 }
 

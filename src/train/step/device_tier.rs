@@ -11,7 +11,7 @@
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
 
-use super::device_flights::Flights;
+use super::flights::Flights;
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
 use crate::base::trace;

@@ -11,6 +11,7 @@ mod device_ahead;
 pub mod device_flights;
 pub mod device_rows;
 pub mod device_tier;
+mod flights;
 pub mod pages;
 pub(crate) mod soundness;
 mod step_faults;
