@@ -308,7 +308,7 @@ fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let least = said.split("give at least ").nth(1).and_then(|rest| rest.split(" MiB").next()).expect(&said);
     let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
     let output = with_budget(&enough);
-    assert!(!stderr(&output).contains("too little for this store"), "{enough} would do: {}", stderr(&output));
+    assert!(!stderr(&output).contains("is not enough for this store"), "{enough} would do: {}", stderr(&output));
     assert!(output.status.success(), "{}", stderr(&output));
     bench.stopped(&["--init-ply", text(&seed)]);
     let mut child = bench.going_on(&[]);
@@ -691,7 +691,7 @@ fn gaussians_round_trip_through_a_store_within_the_budget() {
     let again = failed(&["import", text(&path("in.ply")), "--out", text(&path("store"))]);
     assert!(again.contains("exists already"), "{again}");
     let little = failed(&["import", text(&path("in.ply")), "--out", text(&path("other")), "--host-mem", "20MiB"]);
-    assert!(little.contains("too little") && little.contains("give at least"), "{little}");
+    assert!(little.contains("is not enough") && little.contains("give at least"), "{little}");
     let bytes = std::fs::read(path("in.ply")).unwrap();
     std::fs::write(path("cut.ply"), &bytes[..bytes.len() / 2]).unwrap();
     let cut = failed(&["import", text(&path("cut.ply")), "--out", text(&path("other"))]);
