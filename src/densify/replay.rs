@@ -19,6 +19,7 @@ use crate::scene::events::{Event, EventLog};
 use crate::scene::page_layout::read_page;
 use crate::scene::page_split::{SplitTooDeep, split_page};
 use crate::scene::rows::{Rows, RowsMut, RowsNow};
+use crate::scene::sightings::VIEWS_MOST;
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
@@ -71,6 +72,8 @@ pub struct PageRound {
 pub enum PageEdit {
     /// No byte changed; the page stays clean.
     Unchanged,
+    /// Statistics were cleared in place, and nothing else changed.
+    Cleared,
     /// The rows were edited in place.
     InPlace,
     /// These pages replace the page, ordered by name: the page itself, possibly without rows, or its parts. The rows in
@@ -87,6 +90,17 @@ pub struct Replay {
     pub rounds: Vec<PageRound>,
     /// Rows that opacity resets rewrote.
     pub reset_rows: usize,
+}
+
+/// What is known of the rows of a page whose payload is elsewhere. No row has a blending weight.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PageFacts {
+    /// At least the mean growth score of every row.
+    pub largest_mean: f32,
+    /// Bounds of the rows, for any later step until a step touches the page.
+    pub extremes: Extremes,
+    /// SH degree with which the page is stored.
+    pub sh_degree: u8,
 }
 
 /// The event log of a run with the inputs of a replay. Cheap to create for every step; the pages of a step share one.
@@ -134,6 +148,24 @@ impl<'a> PendingEvents<'a> {
         Ok(replay)
     }
 
+    /// Whether the events from number `applied` on do no more to a page than to clear its statistics, as far as `page` tells; false
+    /// where that is not sure. A round is among them, and none of them moves a count of rows.
+    pub fn only_clears(&self, applied: usize, page: &PageFacts) -> bool {
+        let (mut largest_mean, mut rounds) = (page.largest_mean, 0);
+        let keeps = self.events[applied..].iter().all(|event| match effect_of(&event.kind) {
+            Effect::RaiseShDegree { degree } => degree <= page.sh_degree,
+            Effect::ResetOpacity { .. } => false,
+            Effect::Round(round) => {
+                rounds += 1;
+                // One row with the largest score, one that was drawn as often as can be counted; rounds judge rows one by one.
+                let (grad2d, count) = ([std::mem::take(&mut largest_mean), 0.0], [1, VIEWS_MOST]);
+                let rows = Rows { grad2d: &grad2d, count: &count, ..Rows::default() };
+                round.promised_rows(&rows) == 0 && !round.may_edit(&rows) && round.keeps_all(&page.extremes)
+            }
+        });
+        keeps && rounds > 0
+    }
+
     /// Applies the events from number `applied` on to a table that is neither split nor stored, for evaluation and
     /// export.
     pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
@@ -153,7 +185,9 @@ impl<'a> PendingEvents<'a> {
                 Effect::ResetOpacity { max_opacity } => {
                     let reset_rows = rows.reset_opacities(self.at(index), max_opacity);
                     replay.reset_rows += reset_rows;
-                    replay.mark_edited(reset_rows > 0);
+                    if reset_rows > 0 {
+                        replay.edit = PageEdit::InPlace;
+                    }
                     extremes = None;
                 }
                 Effect::Round(round) => {
@@ -162,8 +196,8 @@ impl<'a> PendingEvents<'a> {
                     if let Some(edits) = edits {
                         ops::apply_edits(rows.table(), &[(0, edits)]);
                         extremes = None;
-                    } else {
-                        replay.mark_edited(rows.clear_statistics());
+                    } else if rows.clear_statistics() && replay.edit == PageEdit::Unchanged {
+                        replay.edit = PageEdit::Cleared;
                     }
                 }
             }
@@ -208,14 +242,6 @@ impl<'a> PendingEvents<'a> {
         let mean = |i: usize| at.evaluate_element(&rows, Column::Means, i / 3, i % 3);
         let means: Vec<f32> = (0..rows.rows() * 3).map(mean).collect();
         split_page(id, state, &means, self.page_rows)
-    }
-}
-
-impl Replay {
-    fn mark_edited(&mut self, is_changed: bool) {
-        if is_changed {
-            self.edit = PageEdit::InPlace;
-        }
     }
 }
 

@@ -17,7 +17,7 @@ use crate::densify::stats::GradHistogram;
 use crate::densify::strategy::{Effect, Strategy, effect_of};
 use crate::optim::bounds::SplitLimits;
 use crate::optim::deferred::DeferredAdam;
-use crate::optim::method::Method;
+use crate::optim::method::{Method, OptimizerPlace};
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
@@ -32,8 +32,7 @@ use crate::scene::page_split::SplitTooDeep;
 use crate::scene::partition::{first_fill, partition};
 use crate::scene::rows::{Rows, RowsNow};
 use crate::scene::state::SceneState;
-use crate::train::error::TrainError;
-use crate::train::error::not_stored;
+use crate::train::error::{TrainError, not_stored};
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -52,6 +51,8 @@ pub struct PageRules {
     /// Limits within which an unseen row may split; used by page bounds.
     splits: SplitLimits,
     sh_degree: u8,
+    /// Pages whose statistics are cleared keep their bounds, which stay valid: a device that clears them finds no new ones.
+    keeps_bounds: bool,
 }
 
 /// Receives the rows of some pages as tables with consecutive row numbers.
@@ -82,6 +83,7 @@ impl PageRules {
             strategy: options.strategy.clone(),
             splits: options.strategy.split_limits(options.scene_scale),
             sh_degree: options.sh_degree_at(0),
+            keeps_bounds: options.optimizer_on == OptimizerPlace::Device,
         }
     }
 
@@ -105,7 +107,7 @@ impl PageRules {
         self.adam.page_bounds(rows, &self.splits)
     }
 
-    fn pending(&self) -> PendingEvents<'_> {
+    pub(super) fn pending(&self) -> PendingEvents<'_> {
         PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
     }
 
@@ -273,7 +275,7 @@ impl PagedScene {
             self.store_parts(page, parts, added)?;
         } else {
             page.meta.events_applied = self.rules.events.len() as u32;
-            if edit == PageEdit::InPlace {
+            if edit == PageEdit::InPlace || (edit == PageEdit::Cleared && !self.rules.keeps_bounds) {
                 page.meta.bounds = self.rules.bounds(&page.rows(0));
             }
         }
