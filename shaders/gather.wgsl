@@ -1,6 +1,6 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
 // camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
-// `bounds` finds the bounds of a page after its update. Where the host does not wait for the numbers of rows, `place` finds where
+// `bounds` finds the bounds of a page after its update. `survey` finds what decides whether a round edits rows of a page. Where the host does not wait for the numbers of rows, `place` finds where
 // the list of each page begins, and `pad` fills the room behind the last row. The twin of src/kernels/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
@@ -61,6 +61,8 @@ struct GatherUniforms {
 /// The pages, for `place`.
 @group(0) @binding(10) var<storage, read_write> placed: array<DevicePage>;
 
+@group(0) @binding(11) var<storage, read_write> surveys: array<PageSurvey>;
+
 /// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
 /// is twice the CPU's, for devices that divide and take roots less exactly.
 const MOVEMENT_SLACK: f32 = 1e-3;
@@ -70,6 +72,8 @@ const SIGMA_SLACK: f32 = 4e-6;
 const SIGMA_MOST: f32 = 1e30;
 const REACH_SLACK: f32 = 1.0001;
 const EPSILON: f32 = 1.1920929e-7;
+/// Quotients of smaller sums are not exact: a mean score above 0 counts as at least this one.
+const SMALLEST_MEAN: f32 = 1e-30;
 /// Opacity, before activation, of entries without a row.
 const HIDDEN_LOGIT: f32 = -100.0;
 
@@ -252,7 +256,7 @@ fn gather(place: Place) {
 
 /// The range that a value passes through on its way to its limit.
 fn hull(page: DevicePage, column: u32, row: u32, e: u32, rate: f32) -> vec2<f32> {
-    let value = bitcast<f32>(slab[column_at(page, column) + 3u * row + e]);
+    let value = bitcast<f32>(slab[column_at(page, column) + row * column_width(column, page.sh_n_width) + e]);
     let limit = element(page, column, row, e, FOR_EVER, rate);
     let low = min(value, limit);
     let high = max(value, limit);
@@ -260,10 +264,15 @@ fn hull(page: DevicePage, column: u32, row: u32, e: u32, rate: f32) -> vec2<f32>
     return vec2<f32>(low - slack, high + slack);
 }
 
+/// Mean growth score of a row.
+fn mean_score(page: DevicePage, row: u32) -> f32 {
+    let views = slab[count_at(page) + row] & VIEWS_MOST;
+    return quotient(bitcast<f32>(slab[grad2d_at(page) + row]), max(views, 1u));
+}
+
 /// Largest distance of a row's children from it.
 fn split_reach(page: DevicePage, row: u32, sigma: f32) -> f32 {
-    let views = slab[count_at(page) + row] & VIEWS_MOST;
-    let mean = quotient(bitcast<f32>(slab[grad2d_at(page) + row]), max(views, 1u));
+    let mean = mean_score(page, row);
     return select(0.0, u.split_reach * REACH_SLACK * sigma, mean > u.grow_grad2d && sigma > u.split_scale);
 }
 
@@ -317,5 +326,35 @@ fn bounds(place: Place) {
             results[p].high[c] = bitcast<u32>(parts[3u + c][0]);
         }
         results[p].sigma_max = bitcast<u32>(parts[6][0]);
+    }
+}
+
+/// One workgroup for each page. The uniform names the column of the opacities.
+@compute @workgroup_size(256)
+fn survey(place: Place) {
+    let p = linear_group(place.workgroup, place.workgroups);
+    if p >= u.page_count || pages[p].slab != u.slab {
+        return;
+    }
+    let page = pages[p];
+    var lowest = 3.4e38;
+    var mean = 0.0;
+    for (var row = place.lane; row < page.rows; row += 256u) {
+        lowest = min(lowest, hull(page, OPACITIES, row, 0u, u.rate).x);
+        let score = mean_score(page, row);
+        mean = max(mean, select(score, max(score, SMALLEST_MEAN), score > 0.0));
+    }
+    parts[0][place.lane] = lowest;
+    parts[1][place.lane] = mean;
+    for (var half = 128u; half > 0u; half = half / 2u) {
+        workgroupBarrier();
+        if place.lane < half {
+            parts[0][place.lane] = min(parts[0][place.lane], parts[0][place.lane + half]);
+            parts[1][place.lane] = max(parts[1][place.lane], parts[1][place.lane + half]);
+        }
+    }
+    if place.lane == 0u {
+        surveys[p].lowest_opacity = bitcast<u32>(parts[0][0]);
+        surveys[p].largest_mean = bitcast<u32>(parts[1][0]);
     }
 }

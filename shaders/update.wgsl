@@ -2,6 +2,8 @@
 // finds whether the gradients of a row are usable, column by column; `step` rewrites a column of the rows whose gradients
 // all are; `finish` counts, stamps and collects statistics. The twin of src/kernels/update.rs.
 //
+// `clear_statistics` takes the place of a round that edits no row.
+//
 // Values come from the stage "gather" at the same step. A row is rewritten as a whole or not at all. Nothing is written behind a
 // closed gate (gate.wgsl).
 #import "shared/dispatch.wgsl"
@@ -13,7 +15,7 @@
 struct UpdateUniforms {
     /// The slab that is bound.
     slab: u32,
-    /// Listed rows of this dispatch.
+    /// Listed rows of this dispatch; pages, in `clear_statistics`.
     row_count: u32,
     /// Column to rewrite, floats per row of its values and gradients, and the first of them in the row of the page.
     column: u32,
@@ -180,5 +182,19 @@ fn finish(place: Place) {
         if u.collects != 0u {
             collect(page, listed.x, listed.y, footprint);
         }
+    }
+}
+
+/// One workgroup for each page.
+@compute @workgroup_size(256)
+fn clear_statistics(place: Place) {
+    let p = linear_group(place.workgroup, place.workgroups);
+    if p >= u.row_count || pages[p].slab != u.slab {
+        return;
+    }
+    let page = pages[p];
+    for (var row = place.lane; row < page.rows; row += 256u) {
+        slab[grad2d_at(page) + row] = 0u;
+        slab[count_at(page) + row] = 0u;
     }
 }

@@ -35,6 +35,15 @@ struct PageResult {
     pad: u32,
 }
 
+/// What decides whether a round edits rows of a page.
+struct PageSurvey {
+    /// Largest mean growth score of a row, bits of a float.
+    largest_mean: u32,
+    /// Lower bound of the opacities, before activation, for all later steps without an update; bits of a float.
+    lowest_opacity: u32,
+    pad: vec2<u32>,
+}
+
 /// Number of the page of an entry without a row, behind the listed rows.
 const UNLISTED: u32 = 0xffffffffu;
 

@@ -6,16 +6,19 @@
 //! not wait for the numbers of rows, [`place`] finds where the list of each page begins; a list has room for more rows than there
 //! are then, and entries without a row ([`UNLISTED`]) are transparent.
 //!
+//! [`survey`] finds what decides whether a round of densification edits rows of a page, so that a page whose statistics a round only
+//! clears need not come to the host.
+//!
 //! One workgroup of a device finds the bounds of a page, by minima and maxima in its own memory. Bounds therefore need no
 //! atomic operations on floats in the form of ordered integers.
 //!
 //! Not here: which pages a step needs (`paging`), uploads (`render`).
 //!
 //! Invariants: 1. listed rows ascend by page and row; 2. a row that the projection would draw is listed; 3. bounds hold
-//! for every later step, in the arithmetic of a device.
+//! for every later step, in the arithmetic of a device; 4. no row has a larger mean score or a lower opacity than a survey says.
 
 use super::deferred::{DeferredTables, FOR_EVER};
-use super::page_words::{DevicePage, PageResult, Table};
+use super::page_words::{DevicePage, PageResult, PageSurvey, Table};
 use super::uniforms_pages::GatherUniforms;
 use crate::base::math::exp32;
 use crate::scene::columns::Column;
@@ -30,6 +33,8 @@ const FLUSH_SLACK: f32 = 2.0 * f32::MIN_POSITIVE;
 const SIGMA_SLACK: f32 = 4e-6;
 const SIGMA_MOST: f32 = 1e30;
 const REACH_SLACK: f32 = 1.0001;
+/// Quotients of smaller sums are not exact on devices: a mean score above 0 counts as at least this one.
+const SMALLEST_MEAN: f32 = 1e-30;
 
 /// Number of the page of an entry without a row, behind the listed rows.
 pub const UNLISTED: u32 = u32::MAX;
@@ -90,8 +95,12 @@ impl GatherInput<'_> {
         [low - slack, high + slack]
     }
 
+    fn mean_score(&self, page: &DevicePage, row: usize) -> f32 {
+        mean_grad2d(f32::from_bits(self.slab[page.grad2d_at(row)]), self.slab[page.count_at(row)])
+    }
+
     fn split_reach(&self, page: &DevicePage, row: usize, sigma: f32) -> f32 {
-        let mean = mean_grad2d(f32::from_bits(self.slab[page.grad2d_at(row)]), self.slab[page.count_at(row)]);
+        let mean = self.mean_score(page, row);
         let is_split = mean > self.uniforms.grow_grad2d && sigma > self.uniforms.split_scale;
         if is_split { self.uniforms.split_reach * REACH_SLACK * sigma } else { 0.0 }
     }
@@ -169,5 +178,18 @@ pub fn bounds(input: &GatherInput<'_>, results: &mut [PageResult]) {
         }
         (result.low, result.high) = (low.map(f32::to_bits), high.map(f32::to_bits));
         result.sigma_max = sigma_max.to_bits();
+    }
+}
+
+/// Finds what decides whether a round edits rows of the pages in the slab. The uniform names the column of the opacities.
+pub fn survey(input: &GatherInput<'_>, surveys: &mut [PageSurvey]) {
+    for (page, survey) in input.pages.iter().zip(surveys).filter(|(page, _)| input.is_bound(page)) {
+        let (mut lowest, mut largest) = (3.4e38f32, 0.0f32);
+        for row in 0..page.rows as usize {
+            lowest = lowest.min(input.hull(page, Column::Opacities, row, 0, input.uniforms.rate)[0]);
+            let score = input.mean_score(page, row);
+            largest = largest.max(if score > 0.0 { score.max(SMALLEST_MEAN) } else { score });
+        }
+        (survey.lowest_opacity, survey.largest_mean) = (lowest.to_bits(), largest.to_bits());
     }
 }

@@ -49,6 +49,18 @@ crate::wgsl_struct! {
     }
 }
 
+crate::wgsl_struct! {
+    /// What decides whether a round edits rows of a page: `PageSurvey` in `shaders/shared/page.wgsl`.
+    pub struct PageSurvey {
+        /// Largest mean growth score of a row, bits.
+        pub largest_mean: u32,
+        /// Lower bound of the opacities, before activation, for all later steps without an update; bits.
+        pub lowest_opacity: u32,
+        /// Unused.
+        pub pad: [u32; 2],
+    }
+}
+
 /// The three tables of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Table {

@@ -67,7 +67,7 @@ crate::wgsl_struct! {
     pub struct UpdateUniforms {
         /// The slab that is bound.
         pub slab: u32,
-        /// Listed rows of this dispatch.
+        /// Listed rows of this dispatch; pages, where statistics are cleared.
         pub row_count: u32,
         /// Column to rewrite.
         pub column: u32,

@@ -1,8 +1,10 @@
 //! Stage "update": one step of Adam on the listed rows of pages, in the words of their payloads, and their statistics.
-//! The twin of `shaders/update.wgsl`, in which the three functions are entry points.
+//! The twin of `shaders/update.wgsl`, in which the functions are entry points.
 //!
 //! [`judge`] finds whether the gradients of a row are usable, column by column; [`step`] rewrites a column of the rows
 //! whose gradients all are; [`finish`] counts, stamps and collects statistics.
+//!
+//! [`clear_statistics`] takes the place of a round that edits no row.
 //!
 //! Sums of growth scores stay floats, as in pages that the host updates. What host and device both decide by is the bin of
 //! a mean score, and that is the same integer on both: devices divide exactly (`shaders/shared/quotient.wgsl`).
@@ -106,6 +108,15 @@ pub fn finish(
                 result.collected += u32::from(collect(footprint, input.uniforms.half_size, at, slab, bins));
             }
         }
+    }
+}
+
+/// Clears the statistics of all rows of the pages in a slab.
+pub fn clear_statistics(pages: &[DevicePage], bound: u32, slab: &mut [u32]) {
+    for page in pages.iter().filter(|page| page.slab == bound) {
+        let rows = page.rows as usize;
+        slab[page.grad2d_at(0)..][..rows].fill(0);
+        slab[page.count_at(0)..][..rows].fill(0);
     }
 }
 

@@ -10,14 +10,14 @@
 
 use super::gpu::{GpuRenderer, submit_batch};
 use super::gpu_gradients::{RowGradients, RowsOut};
-use super::gpu_pages::{DevicePages, PageRows, UpdateBuffers};
+use super::gpu_pages::{DevicePages, PageRows, PendingResults, UpdateBuffers};
 use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
 use super::gpu_segments::{Segment, gradients_of, in_chunks};
 use super::gpu_view::{Unusable, View};
 use super::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepDone, StepJob};
 use super::{RenderError, RowBatches};
 use crate::gpu::{Buffer, GpuResult, Recorder};
-use crate::kernels::page_words::PageResult;
+use crate::kernels::page_words::{PageResult, PageSurvey};
 use crate::scene::optimizer_numbers::StepNumbers;
 
 impl GpuRenderer {
@@ -115,8 +115,8 @@ impl GpuRenderer {
         batch: usize,
         pages: &[SlotPage],
         collects: bool,
-    ) -> Result<Vec<PageResult>, RenderError> {
-        let needs = RenderError::OutOfOrder { call: "update_pages", needs: "pages_out" };
+    ) -> Result<PendingResults, RenderError> {
+        let needs = RenderError::OutOfOrder { call: "begin_update", needs: "pages_out" };
         let (held, first) = (self.held()?, self.first_of_batch(batch));
         let (Some(of_view), Some(first)) = (&self.pages_view, first) else { return Err(needs) };
         let of_batch = &of_view.batches[batch];
@@ -124,7 +124,7 @@ impl GpuRenderer {
             return Err(RenderError::BatchRows { batch, given: pages.len() });
         }
         if pages.is_empty() {
-            return Ok(Vec::new());
+            return Ok(PendingResults::default());
         }
         let mut recorder = self.gpu.begin("update");
         let table = held.table(&mut recorder, pages, of_batch.first_listed())?;
@@ -132,7 +132,7 @@ impl GpuRenderer {
         self.gpu.submit(recorder)?;
         let source = held.source(of_view, of_batch, &table);
         self.update_rows(view, source, first, (&results, collects))?;
-        Ok(held.results(&self.gpu, &source, &results)?)
+        Ok(held.begin_results(&self.gpu, &source, &results)?)
     }
 }
 
@@ -225,20 +225,31 @@ impl PageRenderer for GpuRenderer {
         })
     }
 
-    fn update_pages(
-        &mut self,
-        batch: usize,
-        pages: &[SlotPage],
-        collects: bool,
-    ) -> Result<Vec<PageResult>, RenderError> {
-        let needs = RenderError::OutOfOrder { call: "update_pages", needs: "pages_out" };
+    fn begin_update(&mut self, batch: usize, pages: &[SlotPage], collects: bool) -> Result<(), RenderError> {
+        let needs = RenderError::OutOfOrder { call: "begin_update", needs: "pages_out" };
         let mut view = self.view.take().ok_or(needs)?;
-        let updated = self.update_batch(&mut view, batch, pages, collects);
-        match &updated {
-            Ok(_) => self.view = Some(view),
-            Err(_) => self.drop_view(),
+        let begun = self.update_batch(&mut view, batch, pages, collects);
+        let pending = begun.inspect_err(|_| self.drop_view())?;
+        self.view = Some(view);
+        if let Some(of_view) = &mut self.pages_view {
+            of_view.updating = Some(pending);
         }
-        updated
+        Ok(())
+    }
+
+    fn finish_update(&mut self) -> Result<Vec<PageResult>, RenderError> {
+        let pending = self.pages_view.as_mut().and_then(|of_view| of_view.updating.take());
+        let needs = RenderError::OutOfOrder { call: "finish_update", needs: "begin_update" };
+        let results = pending.ok_or(needs)?.wait();
+        Ok(results.inspect_err(|_| self.drop_view())?)
+    }
+
+    fn survey(&mut self, pages: &[SlotPage]) -> Result<Vec<PageSurvey>, RenderError> {
+        Ok(self.held()?.survey(&self.gpu, pages)?)
+    }
+
+    fn clear_statistics(&mut self, pages: &[SlotPage]) -> Result<(), RenderError> {
+        Ok(self.held()?.clear_statistics(&self.gpu, pages)?)
     }
 
     fn take_bins(&mut self) -> Result<Vec<u32>, RenderError> {

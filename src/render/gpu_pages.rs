@@ -12,13 +12,14 @@
 use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, Window, footprint_bytes, windows};
 use super::gpu_slots::Slots;
 use super::pages::{PageRules, SlotPage};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::deferred::DeferredTables;
-use crate::kernels::page_words::{DevicePage, PageResult};
+use crate::kernels::page_words::{DevicePage, PageResult, PageSurvey};
 use crate::kernels::uniforms_pages::{GatherUniforms, UpdateUniforms};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Column;
 use crate::scene::optimizer_numbers::StepNumbers;
+use bytemuck::Zeroable;
 use std::collections::BTreeSet;
 use std::ops::Range;
 use std::sync::Arc;
@@ -51,6 +52,8 @@ pub(super) struct Stages {
     pub(super) list: Arc<Pipeline>,
     gather: Arc<Pipeline>,
     bounds: Arc<Pipeline>,
+    survey: Arc<Pipeline>,
+    clear: Arc<Pipeline>,
     judge: Arc<Pipeline>,
     step: Arc<Pipeline>,
     finish: Arc<Pipeline>,
@@ -78,6 +81,27 @@ pub struct PagesView {
     recent: Buffer,
     /// The batches that are in.
     pub batches: Vec<PageBatch>,
+    /// The update that has begun and that nobody has waited for.
+    pub(super) updating: Option<PendingResults>,
+}
+
+/// What an update does to the pages of a batch, on its way to the host.
+#[derive(Debug, Default)]
+pub struct PendingResults {
+    read: Option<Readback>,
+    pages: usize,
+}
+
+impl PendingResults {
+    /// Waits for the results of the pages.
+    ///
+    /// # Errors
+    /// The device failed.
+    pub fn wait(self) -> GpuResult<Vec<PageResult>> {
+        let mut results = vec![PageResult::zeroed(); self.pages];
+        self.read.map_or(Ok(()), |read| read.copy_to(&mut results))?;
+        Ok(results)
+    }
 }
 
 /// The listed rows of a batch.
@@ -119,6 +143,8 @@ impl DevicePages {
             list: of("gather.wgsl", "list")?,
             gather: of("gather.wgsl", "gather")?,
             bounds: of("gather.wgsl", "bounds")?,
+            survey: of("gather.wgsl", "survey")?,
+            clear: of("update.wgsl", "clear_statistics")?,
             judge: of("update.wgsl", "judge")?,
             step: of("update.wgsl", "step")?,
             finish: of("update.wgsl", "finish")?,
@@ -154,7 +180,7 @@ impl DevicePages {
         step: &StepNumbers,
     ) -> GpuResult<PagesView> {
         let recent = recorder.buffer_with("recent", step.recent.as_flattened())?;
-        Ok(PagesView { camera: *camera, step: step.clone(), recent, batches: Vec::new() })
+        Ok(PagesView { camera: *camera, step: step.clone(), recent, batches: Vec::new(), updating: None })
     }
 
     pub(super) fn uniforms(&self, view: &PagesView, pages: usize) -> GatherUniforms {
@@ -291,13 +317,24 @@ impl DevicePages {
     /// # Errors
     /// The device failed, or has no memory.
     pub fn results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Vec<PageResult>> {
+        self.begin_results(gpu, source, results)?.wait()
+    }
+
+    /// As [`DevicePages::results`], without waiting.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub(super) fn begin_results(
+        &self,
+        gpu: &Gpu,
+        source: &PageRows<'_>,
+        results: &Buffer,
+    ) -> GpuResult<PendingResults> {
         let mut recorder = gpu.begin("update");
         self.bounds(&mut recorder, source, results)?;
         let read = recorder.read_back("update", &results.view())?;
         gpu.submit(recorder)?;
-        let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); source.table.pages.len()];
-        read.copy_to(&mut results)?;
-        Ok(results)
+        Ok(PendingResults { read: Some(read), pages: source.table.pages.len() })
     }
 
     /// Records the bounds of the pages of a batch.
@@ -315,6 +352,47 @@ impl DevicePages {
             recorder.dispatch("update", &self.stages.bounds, &views, groups)?;
         }
         Ok(())
+    }
+
+    /// What decides whether a round edits rows of these pages. Waits.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn survey(&self, gpu: &Gpu, pages: &[SlotPage]) -> GpuResult<Vec<PageSurvey>> {
+        let mut recorder = gpu.begin("survey");
+        let table = self.table(&mut recorder, pages, &[])?;
+        let surveys = recorder.buffer_zeroed("surveys", (size_of::<PageSurvey>() * pages.len()) as u64)?;
+        let uniforms = GatherUniforms { page_count: pages.len() as u32, ..GatherUniforms::zeroed() };
+        let uniforms = uniforms.of_column(&self.rules.numbers, Column::Opacities, 1, 0);
+        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        for slab in table.slabs() {
+            let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
+            // No sum of a present step is asked for: the tables stand in the place of those.
+            let [slab, tables] = [self.slots.slab(slab)?, self.tables.view()];
+            let views = [uniform, table.on_device.view(), slab, tables.clone(), tables, surveys.view()];
+            recorder.dispatch("gather", &self.stages.survey, &views, groups)?;
+        }
+        let read = recorder.read_back("survey", &surveys.view())?;
+        gpu.submit(recorder)?;
+        let mut of_pages = vec![PageSurvey::zeroed(); pages.len()];
+        read.copy_to(&mut of_pages)?;
+        Ok(of_pages)
+    }
+
+    /// Clears the statistics of all rows of these pages. Does not wait.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory.
+    pub fn clear_statistics(&self, gpu: &Gpu, pages: &[SlotPage]) -> GpuResult<()> {
+        let mut recorder = gpu.begin("clear statistics");
+        let table = self.table(&mut recorder, pages, &[])?;
+        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        for slab in table.slabs() {
+            let uniform = UpdateUniforms { slab, row_count: pages.len() as u32, ..UpdateUniforms::zeroed() };
+            let views = [recorder.uniform(&uniform)?, table.on_device.view(), self.slots.slab(slab)?];
+            recorder.dispatch("update", &self.stages.clear, &views, groups)?;
+        }
+        gpu.submit(recorder).map(|_| ())
     }
 
     /// Takes the bins and clears them. Waits.

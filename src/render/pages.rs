@@ -7,7 +7,7 @@
 //! batches or the room for them.
 
 use super::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
-use crate::kernels::page_words::PageResult;
+use crate::kernels::page_words::{PageResult, PageSurvey};
 use crate::kernels::uniforms_pages::SplitNumbers;
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
@@ -88,7 +88,7 @@ pub struct StepDone {
 /// Stages on pages, in place of those on rows:
 ///
 /// ```text
-/// begin_view ──> pages_in (each batch) ──> picture ─ ─ > picture_back ──> pages_out (each batch) ──> update_pages
+/// begin_view ──> pages_in (each batch) ──> picture ─ ─ > picture_back ──> pages_out, begin_update, finish_update (each batch)
 /// ```
 ///
 /// `loss_value` and `unusable_splats` may follow the first `pages_out`, before anything is updated. A step of one batch may be recorded
@@ -157,17 +157,30 @@ pub trait PageRenderer: Renderer {
     /// As [`Renderer::rows_out`].
     fn pages_out(&mut self, batch: usize) -> Result<(), RenderError>;
 
-    /// Takes the step on the rows of a batch, in their slots, and collects statistics if `collects`. `pages` are those of
-    /// [`PageRenderer::pages_in`], perhaps in other slots. Returns what it did to each page. Waits.
+    /// Begins the step on the rows of a batch, in their slots, which collects statistics if `collects`. `pages` are those of
+    /// [`PageRenderer::pages_in`], perhaps in other slots. Does not wait.
     ///
     /// # Errors
     /// [`PageRenderer::pages_out`] of the batch has not run, or the device failed: some pages may be updated then.
-    fn update_pages(
-        &mut self,
-        batch: usize,
-        pages: &[SlotPage],
-        collects: bool,
-    ) -> Result<Vec<PageResult>, RenderError>;
+    fn begin_update(&mut self, batch: usize, pages: &[SlotPage], collects: bool) -> Result<(), RenderError>;
+
+    /// Waits for the update that [`PageRenderer::begin_update`] began. Returns what it did to each page.
+    ///
+    /// # Errors
+    /// No update has begun, or the device failed.
+    fn finish_update(&mut self) -> Result<Vec<PageResult>, RenderError>;
+
+    /// What decides whether a round edits rows of these pages, which have all steps so far. Waits.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory; no pages are held.
+    fn survey(&mut self, pages: &[SlotPage]) -> Result<Vec<PageSurvey>, RenderError>;
+
+    /// Clears the statistics of all rows of these pages. Does not wait.
+    ///
+    /// # Errors
+    /// The device failed, or has no memory; no pages are held. No page is changed then.
+    fn clear_statistics(&mut self, pages: &[SlotPage]) -> Result<(), RenderError>;
 
     /// Takes the change of the number of rows by bin of the mean growth score since the last call, modulo 2^32. Waits.
     ///

@@ -14,6 +14,7 @@ const LAYOUTS: &[&[StructLayout]] = &[
     &[
         page_words::DevicePage::LAYOUT,
         page_words::PageResult::LAYOUT,
+        page_words::PageSurvey::LAYOUT,
         uniforms_pages::GatherUniforms::LAYOUT,
         uniforms_pages::UpdateUniforms::LAYOUT,
         gate::GateUniforms::LAYOUT,

@@ -42,49 +42,55 @@ const RUN: &[&str] = &[
 ];
 
 /// Events of a trace: name, beginning and end in microseconds, the step that the host was at, and the values of an event.
-struct Span {
-    name: String,
-    began: f64,
-    step: u64,
-    args: serde_json::Value,
+pub(super) struct Span {
+    pub name: String,
+    pub began: f64,
+    pub step: u64,
+    pub args: serde_json::Value,
 }
 
 /// What a run left behind.
 #[derive(PartialEq)]
-struct Result {
-    ply: Vec<u8>,
-    losses: Vec<String>,
+pub(super) struct Result {
+    pub ply: Vec<u8>,
+    pub losses: Vec<String>,
     /// Label and checksum of the payload of every stored page.
-    pages: BTreeMap<u64, (Vec<u8>, u128)>,
+    pub pages: BTreeMap<u64, (Vec<u8>, u128)>,
 }
 
-struct Bench {
+/// A scene, and the runs on it.
+pub(super) struct Bench {
     folder: TempDir,
-    scene: PathBuf,
+    pub scene: PathBuf,
 }
 
 impl Bench {
     /// `None` without a device.
-    fn new() -> Option<Bench> {
+    pub fn new() -> Option<Bench> {
         gpu::open(&GpuOptions::default())?;
         let folder = TempDir::new().unwrap();
         let scene = wide_city(folder.path(), 6000);
         Some(Bench { folder, scene })
     }
 
-    fn path(&self, name: &str) -> PathBuf {
+    pub fn path(&self, name: &str) -> PathBuf {
         self.folder.path().join(name)
     }
 
-    /// Runs with these arguments and with at most `in_flight` steps in flight, after which the store is kept. Whether the run was
-    /// finished.
-    fn run(&self, name: &str, in_flight: &str, faults: &str, more: &[&str]) -> bool {
+    /// A run with these arguments, after which the store is kept.
+    pub fn command(&self, name: &str, more: &[&str]) -> Command {
         let [out, spill, trace] = ["out", "spill", "trace"].map(|part| self.path(&format!("{name}.{part}")));
         let of_run = [text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill), "--trace", text(&trace)];
         let mut run = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
         // Flags with their values; the last one has none.
         let others = RUN.chunks(2).filter(|flag| !more.contains(&flag[0])).flatten();
         run.args(of_run).arg("--keep-checkpoint").args(others).args(CLASSIC).args(more);
+        run
+    }
+
+    /// Runs with these arguments and with at most `in_flight` steps in flight. Whether the run was finished.
+    pub fn run(&self, name: &str, in_flight: &str, faults: &str, more: &[&str]) -> bool {
+        let mut run = self.command(name, more);
         run.env("GSSCALE_STEPS_IN_FLIGHT", in_flight).env("GSSCALE_STEP_FAULT", faults);
         let output = run.output().unwrap();
         let is_done = output.status.success();
@@ -92,10 +98,15 @@ impl Bench {
         is_done
     }
 
-    fn result(&self, name: &str) -> Result {
+    /// The lines of `metrics.jsonl`.
+    pub fn metrics(&self, name: &str) -> Vec<serde_json::Value> {
+        let lines = std::fs::read_to_string(self.path(&format!("{name}.out")).join("metrics.jsonl")).unwrap();
+        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    }
+
+    pub fn result(&self, name: &str) -> Result {
         let out = self.path(&format!("{name}.out"));
-        let lines = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-        let loss = |line: &str| serde_json::from_str::<serde_json::Value>(line).unwrap()["loss"].to_string();
+        let losses = self.metrics(name).iter().map(|line| line["loss"].to_string()).collect();
         let store =
             StoreReader::open(&self.path(&format!("{name}.spill")), Access::Pages, WitnessRule::Obeyed).unwrap();
         let (mut reader, mut pages) = (store.slot_reader(), BTreeMap::new());
@@ -103,10 +114,10 @@ impl Bench {
             pages.insert(page.to_bits(), (label.to_vec(), checksum(reader.payload(page, &slot).unwrap())));
         }
         let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
-        Result { ply, losses: lines.lines().map(loss).collect(), pages }
+        Result { ply, losses, pages }
     }
 
-    fn spans(&self, name: &str) -> Vec<Span> {
+    pub fn spans(&self, name: &str) -> Vec<Span> {
         let trace: Vec<serde_json::Value> =
             serde_json::from_slice(&std::fs::read(self.path(&format!("{name}.trace"))).unwrap()).unwrap();
         let span = |event: &serde_json::Value| {
@@ -121,15 +132,22 @@ impl Bench {
     }
 }
 
-fn same(one: &Result, other: &Result, name: &str) {
+pub(super) fn same(one: &Result, other: &Result, name: &str) {
     assert!(one.ply == other.ply, "{name}: another scene");
     assert_eq!(one.losses, other.losses, "{name}");
     assert!(one.pages == other.pages, "{name}: other pages are stored");
 }
 
 /// Steps that were recorded while another one was in flight.
+pub(super) fn recorded_behind(spans: &[Span]) -> Vec<u64> {
+    let recorded =
+        spans.iter().filter(|s| s.name == "record step").filter_map(|s| Some((s.step, s.args["recorded"].as_u64()?)));
+    recorded.filter(|(now, recorded)| recorded > now).map(|(_, recorded)| recorded).collect()
+}
+
+/// How many.
 fn recorded_ahead(spans: &[Span]) -> usize {
-    spans.iter().filter(|s| s.name == "record step" && s.args["recorded"].as_u64() > Some(s.step)).count()
+    recorded_behind(spans).len()
 }
 
 #[test]
@@ -162,9 +180,7 @@ fn steps_in_flight_change_no_byte() {
         assert!(ahead >= *least, "{more:?}: {ahead} of 90 steps were recorded behind another one");
         if let Some(at) = more.iter().position(|flag| *flag == "--device-mem") {
             let most = u64::from(more[at + 1].trim_end_matches("MiB").parse::<u32>().unwrap()) << 20;
-            let lines = std::fs::read_to_string(bench.path(&format!("{name}.out")).join("metrics.jsonl")).unwrap();
-            let last: serde_json::Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
-            let peak = last["device_bytes_peak"].as_u64().unwrap();
+            let peak = bench.metrics(&name).last().unwrap()["device_bytes_peak"].as_u64().unwrap();
             assert!(peak <= most, "{more:?}: {peak} bytes of device memory");
         }
     }
@@ -260,4 +276,49 @@ fn the_next_step_is_submitted_before_this_one_is_waited_for() {
     }
     println!("{both} of 89 steps were submitted before the one before them was waited for");
     assert!(both > 70, "{both} of 89 steps were submitted before the one before them was waited for");
+}
+
+/// What a step of several batches does in its last one: the update is submitted, payloads of the next step go up, and then the host waits
+/// for the update. `None` for a step of one batch; whether payloads went up.
+fn took_payloads_up(spans: &[Span], step: u64) -> Option<bool> {
+    let began = |names: [&str; 2], of_update: bool| -> Vec<f64> {
+        let is_update = |s: &Span| ["what", "for"].iter().any(|key| s.args[*key].as_str() == Some("update"));
+        let is_it = |s: &&Span| s.step == step && names.contains(&s.name.as_str()) && (!of_update || is_update(s));
+        spans.iter().filter(is_it).map(|s| s.began).collect()
+    };
+    let batches = began(["rows out"; 2], false);
+    let last_batch = batches.iter().copied().fold(0.0, f64::max);
+    let first = |times: Vec<f64>| times.into_iter().filter(|began| *began > last_batch).fold(f64::MAX, f64::min);
+    let up = first(began(["load ahead"; 2], false));
+    if up < f64::MAX && batches.len() > 1 {
+        let (submitted, read) = (first(began(["submit"; 2], true)), first(began(["wait", "read back"], true)));
+        assert!(submitted < up && up < read && read < f64::MAX, "step {step}: {submitted} us, {up} us, {read} us");
+    }
+    (batches.len() > 1).then_some(up < f64::MAX)
+}
+
+/// Views that need more pages than there are slots.
+#[test]
+fn views_of_several_batches_take_payloads_of_the_next_step_up_ahead() {
+    let Some(bench) = Bench::new() else { return };
+    let shuffled = ["--view-order", "shuffle"];
+    assert!(bench.run("whole", "2", "", &shuffled));
+    let want = bench.result("whole");
+    for device_mem in ["3MiB", "2500KiB"] {
+        assert!(bench.run(device_mem, "2", "", &[&shuffled[..], &["--device-mem", device_mem]].concat()));
+        same(&bench.result(device_mem), &want, device_mem);
+        let spans = bench.spans(device_mem);
+        // The last step has no next one.
+        let several: Vec<bool> = (1..89).filter_map(|step| took_payloads_up(&spans, step)).collect();
+        let ahead = several.iter().filter(|is_ahead| **is_ahead).count();
+        let last = bench.metrics(device_mem).pop().unwrap();
+        let (slots, peak) = (&last["slots"], last["device_bytes_peak"].as_u64().unwrap());
+        let several = several.len();
+        println!("{device_mem}: {ahead} of {several} steps of several batches took payloads up ahead; {slots}");
+        assert!(
+            several > 20 && ahead > 10 && slots["loads_ahead"].as_u64().unwrap() > 50,
+            "{ahead} of {several}: {slots}"
+        );
+        assert!(peak <= if device_mem == "3MiB" { 3 << 20 } else { 2500 << 10 }, "{peak} bytes of device memory");
+    }
 }

@@ -18,6 +18,8 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod gpu_ends;
+mod gpu_events;
 mod gpu_flights;
 mod gpu_pages;
 mod gpu_trace;

@@ -46,6 +46,11 @@ pub trait RowBackend {
         usize::MAX
     }
 
+    /// The most pages of a batch of a view of `pages` pages: at most [`RowBackend::pages_most`].
+    fn pages_per_batch(&self, pages: usize) -> usize {
+        self.pages_most().min(pages)
+    }
+
     /// Pages outside of a batch that must be written back some time and that the pager takes for clean.
     fn pages_held(&self) -> usize {
         0

@@ -6,6 +6,14 @@
 //! device          │ picture ....................... loss .................. gradients .............................│ update
 //! ```
 //!
+//! A view of several batches needs all slots until the last batch of the pass out. Then its other pages make room, and payloads go up
+//! beside the update of that batch:
+//!
+//! ```text
+//! host    ... last batch: its payloads up, begin_ahead │ update begins │ load_ahead │ wait
+//! device  ............................................ │ update ...................│
+//! ```
+//!
 //! The list of a next view's pages follows from the bounds before this step, so it may name too few or too many. What a step touches
 //! follows from the bounds at that step ([`DeviceTier::load`]): a page that the list lacks is copied then, and a page too many changes no
 //! bit.

@@ -21,7 +21,12 @@
 //! | corrections of pictures, masks of blocks, views that may be left out | the trainer |
 //! | a page of the view has events to apply | this file |
 //! | pages of the view have no slot and no slot is free, or there are too few frames for two views | this file |
-//! | memory for the step is short, or its view is several batches | the renderer; this file tries again some steps later |
+//! | the view is several batches | this file |
+//! | memory for the step is short | the renderer; this file tries again some steps later |
+//!
+//! A view of several batches gives each slot to several pages within its step. The host copies a page back before the slot takes
+//! the next one, so it waits several times in such a step whatever is recorded. A step recorded behind it would need slots for its own pages
+//! as well, which no such view leaves. So only payloads of the next step go up ahead there (`device_ahead`).
 //!
 //! The pages of a step behind another are listed by bounds that are as wide as the other step can make them
 //! ([`crate::optim::one_step`]). So the list has all pages that the exact bounds name; a page too many has no row in view and stays as it

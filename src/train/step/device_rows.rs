@@ -11,10 +11,14 @@ use super::device_tier::{DeviceTier, device_of};
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
+use crate::kernels::page_words::PageResult;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Renderer;
 use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
+
+/// The part of the slots that a batch of a view of several batches leaves to the next step.
+const SLOTS_AHEAD_SHARE: usize = 4;
 
 /// Rows on the device of a renderer.
 pub struct DeviceRows<'a> {
@@ -22,6 +26,8 @@ pub struct DeviceRows<'a> {
     renderer: &'a mut dyn Renderer,
     /// Number and camera of the next step.
     next: Option<(u32, &'a Camera)>,
+    /// Number of the next step, whose payloads go up beside the update of the last batch.
+    beside_update: Option<u32>,
 }
 
 impl<'a> DeviceRows<'a> {
@@ -36,7 +42,23 @@ impl<'a> DeviceRows<'a> {
         (step, next): (u32, Option<&'a Camera>),
     ) -> Result<DeviceRows<'a>, TrainError> {
         tier.begin_step(scene, renderer, step)?;
-        Ok(DeviceRows { tier, renderer, next: next.map(|camera| (step + 1, camera)) })
+        Ok(DeviceRows { tier, renderer, next: next.map(|camera| (step + 1, camera)), beside_update: None })
+    }
+
+    /// Updates the pages of a batch in their slots; payloads of the next step go up while the device does it.
+    fn update_slots(
+        &mut self,
+        scene: &mut PagedScene,
+        batch: usize,
+        pinned: &[PinnedPage],
+        collects: bool,
+    ) -> Result<Vec<PageResult>, TrainError> {
+        let pages = self.tier.loaded(pinned);
+        device_of(self.renderer)?.begin_update(batch, &pages, collects)?;
+        if let Some(step) = self.beside_update.take() {
+            self.tier.load_ahead(scene, self.renderer, step)?;
+        }
+        Ok(device_of(self.renderer)?.finish_update()?)
     }
 }
 
@@ -47,6 +69,12 @@ impl RowBackend for DeviceRows<'_> {
 
     fn pages_most(&self) -> usize {
         self.tier.slots()
+    }
+
+    /// A view that needs several batches anyway leaves slots free for pages of the next step: smaller batches copy no byte more.
+    fn pages_per_batch(&self, pages: usize) -> usize {
+        let slots = self.tier.slots();
+        if pages <= slots { slots } else { slots - slots / SLOTS_AHEAD_SHARE }
     }
 
     fn pages_held(&self) -> usize {
@@ -94,11 +122,17 @@ impl RowBackend for DeviceRows<'_> {
         _: AtStep<'_>,
         _: &mut WorkingSet,
     ) -> Result<(), TrainError> {
+        // The last batch of the pass out: the step needs no other page any more.
+        let next = self.next.filter(|_| batch == 0);
         if is_again {
             self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
+            if let Some(next) = next {
+                self.tier.begin_ahead(scene, self.renderer, next)?;
+                self.beside_update = Some(next.0);
+            }
         }
         device_of(self.renderer)?.pages_out(batch)?;
-        match self.next.filter(|_| batch == 0) {
+        match next.filter(|_| !is_again) {
             // The device is at work on the gradients, which only `loss_value` and what follows wait for.
             Some((step, _)) => self.tier.load_ahead(scene, self.renderer, step),
             None => Ok(()),
@@ -107,16 +141,15 @@ impl RowBackend for DeviceRows<'_> {
 
     fn update(
         &mut self,
-        _: &mut PagedScene,
+        scene: &mut PagedScene,
         batch: usize,
         pinned: &mut [PinnedPage],
         _: AtStep<'_>,
         _: &WorkingSet,
         collects: bool,
     ) -> Result<UpdateCounts, TrainError> {
-        let pages = self.tier.loaded(pinned);
-        let results = device_of(self.renderer)?.update_pages(batch, &pages, collects);
-        let results = results.map_err(|error| TrainError::Torn { source: Box::new(error.into()) })?;
+        let results = self.update_slots(scene, batch, pinned, collects);
+        let results = results.map_err(|error| TrainError::Torn { source: Box::new(error) })?;
         let mut counts = UpdateCounts::default();
         for (page, result) in pinned.iter_mut().filter(|page| page.meta.rows > 0).zip(results) {
             counts.updated += u64::from(result.updated);

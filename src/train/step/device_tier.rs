@@ -5,7 +5,7 @@
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: steps in flight (`device_flights`); copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
+//! Not here: pages that events change (`device_events`); steps in flight (`device_flights`); copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
 //! it, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
@@ -51,6 +51,9 @@ pub struct SlotTraffic {
     pub bytes_drained: u64,
     /// Pages of batches that were on the device already.
     pub hits: u64,
+    /// Pages whose statistics the device cleared after a round, in place of a drain, an edit and a load.
+    #[serde(default)]
+    pub cleared: u64,
     /// Slots.
     #[serde(default)]
     pub slots: u64,
@@ -80,7 +83,7 @@ pub struct DeviceTier {
     /// Steps in flight.
     pub(super) flights: Flights,
     /// Loads that no order of eviction avoids.
-    fewest: FewestReads,
+    pub(super) fewest: FewestReads,
 }
 
 /// The device of a renderer.
@@ -259,7 +262,7 @@ impl DeviceTier {
     }
 
     /// Copies the slots of pages, which are newer, to their frames.
-    fn copy_back<'a>(
+    pub(super) fn copy_back<'a>(
         &mut self,
         renderer: &mut dyn Renderer,
         pages: impl Iterator<Item = &'a mut PinnedPage>,
@@ -316,27 +319,6 @@ impl DeviceTier {
     /// The device failed.
     pub(crate) fn take_bins(&self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
         scene.histogram.add_changes(&device_of(renderer)?.take_bins()?);
-        Ok(())
-    }
-
-    /// Copies pinned pages back that events are about to change, and gives up their slots.
-    pub(super) fn before_events(
-        &mut self,
-        scene: &PagedScene,
-        renderer: &mut dyn Renderer,
-        pinned: &mut [PinnedPage],
-    ) -> Result<(), TrainError> {
-        let slots = &self.slots;
-        let behind = pinned.iter_mut().filter(|page| scene.rules.is_behind(&page.meta));
-        let (newer, equal): (Vec<_>, Vec<_>) = behind.partition(|page| slots.is_dirty(page.page));
-        let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
-        self.copy_back(renderer, newer.into_iter())?;
-        for page in pages {
-            self.fewest.lose(page);
-            if self.slots.state(page).is_some() {
-                self.slots.evict(page);
-            }
-        }
         Ok(())
     }
 

@@ -8,6 +8,7 @@ pub mod catch_up;
 pub mod comparison;
 pub(crate) mod dense;
 mod device_ahead;
+mod device_events;
 pub mod device_flights;
 pub mod device_rows;
 pub mod device_tier;

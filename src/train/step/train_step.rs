@@ -91,7 +91,7 @@ pub fn train_step(
     backend.renderer().weigh_rows(collects && scene.rules.strategy.needs_weights())?;
     let pages = scene.pager.begin_view(step, camera)?;
     let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
-    let pages_most = pages_most.min(backend.pages_most());
+    let pages_most = pages_most.min(backend.pages_per_batch(pages.len()));
     let mut passes = Passes { scene, working, backend, step, camera, batches, pinned, outcome };
     let done = passes
         .rows_in(pages, pages_most, render)

@@ -10,7 +10,7 @@ use gsscale::densify::stats::GradHistogram;
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, Source, groups_1d};
 use gsscale::kernels::deferred::DeferredTables;
 use gsscale::kernels::gather::{self, GatherInput};
-use gsscale::kernels::page_words::{DevicePage, PageResult};
+use gsscale::kernels::page_words::{DevicePage, PageResult, PageSurvey};
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
 use gsscale::kernels::update::{self, UpdateInput};
 use gsscale::optim::adam::AdamConfig;
@@ -23,7 +23,7 @@ use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
-use gsscale::scene::rows::RowsNow;
+use gsscale::scene::rows::{RowsNow, mean_grad2d};
 use gsscale::scene::state::SceneState;
 
 const STEPS: u32 = 900;
@@ -382,6 +382,35 @@ fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
         histogram.add_changes(&bins);
         assert_eq!((histogram.uncounted(), histogram == after), (0, true), "bins of the device are those of the CPU");
         assert_bounds(&world, &payloads, &results, &twin.1);
+        assert_bounds_of_device(&on, &world, &results);
+    }
+}
+
+/// The same for positions and scales as the device evaluates them, of the rows that the camera sees at later steps.
+fn assert_bounds_of_device(on: &OnDevice<'_>, world: &World, results: &[PageResult]) {
+    for later in [1, 3, 50, 199] {
+        let view = on.pages.begin(on.gpu, &camera(), &world.adam.at(world.now + later).numbers()).unwrap();
+        let (batch, table) = on.pages.list(on.gpu, &view, &on.slots).unwrap();
+        let listed: Vec<[u32; 2]> = read(on.gpu, batch.listed(), batch.rows as usize);
+        let columns = DeviceColumns::new(on.gpu, batch.rows, world.layouts[0].sh_degree).unwrap();
+        let mut recorder = on.gpu.begin("parity");
+        let all = 0..batch.rows as usize;
+        on.pages.source(&view, &batch, &table).geometry(on.gpu, &mut recorder, &columns, &all).unwrap();
+        on.gpu.submit(recorder).unwrap();
+        let mut outside = 0;
+        for ((buffer, width), (column, ..)) in columns.columns().zip(parts(world.layouts[0].sh_degree)) {
+            let values: Vec<f32> = read(on.gpu, buffer, width * listed.len());
+            for ([page, _], row) in listed.iter().zip(values.chunks(width)) {
+                let Some(bounds) = results[*page as usize].bounds() else { continue };
+                outside += match column {
+                    Column::Means => (0..3).filter(|&c| !(bounds.lo[c]..=bounds.hi[c]).contains(&row[c])).count(),
+                    Column::Scales => row.iter().filter(|scale| scale.exp() > bounds.sigma_max).count(),
+                    _ => 0,
+                };
+            }
+        }
+        assert_eq!(outside, 0, "{later} steps later, of {} rows", listed.len());
+        assert!(listed.len() > 50, "{} rows are seen", listed.len());
     }
 }
 
@@ -408,6 +437,45 @@ fn assert_bounds(world: &World, payloads: &[Vec<u32>], results: &[PageResult], t
             assert!((bounds.lo[c] - of_twin.lo[c]).abs() <= slack && (bounds.hi[c] - of_twin.hi[c]).abs() <= slack);
         }
         assert!((bounds.sigma_max / of_twin.sigma_max - 1.0).abs() < 1e-5);
+    }
+}
+
+/// What a round needs to know of pages, and statistics that it clears: the survey bounds all rows, and is that of the twin.
+#[test]
+fn surveys_hold_all_rows_and_only_statistics_are_cleared() {
+    let world = World::new(3, 700);
+    let numbers = world.adam.numbers(STEPS).unwrap();
+    let tables = DeferredTables::new(&numbers);
+    let (mut slab, pages) = world.slab();
+    let uniforms = GatherUniforms::new(&camera(), &numbers, 700, &SPLITS, pages.len() as u32);
+    let uniforms = uniforms.of_column(&numbers, Column::Opacities, 1, 0);
+    let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables: &tables, recent: &[] };
+    let mut twin = vec![<PageSurvey as bytemuck::Zeroable>::zeroed(); pages.len()];
+    gather::survey(&input, &mut twin);
+    for (state, survey) in world.states.iter().zip(&twin) {
+        let (rows, lowest) = (state.view(), f32::from_bits(survey.lowest_opacity));
+        for later in [0, 1, 50, 199] {
+            let at = world.adam.at(700 + later);
+            let opacity = |row: usize| at.evaluate_element(&rows, Column::Opacities, row, 0);
+            assert!((0..state.rows()).all(|row| opacity(row) >= lowest), "{later} steps later, {lowest}");
+        }
+        let means = state.grad2d.iter().zip(&state.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
+        assert_eq!(survey.largest_mean, means.fold(0.0f32, f32::max).to_bits());
+    }
+    update::clear_statistics(&pages, 0, &mut slab);
+    let Some(gpu) = device(&world) else { return };
+    let on = OnDevice::new(&gpu, &world);
+    for (of_device, twin) in on.pages.survey(&gpu, &on.slots).unwrap().iter().zip(&twin) {
+        assert_eq!(of_device.largest_mean, twin.largest_mean);
+        assert!(agree(of_device.lowest_opacity, twin.lowest_opacity, 2e-6), "{of_device:?} {twin:?}");
+    }
+    let before = on.payloads();
+    // All but the second page.
+    let cleared: Vec<SlotPage> = on.slots.iter().enumerate().filter(|(p, _)| *p != 1).map(|(_, page)| *page).collect();
+    on.pages.clear_statistics(&gpu, &cleared).unwrap();
+    for (p, (payload, page)) in on.payloads().into_iter().zip(&pages).enumerate() {
+        let words = &slab[page.base as usize..][..payload.len()];
+        assert!(payload == if p == 1 { &before[p][..] } else { words }, "page {p}");
     }
 }
 

@@ -1,0 +1,119 @@
+//! Events on pages that lie on a device. The host applies an event: the page is drained, edited and loaded again. Only a round that edits
+//! no row of a page, and so does no more than to clear its statistics, is left to the device: the page stays where it is.
+//!
+//! ```text
+//! pages behind in events │ survey: largest score, lowest opacity, 16 bytes a page │ ── no row is edited ──> cleared on the device
+//!                                                                                 └─ a row may be ──────> drained, edited, loaded
+//! ```
+//!
+//! A cap that is reached makes most rounds such rounds. A survey is conservative; a page for which it is not sure goes to the host, which
+//! decides row by row. Both ways leave the same bytes, so the result does not depend on which pages have slots. That includes
+//! the bounds of the page: clearing statistics keeps them, on the host as well (`PageRules`).
+//!
+//! Not here: which rounds edit what (`densify::replay`), the stages of the device (`render`).
+//!
+//! Invariants: 1. a page is cleared by the device only if the host would have changed nothing else; 2. where the device has no memory for
+//! a survey, the host applies the events.
+
+use super::device_tier::{DeviceTier, device_of};
+use super::pages::PagedScene;
+use crate::base::ids::PageNo;
+use crate::base::trace;
+use crate::densify::replay::PageFacts;
+use crate::densify::strategy::Extremes;
+use crate::kernels::page_words::PageSurvey;
+use crate::paging::pinned::PinnedPage;
+use crate::render::pages::SlotPage;
+use crate::render::{RenderError, Renderer};
+use crate::train::error::TrainError;
+
+/// What a device found out about a page, with what the index of pages says.
+fn facts(page: &PinnedPage, survey: &PageSurvey) -> PageFacts {
+    let lowest_opacity = f32::from_bits(survey.lowest_opacity);
+    PageFacts {
+        largest_mean: f32::from_bits(survey.largest_mean),
+        extremes: Extremes { lowest_opacity, sigma_max: page.meta.bounds.sigma_max },
+        sh_degree: page.meta.sh_degree,
+    }
+}
+
+/// What a page would be like that no round edits.
+fn best_facts(page: &PinnedPage) -> PageFacts {
+    facts(page, &PageSurvey { largest_mean: 0, lowest_opacity: f32::INFINITY.to_bits(), pad: [0; 2] })
+}
+
+/// `None` where memory is short.
+fn unless_short<T>(done: Result<T, RenderError>) -> Result<Option<T>, TrainError> {
+    match done {
+        Err(RenderError::Device(error)) if error.lacks_room() => Ok(None),
+        done => Ok(Some(done?)),
+    }
+}
+
+impl DeviceTier {
+    /// Prepares pinned pages for the events that they are behind in: the device clears the statistics of those of which nothing else
+    /// changes, and they are behind no more; the others are copied back, and their slots given up.
+    pub(super) fn before_events(
+        &mut self,
+        scene: &PagedScene,
+        renderer: &mut dyn Renderer,
+        pinned: &mut [PinnedPage],
+    ) -> Result<(), TrainError> {
+        self.clear_statistics(scene, renderer, pinned)?;
+        let slots = &self.slots;
+        let behind = pinned.iter_mut().filter(|page| scene.rules.is_behind(&page.meta));
+        let (newer, equal): (Vec<_>, Vec<_>) = behind.partition(|page| slots.is_dirty(page.page));
+        let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
+        self.copy_back(renderer, newer.into_iter())?;
+        for page in pages {
+            self.fewest.lose(page);
+            if self.slots.state(page).is_some() {
+                self.slots.evict(page);
+            }
+        }
+        Ok(())
+    }
+
+    /// Clears the statistics of pages in slots, where the events that they are behind in do nothing else.
+    fn clear_statistics(
+        &mut self,
+        scene: &PagedScene,
+        renderer: &mut dyn Renderer,
+        pinned: &mut [PinnedPage],
+    ) -> Result<(), TrainError> {
+        let (pending, slots) = (scene.rules.pending(), &self.slots);
+        let only_clears =
+            |page: &PinnedPage, facts: &PageFacts| pending.only_clears(page.meta.events_applied as usize, facts);
+        let in_slot = |page: &PinnedPage| Some(SlotPage { slot: *slots.memory(page.page)?, layout: page.layout() });
+        let (mut pages, mut in_slots) = (Vec::new(), Vec::new());
+        for page in pinned.iter_mut().filter(|page| page.meta.rows > 0 && scene.rules.is_behind(&page.meta)) {
+            if let Some(slot) = in_slot(page).filter(|_| only_clears(page, &best_facts(page))) {
+                pages.push(page);
+                in_slots.push(slot);
+            }
+        }
+        if pages.is_empty() {
+            return Ok(());
+        }
+        let _span = trace::span("clear statistics").with("pages", pages.len() as u64);
+        let device = device_of(renderer)?;
+        let Some(surveys) = unless_short(device.survey(&in_slots))? else { return Ok(()) };
+        let of_pages = pages.into_iter().zip(in_slots).zip(&surveys);
+        let (cleared, in_slots): (Vec<&mut PinnedPage>, Vec<SlotPage>) = of_pages
+            .filter(|((page, _), survey)| only_clears(page, &facts(page, survey)))
+            .map(|(page_in_slot, _)| page_in_slot)
+            .unzip();
+        if cleared.is_empty() || unless_short(device.clear_statistics(&in_slots))?.is_none() {
+            return Ok(());
+        }
+        self.traffic.cleared += cleared.len() as u64;
+        for page in cleared {
+            page.meta.events_applied = pending.len() as u32;
+            page.dirty = true;
+            if let Some((slot, _)) = self.slots.pin(page.page, false) {
+                self.slots.unpin(page.page, slot, true);
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,76 @@
+//! Runs with steps in flight on a device that end all at once: killed, or with the device lost. Through the real binary; what is left
+//! ends with the bytes of a run that nothing disturbed.
+
+use super::gpu_flights::{Bench, Span, recorded_behind, same};
+use crate::support::scenes::stderr;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// A run whose pages are newer in their slots than in frames and on the drive, most of the time.
+const SELDOM: &[&str] = &["--commit-every", "0.5"];
+
+/// Steps at which a run has another step in flight, and at the next step too.
+fn in_flight(spans: &[Span]) -> Vec<u64> {
+    let behind = recorded_behind(spans);
+    (0..90).filter(|step| [step + 1, step + 2].iter().all(|more| behind.contains(more))).collect()
+}
+
+#[test]
+fn a_run_that_is_killed_with_steps_in_flight_ends_with_the_same_bytes() {
+    let Some(bench) = Bench::new() else { return };
+    assert!(bench.run("alone", "2", "", SELDOM));
+    let want = bench.result("alone");
+    let steps = in_flight(&bench.spans("alone"));
+    assert!(steps.len() > 10, "{steps:?}");
+    let part = |tenths: usize| steps[steps.len() * tenths / 10] as usize;
+    let begin = |mut run: Command| {
+        // Most of the time of a step passes while it is in flight.
+        run.env("GSSCALE_EMULATE_BUS", "200MB/s,300us").stderr(Stdio::null()).spawn().unwrap()
+    };
+    let resume = || {
+        let mut run = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
+        run.arg("--resume").arg(bench.path("killed.out")).args(["--quiet", "--keep-checkpoint"]);
+        run
+    };
+    let metrics = bench.path("killed.out").join("metrics.jsonl");
+    let lines = || std::fs::read_to_string(&metrics).unwrap_or_default().lines().count();
+    let mut child = begin(bench.command("killed", SELDOM));
+    let mut kills = 0;
+    for step in [part(2), part(5), part(8)] {
+        let began = Instant::now();
+        while lines() <= step && child.try_wait().unwrap().is_none() {
+            assert!(began.elapsed() < Duration::from_secs(180), "no step in three minutes");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        child.kill().unwrap();
+        kills += usize::from(!child.wait().unwrap().success());
+        child = begin(resume());
+    }
+    assert!(child.wait().unwrap().success() && kills == 3, "{kills} kills");
+    same(&bench.result("killed"), &want, "killed");
+}
+
+#[test]
+fn a_device_that_is_lost_with_steps_in_flight_loses_the_steps_since_the_last_commit_alone() {
+    let Some(bench) = Bench::new() else { return };
+    assert!(bench.run("alone", "2", "", SELDOM));
+    let want = bench.result("alone");
+    let submissions = bench.spans("alone").iter().filter(|s| s.name == "submit").count();
+    // The fault strikes every device that a process opens, at this submission.
+    let mut lost_in_flight = 0;
+    for at in [4, 5, 7].map(|tenths| submissions * tenths / 10) {
+        let name = format!("lost{at}");
+        let mut run = bench.command(&name, &[SELDOM, &["--restarts", "3"]].concat());
+        let output = run.env("GSSCALE_GPU_FAULT", format!("lost@{at}")).output().unwrap();
+        let said = stderr(&output);
+        assert!(output.status.success() && said.contains("(restart 1 of at most 3)"), "{said}");
+        same(&bench.result(&name), &want, &name);
+        // Every step that is recorded is finished or given up, unless the device is lost.
+        let spans = bench.spans(&name);
+        let count = |name: &str| spans.iter().filter(|s| s.name == name).count();
+        let [recorded, finished] = [count("record step"), count("finish step")];
+        println!("{name}: {recorded} steps were recorded, {finished} finished");
+        lost_in_flight += usize::from(recorded > finished);
+    }
+    assert!(lost_in_flight > 0, "no device was lost with a step in flight behind another one");
+}
