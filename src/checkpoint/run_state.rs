@@ -5,7 +5,8 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 6 had no blocks of photos, version 5 neither outliers nor checks of
+//! [`crate::page::format::encoding`] writes them. Version 7 did not count first exposures, version 6 had no blocks of
+//! photos, version 5 neither outliers nor checks of
 //! growth, version 4 no appearance either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
 //! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
 
@@ -20,8 +21,10 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 7;
-/// The version before blocks of photos: the same values without these, the last of the list.
+pub const VERSION: u32 = 8;
+/// The version before first exposures: the same values without their number, the last of the list.
+const WITHOUT_FIRST_EXPOSURES: u32 = 7;
+/// The version before blocks of photos: the same values without these and what came later.
 const WITHOUT_BLOCKS: u32 = 6;
 /// The version before outliers and checks of growth: the same values without these two and what came later.
 const WITHOUT_OUTLIERS: u32 = 5;
@@ -117,6 +120,8 @@ pub struct TrainerState {
     pub growth: GrowthState,
     /// What is known of the blocks of photos that show what the scene does not.
     pub blocks: BlockOutliers,
+    /// Photos whose exposure started from EXIF data.
+    pub first_exposures: u32,
 }
 
 impl TrainerState {
@@ -124,7 +129,7 @@ impl TrainerState {
     /// again. They come from an older program, or from other photos.
     pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
         if !self.appearance.is_as_large_as(&fresh.appearance) {
-            self.appearance = fresh.appearance;
+            (self.appearance, self.first_exposures) = (fresh.appearance, fresh.first_exposures);
         }
         if !self.outliers.is_as_large_as(&fresh.outliers) {
             self.outliers = fresh.outliers;
@@ -162,13 +167,14 @@ pub struct RunState {
 /// The values at the end that a state of an earlier version lacks, as those of a run without.
 fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
     let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-    let blocks = encoding::to_bytes(&BlockOutliers::default())?;
+    let blocks = BlockOutliers::default();
     let before = match version {
-        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth))?,
-        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth))?,
+        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
+        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks))?,
+        WITHOUT_BLOCKS => encoding::to_bytes(&blocks)?,
         _ => Vec::new(),
     };
-    Ok([before, blocks].concat())
+    Ok([before, encoding::to_bytes(&0u32)?].concat())
 }
 
 /// Why bytes are not the state of a run.
@@ -221,7 +227,7 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
-            WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
+            WITHOUT_FIRST_EXPOSURES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
                 RunState::decode(&[body, &lacking_in(version)?].concat())?
             }
             other => return Err(RunStateError::Version(other)),
@@ -235,12 +241,13 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures),
         ))
     }
 
@@ -250,7 +257,8 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -264,6 +272,7 @@ impl RunState {
             outliers,
             growth,
             blocks,
+            first_exposures,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -380,6 +389,7 @@ mod tests {
                     ],
                 },
                 blocks: looked_at(),
+                first_exposures: 2,
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -410,10 +420,12 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..state.trainer.clone() };
+        let of_7 = TrainerState { first_exposures: 0, ..state.trainer.clone() };
+        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
         let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        for (version, trainer) in [(WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)] {
+        let later = [(WITHOUT_FIRST_EXPOSURES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5)];
+        for (version, trainer) in later.into_iter().chain([(WITHOUT_APPEARANCE, of_4)]) {
             let lacking = lacking_in(version).unwrap();
             let without = RunState { trainer, ..state.clone() };
             let mut bytes = without.to_bytes().unwrap();

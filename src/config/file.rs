@@ -167,9 +167,10 @@ config_keys! {
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
         /// Correct the pictures by values trained for each photo: off, exposure (one number a photo) or full (also eight of
-        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change. On the CPU, exposure
-        /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
-        /// gsscale-eval fits these values to the left halves of held-out photos
+        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change. Exposures start from
+        /// the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure costs about
+        /// a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice. gsscale-eval
+        /// fits these values to the left halves of held-out photos
         appearance: AppearanceMode = AppearanceMode::Off => Numbers;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
         /// The log and the report name such views with and without this key

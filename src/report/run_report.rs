@@ -277,9 +277,14 @@ fn add_appearance(page: &mut Page, path: &Path) {
     let stride = points.len().div_ceil(POINTS_MAX);
     let points = points.into_iter().step_by(stride).collect();
     let chart = Chart::new("Exposure", "photo, by name", "stops").with("", points, Mark::LineAndDots);
-    let caption =
-        "Exposure of each training photo against the mean of all, as trained. appearance.json has the numbers.";
-    page.charts(&[(chart.svg(), caption.to_string())]);
+    let first = match values["exposures_from_exif"].as_u64() {
+        None | Some(0) => String::new(),
+        Some(count) => format!(" {count} exposures started from EXIF data."),
+    };
+    let caption = format!(
+        "Exposure of each training photo against the mean of all, as trained.{first} appearance.json has the numbers."
+    );
+    page.charts(&[(chart.svg(), caption)]);
 }
 
 /// The training views whose photo contradicts the scene, if there are any.
