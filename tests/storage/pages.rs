@@ -1,13 +1,14 @@
 //! Scenes in pages: events replayed late, by pages that split and widen, give the rows of events applied on time. The
 //! bounds of a page stay valid until the page is changed.
 
+use crate::support::apply_event::apply_event;
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::replay::{PageEdit, PendingEvents, apply_event};
+use gsscale::densify::replay::{PageEdit, PendingEvents};
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::densify::strategy::{DrawnRows, Effect, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
