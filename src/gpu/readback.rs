@@ -100,11 +100,6 @@ impl PendingMap {
 }
 
 impl Readback {
-    /// Size, bytes.
-    pub fn size(&self) -> u64 {
-        self.size
-    }
-
     /// Waits, then returns the elements.
     ///
     /// # Errors

@@ -23,7 +23,7 @@ use super::stats::{Counters, PagerStats, SlotSpace};
 use super::timing::{Asker, Transfers};
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::format::slot_header::{HEADER_BYTES, SlotRef, transfer_bytes};
+use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
 use crate::page::versions::paged_store::PagedStore;
 use crate::scene::camera::Camera;
 use crate::scene::page_layout::capacity_bytes;
@@ -360,11 +360,6 @@ impl Pager {
     /// What the frame of a page holds behind the header; `None` for a page that is not in memory, is pinned, or is moving.
     pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
         self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
-    }
-
-    /// The slots of the pages on the drive, by page: for the index of a commit, once no page is dirty.
-    pub fn slots(&self) -> &[Option<SlotRef>] {
-        self.index.slots()
     }
 
     /// How full the store is; `None` for a pager without a store.

@@ -178,11 +178,6 @@ impl CpuRenderer {
         &self.raster
     }
 
-    /// Footprints of the last view, one entry per row over all batches.
-    pub fn projected(&self) -> &Projected {
-        &self.projected
-    }
-
     /// Takes the gradient of the picture back to the splats, range by range. The lists of a picture of one range are still
     /// there; others are made again.
     fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions) {

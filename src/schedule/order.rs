@@ -98,11 +98,6 @@ impl ViewOrder {
         self.order
     }
 
-    /// Steps of an epoch.
-    pub fn views(&self) -> usize {
-        self.views
-    }
-
     fn draw(&mut self, epoch: u64) {
         self.epoch = epoch;
         self.drawn.clear();
@@ -189,7 +184,7 @@ mod tests {
     }
 
     fn epoch(order: &mut ViewOrder, epoch: u32) -> Vec<usize> {
-        let views = order.views() as u32;
+        let views = order.views as u32;
         (epoch * views..(epoch + 1) * views).map(|step| order.view_at(step)).collect()
     }
 

@@ -328,7 +328,8 @@ fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, 
         for step in 0..STEPS {
             pages.step(step, &log, &whole.root_from_uid, chance);
             assert!(pages.rows_bound >= pages.rows());
-            for (index, event) in whole.log.pending(log.len()).filter(|(_, e)| e.step == step).collect::<Vec<_>>() {
+            let pending = whole.log.events().iter().enumerate().skip(log.len());
+            for (index, &event) in pending.filter(|(_, e)| e.step == step) {
                 assert!(pages.histogram == whole.histograms[index], "what a round decides by, event {index}");
                 log.push(event);
                 pages.log_event(event);

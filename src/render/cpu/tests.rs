@@ -80,7 +80,7 @@ fn bits_of_batches(renderer: &mut CpuRenderer, rows: &Columns, camera: &Camera, 
     renderer.picture().unwrap();
     let rgb = (0..3 * camera.pixels()).map(|i| (i % 251) as u8).collect();
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-    let loss = LossOptions::new(0.2, SsimPadding::Valid, SimdPath::best());
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
     renderer.loss(&target, &loss).unwrap();
     renderer.picture_back().unwrap();
     let mut all = vec![Vec::new(); 9];

@@ -127,8 +127,6 @@ pub struct Forecast {
     pub bytes_written: f64,
     /// Most bytes that commits write.
     pub commit_bytes_most: f64,
-    /// Seconds of a step with the Gaussians of now.
-    pub step_seconds: f64,
     /// Seconds of all steps.
     pub seconds: f64,
 }
@@ -184,7 +182,6 @@ impl Forecast {
             ply_bytes: ply_bytes(config, last),
             bytes_written: 0.0,
             commit_bytes_most: commit_bytes(config, state_bytes, seconds),
-            step_seconds,
             seconds,
         };
         if !is_in_memory {
