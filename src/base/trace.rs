@@ -72,7 +72,8 @@ pub fn start(path: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Ends the trace; nothing without one. A trace without a span leaves no file: the run was refused, and its next attempt may take the name.
+/// Ends the trace; does nothing if none was begun. Removes the file of a trace without a span: the run was refused, and its next
+/// attempt may use the name.
 ///
 /// # Errors
 /// A part of the trace could not be written.

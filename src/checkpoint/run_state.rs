@@ -5,10 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 7 did not count first exposures, version 6 had no blocks of
-//! photos, version 5 neither outliers nor checks of
-//! growth, version 4 no appearance either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
-//! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures. Version 6 also lacks blocks of photos,
+//! version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that of a run without it. No program
+//! was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new
+//! version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -125,8 +125,8 @@ pub struct TrainerState {
 }
 
 impl TrainerState {
-    /// This state for a trainer that began as `fresh`: lists by view or camera that have another length than the trainer's begin
-    /// again. They come from an older program, or from other photos.
+    /// This state, for a trainer whose initial state is `fresh`. A list by view or by camera of another length than in `fresh` comes from
+    /// an older program or from other photos: that of `fresh` replaces it.
     pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
         if !self.appearance.is_as_large_as(&fresh.appearance) {
             (self.appearance, self.first_exposures) = (fresh.appearance, fresh.first_exposures);

@@ -15,7 +15,7 @@ crate::wgsl_struct! {
         pub isects_room: u32,
         /// Entries of one tile's list that the recorded blending covers.
         pub list_room: u32,
-        /// More than one row in so many with unusable gradients closes the gate.
+        /// The gate closes if more than one in this many rows has unusable gradients.
         pub rows_per_unusable: u32,
         /// Word of the counts with the number of listed rows.
         pub rows_at: u32,

@@ -1,7 +1,7 @@
 //! Training views that are held out while the run decides its count.
 //!
-//! Some evenly spread training views are not trained on as long as the scene may grow; in the turn of each, the next view
-//! is trained. From then on they are training views like all others. The views of the evaluation have no part in this.
+//! Some evenly spread training views are not trained on as long as the scene may grow. The next view is trained in their turn.
+//! Afterwards they are training views like all others. Evaluation views have no part in this.
 //!
 //! Not here: the checks that they serve (`growth_checks`).
 //!
@@ -16,7 +16,7 @@ use crate::dataset::loader::Dataset;
 use crate::densify::strategy::Strategy;
 use std::sync::Arc;
 
-/// Of so many training views one is held out, if that makes at least [`VIEWS_LEAST`] and at most [`VIEWS_MOST`].
+/// One in this many training views is held out, if that makes at least [`VIEWS_LEAST`] and at most [`VIEWS_MOST`].
 const ONE_OF: usize = 16;
 const VIEWS_LEAST: usize = 3;
 const VIEWS_MOST: usize = 16;

@@ -20,7 +20,7 @@ use crate::train::step::pages::PagedScene;
 use crate::train::step::view::{batches, begin};
 use crate::train::step::working_set::WorkingSet;
 
-/// One row of so many of the drawn ones is left out.
+/// One in this many drawn rows is left out.
 const LEFT_OUT_OF: usize = 4;
 
 /// What a view needs to be drawn and compared.

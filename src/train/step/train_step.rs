@@ -24,7 +24,7 @@ use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
 use std::collections::VecDeque;
 
-/// More than one row in so many with unusable gradients skip a step.
+/// A step is skipped if more than one in this many rows has unusable gradients.
 pub(super) const ROWS_PER_UNUSABLE: u64 = 10_000;
 
 /// Whether so many of the rows of a view are too many to go on without them.
