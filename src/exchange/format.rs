@@ -44,7 +44,7 @@ impl ExportFormat {
             () if path.file_name().is_some_and(|name| name == TREE_FILE) => Ok(ExportFormat::Sog),
             () => {
                 let remedy = format!("use {}", ExportFormat::NAMES);
-                Err(InputError::new(path, "this file name names no format", remedy))
+                Err(InputError::new(path, "no export format has this file name", remedy))
             }
         }
     }

@@ -250,9 +250,9 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
     page.heading("Number of Gaussians");
     page.paragraph(&format!(
-        "The run decided that up to {} Gaussians pay (--quality). Training photos that were held out until then lost so many \
-         decibels without the quarter of the Gaussians that weighs least in each of them. Where they lose more than growth pays \
-         from, the scene grows.",
+        "The run decided that up to {} Gaussians pay (--quality). The chart shows what training photos that were held out lost, in \
+         each check, without the quarter of the Gaussians that weighs least in them. The scene grows if that loss exceeds the \
+         threshold from which growth pays.",
         short(allowed)
     ));
     let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();

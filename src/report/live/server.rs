@@ -41,7 +41,7 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
             axum::serve(listener, app).await
         });
         if let Err(error) = served {
-            eprintln!("warning: the live page is gone: {error}");
+            eprintln!("warning: the live page has stopped: {error}");
         }
     })?;
     Ok(())
@@ -53,7 +53,7 @@ async fn check_host(State(live): State<Live>, request: Request, next: Next) -> R
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
     match is_own_host(live.address(), host) {
         true => next.run(request).await,
-        false => (StatusCode::FORBIDDEN, "this page has another address").into_response(),
+        false => (StatusCode::FORBIDDEN, "this page answers only requests to its own address").into_response(),
     }
 }
 
@@ -105,7 +105,7 @@ async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Respon
     match asked {
         Ok(Some(Ok(png))) => fresh("image/png", png),
         Ok(Some(Err(why))) => (StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
-        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time; it may be busy").into_response(),
+        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time: it may be busy").into_response(),
     }
 }
 
