@@ -118,7 +118,7 @@ pub struct TrainerState {
     pub outliers: ViewOutliers,
     /// What a run that decides its count knows of it.
     pub growth: GrowthState,
-    /// What is known of the blocks of photos that show what the scene does not.
+    /// The states of the blocks of photos, from which masks of moving objects follow.
     pub blocks: BlockOutliers,
     /// Photos whose exposure started from EXIF data.
     pub first_exposures: u32,

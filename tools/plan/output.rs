@@ -1,4 +1,4 @@
-//! What `gsscale-plan` prints of its plans: JSON, or text with a table.
+//! The output of `gsscale-plan`: JSON, or text with a table.
 //!
 //! Not here: the plans.
 

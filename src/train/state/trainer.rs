@@ -79,7 +79,7 @@ pub struct Trainer {
     pub(super) idle: Idle,
     /// The caller does nothing with the scene between the step that it takes and the next one, which may be recorded ahead.
     pub(crate) goes_ahead: bool,
-    /// What kept a step from being recorded ahead.
+    /// The error that kept a step from being recorded ahead.
     pub(super) ahead_failed: Option<TrainError>,
     /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
     pub(super) rows_of_views: Vec<u32>,
@@ -361,7 +361,7 @@ impl Trainer {
         }
     }
 
-    /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
+    /// Stores how many of the rows in the pages of a view were drawn, and whether the view was one batch.
     fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
         self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
         self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);

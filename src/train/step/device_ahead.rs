@@ -6,14 +6,14 @@
 //! device          │ picture ....................... loss .................. gradients .............................│ update
 //! ```
 //!
-//! The list of a next view's pages follows from the bounds before this step, so it may name too few or too many. What a step touches
-//! follows from the bounds at that step ([`DeviceTier::load`]): a page that the list lacks is copied then, and a page too many changes no
-//! bit.
+//! The list of the next view's pages is computed from the bounds before this step, so it may lack pages or have superfluous ones. The
+//! pages that a step touches follow from the bounds at that step ([`DeviceTier::load`]): a missing page is copied then, and a superfluous
+//! page changes no bit.
 //!
 //! Not here: copies for the present step (`device_tier`).
 //!
-//! Invariants: 1. no page of this view or of the next one makes room; 2. a copy that finds no memory or no slot is left to the next step;
-//! 3. a page that comes back is in [`DeviceTier::leaving`] alone, neither held nor released, until its frame is filled.
+//! Invariants: 1. no page of this view or of the next one makes room; 2. a copy for which there is no memory or no slot is left to the
+//! next step; 3. a page that comes back is in [`DeviceTier::leaving`] alone, neither held nor released, until its frame is filled.
 
 use super::device_tier::{DeviceTier, device_of};
 use super::pages::PagedScene;

@@ -1,12 +1,12 @@
-//! The pages of a run on a device: which page lies in which slot, which slots are newer than their frames, and what was copied.
+//! The cache of pages on a device: which page lies in which slot, which slots are newer than their frames, and traffic counters.
 //!
 //! A device is one more level of the cache of [`crate::paging`], with the same table of frames and the same order of
 //! eviction. A page that lies on the device has its frame as well while a step works on it, and until its slot was copied
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: steps in flight (`device_flights`); copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
-//! it, and the step waits.
+//! Not here: steps in flight (`device_flights`); copies for the next step while the device computes this one (`device_ahead`). A page
+//! that neither has copied is copied when a step needs it, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
@@ -35,7 +35,7 @@ pub const SLOTS_SHARE: u64 = 2;
 /// Slots that a growing scene adds at once, in parts of those it has.
 const MORE_SLOTS_SHARE: usize = 4;
 
-/// What was copied between frames and slots.
+/// Traffic between frames and slots.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SlotTraffic {
     /// Payloads copied to the device.
