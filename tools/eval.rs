@@ -95,7 +95,7 @@ fn scene_of(ply: &Path) -> InputResult<PathBuf> {
         return Ok(scene);
     }
     let remedy = format!("if it was moved: gsscale-eval {} SCENE", ply.display());
-    Err(InputError::new(&scene, "the scene of this run is not there", remedy))
+    Err(InputError::new(&scene, "the scene of this run is missing", remedy))
 }
 
 fn read_config(path: Option<&Path>) -> InputResult<TrainConfig> {

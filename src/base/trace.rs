@@ -1,5 +1,5 @@
-//! A trace of the process: what its host threads did, and when, as JSON in Chrome's trace-event format. Perfetto
-//! (<https://ui.perfetto.dev>) and `chrome://tracing` open it.
+//! A trace of the process: the spans of work of its host threads, with their times, as JSON in Chrome's trace-event format.
+//! Perfetto (<https://ui.perfetto.dev>) and `chrome://tracing` open it.
 //!
 //! A process has at most one trace. Each span is written when it ends, so a process that is killed leaves a file that viewers still open:
 //! the format allows the closing bracket to be missing.

@@ -31,7 +31,7 @@ impl PartFolder {
     /// # Errors
     /// The folder cannot be written, `target` names no folder, or the folder exists and holds foreign files.
     pub fn create(target: &Path, is_ours: IsOurs) -> InputResult<PartFolder> {
-        let no_name = || InputError::new(target, "this path names no folder of its own", "name a new folder");
+        let no_name = || InputError::new(target, "this path names no folder", "name a new folder");
         let name = target.file_name().ok_or_else(no_name)?;
         let beside = |ending: &str| {
             let mut hidden = std::ffi::OsString::from(".");

@@ -1,4 +1,4 @@
-//! The count that a run decides itself: growth in stages, as long as more Gaussians pay.
+//! The number of Gaussians, where the run decides it: growth in stages, as long as more Gaussians pay.
 //!
 //! A few training views are held out while the scene may grow. Before a round, each of them is drawn with all Gaussians, and
 //! without the quarter of the drawn ones that have the least blending weight in it. Where Gaussians are scarce even the
@@ -14,8 +14,8 @@
 //! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`), which rows grow
 //! ([`super::long_axis`]).
 //!
-//! Invariants: 1. a decision is a function of the step, of the loss, and of the decisions before it, which a commit holds;
-//! 2. the count that is allowed never falls.
+//! Invariants: 1. a decision is a function of the step, the loss and the earlier decisions, which are part of commits; 2.
+//! the allowed number never falls.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;

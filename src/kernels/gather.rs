@@ -2,9 +2,9 @@
 //! `shaders/gather.wgsl`, in which the functions are entry points.
 //!
 //! [`cull`] lists the rows of each page that the camera may draw, [`list`] packs the lists in the order of the pages,
-//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the host does
-//! not wait for the numbers of rows, [`place`] finds where the list of each page begins; a list has room for more rows than there
-//! are then, and entries without a row ([`UNLISTED`]) are transparent.
+//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the
+//! host does not wait for the numbers of rows, [`place`] finds where the list of each page begins. The list then has spare
+//! room, and entries without a row ([`UNLISTED`]) are transparent.
 //!
 //! One workgroup of a device finds the bounds of a page, by minima and maxima in its own memory. Bounds therefore need no
 //! atomic operations on floats in the form of ordered integers.

@@ -1,4 +1,4 @@
-//! Outliers: what in the photos contradicts the rest of the scene.
+//! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
 //! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks.
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).

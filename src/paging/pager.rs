@@ -1,9 +1,10 @@
 //! The pager hands out the pages of a view and takes them back.
 //!
-//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which pages are
-//! in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several parts stand in
-//! files of their own: `fetch` brings what is needed now, `batches` walks a view that is larger than the frames, `prefetch` what will be needed, `transfers` begins and ends reads and
-//! write-backs, `commit` makes what the pages hold durable.
+//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which
+//! pages are in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several
+//! parts stand in files of their own: `fetch` reads the pages of the current step, `prefetch` those of coming steps,
+//! `batches` walks a view that is larger than the frames, `transfers` begins and ends reads and write-backs, `commit` makes
+//! the pages durable.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
 //! 2. a page's buffer is in one place: in its frame, with the mover, or with the caller who pinned it; 3. what a step

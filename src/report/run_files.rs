@@ -1,4 +1,4 @@
-//! The files in the output folder of a run: names, kinds, and which of them belong to what part of a run.
+//! The files in the output folder of a run: names, kinds, and the part of a run that each belongs to.
 //!
 //! Not here: their content, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
 //! another file into the folder adds it, and so it is removed with the rest when a run replaces an earlier one.

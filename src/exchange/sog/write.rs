@@ -56,7 +56,7 @@ pub fn memory_bytes() -> u64 {
 /// The folder that a path of a `lod-meta.json` names.
 ///
 /// # Errors
-/// The path names no folder of its own.
+/// The path names no folder.
 pub fn folder_of_tree(path: &Path) -> InputResult<&Path> {
     let folder = path.parent().unwrap_or(Path::new(""));
     match folder.components().next_back() {
@@ -207,7 +207,7 @@ impl SogWriter {
 impl GaussianSink for SogWriter {
     fn write(&mut self, columns: &Columns) -> InputResult<()> {
         if columns.sh_degree > self.sh_degree {
-            return Err(InputError::new(&self.path, "rows with more bands than announced", "report this as a bug"));
+            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
         }
         for row in 0..columns.rows() {
             self.given += 1;

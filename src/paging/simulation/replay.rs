@@ -4,11 +4,12 @@
 //! [`EvictPolicy::FarthestNextUse`], without reading ahead, and with a plan that looks at least two epochs ahead, it reads
 //! Belady's bound: no cache with that many frames can read fewer pages for the same views in the same order.
 //!
-//! The model of time: one drive serves one request after the other, reads in the order of steps. Each read is preceded by the
-//! write-back of the page that is evicted for it. A page is evicted at the end of the step that last needs it, but at most
-//! [`STEPS_AHEAD`] steps before the one that it is evicted for, and any frame serves any read. A step takes the same time
-//! everywhere. The run waits for what is still missing when a step could start. A replay that reads ahead evicts pages as a run
-//! does. Not modelled: how many bytes may be in flight, and when in a step the run looks what has ended.
+//! The model of time: one drive serves one request after the other, reads in the order of steps. Each read is preceded by
+//! the write-back of the page that is evicted for it. A page is evicted at the end of the step that last needs it, but at
+//! most [`STEPS_AHEAD`] steps before the step that needs its frame, and any frame serves any read. A step takes the same
+//! time everywhere. The run waits for what is still missing when a step could start. A replay that reads ahead evicts pages
+//! as a run does. Not modelled: the limit on bytes in flight, and the moments in a step at which the run polls for
+//! completed transfers.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
 //! page moves, whole pages only; every evicted page was changed and is written, unless its share says otherwise.

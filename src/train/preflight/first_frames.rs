@@ -2,7 +2,8 @@
 //!
 //! Not here: frames of a scene that has grown (`fitting`).
 //!
-//! Invariant: a budget that holds no batch of the largest view is refused, with the least budget that would do.
+//! Invariant: a budget that holds no batch of the largest view is refused, and the error names the smallest budget that
+//! suffices.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};

@@ -1,4 +1,4 @@
-//! appearance.json: what a run has found of its photos and cameras, as plain numbers for people and other programs.
+//! appearance.json: the trained corrections of photos and cameras, as plain numbers for people and other programs.
 
 use crate::appearance::model::CHANNEL_VALUES;
 use crate::base::error::{InputError, InputResult};

@@ -58,7 +58,7 @@ impl Finished<'_> {
         machine::set_up(&self.config)?;
         if !scene.exists() {
             let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
-            return Err(InputError::new(scene, "the scene of this run is not there", remedy).into());
+            return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
         }
         let kept = keep_result(out, summary.steps)?;
         eprintln!(

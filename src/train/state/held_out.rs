@@ -1,12 +1,12 @@
 //! Training views that are held out while the run decides its count.
 //!
-//! Some evenly spread training views are not trained on as long as the scene may grow. The next view is trained in their turn.
-//! Afterwards they are training views like all others. Evaluation views have no part in this.
+//! As long as the scene may grow, some evenly spread training views are not trained on; in the turn of such a view, the run
+//! trains the view after it. Afterwards they are training views like all others. Evaluation views have no part in this.
 //!
 //! Not here: the checks that they serve (`growth_checks`).
 //!
-//! Where training views are too few to hold some out, nothing says what more Gaussians bring, and the run keeps the number
-//! that it starts with.
+//! With too few training views to hold some out, the gain from more Gaussians is unknown, and the run keeps the number that
+//! it starts with.
 //!
 //! Invariant: which view a step trains on is a function of the step and the views.
 

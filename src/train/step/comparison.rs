@@ -1,8 +1,8 @@
 //! Correction, masks and loss: all that happens between the picture of a view and the gradient of its splats, in training steps and in
 //! the rehearsal before the first step.
 //!
-//! A second loss term is added in `Comparison::loss_and_back`, as the correction of the picture is ([`crate::appearance`]);
-//! what it needs is a field of [`Comparison`], so that step and rehearsal pass it on unchanged.
+//! A second loss term goes into `Comparison::loss_and_back`, beside the correction of the picture ([`crate::appearance`]).
+//! Its inputs are a field of [`Comparison`], so that step and rehearsal pass them on unchanged.
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
 //! picture stays where the renderer keeps it, and masks of blocks only read it; 3. the loss, its gradient and the errors that

@@ -1,5 +1,5 @@
-//! Copies for the next step while the device computes this one: payloads that the next view needs and the device lacks go up, and
-//! pages that make room for them come back.
+//! Prefetch for the next step while the device computes this one: uploads payloads that the next view needs and the device
+//! lacks, and reads back the pages that are evicted for them.
 //!
 //! ```text
 //! host    rows in │ begin_ahead: read-backs begin │ loss, gradients begin │ load_ahead: frames filled, payloads up │ wait, update
@@ -12,8 +12,9 @@
 //!
 //! Not here: copies for the present step (`device_tier`).
 //!
-//! Invariants: 1. no page of this view or of the next one makes room; 2. a copy for which there is no memory or no slot is left to the
-//! next step; 3. a page that comes back is in [`DeviceTier::leaving`] alone, neither held nor released, until its frame is filled.
+//! Invariants: 1. no page of this view or of the next one is evicted; 2. a copy for which there is no memory or no slot is
+//! left to the next step; 3. a page that is read back is in [`DeviceTier::leaving`] alone, neither held nor released, until
+//! its frame is filled.
 
 use super::device_tier::{DeviceTier, device_of};
 use super::pages::PagedScene;

@@ -271,7 +271,7 @@ impl DeviceTier {
             let done = device_of(renderer)?.finish_step()?;
             self.release_flight(scene, &behind.pages);
             if done.closed == 0 {
-                let problem = "a step was taken behind one that was not";
+                let problem = "a step was taken after a step that was given up";
                 return Err(InputError::new("the device", problem, "report this as a bug").into());
             }
         }

@@ -5,8 +5,8 @@
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: steps in flight (`device_flights`); copies for the next step while the device computes this one (`device_ahead`). A page
-//! that neither has copied is copied when a step needs it, and the step waits.
+//! Not here: steps in flight (`device_flights`); copies for the next step while the device computes this one
+//! (`device_ahead`). A page that neither file has copied ahead is copied on demand, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
