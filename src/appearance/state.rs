@@ -103,7 +103,7 @@ impl AppearanceState {
         }
     }
 
-    /// Whether the values are of as many photos and cameras as `other`.
+    /// Whether both have the same numbers of photos and cameras.
     pub fn is_as_large_as(&self, other: &AppearanceState) -> bool {
         (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
     }

@@ -114,9 +114,9 @@ pub struct TrainerState {
     pub test: Option<LastTest>,
     /// The values of photos and cameras.
     pub appearance: AppearanceState,
-    /// What is known of views whose photo contradicts the scene.
+    /// State of the views whose photo contradicts the scene.
     pub outliers: ViewOutliers,
-    /// What a run that decides its count knows of it.
+    /// State of the decision about the count.
     pub growth: GrowthState,
     /// The states of the blocks of photos, from which masks of moving objects follow.
     pub blocks: BlockOutliers,

@@ -168,7 +168,8 @@ fn split_child(parent: &RowBlock, seed: u64, uid: u64, event: u64) -> RowBlock {
 /// at random.
 ///
 /// The factors were the best of those measured (children at 0.5 or 0.87 sigma, unshrunk short axes and full opacity were
-/// worse by 0.1 dB each): the children together cover the parent's length and hide about what it hid.
+/// worse by 0.1 dB each): the children together cover the length of the parent and occlude about as much as the parent
+/// did.
 fn long_axis_children(parent: &RowBlock) -> [RowBlock; 2] {
     let (scales, quats, opacity) =
         (first_lane(Column::Scales), first_lane(Column::Quats), first_lane(Column::Opacities));

@@ -36,7 +36,7 @@ pub const UNLISTED: u32 = u32::MAX;
 /// Opacity, before activation, of entries without a row.
 const HIDDEN_LOGIT: f32 = -100.0;
 
-/// What the stage reads: the pages of a batch, the slab that is bound, and the optimizer's numbers.
+/// Input of the stage: the pages of a batch, the slab that is bound, and the optimizer's numbers.
 #[derive(Debug, Clone, Copy)]
 pub struct GatherInput<'a> {
     /// Uniforms of the dispatch.

@@ -171,7 +171,7 @@ impl BlockOutliers {
         (size_of::<Vec<BlockState>>() + size_of::<BlockState>() * BlockGrid::of(width, height).blocks()) as u64
     }
 
-    /// Whether it has as many views as `other`.
+    /// Whether both have the same number of views.
     pub fn is_as_large_as(&self, other: &BlockOutliers) -> bool {
         self.views.len() == other.views.len()
     }

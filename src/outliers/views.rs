@@ -81,7 +81,7 @@ impl ViewOutliers {
         ViewOutliers { views: vec![ViewState::default(); views] }
     }
 
-    /// Whether it has as many views as `other`.
+    /// Whether both have the same number of views.
     pub fn is_as_large_as(&self, other: &ViewOutliers) -> bool {
         self.views.len() == other.views.len()
     }

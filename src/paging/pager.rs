@@ -39,7 +39,7 @@ pub struct PagerConfig {
     pub page_rows: usize,
     /// Degree of the scene: a frame holds a full page of that degree.
     pub sh_degree: u8,
-    /// The most pages in memory; `usize::MAX` for as many as there are.
+    /// The most pages in memory; `usize::MAX` for no limit.
     pub frames: usize,
     /// Which page is evicted first.
     pub policy: EvictPolicy,
@@ -343,7 +343,7 @@ impl Pager {
         self.frames.frames()
     }
 
-    /// The most frames that there may be; `usize::MAX` for as many as needed.
+    /// The limit on frames; `usize::MAX` for no limit.
     pub fn frames_max(&self) -> usize {
         self.frames.frames_max()
     }
@@ -358,7 +358,8 @@ impl Pager {
         self.frames.state(page).is_some()
     }
 
-    /// What the frame of a page holds behind the header; `None` for a page that is not in memory, is pinned, or is moving.
+    /// The payload in the frame of a page, without the header; `None` for a page that is not in memory, is pinned, or is
+    /// moving.
     pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
         self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
     }

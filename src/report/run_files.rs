@@ -46,7 +46,7 @@ pub enum RunFile {
     Pictures(&'static str),
 }
 
-/// What a file is about. It decides when a later run in the folder removes the file.
+/// The part of a run that a file describes. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
     /// How the run began.

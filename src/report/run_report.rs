@@ -189,8 +189,8 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts
 }
 
-/// Adds a noisy curve: pale, and its running mean before it where it has points enough for one. Returns also what a caption says
-/// of the mean.
+/// Adds a noisy curve in a pale colour and, where it has enough points, its running mean in front. Also returns the words
+/// of the caption on the mean.
 fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> (Chart, &'static str) {
     let mean = smoothed(&points);
     if mean.is_empty() {

@@ -144,10 +144,11 @@ impl ViewOrder {
     }
 }
 
-/// Orders groups along a short tour through their centres, from a random group in a random direction, so that neighbouring groups
-/// follow each other. On a survey whose views see 7 % of the pages, with a quarter of the pages in memory, 25 groups read .021
-/// of what they need in this order and .040 in random order, 100 groups .021 and .084 (`tests/storage/replay.rs` prints such
-/// figures); what training loses is only that a group's neighbour comes next, which its next epoch turns round anyway.
+/// Orders groups along a short tour through their centres, from a random group in a random direction, so that
+/// neighbouring groups follow each other. On a survey whose views see 7 % of the pages, with a quarter of the pages in
+/// memory, 25 groups read .021 of what they need in this order and .040 in random order, 100 groups .021 and .084
+/// (`tests/storage/replay.rs` prints such figures); the price is that a neighbouring group comes next, and the next epoch
+/// draws another direction anyway.
 fn order_groups(places: &[Place], groups: &mut Vec<Vec<u32>>, draws: &mut Stream) {
     let middles: Vec<Place> = groups.iter().map(|group| mean(places, group)).collect();
     let mut way = tour(&middles);

@@ -22,7 +22,8 @@ pub fn walk(pages: &[PageNo], frames: usize) -> impl Iterator<Item = &[PageNo]> 
     pages.chunks(per_batch).chain(pages.chunks(per_batch).rev().skip(1))
 }
 
-/// Of views with these numbers of pages: how many need several batches, and the most batches of one of them, 1 at least.
+/// For views with these numbers of pages: the number of views that need several batches, and the most batches of a view
+/// (at least 1).
 pub fn cut_views(pages: impl Iterator<Item = usize>, frames: usize, pages_most: usize) -> (usize, usize) {
     pages.fold((0, 1), |(views, most), pages| {
         let batches = pages.div_ceil(pages_per_batch(pages, frames).min(pages_most).max(1));

@@ -64,7 +64,7 @@ impl CpuRenderer {
         }
     }
 
-    /// Frees what the packed splats hold too.
+    /// Frees the buffers whose content the packed splats repeat.
     pub(super) fn free_after_pack(&mut self) {
         self.note_bytes();
         if self.is_crowded {

@@ -27,8 +27,8 @@ impl Trainer {
         ViewMemory { now, at_last }
     }
 
-    /// Memory of a view whose pages hold `rows` rows, in one batch: what is held already, unless no view with as many rows was
-    /// one batch so far.
+    /// Memory of a view whose pages hold `rows` rows, in one batch: the memory held now, if a view of that many rows has
+    /// been one batch before.
     fn view_memory_of(&self, rows: u64) -> ViewMemory {
         let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
         if rows <= self.whole_rows {

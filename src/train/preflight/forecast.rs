@@ -27,10 +27,11 @@ const ADDED_BY_A_ROUND: f64 = 20_000.0;
 const ROUND_STEPS: f64 = 33.0;
 /// Rounds that are further apart add more: their number grows with this power of the steps between them.
 const ROUND_POWER: f64 = 0.4;
-/// Most Gaussians that a round adds, as a share of those that are there: what the first rounds of a scene of few points add.
+/// Most Gaussians that a round adds, as a share of the existing ones: the share that the first rounds of a scene with few
+/// points add.
 const ADDED_MOST: f64 = 0.6;
-/// Gaussians that a run decides for, over the first ones: 1.0 on seneca and brighton, 2.8 on sheffield_cross, see "A count that the
-/// program decides" in `benches/RESULTS.md`.
+/// The number of Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.8 on sheffield_cross,
+/// see "A count that the program decides" in `benches/RESULTS.md`.
 const DECIDED: f64 = 2.0;
 /// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power of
 /// their number.

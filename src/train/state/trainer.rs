@@ -348,8 +348,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Copies back what is newer on a device than in memory, so that the pages and their histogram are those of the last
-    /// step. Nothing for a run that updates in host memory.
+    /// Copies back the pages that are newer on a device than in memory, so that the pages and their histogram are those
+    /// of the last step. Nothing for a run that updates in host memory.
     ///
     /// # Errors
     /// The device failed: the run can go on from its last commit only.

@@ -35,8 +35,8 @@ fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
 }
 
 impl DeviceTier {
-    /// Chooses the pages that 0-based `step`, the next one, needs for `camera` and the device lacks, and begins the copies back of those
-    /// that make room for them. Does not wait.
+    /// Chooses the pages that 0-based `step`, the next one, needs for `camera` and the device lacks, and begins to read
+    /// back the pages that are evicted for them. Does not wait.
     pub(super) fn begin_ahead(
         &mut self,
         scene: &mut PagedScene,

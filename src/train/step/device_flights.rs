@@ -48,9 +48,9 @@ use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use std::collections::BTreeSet;
 
-/// Steps after one that lacked memory in which none is recorded.
+/// After a step that lacked memory, no step is recorded for this number of steps.
 const STEPS_WITHOUT: u32 = 16;
-/// Rows beside the likely ones that a list has room for.
+/// Spare room of a list, rows, beyond the number that is expected.
 const ROWS_MORE: u64 = 256;
 
 /// A step to record.
@@ -108,8 +108,8 @@ impl DeviceTier {
         self.in_flight() < self.flights.most
     }
 
-    /// The pages that `camera` may need once the steps in flight are done, by bounds as wide as one of these, taken after `now` steps,
-    /// can make them; ascending by id.
+    /// The pages that `camera` may need once the steps in flight are done, ascending by id. The bounds are widened by the
+    /// most that a step after `now` steps can move them.
     pub(super) fn pages_behind(&self, scene: &PagedScene, camera: &Camera, now: u32) -> Vec<PageNo> {
         let mut pages = scene.pager.pages_of_view(camera);
         if self.flights.pages.is_empty() {
@@ -264,7 +264,7 @@ impl DeviceTier {
         Ok(Some(outcome))
     }
 
-    /// Gives up the steps in flight behind one that was not taken, and opens the gate.
+    /// Gives up the steps in flight behind a step that was not taken, and opens the gate.
     fn give_up(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
         let _span = trace::span("give up").with("behind", self.in_flight() as u64);
         while let Some(behind) = self.flights.steps.pop_front() {
@@ -316,7 +316,7 @@ impl DeviceTier {
         self.release(scene, done);
     }
 
-    /// Fails if the step behind the one that has ended lacks a page that its view needs.
+    /// Fails if the next step in flight lacks a page that its view needs.
     fn check_list_behind(&self, scene: &PagedScene) -> Result<(), TrainError> {
         let Some(behind) = self.flights.steps.front() else { return Ok(()) };
         let needed = scene.pager.pages_of_view(&behind.camera);

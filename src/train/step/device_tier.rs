@@ -32,7 +32,7 @@ use std::collections::BTreeMap;
 
 /// The share of the device memory of a run that slots may take; views keep the rest.
 pub const SLOTS_SHARE: u64 = 2;
-/// Slots that a growing scene adds at once, in parts of those it has.
+/// A growing scene adds its number of slots over this number at once.
 const MORE_SLOTS_SHARE: usize = 4;
 
 /// Traffic between frames and slots.
@@ -94,7 +94,8 @@ pub(crate) fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
 }
 
-/// How many slots for payloads of at most `payload` bytes a device memory of `device_mem` bytes holds, beside what a view takes.
+/// Number of slots, for payloads of at most `payload` bytes, in a device memory of `device_mem` bytes beside the memory
+/// of a view.
 pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
     usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
 }
@@ -224,7 +225,7 @@ impl DeviceTier {
         Ok(pinned)
     }
 
-    /// Copies held pages back until at most `most` are held, those that are needed last first, but none of `kept`.
+    /// Copies held pages back until at most `most` are held, the pages with the farthest next use first, but none of `kept`.
     fn drain_to(
         &mut self,
         scene: &mut PagedScene,
@@ -296,8 +297,8 @@ impl DeviceTier {
         copied
     }
 
-    /// Copies all held pages back, and adds what the device counted to the histogram: the scene is as though the host had taken
-    /// all steps.
+    /// Copies all held pages back and adds the counts of the device to the histogram. The scene is then as if the host
+    /// had taken all steps.
     ///
     /// # Errors
     /// The device failed; the pages that are still held exist there alone.
@@ -310,7 +311,7 @@ impl DeviceTier {
         self.take_bins(scene, renderer)
     }
 
-    /// Adds what the device counted to the histogram.
+    /// Adds the counts of the device to the histogram.
     ///
     /// # Errors
     /// The device failed.

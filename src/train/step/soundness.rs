@@ -51,8 +51,7 @@ fn no_gaussian_left(dataset: &Dataset) -> InputError {
 /// Counts the skipped rows and steps of a step in `state`, and warns of the first. `init_ply` is the file from which the
 /// run started, or empty.
 ///
-/// # Errors
-/// This is one of [`UNSOUND_STEPS_MAX`] unsound steps in a row.
+/// # Errors This step is the last of [`UNSOUND_STEPS_MAX`] unsound steps in a row.
 pub(crate) fn note_soundness(
     state: &mut TrainerState,
     outcome: &StepOutcome,

@@ -283,7 +283,7 @@ impl Passes<'_> {
         Ok(are_too_many(unusable, self.outcome.rows).then_some(Skipped::Gradients(unusable)))
     }
 
-    /// Begins reads during the pass in: of the next batch, or of the next steps where there is none.
+    /// Begins reads during the pass in: of the next batch or, after the last batch, of the next steps.
     fn prefetch(&mut self, coming: &VecDeque<PageNo>, per_batch: usize) {
         if coming.is_empty() && self.batches.is_empty() {
             return self.scene.pager.prefetch(self.step);
@@ -292,7 +292,7 @@ impl Passes<'_> {
         self.scene.pager.prefetch_batch(&next);
     }
 
-    /// Begins reads during the pass out: of the batch before, or of the next steps where there is none.
+    /// Begins reads during the pass out: of the preceding batch or, at the first batch, of the next steps.
     fn prefetch_before_last(&mut self) {
         // While a batch is taken out, it is no longer in the list.
         let is_out = usize::from(self.outcome.batches != self.batches.len());
