@@ -168,6 +168,7 @@ struct Row {
 }
 
 fn main() -> ExitCode {
+    gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
     match start(&parse_command_line()) {
         Ok(text) => {

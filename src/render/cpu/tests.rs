@@ -159,6 +159,28 @@ fn a_crowded_view_gives_buffers_up_and_keeps_its_bits() {
     }
 }
 
+/// A renderer says before a view what the rows of the view will take, and gives this memory back.
+#[test]
+fn memory_of_rows_is_stated_before_a_view_and_freed_after_it() {
+    let (rows, camera) = scene(60_000, 123, 77);
+    for list_bytes in [None, Some(7_500 * (LIST_BYTES + 8))] {
+        let mut renderer = CpuRenderer::new();
+        renderer.set_list_bytes(list_bytes);
+        renderer.weigh_rows(true).unwrap();
+        let stated = renderer.host_bytes_for_rows(60_000);
+        let one = bits_of_batches(&mut renderer, &rows, &camera, &[60_000]);
+        let held = renderer.host_bytes_of_rows();
+        assert!(held <= stated, "{held} bytes, {stated} stated, lists {list_bytes:?}");
+        // A first allocation spares nothing, and a crowded view does not hold its largest buffers at one time.
+        assert!(stated <= held + held / 3, "{stated} bytes stated, {held} held, lists {list_bytes:?}");
+        let beside = renderer.host_bytes() - held;
+        renderer.free_rows();
+        assert_eq!(renderer.host_bytes_of_rows(), 0);
+        assert!(renderer.host_bytes() <= beside, "{} bytes, {beside} beside the rows", renderer.host_bytes());
+        assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[60_000]), "lists {list_bytes:?}");
+    }
+}
+
 #[test]
 fn stages_out_of_order_are_errors_and_change_nothing() {
     let (rows, camera) = scene(600, 40, 30);

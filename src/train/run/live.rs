@@ -78,6 +78,7 @@ impl Trainer {
         let base = &dataset.views[view].camera;
         let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
         let camera = orbit_camera(base, pivot, self.options.up, orbit);
+        self.fit_widest([&camera]);
         let render = self.render_options();
         let now = (&mut self.scene, self.state.step, &mut self.working);
         draw(now, &mut *self.renderer, &camera, &render)?;
