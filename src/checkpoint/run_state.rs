@@ -5,9 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 6 had no blocks of photos, version 5 neither outliers nor checks of
-//! growth, version 4 no appearance either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
-//! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 7 had no motions of poses, version 6 no blocks of photos either,
+//! version 5 no outliers and no checks of growth either, version 4 no appearance either: they are read as those of a run
+//! without. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of
+//! `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -16,12 +17,15 @@ use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
+use crate::poses::state::PoseState;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 7;
-/// The version before blocks of photos: the same values without these, the last of the list.
+pub const VERSION: u32 = 8;
+/// The version before poses: the same values without these, the last of the list.
+const WITHOUT_POSES: u32 = 7;
+/// The version before blocks of photos: the same values without these and what came later.
 const WITHOUT_BLOCKS: u32 = 6;
 /// The version before outliers and checks of growth: the same values without these two and what came later.
 const WITHOUT_OUTLIERS: u32 = 5;
@@ -117,6 +121,8 @@ pub struct TrainerState {
     pub growth: GrowthState,
     /// What is known of the blocks of photos that show what the scene does not.
     pub blocks: BlockOutliers,
+    /// The motions of cameras.
+    pub poses: PoseState,
 }
 
 impl TrainerState {
@@ -131,6 +137,9 @@ impl TrainerState {
         }
         if !self.blocks.is_as_large_as(&fresh.blocks) {
             self.blocks = fresh.blocks;
+        }
+        if !self.poses.is_as_large_as(&fresh.poses) {
+            self.poses = fresh.poses;
         }
         self
     }
@@ -162,13 +171,13 @@ pub struct RunState {
 /// The values at the end that a state of an earlier version lacks, as those of a run without.
 fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
     let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-    let blocks = encoding::to_bytes(&BlockOutliers::default())?;
-    let before = match version {
-        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth))?,
-        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth))?,
-        _ => Vec::new(),
-    };
-    Ok([before, blocks].concat())
+    let (blocks, poses) = (BlockOutliers::default(), PoseState::default());
+    match version {
+        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks, poses)),
+        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks, poses)),
+        WITHOUT_BLOCKS => encoding::to_bytes(&(blocks, poses)),
+        _ => encoding::to_bytes(&poses),
+    }
 }
 
 /// Why bytes are not the state of a run.
@@ -221,7 +230,7 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
-            WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
+            WITHOUT_POSES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
                 RunState::decode(&[body, &lacking_in(version)?].concat())?
             }
             other => return Err(RunStateError::Version(other)),
@@ -235,12 +244,12 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, poses, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks, poses),
         ))
     }
 
@@ -250,7 +259,7 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks, poses),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -264,6 +273,7 @@ impl RunState {
             outliers,
             growth,
             blocks,
+            poses,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -309,8 +319,12 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, growth, blocks, .. } = &self.trainer;
-        let of_photos = appearance.check().and_then(|()| outliers.check()).and_then(|()| blocks.check());
+        let TrainerState { appearance, outliers, growth, blocks, poses, .. } = &self.trainer;
+        let of_photos = appearance
+            .check()
+            .and_then(|()| outliers.check())
+            .and_then(|()| blocks.check())
+            .and_then(|()| poses.check());
         of_photos.and_then(|()| growth.check(step)).or_else(refuse)
     }
 }
@@ -322,6 +336,7 @@ mod tests {
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
     use crate::outliers::blocks::look;
+    use crate::poses::gradient::MotionGradient;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 
@@ -333,6 +348,13 @@ mod tests {
         blocks.learn(2, look(&[], &picture, &photo).unwrap());
         assert!(blocks.masked_share() == Some(1.0 / 16.0));
         blocks
+    }
+
+    /// Three photos, the second of which has moved.
+    fn moved() -> PoseState {
+        let mut poses = PoseState::new(3);
+        poses.learn(1, &MotionGradient { shift: [0.0, 1.0, -0.5], turn: [0.25; 3] }, 1.5, 1e-3);
+        poses
     }
 
     fn sample() -> RunState {
@@ -380,6 +402,7 @@ mod tests {
                     ],
                 },
                 blocks: looked_at(),
+                poses: moved(),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -410,10 +433,13 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..state.trainer.clone() };
+        let of_7 = TrainerState { poses: PoseState::default(), ..state.trainer.clone() };
+        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
         let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        for (version, trainer) in [(WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)] {
+        let of_versions =
+            [(WITHOUT_POSES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)];
+        for (version, trainer) in of_versions {
             let lacking = lacking_in(version).unwrap();
             let without = RunState { trainer, ..state.clone() };
             let mut bytes = without.to_bytes().unwrap();
