@@ -5,10 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures. Version 6 also lacks blocks of photos,
-//! version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that of a run without it. No program
-//! was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of `encode` and `decode`, and a new
-//! version.
+//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures and the motions of poses. Version 6
+//! also lacks blocks of photos, version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that
+//! of a run without it. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end
+//! of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -17,13 +17,14 @@ use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
+use crate::poses::state::PoseState;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 8;
-/// The version before first exposures: the same values without their number, the last of the list.
-const WITHOUT_FIRST_EXPOSURES: u32 = 7;
+/// The version before first exposures and poses: the same values without these two, the last of the list.
+const WITHOUT_POSES: u32 = 7;
 /// The version before blocks of photos: the same values without these and what came later.
 const WITHOUT_BLOCKS: u32 = 6;
 /// The version before outliers and checks of growth: the same values without these two and what came later.
@@ -122,6 +123,8 @@ pub struct TrainerState {
     pub blocks: BlockOutliers,
     /// Photos whose exposure started from EXIF data.
     pub first_exposures: u32,
+    /// The motions of cameras.
+    pub poses: PoseState,
 }
 
 impl TrainerState {
@@ -136,6 +139,9 @@ impl TrainerState {
         }
         if !self.blocks.is_as_large_as(&fresh.blocks) {
             self.blocks = fresh.blocks;
+        }
+        if !self.poses.is_as_large_as(&fresh.poses) {
+            self.poses = fresh.poses;
         }
         self
     }
@@ -174,7 +180,7 @@ fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
         WITHOUT_BLOCKS => encoding::to_bytes(&blocks)?,
         _ => Vec::new(),
     };
-    Ok([before, encoding::to_bytes(&0u32)?].concat())
+    Ok([before, encoding::to_bytes(&(0u32, PoseState::default()))?].concat())
 }
 
 /// Why bytes are not the state of a run.
@@ -227,7 +233,7 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
-            WITHOUT_FIRST_EXPOSURES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
+            WITHOUT_POSES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
                 RunState::decode(&[body, &lacking_in(version)?].concat())?
             }
             other => return Err(RunStateError::Version(other)),
@@ -241,13 +247,13 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, poses, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
-            (appearance, outliers, growth, blocks, first_exposures),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ))
     }
 
@@ -258,7 +264,7 @@ impl RunState {
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
-            (appearance, outliers, growth, blocks, first_exposures),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -273,6 +279,7 @@ impl RunState {
             growth,
             blocks,
             first_exposures,
+            poses,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -318,8 +325,12 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, growth, blocks, .. } = &self.trainer;
-        let of_photos = appearance.check().and_then(|()| outliers.check()).and_then(|()| blocks.check());
+        let TrainerState { appearance, outliers, growth, blocks, poses, .. } = &self.trainer;
+        let of_photos = appearance
+            .check()
+            .and_then(|()| outliers.check())
+            .and_then(|()| blocks.check())
+            .and_then(|()| poses.check());
         of_photos.and_then(|()| growth.check(step)).or_else(refuse)
     }
 }
@@ -331,6 +342,7 @@ mod tests {
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
     use crate::outliers::blocks::look;
+    use crate::poses::gradient::MotionGradient;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 
@@ -342,6 +354,13 @@ mod tests {
         blocks.learn(2, look(&[], &picture, &photo).unwrap());
         assert!(blocks.masked_share() == Some(1.0 / 16.0));
         blocks
+    }
+
+    /// Three photos, the second of which has moved.
+    fn moved() -> PoseState {
+        let mut poses = PoseState::new(3);
+        poses.learn(1, &MotionGradient { shift: [0.0, 1.0, -0.5], turn: [0.25; 3] }, 1.5, 1e-3);
+        poses
     }
 
     fn sample() -> RunState {
@@ -390,6 +409,7 @@ mod tests {
                 },
                 blocks: looked_at(),
                 first_exposures: 2,
+                poses: moved(),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -420,12 +440,13 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_7 = TrainerState { first_exposures: 0, ..state.trainer.clone() };
+        let of_7 = TrainerState { first_exposures: 0, poses: PoseState::default(), ..state.trainer.clone() };
         let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
         let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        let later = [(WITHOUT_FIRST_EXPOSURES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5)];
-        for (version, trainer) in later.into_iter().chain([(WITHOUT_APPEARANCE, of_4)]) {
+        let of_versions =
+            [(WITHOUT_POSES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)];
+        for (version, trainer) in of_versions {
             let lacking = lacking_in(version).unwrap();
             let without = RunState { trainer, ..state.clone() };
             let mut bytes = without.to_bytes().unwrap();

@@ -179,6 +179,10 @@ config_keys! {
         /// side of a masked block is a 64th of the photo's longer side. At most a quarter of a photo is masked, from a tenth
         /// of the run on (step 500 at the latest). Masks of your own work better: see --masks
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
+        /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
+        /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. poses.json has the
+        /// refined ones. Not with --optimizer-on device
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }

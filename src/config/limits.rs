@@ -68,6 +68,8 @@ pub struct RunOptions {
     pub robust_views: bool,
     /// Whether blocks of photos that contradict the scene are masked.
     pub robust_pixels: bool,
+    /// Whether the poses of training photos are refined.
+    pub refine_poses: bool,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
@@ -124,6 +126,7 @@ impl RunOptions {
             appearance: config.appearance,
             robust_views: config.robust_views,
             robust_pixels: config.robust_pixels,
+            refine_poses: config.refine_poses,
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),

@@ -21,6 +21,8 @@ pub const REPORT_FILE: &str = "report.html";
 pub const PAGES_FILE: &str = "pages.json";
 /// Exposure and colours of each photo, vignetting of each camera: what `--appearance` has found.
 pub const APPEARANCE_FILE: &str = "appearance.json";
+/// The poses of training photos as `--refine-poses` leaves them.
+pub const POSES_FILE: &str = "poses.json";
 /// Folder of the pictures of the held-out views.
 pub const PICTURES_FOLDER: &str = "renders/test";
 /// PSNR and SSIM of each held-out view, beside its picture.
@@ -60,7 +62,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 15] = [
+pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -71,6 +73,7 @@ pub const RUN_FILES: [(RunFile, Tells); 15] = [
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),
+    (RunFile::File(POSES_FILE), Tells::Result),
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),

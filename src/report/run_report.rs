@@ -9,7 +9,8 @@ use super::numbers::short;
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
 use super::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, POSES_FILE, REPORT_FILE, SUMMARY_FILE,
+    VIEWS_FILE,
 };
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_grouped};
@@ -48,6 +49,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.charts(&tiers);
     }
     add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
+    add_poses(&mut page, &folder.join(POSES_FILE));
     add_outliers(&mut page, &summary);
     add_masked_share(&mut page, &summary);
     add_page_map(&mut page, &folder.join(PAGES_FILE));
@@ -285,6 +287,27 @@ fn add_appearance(page: &mut Page, path: &Path) {
         "Exposure of each training photo against the mean of all, as trained.{first} appearance.json has the numbers."
     );
     page.charts(&[(chart.svg(), caption)]);
+}
+
+/// How far the run has moved the cameras of its photos, if it refines poses.
+fn add_poses(page: &mut Page, path: &Path) {
+    let file = read_json(path).unwrap_or(Value::Null);
+    let of = |what: &str, which: &str| file[what][which].as_f64();
+    let (Some(median), Some(largest), Some(scale)) =
+        (of("shift", "median"), of("shift", "largest"), file["scene_scale"].as_f64())
+    else {
+        return;
+    };
+    let [turn, most] = ["median", "largest"].map(|which| of("turn_degrees", which).unwrap_or_default());
+    page.heading("Poses");
+    page.paragraph(&format!(
+        "The run has refined the poses of {} training photos (--refine-poses): against the dataset their cameras moved by {:.2} % \
+         of the scene's scale (median; {:.2} % at most) and turned by {turn:.2} degrees ({most:.2} at most). poses.json has the \
+         refined poses.",
+        file["refined"],
+        100.0 * median / scale,
+        100.0 * largest / scale,
+    ));
 }
 
 /// The training views whose photo contradicts the scene, if there are any.

@@ -76,7 +76,7 @@ impl Recipe {
         }
     }
 
-    fn settings(&self) -> Settings {
+    pub(super) fn settings(&self) -> Settings {
         let o = self.options();
         Settings {
             sh_degree: o.sh_degree,

@@ -55,8 +55,8 @@ const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
     ("white-balance", Disturbance::WhiteBalance { stops: 0.3 }, Some(correct_colors)),
     ("swapped5", Disturbance::Swapped { share: 0.05 }, Some(leave_out_views)),
     ("swapped10", Disturbance::Swapped { share: 0.1 }, Some(leave_out_views)),
-    ("poses005", Disturbance::PoseNoise { share: 0.0005 }, None),
-    ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(leave_out_views)),
+    ("poses005", Disturbance::PoseNoise { share: 0.0005 }, Some(refine_poses)),
+    ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(refine_poses)),
     ("jpeg20", Disturbance::Jpeg { quality: 20 }, None),
     ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, Some(mask_blocks)),
     ("boxes-masked", Disturbance::Boxes { count: 20, are_masked: true }, None),
@@ -78,6 +78,10 @@ fn leave_out_views(config: &mut TrainConfig) {
     config.robust_views = true;
 }
 
+fn refine_poses(config: &mut TrainConfig) {
+    config.refine_poses = true;
+}
+
 fn mask_blocks(config: &mut TrainConfig) {
     config.robust_pixels = true;
 }
@@ -92,6 +96,7 @@ fn all_remedies(config: &mut TrainConfig) {
     correct_exposure(config);
     leave_out_views(config);
     mask_blocks(config);
+    refine_poses(config);
 }
 
 /// Disturbs a scene in the ways of real captures, trains each with and without remedies, and charts the decibels lost.

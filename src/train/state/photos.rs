@@ -1,9 +1,9 @@
-//! What a run knows of its photos: their exposures and colours, which of them contradict the scene, and which blocks of them
-//! do. Steps read it before they compare a picture, and add to it afterwards.
+//! What a run knows of its photos: their exposures and colours, where their cameras stand, which of them contradict the scene, and
+//! which blocks of them do. Steps read it before they compare a picture, and add to it afterwards.
 //!
-//! Not here: the values themselves ([`crate::appearance`], [`crate::outliers`]).
+//! Not here: the values themselves ([`crate::appearance`], [`crate::poses`], [`crate::outliers`]).
 //!
-//! Invariants: 1. a step that was skipped teaches nothing about exposures, colours and blocks; 2. all that is known lies in
+//! Invariants: 1. a step that was skipped teaches nothing about exposures, colours, poses and blocks; 2. all that is known lies in
 //! [`crate::checkpoint::run_state::TrainerState`], so a resumed run knows the same.
 
 use super::trainer::Trainer;
@@ -15,11 +15,12 @@ use crate::appearance::state::AppearanceState;
 use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::outliers::blocks::{BlockState, STEPS_AFTER_RESET, counts_masked_blocks, first_look_at_blocks};
+use crate::poses::state::{PoseState, first_step, rate_at};
 use crate::scene::camera::Camera;
 use crate::scene::events::{Event, EventKind};
 use crate::scene::image::Target;
 use crate::train::log::report::OutlierView;
-use crate::train::step::comparison::BlocksBefore;
+use crate::train::step::comparison::{BlocksBefore, Comparison};
 use crate::train::step::soundness::warn_of_outliers;
 use crate::train::step::train_step::StepOutcome;
 use rayon::prelude::*;
@@ -85,6 +86,25 @@ impl Trainer {
         }
     }
 
+    /// The camera of a view as steps see it: its pose in the dataset, refined where the run refines poses.
+    pub(crate) fn camera(&self, dataset: &Dataset, view: usize) -> Camera {
+        self.state.poses.motion(view, self.options.scene_scale).applied_to(&dataset.views[view].camera)
+    }
+
+    /// Whether the coming step refines the pose of its view.
+    pub(super) fn refines_pose(&self, comparison: &Comparison<'_>) -> bool {
+        let is_begun = self.state.step >= first_step(self.options.steps, self.train_views.len());
+        self.options.refine_poses && is_begun && !comparison.is_left_out
+    }
+
+    /// Moves the camera of a view by what a step that was taken has found.
+    pub(super) fn learn_pose(&mut self, view: usize, outcome: &StepOutcome) {
+        if let (Some(sum), None) = (self.working.motion.take(), outcome.skipped) {
+            let rate = rate_at(self.state.step, self.options.steps, self.train_views.len());
+            self.state.poses.learn(view, &sum.gradient(), self.options.scene_scale, rate);
+        }
+    }
+
     /// The blocks of a photo whose `states` the last look left, where blocks are masked at this step.
     pub(super) fn blocks_before<'a>(&self, states: &'a [BlockState]) -> Option<BlocksBefore<'a>> {
         let step = self.state.step;
@@ -131,6 +151,11 @@ impl Trainer {
     /// Photos whose exposure started from EXIF data.
     pub fn first_exposures(&self) -> u32 {
         self.state.first_exposures
+    }
+
+    /// The motions of cameras; empty if the run refines no poses.
+    pub fn poses(&self) -> &PoseState {
+        &self.state.poses
     }
 
     /// The cameras whose vignetting the run trains, each with its values by channel.

@@ -22,6 +22,8 @@ use crate::optim::method::{Method, OptimizerPlace};
 use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::poses::gradient::MotionSum;
+use crate::poses::state::PoseState;
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::camera::Camera;
@@ -142,6 +144,7 @@ impl Trainer {
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
         let is_on = options.appearance.is_on();
+        let refined = if options.refine_poses { dataset.views.len() } else { 0 };
         let camera_groups = camera_groups(dataset.views.iter().filter(|_| is_on).map(|view| &view.camera));
         Trainer {
             scene,
@@ -156,6 +159,7 @@ impl Trainer {
                 appearance: AppearanceState::new(&camera_groups),
                 outliers: ViewOutliers::new(dataset.views.len()),
                 blocks: BlockOutliers::new(dataset.views.len()),
+                poses: PoseState::new(refined),
                 ..TrainerState::default()
             },
             camera_groups,
@@ -189,7 +193,7 @@ impl Trainer {
         let render = self.render_options();
         let (mut probed, mut seconds) = (Probed::default(), Vec::new());
         for &view in views {
-            let camera = &dataset.views[view].camera;
+            let camera = &self.camera(dataset, view);
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             let look = self.look(view, camera);
@@ -288,7 +292,7 @@ impl Trainer {
         let view = self.next_view();
         targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
         if !self.is_ahead() {
-            self.fit_frames(&dataset.views[view].camera);
+            self.fit_frames(&self.camera(dataset, view));
         }
         self.prepare_device()?;
         self.look_ahead(dataset);
@@ -324,6 +328,7 @@ impl Trainer {
         }
         self.learn_appearance(view, &outcome);
         self.learn_blocks(view, &outcome);
+        self.learn_pose(view, &outcome);
         self.state.step += 1;
         self.judge_views(view, &outcome, &target, dataset);
         self.state.train_seconds += started.elapsed().as_secs_f64();
@@ -340,7 +345,8 @@ impl Trainer {
         if self.options.optimizer_on == OptimizerPlace::Device {
             return self.step_on_device(inputs, view, how.1);
         }
-        let (step, camera) = (self.state.step, &inputs.0.views[view].camera);
+        let (step, camera) = (self.state.step, &self.camera(inputs.0, view));
+        self.working.motion = self.refines_pose(how.1).then(MotionSum::default);
         let collects = self.options.strategy.collects(step);
         let mut rows = HostRows::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
