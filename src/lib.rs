@@ -31,6 +31,7 @@
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
+//! | [`poses`] | where the cameras of photos really stand: a small motion of each, its gradient from those of the rows, its values |
 //! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
 //! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
@@ -83,13 +84,21 @@
 //! 5. Where the time of the term matters: instead of 1 and 2 the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl`
 //!    among the shaders.
 //!
-//! **Parameters of photos, or another correction of the picture than [`appearance`]**
-//! 1. A file in `appearance/`: the correction and its derivatives. `train/step/comparison.rs` applies it. What it needs is a
-//!    field of [`train::step::comparison::Comparison`]; what it finds is a field of
-//!    [`train::step::comparison::Correction`], which the step reads afterwards.
-//! 2. `train/state/trainer.rs` and `train/preflight/first_look.rs`: fill the field, for steps and for the first rehearsal.
-//! 3. Parameters that are trained are a resumable value, which `Trainer::learn_appearance` changes after a step that was not
-//!    skipped. `train/state/growth_checks.rs` corrects the held-out photos as well.
+//! **Parameters of photos**
+//! 1. A file in `appearance/` for what acts on the picture, in `poses/` for what acts on the camera: the change, its
+//!    derivatives, its values by photo.
+//! 2. For the picture: `train/step/comparison.rs` applies the correction. What it needs is a field of
+//!    [`train::step::comparison::Comparison`]; what it finds is a field of
+//!    [`train::step::comparison::Correction`], which the step reads afterwards. `train/state/trainer.rs` and
+//!    `train/preflight/first_look.rs` fill the field, for steps and for the first rehearsal.
+//! 3. For the camera: `Trainer::camera` (`train/state/photos.rs`) is the one camera of plans and steps. A derivative comes from
+//!    the gradients of rows, in `train/step/batch.rs`, and waits for the end of the step in
+//!    [`train::step::working_set::WorkingSet`]. The renderer does not change.
+//! 4. Parameters that are trained are a resumable value, which `train/state/photos.rs` changes after a step that was not skipped.
+//!    `train/state/growth_checks.rs` corrects the pictures of held-out photos as well. `train/state/in_flight.rs` and
+//!    `config/check.rs` say what an optimizer on the device cannot do.
+//! 5. A file of the results: its name in `report/run_files.rs`, its writer beside `train/run/appearance_file.rs`, a call in
+//!    `train/run/run_folder.rs`, a paragraph in `report/run_report.rs`.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
@@ -126,6 +135,7 @@ pub mod optim;
 pub mod outliers;
 pub mod page;
 pub mod paging;
+pub mod poses;
 pub mod render;
 pub mod report;
 pub mod scene;

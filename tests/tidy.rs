@@ -13,12 +13,13 @@ const LAYERS: &[(&str, &[&str])] = &[
     ("schedule", &["base", "scene"]),
     ("page", &["base"]),
     ("paging", &["base", "scene", "page", "schedule"]),
-    ("checkpoint", &["base", "scene", "page", "paging", "appearance", "outliers", "densify"]),
+    ("checkpoint", &["base", "scene", "page", "paging", "appearance", "outliers", "densify", "poses"]),
     ("gpu", &["base"]),
     ("kernels", &["base", "scene"]),
     ("optim", &["base", "scene"]),
     ("appearance", &["base", "scene"]),
     ("outliers", &["base", "scene"]),
+    ("poses", &["base", "scene", "kernels"]),
     ("densify", &["base", "scene", "optim"]),
     ("render", &["base", "scene", "gpu", "kernels"]),
     ("exchange", &["base", "scene"]),
@@ -57,6 +58,7 @@ const LAYERS: &[(&str, &[&str])] = &[
             "densify",
             "appearance",
             "outliers",
+            "poses",
             "gpu",
             "render",
             "exchange",
@@ -68,6 +70,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
+    "src/base/allocator.rs",
     "src/base/eight.rs",
     "src/base/environment.rs",
     "src/base/simd.rs",

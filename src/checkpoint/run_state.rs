@@ -5,9 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 6 had no blocks of photos, version 5 neither outliers nor checks of
-//! growth, version 4 no appearance either: they are read as those of a run without. No program was released with versions 1 to 3. A new value is a field of
-//! [`TrainerState`], a place at the end of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures and the motions of poses. Version 6
+//! also lacks blocks of photos, version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that
+//! of a run without it. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end
+//! of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -16,12 +17,15 @@ use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
+use crate::poses::state::PoseState;
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 7;
-/// The version before blocks of photos: the same values without these, the last of the list.
+pub const VERSION: u32 = 8;
+/// The version before first exposures and poses: the same values without these two, the last of the list.
+const WITHOUT_POSES: u32 = 7;
+/// The version before blocks of photos: the same values without these and what came later.
 const WITHOUT_BLOCKS: u32 = 6;
 /// The version before outliers and checks of growth: the same values without these two and what came later.
 const WITHOUT_OUTLIERS: u32 = 5;
@@ -111,26 +115,33 @@ pub struct TrainerState {
     pub test: Option<LastTest>,
     /// The values of photos and cameras.
     pub appearance: AppearanceState,
-    /// What is known of views whose photo contradicts the scene.
+    /// State of the views whose photo contradicts the scene.
     pub outliers: ViewOutliers,
-    /// What a run that decides its count knows of it.
+    /// State of the decision about the count.
     pub growth: GrowthState,
-    /// What is known of the blocks of photos that show what the scene does not.
+    /// The states of the blocks of photos, from which masks of moving objects follow.
     pub blocks: BlockOutliers,
+    /// Photos whose exposure started from EXIF data.
+    pub first_exposures: u32,
+    /// The motions of cameras.
+    pub poses: PoseState,
 }
 
 impl TrainerState {
-    /// This state for a trainer that began as `fresh`: lists by view or camera that have another length than the trainer's begin
-    /// again. They come from an older program, or from other photos.
+    /// This state, for a trainer whose initial state is `fresh`. A list by view or by camera of another length than in `fresh` comes from
+    /// an older program or from other photos: that of `fresh` replaces it.
     pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
         if !self.appearance.is_as_large_as(&fresh.appearance) {
-            self.appearance = fresh.appearance;
+            (self.appearance, self.first_exposures) = (fresh.appearance, fresh.first_exposures);
         }
         if !self.outliers.is_as_large_as(&fresh.outliers) {
             self.outliers = fresh.outliers;
         }
         if !self.blocks.is_as_large_as(&fresh.blocks) {
             self.blocks = fresh.blocks;
+        }
+        if !self.poses.is_as_large_as(&fresh.poses) {
+            self.poses = fresh.poses;
         }
         self
     }
@@ -162,13 +173,14 @@ pub struct RunState {
 /// The values at the end that a state of an earlier version lacks, as those of a run without.
 fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
     let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-    let blocks = encoding::to_bytes(&BlockOutliers::default())?;
+    let blocks = BlockOutliers::default();
     let before = match version {
-        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth))?,
-        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth))?,
+        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
+        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks))?,
+        WITHOUT_BLOCKS => encoding::to_bytes(&blocks)?,
         _ => Vec::new(),
     };
-    Ok([before, blocks].concat())
+    Ok([before, encoding::to_bytes(&(0u32, PoseState::default()))?].concat())
 }
 
 /// Why bytes are not the state of a run.
@@ -221,7 +233,7 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body)?,
-            WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
+            WITHOUT_POSES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
                 RunState::decode(&[body, &lacking_in(version)?].concat())?
             }
             other => return Err(RunStateError::Version(other)),
@@ -235,12 +247,13 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, poses, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ))
     }
 
@@ -250,7 +263,8 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -264,6 +278,8 @@ impl RunState {
             outliers,
             growth,
             blocks,
+            first_exposures,
+            poses,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
@@ -309,8 +325,12 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, growth, blocks, .. } = &self.trainer;
-        let of_photos = appearance.check().and_then(|()| outliers.check()).and_then(|()| blocks.check());
+        let TrainerState { appearance, outliers, growth, blocks, poses, .. } = &self.trainer;
+        let of_photos = appearance
+            .check()
+            .and_then(|()| outliers.check())
+            .and_then(|()| blocks.check())
+            .and_then(|()| poses.check());
         of_photos.and_then(|()| growth.check(step)).or_else(refuse)
     }
 }
@@ -322,6 +342,7 @@ mod tests {
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
     use crate::outliers::blocks::look;
+    use crate::poses::gradient::MotionGradient;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 
@@ -333,6 +354,13 @@ mod tests {
         blocks.learn(2, look(&[], &picture, &photo).unwrap());
         assert!(blocks.masked_share() == Some(1.0 / 16.0));
         blocks
+    }
+
+    /// Three photos, the second of which has moved.
+    fn moved() -> PoseState {
+        let mut poses = PoseState::new(3);
+        poses.learn(1, &MotionGradient { shift: [0.0, 1.0, -0.5], turn: [0.25; 3] }, 1.5, 1e-3);
+        poses
     }
 
     fn sample() -> RunState {
@@ -380,6 +408,8 @@ mod tests {
                     ],
                 },
                 blocks: looked_at(),
+                first_exposures: 2,
+                poses: moved(),
             },
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
@@ -410,10 +440,13 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..state.trainer.clone() };
+        let of_7 = TrainerState { first_exposures: 0, poses: PoseState::default(), ..state.trainer.clone() };
+        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
         let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        for (version, trainer) in [(WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)] {
+        let of_versions =
+            [(WITHOUT_POSES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)];
+        for (version, trainer) in of_versions {
             let lacking = lacking_in(version).unwrap();
             let without = RunState { trainer, ..state.clone() };
             let mut bytes = without.to_bytes().unwrap();

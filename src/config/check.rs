@@ -69,6 +69,7 @@ impl TrainConfig {
         let needs = [
             (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
             (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
+            (!self.refine_poses, "it leaves the gradients of poses on the device", "leave out --refine-poses"),
             (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
         ];
         match needs.iter().find(|(holds, ..)| !holds) {

@@ -36,8 +36,6 @@ pub struct RunOptions {
     pub sh_every: u32,
     /// SH degree at step 0: that of the config or of the Gaussians from which the run starts.
     pub sh_degree_start: u8,
-    /// Cap on Gaussians; 0 = none.
-    pub max_gaussians: usize,
     /// Capacity of a page, rows.
     pub page_rows: usize,
     /// View order; a shuffle until `auto` has been decided.
@@ -70,6 +68,8 @@ pub struct RunOptions {
     pub robust_views: bool,
     /// Whether blocks of photos that contradict the scene are masked.
     pub robust_pixels: bool,
+    /// Whether the poses of training photos are refined.
+    pub refine_poses: bool,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
@@ -95,7 +95,6 @@ impl RunOptions {
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
             sh_degree_start: first_sh_degree(config),
-            max_gaussians: config.max_gaussians as usize,
             page_rows: config.page_rows as usize,
             view_order: config.view_order.0.unwrap_or(Order::Shuffle),
             render: RenderOptions {
@@ -127,6 +126,7 @@ impl RunOptions {
             appearance: config.appearance,
             robust_views: config.robust_views,
             robust_pixels: config.robust_pixels,
+            refine_poses: config.refine_poses,
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),

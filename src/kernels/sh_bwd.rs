@@ -8,7 +8,7 @@
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, lane};
 use crate::kernels::project_fwd::dot;
-use crate::kernels::sh_fwd::{BASIS, C1, C2, C3, ShChunk, basis_len};
+use crate::kernels::sh_fwd::{BASIS, C0, C1, C2, C3, ShChunk, basis_len, unit_direction};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Columns, sh_n_width};
 use rayon::prelude::*;
@@ -46,6 +46,23 @@ fn sh_basis_vjp(degree: u8, dir: [f32; 3], v_basis: &[f32; BASIS]) -> [f32; 3] {
 fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3] {
     let along = dot(unit, v_unit);
     std::array::from_fn(|i| (v_unit[i] - along * unit[i]) * inv_len)
+}
+
+/// The part of the gradient of a row's mean that comes through the viewing direction of its colour. `gradients` are those of
+/// the row's stored values: that of `sh0` is the gradient of the colour times the constant of band 0, with clamped channels at 0.
+pub fn direction_vjp(sh_degree: u8, rows: &Columns, gradients: &Columns, row: usize, centre: [f32; 3]) -> [f32; 3] {
+    let degree = sh_degree.min(rows.sh_degree);
+    if degree == 0 {
+        return [0.0; 3];
+    }
+    let v_color: [f32; 3] = std::array::from_fn(|c| gradients.sh0[3 * row + c] / C0);
+    let (unit, inv_len) = unit_direction(std::array::from_fn(|i| rows.means[3 * row + i] - centre[i]));
+    let coefficients = &rows.sh_n[row * sh_n_width(rows.sh_degree)..][..3 * (basis_len(degree) - 1)];
+    let mut v_basis = [0.0; BASIS];
+    for (v, coefficient) in v_basis[1..].iter_mut().zip(coefficients.as_chunks::<3>().0) {
+        *v = dot(*coefficient, v_color);
+    }
+    unit_direction_vjp(unit, inv_len, sh_basis_vjp(degree, unit, &v_basis))
 }
 
 /// Backward of `sh_fwd`: writes `grads.means`, `grads.sh0` and `grads.sh_n`.

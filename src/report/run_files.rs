@@ -1,4 +1,4 @@
-//! The files in the output folder of a run: names, kinds, and which of them belong to what part of a run.
+//! The files in the output folder of a run: names, kinds, and the part of a run that each belongs to.
 //!
 //! Not here: their content, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
 //! another file into the folder adds it, and so it is removed with the rest when a run replaces an earlier one.
@@ -21,6 +21,8 @@ pub const REPORT_FILE: &str = "report.html";
 pub const PAGES_FILE: &str = "pages.json";
 /// Exposure and colours of each photo, vignetting of each camera: what `--appearance` has found.
 pub const APPEARANCE_FILE: &str = "appearance.json";
+/// The poses of training photos as `--refine-poses` leaves them.
+pub const POSES_FILE: &str = "poses.json";
 /// Folder of the pictures of the held-out views.
 pub const PICTURES_FOLDER: &str = "renders/test";
 /// PSNR and SSIM of each held-out view, beside its picture.
@@ -46,7 +48,7 @@ pub enum RunFile {
     Pictures(&'static str),
 }
 
-/// What a file is about. It decides when a later run in the folder removes the file.
+/// The part of a run that a file describes. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
     /// How the run began.
@@ -60,7 +62,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 15] = [
+pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -71,6 +73,7 @@ pub const RUN_FILES: [(RunFile, Tells); 15] = [
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
     (RunFile::File(APPEARANCE_FILE), Tells::Result),
+    (RunFile::File(POSES_FILE), Tells::Result),
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),

@@ -16,6 +16,7 @@ mod lpips;
 mod oracle;
 mod parity;
 mod poison;
+mod poses;
 mod shaders;
 mod upright;
 mod visibility;

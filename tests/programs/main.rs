@@ -32,6 +32,7 @@ mod outgrown;
 mod outliers;
 mod paging_train;
 mod plan_tool;
+mod poses;
 mod published;
 mod real_scenes;
 mod report;

@@ -1,4 +1,4 @@
-//! `gsscale-bench stability`: what faults of photos, poses and points cost, and what the remedies win back.
+//! `gsscale-bench stability`: measures the loss of quality by faults of photos, poses and points, with and without remedies.
 
 use super::sweep::{MadeScene, Planned, Surroundings, Sweep, SweepArgs};
 use super::table::table;
@@ -47,7 +47,7 @@ const REMEDIES: [&str; 3] = [NO_REMEDY, "own", "all"];
 /// Change of a config.
 type Change = fn(&mut TrainConfig);
 
-/// Name, what is disturbed, and the remedy that is meant for it.
+/// Name of a disturbance, the disturbance, and its own remedy.
 const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
     (CLEAN, Disturbance::Nothing, None),
     ("exposure05", Disturbance::Exposure { stops: 0.5 }, Some(correct_exposure)),
@@ -55,8 +55,8 @@ const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
     ("white-balance", Disturbance::WhiteBalance { stops: 0.3 }, Some(correct_colors)),
     ("swapped5", Disturbance::Swapped { share: 0.05 }, Some(leave_out_views)),
     ("swapped10", Disturbance::Swapped { share: 0.1 }, Some(leave_out_views)),
-    ("poses005", Disturbance::PoseNoise { share: 0.0005 }, None),
-    ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(leave_out_views)),
+    ("poses005", Disturbance::PoseNoise { share: 0.0005 }, Some(refine_poses)),
+    ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(refine_poses)),
     ("jpeg20", Disturbance::Jpeg { quality: 20 }, None),
     ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, Some(mask_blocks)),
     ("boxes-masked", Disturbance::Boxes { count: 20, are_masked: true }, None),
@@ -78,6 +78,10 @@ fn leave_out_views(config: &mut TrainConfig) {
     config.robust_views = true;
 }
 
+fn refine_poses(config: &mut TrainConfig) {
+    config.refine_poses = true;
+}
+
 fn mask_blocks(config: &mut TrainConfig) {
     config.robust_pixels = true;
 }
@@ -92,6 +96,7 @@ fn all_remedies(config: &mut TrainConfig) {
     correct_exposure(config);
     leave_out_views(config);
     mask_blocks(config);
+    refine_poses(config);
 }
 
 /// Disturbs a scene in the ways of real captures, trains each with and without remedies, and charts the decibels lost.
@@ -176,7 +181,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     Ok(())
 }
 
-/// The config of all runs before remedies. The scenes that are written have photos of training size, and their own split.
+/// The config of all runs, without remedies. The disturbed scenes have photos of training size and their own split.
 fn base_config(given: &TrainConfig) -> TrainConfig {
     let plain = TrainConfig::default();
     TrainConfig {

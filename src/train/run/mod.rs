@@ -11,6 +11,7 @@ mod more_steps;
 pub mod out_folder;
 mod outgrown;
 pub mod page_map;
+mod poses_file;
 pub mod request;
 pub mod restart;
 pub mod resume;

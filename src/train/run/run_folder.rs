@@ -11,6 +11,7 @@ use super::costs::Meter;
 use super::live::LivePage;
 use super::out_folder;
 use super::page_map::write_page_map;
+use super::poses_file::write_poses;
 use super::request::{RunOutcome, RunRequest};
 use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
@@ -26,7 +27,7 @@ use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
 use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
+    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, POSES_FILE, SUMMARY_FILE,
 };
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
@@ -186,6 +187,7 @@ pub(super) fn train_into(
     write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
     write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
+    write_poses(&out.join(POSES_FILE), dataset, &trainer)?;
     write_report(request)?;
     tested?;
     tiers.is_done = summary.finished;
@@ -213,7 +215,10 @@ fn save_result(
     format.write_transform(&other, &meta, exported.frame)?;
     if exported.rows < written.rows {
         let lost = written.rows - exported.rows;
-        eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", other.display());
+        eprintln!(
+            "warning: {} cannot hold {lost} Gaussians: they lie outside the range of its format",
+            other.display()
+        );
     }
     if let (Some(levels), false) = (exported.levels, request.quiet) {
         eprintln!("{}: {levels}", other.display());

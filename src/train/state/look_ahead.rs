@@ -30,8 +30,9 @@ impl Trainer {
         }
         // Two epochs contain a use of every page that any view needs.
         let count = (2 * self.train_views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
-        let cameras: Vec<&Camera> =
-            self.coming_views(count).iter().skip(first).map(|&view| &dataset.views[view].camera).collect();
+        let cameras: Vec<Camera> =
+            self.coming_views(count).iter().skip(first).map(|&view| self.camera(dataset, view)).collect();
+        let cameras: Vec<&Camera> = cameras.iter().collect();
         self.scene.pager.look_ahead(self.state.step + first as u32, &cameras);
     }
 

@@ -182,15 +182,19 @@ impl RowBackend for HostRows<'_> {
         scene: &mut PagedScene,
         (batch, is_again): (usize, bool),
         pinned: &[PinnedPage],
-        AtStep { step, .. }: AtStep<'_>,
+        AtStep { step, camera }: AtStep<'_>,
         working: &mut WorkingSet,
     ) -> Result<(), TrainError> {
-        let WorkingSet { row_from_working, columns, gradients, .. } = working;
+        let WorkingSet { row_from_working, columns, gradients, motion, .. } = working;
         if is_again {
             let rules = &scene.rules;
             catch_up::gather(&row_tables(pinned), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
         }
-        Ok(self.renderer.rows_out(batch, columns, gradients)?)
+        self.renderer.rows_out(batch, columns, gradients)?;
+        if let Some(motion) = motion {
+            motion.add(columns, &gradients.columns, camera, scene.rules.sh_degree());
+        }
+        Ok(())
     }
 
     fn update(

@@ -108,7 +108,7 @@ impl DeviceTier {
         }
         self.traffic.cleared += cleared.len() as u64;
         for page in cleared {
-            page.meta.events_applied = pending.len() as u32;
+            page.meta.events_applied = scene.events().len() as u32;
             page.dirty = true;
             if let Some((slot, _)) = self.slots.pin(page.page, false) {
                 self.slots.unpin(page.page, slot, true);

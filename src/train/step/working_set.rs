@@ -1,6 +1,7 @@
 //! The working set: the rows of one batch of a view and their gradients during a step.
 
 use super::comparison::Correction;
+use crate::poses::gradient::MotionSum;
 use crate::render::Gradients;
 use crate::scene::columns::{Columns, row_width};
 
@@ -15,6 +16,8 @@ pub struct WorkingSet {
     pub gradients: Gradients,
     /// Of the picture of the view, if it is corrected.
     pub correction: Correction,
+    /// The derivative of the loss by the motion of the camera, where the step is to find it.
+    pub motion: Option<MotionSum>,
 }
 
 impl WorkingSet {

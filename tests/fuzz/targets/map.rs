@@ -26,6 +26,7 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::stats::PagerStats;
+use gsscale::poses::state::PoseState;
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
@@ -240,10 +241,12 @@ fn sample() -> RunState {
             appearance: AppearanceState::new(&[0, 0]),
             outliers: ViewOutliers::new(2),
             blocks: BlockOutliers::new(2),
+            poses: PoseState::new(2),
             growth: GrowthState {
                 first: 7,
                 checks: vec![GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 }],
             },
+            first_exposures: 2,
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],

@@ -81,6 +81,9 @@ pub struct Render64 {
     pub ended: usize,
 }
 
+/// World to camera, row-major 3x4.
+pub type Pose64 = [[f64; 4]; 3];
+
 type Matrix = [[f64; 3]; 3];
 
 fn multiply(a: &Matrix, b: &Matrix) -> Matrix {
@@ -146,9 +149,18 @@ fn color(rows: &Rows64, row: usize, centre: [f64; 3], sh_degree: u8) -> ([f64; 3
     (raw.map(|x| x.max(0.0)), raw.iter().fold(f64::INFINITY, |m, x| m.min(x.abs())))
 }
 
+/// The pose of a camera as it is.
+pub fn pose_of(camera: &Camera) -> Pose64 {
+    camera.viewmat.map(|r| r.map(f64::from))
+}
+
 /// One row on the screen; `None` outside of the depth range.
 pub fn project(rows: &Rows64, camera: &Camera, settings: &Settings, row: usize) -> Option<Splat64> {
-    let m = camera.viewmat.map(|r| r.map(f64::from));
+    project_from(rows, (camera, &pose_of(camera)), settings, row)
+}
+
+/// As [`project`], from another pose than that of the camera.
+fn project_from(rows: &Rows64, (camera, m): (&Camera, &Pose64), settings: &Settings, row: usize) -> Option<Splat64> {
     let view: Matrix = std::array::from_fn(|i| std::array::from_fn(|j| m[i][j]));
     let mean = rows.row(Column::Means, row);
     let p: [f64; 3] = std::array::from_fn(|i| (0..3).map(|j| m[i][j] * mean[j]).sum::<f64>() + m[i][3]);
@@ -200,7 +212,13 @@ pub fn project(rows: &Rows64, camera: &Camera, settings: &Settings, row: usize) 
 
 /// Renders rows.
 pub fn render(rows: &Rows64, camera: &Camera, settings: &Settings) -> Render64 {
-    let mut splats: Vec<Splat64> = (0..rows.rows()).filter_map(|r| project(rows, camera, settings, r)).collect();
+    render_from(rows, (camera, &pose_of(camera)), settings)
+}
+
+/// As [`render`], from another pose than that of the camera.
+pub fn render_from(rows: &Rows64, (camera, pose): (&Camera, &Pose64), settings: &Settings) -> Render64 {
+    let mut splats: Vec<Splat64> =
+        (0..rows.rows()).filter_map(|r| project_from(rows, (camera, pose), settings, r)).collect();
     // Stable: rows of equal depth keep their order.
     splats.sort_by(|a, b| a.depth.total_cmp(&b.depth));
     let gaps = splats.windows(2).map(|w| w[1].depth / w[0].depth - 1.0);

@@ -10,4 +10,5 @@ mod more_steps;
 mod outliers;
 mod ownership;
 mod paths;
+mod poses;
 mod stops;
