@@ -50,7 +50,7 @@ fn main() {
         assert!(tiny().is_none_or(|hash| hash != 0));
         return;
     }
-    let Ok(gpu) = Gpu::open(&DeviceChoice::Gpu) else {
+    let Ok(gpu) = Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions::default()) else {
         eprintln!("SKIPPED: there is no usable GPU adapter; mesa-vulkan-drivers has a software one");
         return;
     };

@@ -25,8 +25,8 @@ fn pictures(width: u32, height: u32) -> (Image, Target) {
 /// Median wall and CPU milliseconds, and the bits of the loss.
 fn median_ms(width: u32, height: u32, simd: SimdPath, time: Duration) -> (f64, f64, u64) {
     let (image, target) = pictures(width, height);
-    let options = LossOptions::new(0.2, SsimPadding::Valid, simd);
-    let (mut loss, mut v_rgb) = (ImageLoss::new(), Vec::new());
+    let options = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd };
+    let (mut loss, mut v_rgb) = (ImageLoss::default(), Vec::new());
     let mut bits = 0;
     let t = steady_time(time, || {
         let value = loss.value_and_gradient(&image, &target, &options, &mut v_rgb);

@@ -15,7 +15,7 @@ use gsscale::base::machine::process_cpu_seconds;
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{self, RunOptions};
-use gsscale::dataset::import::{Budget, ImportOptions, PointSource};
+use gsscale::dataset::import::{Budget, ImportOptions, PointSource, import_points};
 use gsscale::dataset::loader::{Dataset, load_dataset};
 use gsscale::dataset::read::read_scene;
 use gsscale::dataset::target_cache::TargetCache;
@@ -181,7 +181,13 @@ fn size(config: &TrainConfig, points: &Copies<'_>, frames: usize) -> Result<Size
     let beside = Path::new(&own.spill_dir).parent().filter(|p| p.is_dir()).unwrap_or(&folder);
     let fill = first_fill(options.page_rows, options.strategy.grows());
     let import = ImportOptions { init: &init, fill, budget: Budget { folder: beside, bytes: IMPORT_BYTES } };
-    let scene = PagedScene::import(points, &import, pager, &options)?;
+    let mut scene = PagedScene::empty(pager, &options);
+    import_points(points, &import, &mut |page| {
+        let id = page.id;
+        let mut state = page.into_state();
+        state.raise_sh_degree(options.sh_degree_at(0));
+        scene.insert_first_page(id, &state).map_err(|e| InputError::new("the pages", e.to_string(), "check the drive"))
+    })?;
     let trainer = Trainer::of_scene(scene, dataset, Box::new(CpuRenderer::new()), options);
     let before = trainer.scene.pager.stats();
     let copies = points.count;

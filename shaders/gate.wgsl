@@ -7,7 +7,7 @@ struct GateUniforms {
     rows_room: u32,
     isects_room: u32,
     list_room: u32,
-    /// More than one row in so many with unusable gradients closes the gate.
+    /// The gate closes if more than one in this many rows has unusable gradients.
     rows_per_unusable: u32,
     /// Word of `counts` with the number of listed rows, word of `offsets` with the number of intersections.
     rows_at: u32,

@@ -70,6 +70,7 @@ const LAYERS: &[(&str, &[&str])] = &[
 
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
+    "src/base/allocator.rs",
     "src/base/eight.rs",
     "src/base/environment.rs",
     "src/base/simd.rs",

@@ -53,6 +53,7 @@ Each command has --help with examples: gsscale-bench run --help, gsscale-bench r
 Published scenes:";
 
 fn main() -> ExitCode {
+    gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
     let name = arguments.get(1).and_then(|a| a.to_str()).map(str::to_string);

@@ -1,6 +1,7 @@
 //! `gsscale-eval`: held-out PSNR and SSIM of a PLY (or of a run's PLY). Parses, calls the library, prints.
 
 use clap::Parser;
+use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::{folder_of, write_whole};
@@ -49,6 +50,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    return_freed_blocks();
     quiet_wayland();
     match start(parse_command_line()) {
         Ok(()) => ExitCode::SUCCESS,
@@ -95,7 +97,7 @@ fn scene_of(ply: &Path) -> InputResult<PathBuf> {
         return Ok(scene);
     }
     let remedy = format!("if it was moved: gsscale-eval {} SCENE", ply.display());
-    Err(InputError::new(&scene, "the scene of this run is not there", remedy))
+    Err(InputError::new(&scene, "the scene of this run is missing", remedy))
 }
 
 fn read_config(path: Option<&Path>) -> InputResult<TrainConfig> {

@@ -168,6 +168,7 @@ struct Row {
 }
 
 fn main() -> ExitCode {
+    gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
     match start(&parse_command_line()) {
         Ok(text) => {
@@ -437,7 +438,7 @@ fn device_rows(args: &Args, scene: &Scene, rows: &[Row], bus: EmulatedBus) -> In
         budget => pages.min(slots_of_budget(budget, slot_bytes)),
     };
     if slots == 0 {
-        let problem = format!("no page of {} fits into the part for pages", format_bytes(slot_bytes));
+        let problem = format!("a page takes {}, which is more than the share for pages", format_bytes(slot_bytes));
         return Err(InputError::new("--device-mem", problem, "give more, or lower --page-rows"));
     }
     let mean = |sum: f64, count: usize| sum / count.max(1) as f64;

@@ -1,6 +1,7 @@
 //! `gsscale-train`: trains a scene from photos to a PLY. Parses, calls the library, prints.
 
 use clap::Parser;
+use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::trace;
@@ -90,6 +91,7 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    return_freed_blocks();
     quiet_wayland();
     let args: Args = parse_command_line();
     if args.list_devices {

@@ -1,8 +1,8 @@
 //! The values of a correction that bring a picture closest to its photo: damped Gauss-Newton steps.
 //!
-//! What is minimised is the mean absolute difference of picture and photo, as weighted squares, plus a small weight times
-//! the square of each value, which pulls the values towards no change. A few ten thousand pixels determine nine values,
-//! so a large picture is sampled on a grid that depends on its size alone.
+//! The fit minimises the mean absolute difference between picture and photo, as weighted squares, plus a small weight times
+//! the square of each value. These weights pull the values towards no change. A few ten thousand pixels determine nine
+//! values, so a large picture is sampled on a grid that depends on its size alone.
 //!
 //! Invariants: 1. sums are f64, by row and then over rows in order, so the bits are the same for any number of threads;
 //! 2. masked pixels, and values at which the photo is white and the picture at least as bright, do not count; 3. the

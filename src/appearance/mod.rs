@@ -16,6 +16,7 @@
 //!
 //! Not here: which step corrects what (`train`), and the bytes of a commit (`checkpoint`).
 
+pub mod first_values;
 pub mod fit;
 pub mod model;
 pub mod picture;

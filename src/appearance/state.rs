@@ -2,7 +2,8 @@
 //!
 //! The values of a photo are fixed-point numbers, and their sums over the photos seen are kept beside them. So the mean is
 //! known at every step without a sweep, and has the same bits whatever the order. What acts on a photo is its value less
-//! that mean; a photo that no step has seen is not corrected.
+//! that mean; a photo without a value is not corrected. A photo has a value once a step has seen it, or from the start of the
+//! run if its file states an exposure ([`super::first_values`]): below, such a photo counts as seen.
 //!
 //! Invariants: 1. the sums are exactly those of the values of the photos seen; 2. what acts is within the bounds of
 //! [`super::fit::bounded`]; 3. a fit that found nothing changes nothing.
@@ -35,7 +36,7 @@ fn gain(sightings: u32, least: f64) -> f64 {
 pub struct ImageState {
     /// Exposure and homography, fixed-point, with the mean in them.
     pub values: [i32; IMAGE_VALUES],
-    /// Steps that have seen the photo.
+    /// Steps that have seen the photo; a first exposure counts as one.
     pub sightings: u32,
 }
 
@@ -102,9 +103,26 @@ impl AppearanceState {
         }
     }
 
-    /// Whether the values are of as many photos and cameras as `other`.
+    /// Whether both have the same numbers of photos and cameras.
     pub fn is_as_large_as(&self, other: &AppearanceState) -> bool {
         (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
+    }
+
+    /// Whether no photo has a value.
+    pub fn is_new(&self) -> bool {
+        self.seen == 0
+    }
+
+    /// Gives first exposures to photos that no step has seen: each a view and its exposure, stops within the bounds of
+    /// [`bounded`]. They act from now on. The fit of the first step that sees the photo counts twice as much.
+    pub fn begin_with(&mut self, exposures: impl IntoIterator<Item = (usize, f64)>) {
+        for (view, exposure) in exposures {
+            let Some(image) = self.images.get_mut(view).filter(|image| image.sightings == 0) else { continue };
+            image.values[0] = (exposure * PER_UNIT).clamp(-STORED_MOST, STORED_MOST).round() as i32;
+            image.sightings = 1;
+            self.sums[0] += i64::from(image.values[0]);
+            self.seen += 1;
+        }
     }
 
     fn mean(&self) -> [f64; IMAGE_VALUES] {
@@ -199,6 +217,23 @@ mod tests {
         assert!((far - (1.0 + 0.6 * 2.0 / 3.0)).abs() < 1e-6, "{far}");
         state.sums[0] += 1;
         assert!(state.check().is_err());
+    }
+
+    #[test]
+    fn first_exposures_act_at_once_and_weigh_half_of_the_first_fit() {
+        let mode = AppearanceMode::Exposure;
+        let mut state = AppearanceState::new(&[0, 0, 0]);
+        state.begin_with([(0, 1.0), (1, 0.0)]);
+        let exposures = |state: &AppearanceState| [0, 1, 2].map(|view| state.acting(view, 1)[0]);
+        assert_eq!(exposures(&state), [0.5, -0.5, 0.0]);
+        assert_eq!((state.check(), state.is_new()), (Ok(()), false));
+        state.learn(mode, (0, 0), &found(0.8));
+        let far = state.acting(0, 1)[0] - state.acting(1, 1)[0];
+        assert!((far - (1.0 + 0.3 * 2.0 / 3.0)).abs() < 1e-6, "{far}");
+        // A photo that was seen keeps its value.
+        let before = state.clone();
+        state.begin_with([(0, -2.0)]);
+        assert_eq!(state, before);
     }
 
     #[test]

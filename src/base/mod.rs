@@ -1,6 +1,7 @@
 //! Shared by every layer: errors, identities, random draws, deterministic math, instruction paths, sizes, files and
 //! folders that are written whole. Knows neither Gaussians, pictures nor disk formats.
 
+pub mod allocator;
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod eight;
 pub mod environment;

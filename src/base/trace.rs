@@ -1,5 +1,5 @@
-//! A trace of the process: what its host threads did, and when, as JSON in Chrome's trace-event format. Perfetto
-//! (<https://ui.perfetto.dev>) and `chrome://tracing` open it.
+//! A trace of the process: the spans of work of its host threads, with their times, as JSON in Chrome's trace-event format.
+//! Perfetto (<https://ui.perfetto.dev>) and `chrome://tracing` open it.
 //!
 //! A process has at most one trace. Each span is written when it ends, so a process that is killed leaves a file that viewers still open:
 //! the format allows the closing bracket to be missing.
@@ -72,7 +72,8 @@ pub fn start(path: &Path) -> InputResult<()> {
     Ok(())
 }
 
-/// Ends the trace; nothing without one. A trace without a span leaves no file: the run was refused, and its next attempt may take the name.
+/// Ends the trace; does nothing if none was begun. Removes the file of a trace without a span: the run was refused, and its next
+/// attempt may use the name.
 ///
 /// # Errors
 /// A part of the trace could not be written.

@@ -3,8 +3,8 @@
 //! Not here: single files ([`super::whole_file`]), the folders of runs and stores.
 //!
 //! Invariants: 1. the target holds either its old files or all new ones; between two renames it is missing for a moment, and its
-//! old files then stand beside it; 2. a folder with anything that its caller does not know is never replaced, nor removed;
-//! 3. files are durable before the folder gets its name; 4. dropping a folder under way removes it.
+//! old files then stand beside it; 2. a folder with a file that `is_ours` rejects is neither replaced nor removed;
+//! 3. files are durable before the folder gets its name; 4. dropping a folder that is being written removes it.
 
 use super::error::{InputError, InputResult};
 use super::whole_file::{folder_of, sync_folder};
@@ -12,10 +12,10 @@ use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-/// Says whether a file, by its path inside a folder, is one that the folder's writer makes.
+/// Whether the writer of a folder makes a file of this path inside the folder. Such a file is called ours; every other one is foreign.
 pub type IsOurs = fn(&Path) -> bool;
 
-/// A folder under way.
+/// A folder that is being written.
 #[derive(Debug)]
 pub struct PartFolder {
     path: PathBuf,
@@ -29,9 +29,9 @@ impl PartFolder {
     /// Begins to write the folder `target`: creates `.NAME.part` beside it.
     ///
     /// # Errors
-    /// The folder cannot be written, `target` names none, or it exists and holds files that are not ours.
+    /// The folder cannot be written, `target` names no folder, or the folder exists and holds foreign files.
     pub fn create(target: &Path, is_ours: IsOurs) -> InputResult<PartFolder> {
-        let no_name = || InputError::new(target, "this path names no folder of its own", "name a new folder");
+        let no_name = || InputError::new(target, "this path names no folder", "name a new folder");
         let name = target.file_name().ok_or_else(no_name)?;
         let beside = |ending: &str| {
             let mut hidden = std::ffi::OsString::from(".");
@@ -42,7 +42,7 @@ impl PartFolder {
         let (path, old) = (beside(".part"), beside(".old"));
         let part = PartFolder { path, old, target: target.to_path_buf(), is_ours, bytes: 0 };
         check_ours(target, is_ours)?;
-        // Processes that were killed left these: between the two renames, or before.
+        // A process that was killed between the two renames left `.old`; one that was killed earlier left `.part`.
         if part.old.is_dir() && !target.exists() {
             std::fs::rename(&part.old, target).map_err(|e| InputError::io(target, "restoring the older folder", &e))?;
         }
@@ -77,7 +77,7 @@ impl PartFolder {
     /// Gives the folder its name, in place of an older one.
     ///
     /// # Errors
-    /// The drive fails, or the target now holds files that are not ours.
+    /// The drive fails, or the target now holds foreign files.
     pub fn finish(self) -> InputResult<()> {
         let io = |doing: &str, e: &std::io::Error| InputError::io(&self.target, doing, e);
         check_ours(&self.target, self.is_ours)?;
@@ -105,10 +105,10 @@ impl Drop for PartFolder {
     }
 }
 
-/// Removes a folder whose files are all ours, if it exists.
+/// Removes a folder without foreign files, if it exists.
 ///
 /// # Errors
-/// It holds other files, which all stay, or the drive fails.
+/// The folder holds foreign files (then every file stays), or the drive fails.
 pub fn remove_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     if !folder.is_dir() {
         return Ok(());
@@ -117,10 +117,10 @@ pub fn remove_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     std::fs::remove_dir_all(folder).map_err(|e| InputError::io(folder, "removing the older folder", &e))
 }
 
-/// Checks that a folder holds no file that is not ours, if it exists.
+/// Checks that a folder holds no foreign file, if it exists.
 ///
 /// # Errors
-/// It does, or cannot be listed.
+/// The folder holds a foreign file, or cannot be listed.
 pub fn check_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     match first_other(folder, Path::new(""), is_ours) {
         Ok(None) => Ok(()),
@@ -134,7 +134,7 @@ pub fn check_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     }
 }
 
-/// A file below `folder`, by its path inside the root, that is not ours. Links are not followed, and are never ours.
+/// A foreign file below `folder`, by its path inside the root. Links are foreign and are not followed.
 fn first_other(folder: &Path, inside: &Path, is_ours: IsOurs) -> std::io::Result<Option<PathBuf>> {
     for entry in std::fs::read_dir(folder)? {
         let entry = entry?;

@@ -5,10 +5,10 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 7 had no motions of poses, version 6 no blocks of photos either,
-//! version 5 no outliers and no checks of growth either, version 4 no appearance either: they are read as those of a run
-//! without. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end of
-//! `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures and the motions of poses. Version 6
+//! also lacks blocks of photos, version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that
+//! of a run without it. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end
+//! of `encode` and `decode`, and a new version.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 8;
-/// The version before poses: the same values without these, the last of the list.
+/// The version before first exposures and poses: the same values without these two, the last of the list.
 const WITHOUT_POSES: u32 = 7;
 /// The version before blocks of photos: the same values without these and what came later.
 const WITHOUT_BLOCKS: u32 = 6;
@@ -115,22 +115,24 @@ pub struct TrainerState {
     pub test: Option<LastTest>,
     /// The values of photos and cameras.
     pub appearance: AppearanceState,
-    /// What is known of views whose photo contradicts the scene.
+    /// State of the views whose photo contradicts the scene.
     pub outliers: ViewOutliers,
-    /// What a run that decides its count knows of it.
+    /// State of the decision about the count.
     pub growth: GrowthState,
-    /// What is known of the blocks of photos that show what the scene does not.
+    /// The states of the blocks of photos, from which masks of moving objects follow.
     pub blocks: BlockOutliers,
+    /// Photos whose exposure started from EXIF data.
+    pub first_exposures: u32,
     /// The motions of cameras.
     pub poses: PoseState,
 }
 
 impl TrainerState {
-    /// This state for a trainer that began as `fresh`: lists by view or camera that have another length than the trainer's begin
-    /// again. They come from an older program, or from other photos.
+    /// This state, for a trainer whose initial state is `fresh`. A list by view or by camera of another length than in `fresh` comes from
+    /// an older program or from other photos: that of `fresh` replaces it.
     pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
         if !self.appearance.is_as_large_as(&fresh.appearance) {
-            self.appearance = fresh.appearance;
+            (self.appearance, self.first_exposures) = (fresh.appearance, fresh.first_exposures);
         }
         if !self.outliers.is_as_large_as(&fresh.outliers) {
             self.outliers = fresh.outliers;
@@ -171,13 +173,14 @@ pub struct RunState {
 /// The values at the end that a state of an earlier version lacks, as those of a run without.
 fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
     let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-    let (blocks, poses) = (BlockOutliers::default(), PoseState::default());
-    match version {
-        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks, poses)),
-        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks, poses)),
-        WITHOUT_BLOCKS => encoding::to_bytes(&(blocks, poses)),
-        _ => encoding::to_bytes(&poses),
-    }
+    let blocks = BlockOutliers::default();
+    let before = match version {
+        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
+        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks))?,
+        WITHOUT_BLOCKS => encoding::to_bytes(&blocks)?,
+        _ => Vec::new(),
+    };
+    Ok([before, encoding::to_bytes(&(0u32, PoseState::default()))?].concat())
 }
 
 /// Why bytes are not the state of a run.
@@ -244,12 +247,13 @@ impl RunState {
         let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, poses, .. } = trainer;
+        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, poses, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks, poses),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ))
     }
 
@@ -259,7 +263,8 @@ impl RunState {
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
-            (metrics_bytes, test, traffic, run, appearance, outliers, growth, blocks, poses),
+            (metrics_bytes, test, traffic, run),
+            (appearance, outliers, growth, blocks, first_exposures, poses),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
@@ -273,6 +278,7 @@ impl RunState {
             outliers,
             growth,
             blocks,
+            first_exposures,
             poses,
         };
         Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
@@ -402,6 +408,7 @@ mod tests {
                     ],
                 },
                 blocks: looked_at(),
+                first_exposures: 2,
                 poses: moved(),
             },
             events: events.to_vec(),
@@ -433,7 +440,7 @@ mod tests {
     fn states_of_earlier_versions_come_back_without_later_values() {
         let state = sample();
         let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_7 = TrainerState { poses: PoseState::default(), ..state.trainer.clone() };
+        let of_7 = TrainerState { first_exposures: 0, poses: PoseState::default(), ..state.trainer.clone() };
         let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
         let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
         let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };

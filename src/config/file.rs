@@ -166,8 +166,9 @@ config_keys! {
         init_scale: f64 = 1.0 => Numbers;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
-        /// Correct the pictures by values trained for each photo: off, exposure (one number a photo) or full (also eight of
-        /// its colours, and the vignetting of each camera). For photos whose exposure or colours change. On the CPU, exposure
+        /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo) or full (also eight
+        /// numbers for its colours, and the vignetting of each camera). For photos whose exposure or colours change. Exposures
+        /// start from the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
         appearance: AppearanceMode = AppearanceMode::Off => Numbers;
@@ -189,16 +190,16 @@ config_keys! {
         /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians, or
         /// at the number that --quality decides, remove the Gaussians that contribute least), or none
         strategy: StrategyName = StrategyName::Default => Numbers;
-        /// Of --strategy long-axis: grow first what has the largest screen-space gradient (gradient), what covers the
-        /// most squared error (error), or the largest geometric mean of both (mixed)
+        /// With --strategy long-axis, grow first the Gaussians with the largest screen-space gradient (gradient), with the
+        /// largest squared error in the pixels that they cover (error), or with the largest geometric mean of both (mixed)
         growth_score: GrowthScore = GrowthScore::Gradient => Numbers;
-        /// Of --strategy long-axis: share of the Gaussians seen that a round at the cap removes; 0 = none
+        /// With --strategy long-axis, the share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers;
-        /// Of --strategy long-axis without --max-gaussians: draft (few Gaussians), normal or archive (many). The run holds out
+        /// With --strategy long-axis and no --max-gaussians: draft (few Gaussians), normal or archive (many). The run holds out
         /// some training photos during its first half (at most 1,700 steps). The scene grows as long as more Gaussians bring
         /// these photos enough decibels
         quality: Quality = Quality::Normal => Numbers;
-        /// Most Gaussians; 0 = no cap; with --strategy long-axis 0 = as --quality decides
+        /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)
         [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;
@@ -206,8 +207,8 @@ config_keys! {
         refine_stop: u32 = 15_000 => Numbers;
         /// Steps between densification rounds
         refine_every: u32 = 100 => Numbers;
-        /// Steps between opacity resets, to twice --prune-opa; 0 = never. None comes in the last third of such an interval
-        /// before the end of the planned run (at most 1,000 steps), in which opacities recover
+        /// Steps between opacity resets (to twice --prune-opa); 0 = never. No reset comes in the last steps of the planned run
+        /// (a third of this number, at most 1,000), because opacities need steps to recover
         reset_every: u32 = 3000 => Numbers;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
         grow_grad2d: f64 = 2e-4 => Numbers;
@@ -232,14 +233,14 @@ config_keys! {
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
-        /// Format of the result: ply; or as well, for viewers, spz (about a tenth of the bytes) or sog (a folder with
-        /// levels of detail, which viewers load in parts)
+        /// Format of the result: ply, or a PLY and another format for viewers: spz (about a tenth of the bytes) or sog (a folder
+        /// with levels of detail, which viewers load in parts)
         export: ExportFormat = ExportFormat::Ply => Free;
         /// Coordinates of the PLY: dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the PLY: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction of the
-        /// dataset). The PLY is turned so that up is -y, as viewers show it; training is not. The file
-        /// point_cloud.transform.json leads back to the dataset
+        /// dataset). The PLY is turned so that up is -y, as viewers show it; training is not affected. The file
+        /// point_cloud.transform.json holds the transform back to the dataset
         [allow_hyphen_values = true] up: Up = Up::Auto => Free;
     }
     "Memory and disk" {

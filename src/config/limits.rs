@@ -36,8 +36,6 @@ pub struct RunOptions {
     pub sh_every: u32,
     /// SH degree at step 0: that of the config or of the Gaussians from which the run starts.
     pub sh_degree_start: u8,
-    /// Cap on Gaussians; 0 = none.
-    pub max_gaussians: usize,
     /// Capacity of a page, rows.
     pub page_rows: usize,
     /// View order; a shuffle until `auto` has been decided.
@@ -97,7 +95,6 @@ impl RunOptions {
             sh_degree: config.sh_degree,
             sh_every: config.sh_every,
             sh_degree_start: first_sh_degree(config),
-            max_gaussians: config.max_gaussians as usize,
             page_rows: config.page_rows as usize,
             view_order: config.view_order.0.unwrap_or(Order::Shuffle),
             render: RenderOptions {

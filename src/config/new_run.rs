@@ -1,4 +1,5 @@
-//! The config of a new run: flags over the config file over the defaults, and what neither gives by the run's length.
+//! The config of a new run. Flags override the config file, which overrides the defaults. The length of the run sets some
+//! of the keys that neither gives ([`super::schedule`]).
 //!
 //! Invariants: 1. a given key is never changed; 2. the result is written to the config of the run as if every key had
 //! been given, so a resumed run keeps its values whatever its new length.

@@ -1,5 +1,5 @@
-//! Lengths and rates that follow from the number of steps: what the keys of a new run become that neither its config
-//! file nor a flag gives.
+//! Lengths and rates that follow from the number of steps: the values of keys that neither the config file nor a flag of a
+//! new run gives.
 //!
 //! The defaults of the 3D Gaussian Splatting code are for 30,000 steps. A run of 3,000 steps would raise its SH degree
 //! to 3 only at its end, and its Gaussians would not get far. [`Schedule::RunLength`] makes these lengths shares of

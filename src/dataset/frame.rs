@@ -30,11 +30,6 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The frame in which local and world coordinates are equal.
-    pub fn identity() -> Self {
-        Frame { origin: DVec3::ZERO, scale: 1.0 }
-    }
-
     /// Converts a world position to local coordinates.
     pub fn to_local(&self, world: DVec3) -> DVec3 {
         (world - self.origin) / self.scale

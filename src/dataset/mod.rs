@@ -8,6 +8,7 @@ mod checks;
 pub mod colmap;
 mod colmap_write;
 pub mod disturb;
+pub mod exif;
 pub mod frame;
 pub mod import;
 pub mod layout;

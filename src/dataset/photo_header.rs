@@ -10,6 +10,8 @@
 //! Invariants: 1. no allocation is proportional to a number in the file; 2. an accepted file has a complete header, and
 //! its format's end marker after the start of the pixel data; 3. EXIF orientation is ignored, as in COLMAP: sizes are
 //! those of the stored pixels.
+//!
+//! Not here: what EXIF data say ([`super::exif`]); a header states only where they lie.
 
 use super::resize::LARGEST_SIDE;
 use crate::base::error::{InputError, InputResult};
@@ -32,6 +34,15 @@ pub enum PhotoFormat {
     Png,
 }
 
+/// Place of the EXIF data of a photo in its file: a TIFF structure, without the marker before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ExifPlace {
+    /// First byte.
+    pub at: u64,
+    /// Bytes, as the file states them.
+    pub bytes: u32,
+}
+
 /// Header of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoHeader {
@@ -45,6 +56,8 @@ pub struct PhotoHeader {
     pub decode_bytes: u64,
     /// Whether pixels may be transparent.
     pub has_alpha: bool,
+    /// The first EXIF data before the pixels.
+    pub exif: Option<ExifPlace>,
 }
 
 impl PhotoHeader {
@@ -89,6 +102,9 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
 /// and previews has some hundred.
 const MOST_SEGMENTS: u32 = 10_000;
 
+/// The first bytes of an APP1 segment with EXIF data.
+const EXIF_MARK: [u8; 6] = *b"Exif\0\0";
+
 const COPY_AGAIN: &str = "copy the photo again from its source, or remove it and use --allow-missing";
 
 fn foreign_format(magic: &[u8; 16]) -> Option<&'static str> {
@@ -127,7 +143,7 @@ impl JpegFrame {
         let of_scans = if has_scans { 2 * self.coefficients } else { 0 };
         let decode_bytes = 2 * bytes + metadata + result + of_scans;
         let (width, height) = (self.width, self.height);
-        PhotoHeader { format: PhotoFormat::Jpeg, width, height, decode_bytes, has_alpha: false }
+        PhotoHeader { format: PhotoFormat::Jpeg, width, height, decode_bytes, has_alpha: false, exif: None }
     }
 }
 
@@ -164,7 +180,7 @@ impl HeaderReader<'_> {
     /// Walks the segments up to the first scan (ITU T.81, annex B).
     fn jpeg(mut self) -> InputResult<PhotoHeader> {
         let mut at = 2u64;
-        let mut frame = None;
+        let (mut frame, mut exif) = (None, None);
         let (mut segments, mut metadata) = (0, 0);
         loop {
             segments += 1;
@@ -192,6 +208,9 @@ impl HeaderReader<'_> {
                     if (0xe0..=0xef).contains(&code) {
                         metadata += length;
                     }
+                    if code == 0xe1 && exif.is_none() {
+                        exif = self.jpeg_exif(at + 4, length - 2)?;
+                    }
                     at += 2 + length;
                 }
                 _ => return Err(self.damaged(at, "a JPEG marker is expected here")),
@@ -202,11 +221,19 @@ impl HeaderReader<'_> {
         };
         let mut scan = [0u8; 3];
         self.read(&mut scan, "the header of its first scan")?;
-        let header = frame.header(self.bytes, metadata, scan[2]);
+        let header = PhotoHeader { exif, ..frame.header(self.bytes, metadata, scan[2]) };
         // Pixel data cannot contain this pair (a 255 in it is followed by 0), but a preview in the header can: so the
         // search starts after the start of the scan. Anything may follow the marker.
         self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
         Ok(header)
+    }
+
+    /// The EXIF data in the `bytes` of an APP1 segment from `at` on, where the file is now.
+    fn jpeg_exif(&mut self, at: u64, bytes: u64) -> InputResult<Option<ExifPlace>> {
+        let Some(rest) = bytes.checked_sub(EXIF_MARK.len() as u64) else { return Ok(None) };
+        let mut mark = [0u8; EXIF_MARK.len()];
+        self.read(&mut mark, "a segment of its header")?;
+        Ok((mark == EXIF_MARK).then_some(ExifPlace { at: at + mark.len() as u64, bytes: rest as u32 }))
     }
 
     fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<JpegFrame> {
@@ -252,7 +279,7 @@ impl HeaderReader<'_> {
         let width = u32::from_be_bytes([h[8], h[9], h[10], h[11]]);
         let height = u32::from_be_bytes([h[12], h[13], h[14], h[15]]);
         let pixels = self.check_size(width, height, 16)?;
-        let (at, is_transparent) = self.png_pixels()?;
+        let (at, is_transparent, exif) = self.png_pixels()?;
         let depth = if h[16] == 16 { 2 } else { 1 };
         // Bytes as decoded, and as converted: RGB directly, or RGBA first if there is alpha.
         let (colors, has_alpha) = match h[17] {
@@ -270,21 +297,24 @@ impl HeaderReader<'_> {
         };
         self.require_end(at, b"IEND\xae\x42\x60\x82", "the end chunk (IEND)")?;
         let decode_bytes = pixels * per_pixel;
-        Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes, has_alpha })
+        Ok(PhotoHeader { format: PhotoFormat::Png, width, height, decode_bytes, has_alpha, exif })
     }
 
-    /// Walks the chunks up to the first pixels: their position, and whether a tRNS chunk makes some transparent.
-    fn png_pixels(&mut self) -> InputResult<(u64, bool)> {
-        let (mut at, mut is_transparent) = (33u64, false);
+    /// Walks the chunks up to the first pixels: their position, whether a tRNS chunk makes some transparent, and the EXIF data.
+    fn png_pixels(&mut self) -> InputResult<(u64, bool, Option<ExifPlace>)> {
+        let (mut at, mut is_transparent, mut exif) = (33u64, false, None);
         for _ in 0..MOST_SEGMENTS {
             self.file.seek(SeekFrom::Start(at)).map_err(|e| self.io(&e))?;
             let mut head = [0u8; 8];
             self.read(&mut head, "a chunk before its pixels")?;
             let [a, b, c, d, kind @ ..] = head;
             match &kind {
-                b"IDAT" => return Ok((at, is_transparent)),
+                b"IDAT" => return Ok((at, is_transparent, exif)),
                 b"IEND" => return Err(self.damaged(at, "it ends before its pixels begin")),
                 b"tRNS" => is_transparent = true,
+                b"eXIf" if exif.is_none() => {
+                    exif = Some(ExifPlace { at: at + 8, bytes: u32::from_be_bytes([a, b, c, d]) });
+                }
                 _ => {}
             }
             at += 12 + u64::from(u32::from_be_bytes([a, b, c, d]));

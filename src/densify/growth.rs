@@ -1,4 +1,4 @@
-//! The count that a run decides itself: growth in stages, as long as more Gaussians pay.
+//! The number of Gaussians, where the run decides it: growth in stages, as long as more Gaussians pay.
 //!
 //! A few training views are held out while the scene may grow. Before a round, each of them is drawn with all Gaussians, and
 //! without the quarter of the drawn ones that have the least blending weight in it. Where Gaussians are scarce even the
@@ -14,8 +14,8 @@
 //! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`), which rows grow
 //! ([`super::long_axis`]).
 //!
-//! Invariants: 1. a decision is a function of the step, of the loss, and of the decisions before it, which a commit holds;
-//! 2. the count that is allowed never falls.
+//! Invariants: 1. a decision is a function of the step, the loss and the earlier decisions, which are part of commits; 2.
+//! the allowed number never falls.
 
 use serde::{Deserialize, Serialize};
 use std::fmt;
@@ -49,9 +49,10 @@ impl Quality {
 /// The checks: at which share of [`GrowthRule::unit`] a check is due, and a loss in decibels. Scenes of small photos have these
 /// losses where the next doubling brings one to two tenths of a decibel.
 const CHECKS: [[f64; 2]; 4] = [[1.0 / 3.0, 0.07], [0.4, 0.16], [1.4 / 3.0, 0.24], [1.6 / 3.0, 0.30]];
-/// Longest unit: in longer runs a scene takes as many steps as in one of this length until its losses tell its count.
+/// Longest unit, steps. In a longer run the losses of a scene tell its count after as many steps as in a run of this
+/// length.
 const UNIT_MOST: u32 = 3000;
-/// Most doublings of one stage: as many rounds lie between two checks.
+/// Most doublings of one stage, which is the number of rounds between two checks.
 const DOUBLINGS_MOST: f64 = 2.0;
 
 /// The rule of a run that decides its count.
@@ -63,7 +64,7 @@ pub struct GrowthRule {
     unit: u32,
 }
 
-/// A check, with what it decided.
+/// A check and its decision.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GrowthCheck {
     /// Steps done.
@@ -78,7 +79,7 @@ pub struct GrowthCheck {
     pub allowed: u64,
 }
 
-/// What a run that decides its count knows of it.
+/// The state of the decision about the count.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GrowthState {
     /// Gaussians before the first event; 0 before that, and in runs that do not decide.
@@ -130,8 +131,8 @@ impl GrowthRule {
         GrowthRule { quality, unit: steps.clamp(1, UNIT_MOST) }
     }
 
-    /// The number of the check that a round after this step begins with, if `round_before` is the step of the round before: the
-    /// last one that fell due since.
+    /// The number of the check at the begin of a round after `step`: the last check that fell due since the round before,
+    /// whose step is `round_before`.
     pub fn due(&self, round_before: Option<u32>, step: u32) -> Option<usize> {
         let is_past = |step: u32, share: f64| f64::from(step) >= share * f64::from(self.unit);
         (0..CHECKS.len()).rfind(|&number| {

@@ -253,7 +253,7 @@ mod tests {
         assert!(kept.iter().map(score).all(|kept| kept < least));
         assert_eq!(round.promised(1000, &histogram), grown.len() as u64);
         assert_eq!(round.promised_rows(&state.view()), grown.len() as u64);
-        assert!(round.may_edit(&state.view()) && !round.may_edit(&SceneState::empty(0).view()));
+        assert!(round.may_edit(&state.view()) && !round.may_edit(&SceneState::default().view()));
         // Without room nothing grows, and rows without statistics never do.
         let full = strategy.round(700, RowCount::unlimited(1300), &histogram);
         assert_eq!(full.promised(1300, &histogram), 0);

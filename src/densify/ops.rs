@@ -14,12 +14,10 @@ use crate::base::math::{exp32, logit};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{LONG_AXIS_OFFSET, SPLIT_SIGMAS};
+use crate::scene::rotation::Rotation;
 use crate::scene::rows::{BLOCK_LANES, RowBlock, Rows, RowsMut, RowsNow, first_lane, scales_of};
 use crate::scene::state::SceneState;
-use rayon::prelude::*;
 
-/// Rows per unit of parallel work.
-const ROWS_PER_TASK: usize = 4096;
 /// Children of a split are smaller than their parent by this factor.
 const SPLIT_SHRINK: f64 = 1.6;
 /// Size of the children of a long-axis split over that of their parent, along the split axis and along the others.
@@ -109,43 +107,14 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
     RoundEdits { removed, added: new_rows.into_state(values.now()), counts }
 }
 
-/// Applies a round to a table and clears the statistics.
-pub fn apply_round<V: RowsNow>(
-    values: &V,
-    state: &mut SceneState,
-    round: &dyn Round,
-    seed: u64,
-    event: u64,
-) -> RoundCounts {
-    let chunks = state.chunks(ROWS_PER_TASK);
-    let edits: Vec<(usize, RoundEdits)> =
-        chunks.par_iter().map(|rows| (rows.first_row, plan_round(values, rows, round, seed, event))).collect();
-    apply_edits(state, &edits)
-}
-
-/// Applies edits, each with the first row of its view, to a table that the views cover. Clears the statistics.
-pub fn apply_edits(state: &mut SceneState, edits: &[(usize, RoundEdits)]) -> RoundCounts {
-    let mut removed = Vec::new();
-    let mut counts = RoundCounts::default();
-    for (first, edit) in edits {
-        removed.extend(edit.removed.iter().map(|&row| row + *first as u32));
-        counts.duplicated += edit.counts.duplicated;
-        counts.split += edit.counts.split;
-        counts.pruned += edit.counts.pruned;
-    }
-    state.remove(&removed);
+/// Applies the edits of all rows of a table. Clears the statistics.
+pub fn apply_edits(state: &mut SceneState, edits: &RoundEdits) {
+    state.remove(&edits.removed);
     // If the reservation fails, `append` fails too, with the allocator's own message.
-    let _ = state.try_reserve_exact(edits.iter().map(|(_, edit)| edit.added.rows()).sum());
-    edits.iter().for_each(|(_, edit)| state.append(&edit.added));
+    let _ = state.try_reserve_exact(edits.added.rows());
+    state.append(&edits.added);
     state.grad2d.fill(0.0);
     state.count.fill(0);
-    counts
-}
-
-/// Applies an opacity reset to a table; returns the number of rewritten rows.
-pub fn reset_opacities<V: RowsNow>(values: &V, state: &mut SceneState, max_opacity: f32) -> usize {
-    let mut chunks = state.chunks_mut(ROWS_PER_TASK);
-    chunks.par_iter_mut().map(|rows| reset_opacity_rows(values, rows, max_opacity)).sum()
 }
 
 /// Caps the opacities of the rows of a view and clears the moments of the opacities. A row whose opacity is at most the
@@ -199,7 +168,8 @@ fn split_child(parent: &RowBlock, seed: u64, uid: u64, event: u64) -> RowBlock {
 /// at random.
 ///
 /// The factors were the best of those measured (children at 0.5 or 0.87 sigma, unshrunk short axes and full opacity were
-/// worse by 0.1 dB each): the children together cover the parent's length and hide about what it hid.
+/// worse by 0.1 dB each): the children together cover the length of the parent and occlude about as much as the parent
+/// did.
 fn long_axis_children(parent: &RowBlock) -> [RowBlock; 2] {
     let (scales, quats, opacity) =
         (first_lane(Column::Scales), first_lane(Column::Quats), first_lane(Column::Opacities));
@@ -233,12 +203,7 @@ pub(super) fn child_log_scale(parent: f32) -> f32 {
 /// Rotation matrix of a quaternion (w, x, y, z) of any length; a zero quaternion gives the identity.
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let [w, x, y, z] = if length > 0.0 { q.map(|c| c / length) } else { [1.0, 0.0, 0.0, 0.0] };
-    [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
+    Rotation::from_quaternion(q.map(|c| c / length)).unwrap_or(Rotation::IDENTITY).matrix()
 }
 
 /// New rows of a round.

@@ -1,4 +1,4 @@
-//! Applies logged events to rows: one event to a table, or all pending events to a page.
+//! Applies the pending events of a page to its rows.
 //!
 //! Not here: when pages are pinned, and where the parts of a split page are stored.
 //!
@@ -21,37 +21,6 @@ use crate::scene::page_split::{SplitTooDeep, split_page};
 use crate::scene::rows::{Rows, RowsMut, RowsNow};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
-
-/// The effect of an event.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct EventOutcome {
-    /// The effect of a densification round.
-    pub round: RoundCounts,
-    /// Rows that an opacity reset rewrote.
-    pub reset_rows: usize,
-}
-
-/// Applies event number `index` of the log to all rows of a table (the scene or one page) on time and without
-/// shortcuts. [`PendingEvents`] must give the same result.
-pub fn apply_event(
-    state: &mut SceneState,
-    adam: &DeferredAdam,
-    seed: u64,
-    index: usize,
-    event: &Event,
-) -> EventOutcome {
-    let mut outcome = EventOutcome::default();
-    match effect_of(&event.kind) {
-        Effect::Round(round) => {
-            outcome.round = ops::apply_round(&adam.at(event.now()), state, round, seed, index as u64);
-        }
-        Effect::ResetOpacity { max_opacity } => {
-            outcome.reset_rows = ops::reset_opacities(&adam.at(event.now()), state, max_opacity);
-        }
-        Effect::RaiseShDegree { degree } => state.raise_sh_degree(degree),
-    }
-    outcome
-}
 
 /// The effect of one round on a page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -106,16 +75,6 @@ impl<'a> PendingEvents<'a> {
         PendingEvents { adam, seed, page_rows, events, at: events.iter().map(|_| OnceLock::new()).collect() }
     }
 
-    /// Number of events, which is the number that a page has applied after a replay.
-    pub fn len(&self) -> usize {
-        self.events.len()
-    }
-
-    /// Whether the log has no event yet.
-    pub fn is_empty(&self) -> bool {
-        self.events.is_empty()
-    }
-
     fn at(&self, index: usize) -> &AdamNow<'a> {
         self.at[index].get_or_init(|| Box::new(self.adam.at(self.events[index].now())))
     }
@@ -160,7 +119,7 @@ impl<'a> PendingEvents<'a> {
                     let (done, edits) = self.plan(index, round, &rows.view(), &mut extremes);
                     replay.rounds.push(done);
                     if let Some(edits) = edits {
-                        ops::apply_edits(rows.table(), &[(0, edits)]);
+                        ops::apply_edits(rows.table(), &edits);
                         extremes = None;
                     } else {
                         replay.mark_edited(rows.clear_statistics());
@@ -252,7 +211,7 @@ impl EditedRows<'_, '_> {
     /// Returns the number of rewritten rows.
     fn reset_opacities(&mut self, values: &AdamNow<'_>, max_opacity: f32) -> usize {
         match &mut self.table {
-            Some(state) => ops::reset_opacities(values, state, max_opacity),
+            Some(state) => ops::reset_opacity_rows(values, &mut state.view_mut(), max_opacity),
             None => ops::reset_opacity_rows(values, self.page, max_opacity),
         }
     }

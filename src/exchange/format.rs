@@ -1,4 +1,4 @@
-//! The formats of exported Gaussians: their names, the way from a format to its sink, and what a run keeps of them.
+//! The formats of exported Gaussians: file names, sinks, and the files that a run keeps.
 //!
 //! Invariant: everything that follows from a format is a `match` in this file, so that the compiler lists what a new format needs.
 
@@ -28,10 +28,10 @@ impl ExportFormat {
     /// All formats.
     pub const ALL: [ExportFormat; 3] = [ExportFormat::Ply, ExportFormat::Spz, ExportFormat::Sog];
 
-    /// How a file name says the format, for help and remedies.
+    /// The file names of the formats, for help and remedies.
     pub const NAMES: &str = ".ply, .spz, or lod-meta.json in a folder of its own (SOG with levels of detail)";
 
-    /// The format that a file name says, by its ending or as a whole.
+    /// The format of a file, by the ending of its name or the whole name.
     ///
     /// # Errors
     /// No format has this name.
@@ -44,12 +44,12 @@ impl ExportFormat {
             () if path.file_name().is_some_and(|name| name == TREE_FILE) => Ok(ExportFormat::Sog),
             () => {
                 let remedy = format!("use {}", ExportFormat::NAMES);
-                Err(InputError::new(path, "this file name names no format", remedy))
+                Err(InputError::new(path, "no export format has this file name", remedy))
             }
         }
     }
 
-    /// Most memory that its sink takes beside the rows that it is given, bytes; a few MiB count as none.
+    /// Most memory of the format's sink beside its input rows, bytes; a few MiB count as none.
     pub fn memory_bytes(self) -> u64 {
         if self == ExportFormat::Sog { memory_bytes() } else { 0 }
     }
@@ -67,10 +67,10 @@ impl ExportFormat {
         }
     }
 
-    /// Refuses to remove an export in this file: a folder that holds files of others, all of which stay.
+    /// Checks that [`ExportFormat::remove`] may remove the export `file`.
     ///
     /// # Errors
-    /// There is such a folder, or the folder cannot be listed.
+    /// The folder of the export holds files that no export wrote, or cannot be listed.
     pub fn check_removable(self, file: &Path) -> InputResult<()> {
         match self {
             ExportFormat::Ply | ExportFormat::Spz => Ok(()),
@@ -78,7 +78,7 @@ impl ExportFormat {
         }
     }
 
-    /// Removes an export in this file and the transform beside it, if they exist.
+    /// Removes the export `file` and the transform beside it, if they exist.
     ///
     /// # Errors
     /// As [`ExportFormat::check_removable`], or the drive fails.
@@ -119,7 +119,7 @@ impl ExportFormat {
         })
     }
 
-    /// Writes the way from a file of this format to the dataset's coordinates beside it. `meta` is that of a PLY.
+    /// Writes the transform from a file of this format to the dataset's coordinates, beside the file. `meta` is that of a PLY.
     ///
     /// # Errors
     /// The folder cannot be written.

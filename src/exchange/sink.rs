@@ -1,4 +1,4 @@
-//! Where exported Gaussians go: a file of some format that takes rows in parts.
+//! The target of an export: a file in some format that takes rows in parts.
 //!
 //! Not here: the formats, which rows are exported.
 

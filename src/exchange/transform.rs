@@ -1,4 +1,4 @@
-//! The file beside a file of Gaussians that leads from its coordinates to those of the dataset and back, for programs that do
+//! The transform file beside an exported file: maps its coordinates to those of the dataset and back, for programs that do
 //! not read the comments of a PLY.
 //!
 //! Not here: reading it. gsscale reads the comments.

@@ -109,14 +109,6 @@ impl fmt::Debug for Gpu {
 }
 
 impl Gpu {
-    /// Opens the device that `choice` requests, with default options.
-    ///
-    /// # Errors
-    /// As [`Gpu::open_with`].
-    pub fn open(choice: &DeviceChoice) -> GpuResult<Gpu> {
-        Gpu::open_with(choice, &GpuOptions::default())
-    }
-
     /// Opens the device that `choice` requests.
     ///
     /// # Errors
@@ -263,7 +255,7 @@ mod tests {
     #[test]
     #[allow(clippy::unwrap_used)] // a panic is a failed test
     fn a_lost_device_is_reported_by_every_later_call() {
-        let gpu = match Gpu::open(&DeviceChoice::Gpu) {
+        let gpu = match Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions::default()) {
             Ok(gpu) => gpu,
             Err(GpuError::NoSuchDevice { .. }) if std::env::var_os("CI").is_none() => return,
             Err(error) => panic!("{error}"),

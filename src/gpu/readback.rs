@@ -55,7 +55,7 @@ impl Staging {
     }
 }
 
-/// Copies mapped bytes to as many of the host.
+/// Copies mapped bytes to host memory of the same length.
 fn empty(mapped: &[u8], out: &mut [u8]) {
     match out.len() {
         0..=COPY_PART => out.copy_from_slice(mapped),
@@ -100,11 +100,6 @@ impl PendingMap {
 }
 
 impl Readback {
-    /// Size, bytes.
-    pub fn size(&self) -> u64 {
-        self.size
-    }
-
     /// Waits, then returns the elements.
     ///
     /// # Errors
@@ -115,7 +110,7 @@ impl Readback {
         Ok(out)
     }
 
-    /// Waits, then fills `out` from its start with as many elements as there are.
+    /// Waits, then copies all elements to the front of `out`.
     ///
     /// # Errors
     /// The recorder was not submitted, the device was lost, or its work failed.

@@ -3,8 +3,8 @@
 //! A device works on a step behind the gate while the host records the next one. A step may change rows only if all earlier steps
 //! did, its lists had room, its loss is finite, and few of its rows have unusable gradients.
 //!
-//! Invariants: 1. a gate that is closed stays closed until the host opens it; 2. a step without a reason to close the gate is one
-//! that the host would have taken after waiting for all of its numbers.
+//! Invariants: 1. a gate that is closed stays closed until the host opens it; 2. the host would take each step that passes
+//! the gate, had it waited for all numbers of the step.
 
 crate::wgsl_struct! {
     /// Uniform of `gate.wgsl`.
@@ -15,7 +15,7 @@ crate::wgsl_struct! {
         pub isects_room: u32,
         /// Entries of one tile's list that the recorded blending covers.
         pub list_room: u32,
-        /// More than one row in so many with unusable gradients closes the gate.
+        /// The gate closes if more than one in this many rows has unusable gradients.
         pub rows_per_unusable: u32,
         /// Word of the counts with the number of listed rows.
         pub rows_at: u32,

@@ -2,9 +2,9 @@
 //! `shaders/gather.wgsl`, in which the functions are entry points.
 //!
 //! [`cull`] lists the rows of each page that the camera may draw, [`list`] packs the lists in the order of the pages,
-//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the host does
-//! not wait for the numbers of rows, [`place`] finds where the list of each page begins; a list has room for more rows than there
-//! are then, and entries without a row ([`UNLISTED`]) are transparent.
+//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the
+//! host does not wait for the numbers of rows, [`place`] finds where the list of each page begins. The list then has spare
+//! room, and entries without a row ([`UNLISTED`]) are transparent.
 //!
 //! One workgroup of a device finds the bounds of a page, by minima and maxima in its own memory. Bounds therefore need no
 //! atomic operations on floats in the form of ordered integers.
@@ -36,7 +36,7 @@ pub const UNLISTED: u32 = u32::MAX;
 /// Opacity, before activation, of entries without a row.
 const HIDDEN_LOGIT: f32 = -100.0;
 
-/// What the stage reads: the pages of a batch, the slab that is bound, and the optimizer's numbers.
+/// Input of the stage: the pages of a batch, the slab that is bound, and the optimizer's numbers.
 #[derive(Debug, Clone, Copy)]
 pub struct GatherInput<'a> {
     /// Uniforms of the dispatch.

@@ -52,13 +52,6 @@ pub struct LossOptions {
     pub simd: SimdPath,
 }
 
-impl LossOptions {
-    /// The loss of these parts alone, without the further terms that a config may add.
-    pub fn new(ssim_lambda: f32, padding: SsimPadding, simd: SimdPath) -> LossOptions {
-        LossOptions { ssim_lambda, padding, simd }
-    }
-}
-
 /// Loss of one image and its parts.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LossValue {
@@ -130,11 +123,6 @@ pub struct ImageLoss {
 }
 
 impl ImageLoss {
-    /// A loss for pictures of any size.
-    pub fn new() -> Self {
-        ImageLoss::default()
-    }
-
     /// Loss of `image` against `target`, and its derivative with respect to every value of the image into `v_rgb`
     /// (planar `[3][height][width]`, resized; sign(0) = 0 in the L1 part).
     ///

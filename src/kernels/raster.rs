@@ -1,4 +1,4 @@
-//! What both directions of the rasterizer share: their input, and how a splat's exponent becomes alpha. The twin of
+//! Shared by both directions of the rasterizer: their input, and the alpha of a splat from its exponent. The twin of
 //! shaders/shared/raster.wgsl.
 
 use super::constants::TILE;

@@ -282,7 +282,7 @@ mod tests {
         for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
             assert_eq!(of(simd, &state.view()), want, "{}", simd.name());
         }
-        assert!(of(SimdPath::best(), &SceneState::empty(0).view()).is_empty());
+        assert!(of(SimdPath::best(), &SceneState::default().view()).is_empty());
     }
 
     /// The smallest allowed eps, with second moments down to the smallest floats: rewriting flushes them to zero, which

@@ -1,4 +1,4 @@
-//! Learning rates and Adam: the dense form as reference, the deferred form for training.
+//! Learning rates and deferred Adam.
 
 pub mod adam;
 mod adam_now;

@@ -25,16 +25,6 @@ pub enum Moments {
     Bf16,
 }
 
-impl Moments {
-    /// The name on the command line and in config.toml.
-    pub fn name(self) -> &'static str {
-        match self {
-            Moments::F32 => "f32",
-            Moments::Bf16 => "bf16",
-        }
-    }
-}
-
 /// Rounds both moments of a loaded row that contains `steps` steps; `W` is the width of `sh_n`.
 #[inline(always)]
 pub(crate) fn round_block<const W: usize>(m: &mut RowBlock, v: &mut RowBlock, uid: u64, steps: u32) {

@@ -1,9 +1,9 @@
-//! How far one update may move the bounds of a page: what is certain before the update is known.
+//! Upper bound on how far one optimizer update moves the bounds of a page. It holds before the gradients of the update are known.
 //!
 //! Adam bounds its own steps. With m = (1 - b1) sum b1^k g_k and v = (1 - b2) sum b2^k g_k^2, the Cauchy-Schwarz inequality gives
 //! |m| / sqrt(v) <= (1 - b1) / sqrt((1 - b2) (1 - b1^2 / b2)), 7.3 for the usual decays, whatever the gradients. An update after
-//! `now` steps moves a value by that ratio times c_{now+1}, and the limit towards which the row drifts afterwards by the ratio times
-//! S(now+1) more. Both together are the ratio times S(now) / r (`super::drift`), at the rate of the column.
+//! `now` steps moves a value by at most that ratio times c_{now+1}, and the limit towards which the row drifts afterwards by at most the
+//! ratio times S(now+1) more. The sum of both is the ratio times S(now) / r (`super::drift`), at the rate of the column.
 //!
 //! Invariant: bounds after an update lie within the widened bounds before it.
 

@@ -1,19 +1,20 @@
-//! Transient objects: which blocks of a photo show what the scene does not.
+//! Transient objects: which blocks of a photo show something that the scene does not contain.
 //!
-//! A car that drove on stands on one photo only. All other photos of its place agree on the road below, so the picture shows
-//! the road, and the colours of photo and picture differ there over a whole area. Fine detail that the scene has not learnt
-//! yet differs too, but less in the mean over an area, and where the photo is rich in contrast. So a photo is cut into
+//! A car that drove on is visible on one photo only. All other photos of that place agree on the road below, so the picture shows
+//! the road, and the colours of photo and picture differ over a whole area. Fine detail that the scene has not learnt yet
+//! differs too, but the mean over an area differs less, and such detail lies where the photo has much contrast. So a photo is cut into
 //! blocks ([`super::residuals`]). The residual of a block is the difference between the mean colours of photo and picture; its
 //! score is the running mean of its residuals over the contrast of the photo around it.
 //!
-//! At each visit of a view, median and median absolute deviation of its scores say what is usual in this view. A block far
-//! above is masked; so is a block half as far above that touches one or was masked before. Blocks that are masked are still
-//! measured: such a block returns when the scene, taught by the other photos, comes to show it.
+//! At each visit of a view, a block is masked if its score lies far above the median of the view, by the median absolute
+//! deviation. A block half as far above is masked if it touches a masked block or was masked before. Masked blocks are still
+//! measured: such a block is unmasked when the scene, trained on the other photos, shows it.
 //!
 //! Invariants: 1. running means are fixed-point numbers, and a mask follows from them, the photo and the mask before; 2. at most
 //! a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its size.
 
 use super::residuals::{BlockGrid, NO_PIXELS, PER_UNIT, contrasts, residuals};
+use super::{MAD_OF_NORMAL, median_and_deviation};
 use crate::scene::image::Target;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
@@ -30,12 +31,10 @@ const NEAR: f64 = 0.5;
 const RESIDUAL_LEAST: f64 = 0.025;
 /// Added to the contrast, since plain areas of photos are noisy too.
 const CONTRAST_LEAST: f64 = 0.03;
-/// Median absolute deviation of a normal distribution, in standard deviations.
-const MAD_OF_NORMAL: f64 = 0.674_489_75;
 /// Blocks are judged after a tenth of the run, at the latest after [`FIRST_LOOK_LATEST`] steps.
 const FIRST_LOOK_PART: u32 = 10;
 const FIRST_LOOK_LATEST: u32 = 500;
-/// Steps after an opacity reset in which pictures are too dark to be looked at.
+/// Steps after an opacity reset in which pictures are too dark for a judgement.
 pub const STEPS_AFTER_RESET: u32 = 500;
 
 /// The first step that judges blocks, in a run of `steps` steps: pictures have the mean colours of the scene by then.
@@ -44,13 +43,14 @@ pub fn first_look_at_blocks(steps: u32) -> u32 {
 }
 
 /// Whether masked blocks count in the loss at `step` too: in every other epoch of the first half of a run of `steps` steps on `views`
-/// views. What few photos show is far off at first, and a mask would keep it so. When it counts, its residual falls and the
-/// mask ends. The residual of what has moved is back at the next visit, since all other photos contradict it.
+/// views. A part of the scene that few photos show has a large residual at first, and a mask would keep the residual
+/// large. While the part counts, its residual falls and its mask ends. The residual of a moving object rises again by the next visit,
+/// because all other photos contradict the object.
 pub fn counts_masked_blocks(step: u32, steps: u32, views: usize) -> bool {
     step < steps / 2 && (step as usize / views.max(1)).is_multiple_of(2)
 }
 
-/// What is known of a block: twice its running mean, plus one if it is masked.
+/// The state of a block: twice its running mean, plus one if the block is masked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct BlockState(u16);
 
@@ -98,16 +98,9 @@ fn scores(means: &[u16], photo: &Target, grid: &BlockGrid) -> Vec<f64> {
 fn limits(means: &[u16], scores: &[f64]) -> Option<[f64; 2]> {
     let used = means.iter().zip(scores).filter(|(mean, _)| **mean != NO_PIXELS);
     let mut used: Vec<f64> = used.map(|(_, &score)| score).collect();
-    let middle = median(&mut used)?;
-    used.iter_mut().for_each(|score| *score = (*score - middle).abs());
-    let above = (DEVIATIONS * median(&mut used)? / MAD_OF_NORMAL).max(SCORE_LEAST - middle);
+    let (middle, deviation) = median_and_deviation(&mut used)?;
+    let above = (DEVIATIONS * deviation / MAD_OF_NORMAL).max(SCORE_LEAST - middle);
     Some([middle + above, middle + NEAR * above])
-}
-
-/// The value in the middle; the lower of two; `None` without values.
-fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
 /// The blocks of a view after a look at its picture `[3][height][width]`, from the blocks after the look before, if there was
@@ -168,7 +161,7 @@ pub struct BlockOutliers {
 }
 
 impl BlockOutliers {
-    /// Of `views` views, of which nothing is known.
+    /// The state of `views` views before the first look.
     pub fn new(views: usize) -> BlockOutliers {
         BlockOutliers { views: vec![Vec::new(); views] }
     }
@@ -178,7 +171,7 @@ impl BlockOutliers {
         (size_of::<Vec<BlockState>>() + size_of::<BlockState>() * BlockGrid::of(width, height).blocks()) as u64
     }
 
-    /// Whether it knows as many views as `other`.
+    /// Whether both have the same number of views.
     pub fn is_as_large_as(&self, other: &BlockOutliers) -> bool {
         self.views.len() == other.views.len()
     }

@@ -1,4 +1,4 @@
-//! Outliers: what in the photos contradicts the rest of the scene.
+//! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
 //! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks.
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
@@ -12,3 +12,14 @@
 pub mod blocks;
 pub mod residuals;
 pub mod views;
+
+/// Median absolute deviation of a normal distribution, in standard deviations.
+const MAD_OF_NORMAL: f64 = 0.674_489_75;
+
+/// Median and median absolute deviation of values, each the lower of two middle values; `None` without values. Overwrites the values.
+fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
+    let middle = values.len().checked_sub(1)? / 2;
+    let median = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
+    values.iter_mut().for_each(|value| *value = (*value - median).abs());
+    Some((median, *values.select_nth_unstable_by(middle, f64::total_cmp).1))
+}

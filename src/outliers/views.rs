@@ -4,13 +4,14 @@
 //! the share of its photo's variance that its picture leaves unexplained, which photos of much and of little contrast have in
 //! common. The measure is the logarithm of mean squared error over variance.
 //!
-//! At the end of each epoch every view has a measure of that epoch. Median and median absolute deviation of all of them say
-//! what is usual; a view far above earns a strike, another loses one. Strikes outlast chance: a view is an outlier from
-//! two strikes on, until it has lost all of them. Views that are left out are still measured, so they can return.
+//! At the end of each epoch every view has a measure of that epoch. A view whose measure lies far above the median of all views, by the
+//! median absolute deviation, gets a strike; any other view loses one. A view is an outlier from its second strike on, until it has lost
+//! all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
 //!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
 //! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
 
+use super::{MAD_OF_NORMAL, median_and_deviation};
 use crate::scene::image::Target;
 use serde::{Deserialize, Serialize};
 
@@ -18,25 +19,23 @@ use serde::{Deserialize, Serialize};
 const PER_UNIT: f64 = 4096.0;
 /// Largest stored magnitude of a measure, fixed-point.
 const STORED_MOST: f64 = 64.0 * PER_UNIT;
-/// Fewest views of which median and deviation say what is usual.
+/// Fewest views for a verdict: with fewer, median and deviation are unreliable.
 const VIEWS_LEAST: usize = 8;
 /// Least variance of a photo, of values in 0..1: two grey levels. A blank photo has none, and any picture would contradict it.
 const VARIANCE_LEAST: f64 = 6e-5;
-/// Pixels that say what the variance of a photo is, about.
+/// Pixels in the estimate of a photo's variance, about.
 const SAMPLE: usize = 1 << 16;
 /// Strikes from which a view is an outlier, and the most that count.
 const STRIKES_NAMED: u8 = 2;
 const STRIKES_MOST: u8 = 4;
-/// A measure is an outlier if it exceeds the median by so many standard deviations, as the median absolute deviation
-/// estimates them, the error is so many times that of the median, and the picture leaves so large a share of the variance
-/// unexplained: a photo of another place leaves more than all of it, until the scene bends to show it.
+/// A measure is an outlier if three conditions hold: it exceeds the median by this many standard deviations (estimated from the median
+/// absolute deviation), the error is at least this many times the median error, and the picture leaves at least this share of the
+/// variance unexplained. A photo of another place leaves more than all of the variance, until the scene adapts to show the photo.
 const DEVIATIONS: f64 = 3.0;
 const RATIO_LEAST: f64 = 1.6;
 const UNEXPLAINED_LEAST: f64 = 0.3;
-/// Median absolute deviation of a normal distribution, in standard deviations.
-const MAD_OF_NORMAL: f64 = 0.674_489_75;
 
-/// What is known of a view.
+/// The state of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ViewState {
     /// The last measure, fixed-point.
@@ -76,19 +75,13 @@ fn variance(photo: &Target) -> Option<f64> {
     (count > 0).then(|| ((squares as f64 - of_means) / (3.0 * n * 255.0 * 255.0)).max(VARIANCE_LEAST))
 }
 
-/// The value in the middle; the lower of two.
-fn median(values: &mut [i32]) -> i32 {
-    let middle = values.len().saturating_sub(1) / 2;
-    *values.select_nth_unstable(middle).1
-}
-
 impl ViewOutliers {
-    /// Of `views` views, of which nothing is known.
+    /// The state of `views` views before the first measure.
     pub fn new(views: usize) -> ViewOutliers {
         ViewOutliers { views: vec![ViewState::default(); views] }
     }
 
-    /// Whether it knows as many views as `other`.
+    /// Whether both have the same number of views.
     pub fn is_as_large_as(&self, other: &ViewOutliers) -> bool {
         self.views.len() == other.views.len()
     }
@@ -122,14 +115,13 @@ impl ViewOutliers {
     /// Judges the views measured since the last call, at the end of the epoch with this number, from 0. Returns those that
     /// have become outliers, ascending.
     pub fn end_epoch(&mut self, epoch: u32) -> Vec<usize> {
-        let mut measured: Vec<i32> = self.views.iter().filter(|v| v.is_measured).map(|v| v.measure).collect();
+        let measured = self.views.iter().filter(|v| v.is_measured);
+        let mut measured: Vec<f64> = measured.map(|v| f64::from(v.measure)).collect();
         let mut found = Vec::new();
-        if measured.len() >= VIEWS_LEAST && epoch > 0 {
-            let middle = median(&mut measured);
-            let mut deviations: Vec<i32> = measured.iter().map(|m| (m - middle).abs()).collect();
-            let deviation = f64::from(median(&mut deviations)) / MAD_OF_NORMAL;
-            let far = (DEVIATIONS * deviation).max(PER_UNIT * libm::log(RATIO_LEAST));
-            let least = (f64::from(middle) + far).max(PER_UNIT * libm::log(UNEXPLAINED_LEAST));
+        let can_judge = measured.len() >= VIEWS_LEAST && epoch > 0;
+        if let (true, Some((middle, deviation))) = (can_judge, median_and_deviation(&mut measured)) {
+            let far = (DEVIATIONS * (deviation / MAD_OF_NORMAL)).max(PER_UNIT * libm::log(RATIO_LEAST));
+            let least = (middle + far).max(PER_UNIT * libm::log(UNEXPLAINED_LEAST));
             for (number, view) in self.views.iter_mut().enumerate().filter(|(_, view)| view.is_measured) {
                 if view.judge(f64::from(view.measure) > least) {
                     found.push(number);

@@ -21,11 +21,6 @@ impl PageIndex {
         &self.metas
     }
 
-    /// The slots of all pages.
-    pub fn slots(&self) -> &[Option<SlotRef>] {
-        &self.slots
-    }
-
     /// The entry of a page.
     pub fn meta(&self, page: PageNo) -> &PageMeta {
         &self.metas[page.index()]

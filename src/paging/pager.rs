@@ -1,9 +1,10 @@
 //! The pager hands out the pages of a view and takes them back.
 //!
-//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which pages are
-//! in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several parts stand in
-//! files of their own: `fetch` brings what is needed now, `batches` walks a view that is larger than the frames, `prefetch` what will be needed, `transfers` begins and ends reads and
-//! write-backs, `commit` makes what the pages hold durable.
+//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which
+//! pages are in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several
+//! parts stand in files of their own: `fetch` reads the pages of the current step, `prefetch` those of coming steps,
+//! `batches` walks a view that is larger than the frames, `transfers` begins and ends reads and write-backs, `commit` makes
+//! the pages durable.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
 //! 2. a page's buffer is in one place: in its frame, with the mover, or with the caller who pinned it; 3. what a step
@@ -23,7 +24,7 @@ use super::stats::{Counters, PagerStats, SlotSpace};
 use super::timing::{Asker, Transfers};
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::format::slot_header::{HEADER_BYTES, SlotRef, transfer_bytes};
+use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
 use crate::page::versions::paged_store::PagedStore;
 use crate::scene::camera::Camera;
 use crate::scene::page_layout::capacity_bytes;
@@ -38,7 +39,7 @@ pub struct PagerConfig {
     pub page_rows: usize,
     /// Degree of the scene: a frame holds a full page of that degree.
     pub sh_degree: u8,
-    /// The most pages in memory; `usize::MAX` for as many as there are.
+    /// The most pages in memory; `usize::MAX` for no limit.
     pub frames: usize,
     /// Which page is evicted first.
     pub policy: EvictPolicy,
@@ -342,7 +343,7 @@ impl Pager {
         self.frames.frames()
     }
 
-    /// The most frames that there may be; `usize::MAX` for as many as needed.
+    /// The limit on frames; `usize::MAX` for no limit.
     pub fn frames_max(&self) -> usize {
         self.frames.frames_max()
     }
@@ -357,14 +358,10 @@ impl Pager {
         self.frames.state(page).is_some()
     }
 
-    /// What the frame of a page holds behind the header; `None` for a page that is not in memory, is pinned, or is moving.
+    /// The payload in the frame of a page, without the header; `None` for a page that is not in memory, is pinned, or is
+    /// moving.
     pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
         self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
-    }
-
-    /// The slots of the pages on the drive, by page: for the index of a commit, once no page is dirty.
-    pub fn slots(&self) -> &[Option<SlotRef>] {
-        self.index.slots()
     }
 
     /// How full the store is; `None` for a pager without a store.

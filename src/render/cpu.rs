@@ -104,9 +104,11 @@ pub struct CpuRenderer {
     range_chunk_counts: Vec<u64>,
     /// Most bytes of intersections that are listed at once; `None`: all of them.
     list_bytes: Option<u64>,
-    /// Whether this view gives buffers up between stages ([`memory`]), and the most bytes that any view held.
+    /// Whether this view gives buffers up between stages ([`memory`]), and the most bytes that any view held: in total, and in
+    /// buffers that grow with rows.
     is_crowded: bool,
     bytes_most: u64,
+    row_bytes_most: u64,
     footprints: FootprintGradients,
     /// Rows of the view with unusable gradients.
     unusable: u64,
@@ -178,11 +180,6 @@ impl CpuRenderer {
         &self.raster
     }
 
-    /// Footprints of the last view, one entry per row over all batches.
-    pub fn projected(&self) -> &Projected {
-        &self.projected
-    }
-
     /// Takes the gradient of the picture back to the splats, range by range. The lists of a picture of one range are still
     /// there; others are made again.
     fn rasterize_back(&mut self, grid: Grid, options: &RenderOptions) {
@@ -234,6 +231,18 @@ impl Renderer for CpuRenderer {
 
     fn host_bytes(&self) -> u64 {
         self.scratch_bytes().max(self.bytes_most)
+    }
+
+    fn host_bytes_of_rows(&self) -> u64 {
+        self.bytes_of_rows().max(self.row_bytes_most)
+    }
+
+    fn host_bytes_for_rows(&self, rows: u64) -> u64 {
+        self.bytes_for_rows(rows)
+    }
+
+    fn free_rows(&mut self) {
+        self.free_all_rows();
     }
 
     fn set_list_bytes(&mut self, bytes: Option<u64>) {

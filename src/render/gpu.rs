@@ -45,7 +45,7 @@
 //! that is recorded without waiting (`gpu_recorded`) has three submissions and two read-backs, which the host waits for once it has
 //! submitted the next step.
 //!
-//! Invariants: 1. of views, the device holds the rows, lists and picture of the last one only; 2. the same input gives the same
+//! Invariants: 1. the device holds the rows, lists and picture of the last view only; 2. the same input gives the same
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 

@@ -5,8 +5,8 @@
 //!
 //! Not here: the recording of the stages (`gpu_pages`), slots (`gpu_slots`).
 //!
-//! Invariant: an update that has begun is never begun again. What it needs is allocated before its first chunk, or was shown to
-//! fit ([`super::gpu_gradients::check_room`]).
+//! Invariant: an update is never repeated. Its memory is allocated before its first chunk, or was checked to fit
+//! ([`super::gpu_gradients::check_room`]).
 
 use super::gpu::{GpuRenderer, submit_batch};
 use super::gpu_gradients::{RowGradients, RowsOut};
@@ -19,6 +19,10 @@ use super::{RenderError, RowBatches};
 use crate::gpu::{Buffer, GpuResult, Recorder};
 use crate::kernels::page_words::PageResult;
 use crate::scene::optimizer_numbers::StepNumbers;
+
+fn held_mut(pages: &mut Option<Box<DevicePages>>) -> Result<&mut DevicePages, RenderError> {
+    pages.as_deref_mut().ok_or(RenderError::OutOfOrder { call: "pages", needs: "hold_pages" })
+}
 
 impl GpuRenderer {
     fn held(&self) -> Result<&DevicePages, RenderError> {
@@ -154,10 +158,7 @@ impl PageRenderer for GpuRenderer {
     }
 
     fn add_slots(&mut self, wanted: usize) -> Result<usize, RenderError> {
-        match &mut self.pages {
-            Some(pages) => Ok(pages.slots.add(&self.gpu, wanted)?),
-            None => Err(RenderError::OutOfOrder { call: "add_slots", needs: "hold_pages" }),
-        }
+        Ok(held_mut(&mut self.pages)?.slots.add(&self.gpu, wanted)?)
     }
 
     fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError> {
@@ -169,17 +170,11 @@ impl PageRenderer for GpuRenderer {
     }
 
     fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError> {
-        match &mut self.pages {
-            Some(pages) => Ok(pages.slots.begin_reads(&self.gpu, slots)?),
-            None => Err(RenderError::OutOfOrder { call: "begin_reads", needs: "hold_pages" }),
-        }
+        Ok(held_mut(&mut self.pages)?.slots.begin_reads(&self.gpu, slots)?)
     }
 
     fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError> {
-        match &mut self.pages {
-            Some(pages) => Ok(pages.slots.finish_reads(payloads)?),
-            None => Err(RenderError::OutOfOrder { call: "finish_reads", needs: "hold_pages" }),
-        }
+        Ok(held_mut(&mut self.pages)?.slots.finish_reads(payloads)?)
     }
 
     fn pages_in(&mut self, pages: &[SlotPage], step: &StepNumbers) -> Result<usize, RenderError> {

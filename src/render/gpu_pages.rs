@@ -70,7 +70,7 @@ pub struct DevicePages {
     pub(super) gate: Buffer,
 }
 
-/// What the stages of one view share.
+/// Buffers that the stages of one view share.
 #[derive(Debug)]
 pub struct PagesView {
     camera: Camera,

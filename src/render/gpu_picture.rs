@@ -42,8 +42,8 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// Device memory for the lists of a range, beside what the view still needs: gradients of the splats, places of the rows, and
-    /// the photo, the gradient and the derivatives of the loss.
+    /// Device memory for the lists of a range, after a reserve for later buffers of the view: gradients of the splats,
+    /// places of the rows, and the photo, the gradient and the derivatives of the loss.
     fn bytes_for_lists(&self, of: &ViewOptions, segments: &[Segment]) -> u64 {
         let rows: u64 =
             segments.iter().map(|segment| splat_bytes(segment.rows) + PLACE_BYTES * u64::from(segment.rows)).sum();
@@ -53,7 +53,8 @@ impl GpuRenderer {
         room.saturating_sub(reserved).max(room / 8)
     }
 
-    /// Submits what is recorded of the rows, the tile lists and the blending. Waits only if the lists do not fit at once.
+    /// Submits the recorded stages of the rows, the tile lists and the blending. Waits only if the lists do not fit at
+    /// once.
     pub(super) fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
         let (gpu, blend) = (&self.gpu, blend_of(&of));
         let RowsIn { segments, whole } = rows;

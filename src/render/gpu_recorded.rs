@@ -1,10 +1,10 @@
 //! [`GpuRenderer`]: steps on pages that are recorded without waiting, so that the host may record the next one while the device
 //! computes.
 //!
-//! The host knows neither how many rows are listed nor how long the lists are. So a recorded step takes buffers of sizes that its
-//! caller and earlier steps foretell, entries without a row fill the rest of the list of rows, and the gate (`gate.wgsl`) lets the
-//! update write only if all of it fitted and the numbers are sound. Everything else is recorded as in other steps, and has the same
-//! bits: entries without a row are never drawn, and an empty end of a list changes no sum.
+//! The host knows neither how many rows are listed nor how long the lists are. So a recorded step takes buffers whose sizes
+//! its caller and earlier steps predict. Entries without a row fill the rest of the list of rows. The gate (`gate.wgsl`)
+//! lets the update write only if every list fitted and the numbers are sound. Everything else is recorded as in other
+//! steps, and has the same bits: entries without a row are never drawn, and the empty tail of a list changes no sum.
 //!
 //! Two submissions bring uploads (tables, photo), the third brings backward pass, gate and update. Buffers of a step are handed to the
 //! next one as soon as they are recorded, because the device works in the order of the submissions; only the two read-backs of a step

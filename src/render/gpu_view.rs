@@ -1,4 +1,4 @@
-//! What a device holds of the current view, between the stages, and of steps that are recorded without waiting.
+//! Device state between the stages: that of the current view, and that of steps that are recorded without waiting.
 //!
 //! Not here: the stages.
 

@@ -255,8 +255,21 @@ pub trait Renderer: Send {
         None
     }
 
-    /// Host memory that the renderer holds, bytes.
+    /// Host memory that the renderer holds, bytes: the most of any view since [`Renderer::free_rows`].
     fn host_bytes(&self) -> u64;
+
+    /// The part of [`Renderer::host_bytes`] that grows with the rows of a view. 0 for a backend whose rows lie in device memory.
+    fn host_bytes_of_rows(&self) -> u64 {
+        0
+    }
+
+    /// What [`Renderer::host_bytes_of_rows`] is at most after a view with this many rows, if nothing is held before it.
+    fn host_bytes_for_rows(&self, _rows: u64) -> u64 {
+        0
+    }
+
+    /// Frees the buffers that grow with the rows of a view, between views. The next view allocates the buffers again.
+    fn free_rows(&mut self) {}
 
     /// The sizes of the last view, from which its device memory follows; `None` for a backend without a device.
     fn device_sizes(&self) -> Option<ViewSizes> {

@@ -38,7 +38,7 @@ pub struct PageRules {
     pub splits: SplitNumbers,
 }
 
-/// A step that is recorded without waiting, up to its picture.
+/// The first part of a recorded step, up to its picture.
 #[derive(Debug, Clone, Copy)]
 pub struct StepJob<'a> {
     /// The pages of the view, in their slots.
@@ -47,15 +47,15 @@ pub struct StepJob<'a> {
     pub numbers: &'a StepNumbers,
     /// The view.
     pub camera: &'a Camera,
-    /// How it is drawn.
+    /// Render options.
     pub options: &'a RenderOptions,
-    /// Rows that the view lists at most, or so many as the caller foretells: the step is not taken if it lists more.
+    /// Capacity of the list of rows: an upper bound, or the caller's prediction. A step that lists more rows is not taken.
     pub rows_room: u32,
-    /// The same for intersections, beside what the renderer foretells; tests inject lists without room by it.
+    /// Upper limit on the capacity of the list of intersections, which the renderer predicts. Tests lower it to inject a list without room.
     pub isects_most: u32,
 }
 
-/// The rest of a recorded step.
+/// The second part of a recorded step: loss, backward pass, update.
 #[derive(Debug, Clone, Copy)]
 pub struct RecordedUpdate<'a> {
     /// The photo.
@@ -64,16 +64,16 @@ pub struct RecordedUpdate<'a> {
     pub loss: &'a LossOptions,
     /// Whether statistics are collected.
     pub collects: bool,
-    /// The step is not taken if more than one row in so many has unusable gradients.
+    /// The step is not taken if more than one in this many rows has unusable gradients.
     pub rows_per_unusable: u32,
-    /// The step is not taken, whatever it finds: an injected fault.
+    /// An injected fault: the step is not taken, whatever its numbers are.
     pub closes: bool,
 }
 
-/// What a recorded step did.
+/// The outcome of a recorded step.
 #[derive(Debug, Clone)]
 pub struct StepDone {
-    /// Why the step, and every step behind it, changed nothing: bits of [`crate::kernels::gate`]; 0 for a step that was taken.
+    /// The reasons why the step, and every step behind it, changed nothing: bits of [`crate::kernels::gate`]; 0 for a step that was taken.
     pub closed: u32,
     /// Listed rows.
     pub rows: u32,
@@ -176,7 +176,7 @@ pub trait PageRenderer: Renderer {
     fn take_bins(&mut self) -> Result<Vec<u32>, RenderError>;
 
     /// Records a step of one batch up to its picture, without waiting. False where memory is short or the sizes of its lists cannot be
-    /// foretold yet: the step has to take the stages above.
+    /// predicted yet: the caller then runs the stages above.
     ///
     /// # Errors
     /// The device failed, or holds no pages; the pages are stored with another SH degree than the view asks for.

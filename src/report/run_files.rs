@@ -1,4 +1,4 @@
-//! The files in the output folder of a run: names, kinds, and which of them belong to what part of a run.
+//! The files in the output folder of a run: names, kinds, and the part of a run that each belongs to.
 //!
 //! Not here: their content, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
 //! another file into the folder adds it, and so it is removed with the rest when a run replaces an earlier one.
@@ -48,7 +48,7 @@ pub enum RunFile {
     Pictures(&'static str),
 }
 
-/// What a file is about. It decides when a later run in the folder removes the file.
+/// The part of a run that a file describes. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
     /// How the run began.

@@ -191,8 +191,8 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts
 }
 
-/// Adds a noisy curve: pale, and its running mean before it where it has points enough for one. Returns also what a caption says
-/// of the mean.
+/// Adds a noisy curve in a pale colour and, where it has enough points, its running mean in front. Also returns the words
+/// of the caption on the mean.
 fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> (Chart, &'static str) {
     let mean = smoothed(&points);
     if mean.is_empty() {
@@ -252,9 +252,9 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
     page.heading("Number of Gaussians");
     page.paragraph(&format!(
-        "The run decided that up to {} Gaussians pay (--quality). Training photos that were held out until then lost so many \
-         decibels without the quarter of the Gaussians that weighs least in each of them. Where they lose more than growth pays \
-         from, the scene grows.",
+        "The run decided that up to {} Gaussians pay (--quality). The chart shows what training photos that were held out lost, in \
+         each check, without the quarter of the Gaussians that weighs least in them. The scene grows if that loss exceeds the \
+         threshold from which growth pays.",
         short(allowed)
     ));
     let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();
@@ -279,9 +279,14 @@ fn add_appearance(page: &mut Page, path: &Path) {
     let stride = points.len().div_ceil(POINTS_MAX);
     let points = points.into_iter().step_by(stride).collect();
     let chart = Chart::new("Exposure", "photo, by name", "stops").with("", points, Mark::LineAndDots);
-    let caption =
-        "Exposure of each training photo against the mean of all, as trained. appearance.json has the numbers.";
-    page.charts(&[(chart.svg(), caption.to_string())]);
+    let first = match values["exposures_from_exif"].as_u64() {
+        None | Some(0) => String::new(),
+        Some(count) => format!(" {count} exposures started from EXIF data."),
+    };
+    let caption = format!(
+        "Exposure of each training photo against the mean of all, as trained.{first} appearance.json has the numbers."
+    );
+    page.charts(&[(chart.svg(), caption)]);
 }
 
 /// How far the run has moved the cameras of its photos, if it refines poses.

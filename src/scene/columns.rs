@@ -37,18 +37,6 @@ impl Column {
             Column::ShN => sh_n_width(sh_degree),
         }
     }
-
-    /// The field's name.
-    pub fn name(self) -> &'static str {
-        match self {
-            Column::Means => "means",
-            Column::Quats => "quats",
-            Column::Scales => "scales",
-            Column::Opacities => "opacities",
-            Column::Sh0 => "sh0",
-            Column::ShN => "shN",
-        }
-    }
 }
 
 /// Floats of `shN` at a degree: 3 ((degree + 1)^2 - 1).

@@ -112,11 +112,6 @@ impl EventLog {
     pub fn events(&self) -> &[Event] {
         &self.events
     }
-
-    /// The events after the first `applied` ones, with their indices.
-    pub fn pending(&self, applied: usize) -> impl Iterator<Item = (usize, Event)> + '_ {
-        self.events.iter().copied().enumerate().skip(applied)
-    }
 }
 
 #[cfg(test)]
@@ -124,15 +119,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pending_events_come_with_their_index_in_order() {
+    fn a_log_is_in_the_order_of_time() {
         let mut log = EventLog::default();
         assert!(log.is_empty());
         for (i, step) in [1000, 3000, 3000].into_iter().enumerate() {
             let kind = EventKind::RaiseShDegree { degree: i as u8 };
             assert_eq!(log.push(Event { step, kind }), i);
         }
-        let pending: Vec<usize> = log.pending(1).map(|(i, _)| i).collect();
-        assert_eq!(pending, [1, 2]);
         assert_eq!(log.events()[2].now(), 3001);
         assert_eq!(EventLog::from_events(log.events().to_vec()), Some(log.clone()));
         let mut wrong = log.events().to_vec();

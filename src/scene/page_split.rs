@@ -40,14 +40,6 @@ pub fn split_page(
     Ok(parts.into_iter().map(|(id, rows)| (id, state.select(&rows))).collect())
 }
 
-/// Number of pages that [`split_page`] makes of `rows` rows.
-pub fn parts_of(rows: usize, page_rows: usize) -> usize {
-    if rows <= page_rows.max(1) {
-        return 1;
-    }
-    parts_of(rows / 2, page_rows) + parts_of(rows - rows / 2, page_rows)
-}
-
 fn cut(
     id: PageId,
     mut entries: Vec<PointRow>,
@@ -82,6 +74,10 @@ mod tests {
         state.columns.sh_n.iter_mut().for_each(|x| *x = draws.uniform() as f32);
         let means = state.columns.means.iter().map(|x| x * 2.0).collect();
         (state, means)
+    }
+
+    fn parts_of(rows: usize, page_rows: usize) -> usize {
+        if rows <= page_rows { 1 } else { parts_of(rows / 2, page_rows) + parts_of(rows - rows / 2, page_rows) }
     }
 
     #[test]

@@ -35,11 +35,6 @@ pub fn row_bytes(sh_degree: u8) -> usize {
 }
 
 impl SceneState {
-    /// A state without rows, at a degree.
-    pub fn empty(sh_degree: u8) -> Self {
-        SceneState::from_columns(Columns::zeros(0, sh_degree))
-    }
-
     /// New rows: uids 0..n, zero moments, no step contained, no statistics.
     pub fn from_columns(columns: Columns) -> Self {
         let rows = columns.rows();
@@ -63,16 +58,6 @@ impl SceneState {
     /// Degree that the rows are stored with.
     pub fn sh_degree(&self) -> u8 {
         self.columns.sh_degree
-    }
-
-    /// Bytes allocated by all vectors.
-    pub fn bytes(&self) -> usize {
-        let tables = [&self.columns, &self.exp_avg, &self.exp_avg_sq];
-        tables.map(Columns::bytes).iter().sum::<usize>()
-            + self.stamp.capacity() * 4
-            + self.uid.capacity() * 8
-            + self.grad2d.capacity() * 4
-            + self.count.capacity() * 4
     }
 
     /// A shared view of all rows.
@@ -101,39 +86,6 @@ impl SceneState {
             grad2d: &mut self.grad2d,
             count: &mut self.count,
         }
-    }
-
-    /// Consecutive views of `rows_per_chunk` rows (the last may be shorter); at least 1.
-    pub fn chunks(&self, rows_per_chunk: usize) -> Vec<Rows<'_>> {
-        let size = rows_per_chunk.max(1);
-        let mut rest = self.view();
-        let mut chunks = Vec::with_capacity(self.rows().div_ceil(size));
-        while rest.rows() > 0 {
-            let (head, tail) = rest.split_at(size.min(rest.rows()));
-            chunks.push(head);
-            rest = tail;
-        }
-        chunks
-    }
-
-    /// Consecutive mutable views of `rows_per_chunk` rows (the last may be shorter); at least 1.
-    pub fn chunks_mut(&mut self, rows_per_chunk: usize) -> Vec<RowsMut<'_>> {
-        let size = rows_per_chunk.max(1);
-        let mut chunks = Vec::with_capacity(self.rows().div_ceil(size));
-        let mut rest = self.view_mut();
-        while rest.rows() > 0 {
-            let at = size.min(rest.rows());
-            let (head, tail) = rest.split_at(at);
-            chunks.push(head);
-            rest = tail;
-        }
-        chunks
-    }
-
-    /// Keeps the rows for which `keep` returns true, in order.
-    pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
-        let removed: Vec<u32> = (0..self.rows()).filter(|&row| !keep(row)).map(|row| row as u32).collect();
-        self.remove(&removed);
     }
 
     /// Removes the rows in `removed` (ascending, each once); the others keep their order.
@@ -274,30 +226,24 @@ mod tests {
         assert_eq!(state.rows(), 8);
         assert_eq!(state.grad2d.len(), 8);
         assert_eq!(state.count.len(), 8);
-        state.retain(|row| row % 2 == 1);
+        state.remove(&[0, 2, 4, 6]);
         assert_eq!(state.uid, [2, 6, 8, 1]);
-        state.retain(|_| false);
+        state.remove(&[0, 1, 2, 3]);
         assert_eq!(state.rows(), 0);
     }
 
     #[test]
-    fn chunks_cover_all_rows_once_and_blocks_round_trip() {
+    fn blocks_round_trip() {
         let mut state = numbered(11, 1);
         let copy = state.clone();
-        let mut seen = Vec::new();
-        for mut chunk in state.chunks_mut(4) {
-            for row in 0..chunk.rows() {
-                seen.push(chunk.first_row + row);
-                let mut block = [0.0; super::super::rows::BLOCK_LANES];
-                chunk.columns.as_ref().load_row_any(row, &mut block);
-                assert_eq!(block[0], (chunk.first_row + row) as f32);
-                chunk.columns.store_row_any(row, &block);
-            }
+        let mut rows = state.view_mut();
+        for row in 0..rows.rows() {
+            let mut block = [0.0; super::super::rows::BLOCK_LANES];
+            rows.columns.as_ref().load_row_any(row, &mut block);
+            assert_eq!(block[0], row as f32);
+            rows.columns.store_row_any(row, &block);
         }
-        assert_eq!(seen, (0..11).collect::<Vec<_>>());
         assert_eq!(state, copy);
-        assert_eq!(state.chunks(4).iter().map(Rows::rows).collect::<Vec<_>>(), [4, 4, 3]);
-        assert!(state.bytes() >= 11 * row_bytes(1));
         assert_eq!(row_bytes(3), 728);
     }
 }

@@ -98,11 +98,6 @@ impl ViewOrder {
         self.order
     }
 
-    /// Steps of an epoch.
-    pub fn views(&self) -> usize {
-        self.views
-    }
-
     fn draw(&mut self, epoch: u64) {
         self.epoch = epoch;
         self.drawn.clear();
@@ -149,10 +144,11 @@ impl ViewOrder {
     }
 }
 
-/// Orders groups along a short tour through their centres, from a random group in a random direction, so that neighbouring groups
-/// follow each other. On a survey whose views see 7 % of the pages, with a quarter of the pages in memory, 25 groups read .021
-/// of what they need in this order and .040 in random order, 100 groups .021 and .084 (`tests/storage/replay.rs` prints such
-/// figures); what training loses is only that a group's neighbour comes next, which its next epoch turns round anyway.
+/// Orders groups along a short tour through their centres, from a random group in a random direction, so that
+/// neighbouring groups follow each other. On a survey whose views see 7 % of the pages, with a quarter of the pages in
+/// memory, 25 groups read .021 of what they need in this order and .040 in random order, 100 groups .021 and .084
+/// (`tests/storage/replay.rs` prints such figures); the price is that a neighbouring group comes next, and the next epoch
+/// draws another direction anyway.
 fn order_groups(places: &[Place], groups: &mut Vec<Vec<u32>>, draws: &mut Stream) {
     let middles: Vec<Place> = groups.iter().map(|group| mean(places, group)).collect();
     let mut way = tour(&middles);
@@ -189,7 +185,7 @@ mod tests {
     }
 
     fn epoch(order: &mut ViewOrder, epoch: u32) -> Vec<usize> {
-        let views = order.views() as u32;
+        let views = order.views as u32;
         (epoch * views..(epoch + 1) * views).map(|step| order.view_at(step)).collect()
     }
 

@@ -22,10 +22,13 @@
 //! | `image_names` | file names in all of the formats: no path leaves its folder |
 //! | `config` | config.toml, sizes, orders, codecs |
 //! | `torch` | files of PyTorch in Mega-NeRF's layout, and the pickles in them |
-//! | `photo` | JPEG and PNG, header and decoding |
+//! | `photo` | JPEG and PNG, header, EXIF data and decoding |
 #![allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 
 mod allocation;
+#[allow(dead_code)] // other tests use all of it
+#[path = "../support/exif.rs"]
+mod exif;
 mod mutate;
 mod scene_folder;
 mod targets;

@@ -5,6 +5,7 @@ mod support;
 
 mod configs;
 mod disturb;
+mod exif;
 mod import;
 mod photos;
 mod ply;

@@ -1,10 +1,11 @@
 //! Deferred Adam follows dense Adam for every value, however long a row sleeps and however often it is read. Reading a
 //! row changes no bit.
 
+use crate::support::dense_adam::DenseAdam;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::densify::ops::reset_opacities;
-use gsscale::optim::adam::{AdamConfig, DenseAdam};
+use gsscale::densify::ops::reset_opacity_rows;
+use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
@@ -145,7 +146,7 @@ fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
         means.step(&dense[0], rates.at(Column::Means, step));
         opacities.step(&dense[1], rates.at(Column::Opacities, step));
         if (step + 1) % resets == 0 {
-            reset_opacities(&adam.at(step + 1), &mut state, 0.02);
+            reset_opacity_rows(&adam.at(step + 1), &mut state.view_mut(), 0.02);
             opacities.values.iter_mut().for_each(|x| *x = x.min(f64::from(cap)));
             opacities.exp_avg.fill(0.0);
             opacities.exp_avg_sq.fill(0.0);

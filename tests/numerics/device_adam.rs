@@ -1,5 +1,6 @@
 //! The f32 form of deferred Adam that devices compute, by its twin, against dense Adam in f64 over 50,000 steps.
 
+use crate::support::dense_adam::DenseAdam;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::deferred::DeferredTables;
@@ -7,7 +8,7 @@ use gsscale::kernels::gather::{GatherInput, gather};
 use gsscale::kernels::page_words::{DevicePage, PageResult, Table};
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
 use gsscale::kernels::update::{UpdateInput, finish, judge, step};
-use gsscale::optim::adam::{AdamConfig, DenseAdam};
+use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::camera::Camera;

@@ -337,10 +337,14 @@ fn devices_are_found_by_name_and_listed() {
     assert!(all.windows(2).all(|pair| pair[0].kind <= pair[1].kind), "the best first");
     assert_eq!(all.iter().find(|s| s.refusal.is_none()), Some(gpu.summary()));
     let name = gpu.summary().name.to_uppercase();
-    assert_eq!(Gpu::open(&DeviceChoice::Named(name)).unwrap().summary().name, gpu.summary().name);
-    let text = Gpu::open(&DeviceChoice::Named("no such GPU".into())).unwrap_err().to_string();
+    assert_eq!(
+        Gpu::open_with(&DeviceChoice::Named(name), &GpuOptions::default()).unwrap().summary().name,
+        gpu.summary().name
+    );
+    let text =
+        Gpu::open_with(&DeviceChoice::Named("no such GPU".into()), &GpuOptions::default()).unwrap_err().to_string();
     assert!(text.contains("no such GPU") && text.contains(&gpu.summary().name), "{text}");
-    match Gpu::open(&DeviceChoice::Auto) {
+    match Gpu::open_with(&DeviceChoice::Auto, &GpuOptions::default()) {
         Ok(auto) => assert_ne!(auto.summary().kind, DeviceKind::Software),
         Err(error) => assert!(matches!(error, GpuError::NoHardwareGpu { .. }), "{error}"),
     }

@@ -153,9 +153,9 @@ fn compare_all(rows: &Columns, sh_degree: u8, grads: &Columns, loss: impl Fn(&Ro
     for column in Column::ALL {
         let want = differences(rows, column, &loss);
         let (got, width) = (grads.column(column), column.width(rows.sh_degree));
-        assert_eq!(got.len(), want.len(), "{}", column.name());
+        assert_eq!(got.len(), want.len(), "{column:?}");
         if column != Column::ShN {
-            compare(column.name(), got, &want, width, 0, width);
+            compare(&format!("{column:?}"), got, &want, width, 0, width);
             continue;
         }
         for band in 1..=rows.sh_degree {

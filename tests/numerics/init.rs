@@ -17,7 +17,7 @@ fn init(points: &[[f32; 3]], options: &InitOptions) -> Columns {
     let columns = gaussians_from_points(points, &vec![[10, 128, 255]; points.len()], options);
     for column in Column::ALL {
         assert_eq!(columns.column(column).len(), columns.rows() * column.width(options.sh_degree));
-        assert!(columns.column(column).iter().all(|v| v.is_finite()), "{}", column.name());
+        assert!(columns.column(column).iter().all(|v| v.is_finite()), "{column:?}");
     }
     columns
 }

@@ -36,7 +36,7 @@ fn check(recipe: &Recipe, target: &Target, simd: SimdPath) {
     let mut renderer = CpuRenderer::new();
     renderer.weigh_rows(true).unwrap();
     renderer.draw(&rows, &camera, &options).unwrap();
-    let loss = LossOptions::new(0.2, SsimPadding::Valid, simd);
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd };
     renderer.loss(target, &loss).unwrap();
     let mut grads = Gradients::default();
     renderer.backpropagate(&rows, &mut grads).unwrap();
@@ -69,7 +69,7 @@ fn weights_of_rows_are_those_of_a_plain_renderer() {
 fn weighing_changes_no_bit_of_the_gradients_and_is_off_unless_asked_for() {
     let (rows, _) = OPAQUE.scene();
     let (camera, options, target) = (camera(), OPAQUE.options(), photo(false));
-    let loss = LossOptions::new(0.2, SsimPadding::Valid, options.simd);
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: options.simd };
     let mut renderer = CpuRenderer::new();
     let mut run = |is_wanted: bool| {
         renderer.weigh_rows(is_wanted).unwrap();

@@ -1,5 +1,6 @@
 //! Photos that change exposure: what `--appearance` wins back, and what it finds, through the real binaries.
 
+use crate::support::exif::{Settings, add_exif};
 use crate::support::gpu;
 use crate::support::scenes::{city, eval, psnr, stderr, summary, text, train};
 use gsscale::gpu::GpuOptions;
@@ -139,4 +140,88 @@ fn threads_and_frames_give_the_same_bytes_with_appearance() {
         assert!(one == two, "one thread and two threads differ: {file}");
         assert!(one == paged, "batches differ: {file}");
     }
+}
+
+/// Photos of a [`flickering_city`] get EXIF data that fit their stops, for each of the photos that `chosen` takes by number.
+/// Values of photos have a gamma, so a stop of them is 2.2 stops of light.
+fn add_settings(scene: &Path, changed: &[(String, f64)], chosen: impl Fn(usize) -> bool) {
+    for (_, (name, stops)) in changed.iter().enumerate().filter(|(i, _)| chosen(*i)) {
+        add_exif(&scene.join("images").join(name), &Settings::brighter_by(2.2 * stops).tiff());
+    }
+}
+
+/// The files whose bytes a run must keep.
+fn results(out: &Path) -> [Vec<u8>; 2] {
+    ["point_cloud.ply", "appearance.json"].map(|file| std::fs::read(out.join(file)).unwrap())
+}
+
+fn from_exif(out: &Path) -> u64 {
+    let file: Value = serde_json::from_slice(&std::fs::read(out.join("appearance.json")).unwrap()).unwrap();
+    file["exposures_from_exif"].as_u64().unwrap()
+}
+
+#[test]
+fn exposures_start_from_exif_data() {
+    let folder = TempDir::new().unwrap();
+    let (scene, changed) = flickering_city(folder.path());
+    // One pass over the photos, so that no photo is seen twice.
+    let steps = ["--steps", "21", "--device", "cpu", "--appearance", "exposure"];
+    let [without, with] = ["without", "with"].map(|name| folder.path().join(name));
+    run(&scene, &without, &steps);
+    add_settings(&scene, &changed, |_| true);
+    let args = [text(&scene), "--out", text(&with), "--strategy", "none", "--sh-every", "0", "--sh-degree", "0"];
+    let output = train(&[&args[..], &steps].concat());
+    assert!(output.status.success() && !stderr(&output).contains("warning: "), "{}", stderr(&output));
+    assert!(stderr(&output).contains("21 exposures start from EXIF data"), "{}", stderr(&output));
+    let mean = changed.iter().map(|(_, stops)| stops).sum::<f64>() / changed.len() as f64;
+    let error = |out: &Path| {
+        let found = exposures(out);
+        let errors = changed.iter().zip(&found).map(|((_, stops), (_, found))| (found - (stops - mean)).abs());
+        errors.sum::<f64>() / found.len() as f64
+    };
+    println!("mean error {:.3} and {:.3} stops", error(&without), error(&with));
+    println!("{:.2} and {:.2} dB", psnr(&without), psnr(&with));
+    assert!(error(&with) < 0.6 * error(&without) && psnr(&with) > psnr(&without) + 0.1);
+    assert_eq!((from_exif(&without), from_exif(&with)), (0, 21));
+    let report = |out: &Path| std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(report(&with).contains("21 exposures started from EXIF data"));
+    assert!(!report(&without).contains("EXIF"));
+}
+
+#[test]
+fn exif_data_of_too_few_photos_and_of_runs_without_appearance_change_no_byte() {
+    let folder = TempDir::new().unwrap();
+    let (scene, changed) = flickering_city(folder.path());
+    let steps = ["--steps", "21", "--device", "cpu"];
+    let on = [&steps[..], &["--appearance", "exposure"]].concat();
+    let [without, few, off, off_with] = ["without", "few", "off", "off_with"].map(|name| folder.path().join(name));
+    run(&scene, &without, &on);
+    run(&scene, &off, &steps);
+    add_settings(&scene, &changed, |i| i < 10);
+    let args = [text(&scene), "--out", text(&few), "--strategy", "none", "--sh-every", "0", "--sh-degree", "0"];
+    let said = stderr(&train(&[&args[..], &on].concat()));
+    assert!(said.contains("warning: only 10 of 21 training photos state their exposure in EXIF data"), "{said}");
+    assert!(results(&few) == results(&without));
+    add_settings(&scene, &changed, |i| i >= 10);
+    run(&scene, &off_with, &steps);
+    let [off, off_with] = [&off, &off_with].map(|out| std::fs::read(out.join("point_cloud.ply")).unwrap());
+    assert!(off == off_with);
+}
+
+#[test]
+fn damaged_exif_data_are_named_in_one_warning_and_ignored() {
+    let folder = TempDir::new().unwrap();
+    let (scene, changed) = flickering_city(folder.path());
+    add_settings(&scene, &changed, |i| i >= 5);
+    for (name, _) in &changed[..5] {
+        add_exif(&scene.join("images").join(name), b"II*\0\xff\xff\xff\x7f");
+    }
+    let out = folder.path().join("out");
+    let args = [text(&scene), "--out", text(&out), "--steps", "2", "--device", "cpu", "--appearance", "full"];
+    let output = train(&args);
+    let said = stderr(&output);
+    assert!(output.status.success() && said.matches("warning: ").count() == 1, "{said}");
+    assert!(said.contains(&format!("damaged EXIF data are ignored: {} (", changed[0].0)), "{said}");
+    assert!(said.contains(&format!("{}, {}, and 2 more", changed[1].0, changed[2].0)), "{said}");
+    assert_eq!(from_exif(&out), 16);
 }

@@ -172,6 +172,37 @@ fn finishes_in_less_than_a_view(scene: &Path, flags: &[&str], alone: &Path, [out
     }
 }
 
+/// A photo from high above needs most of the memory for its own rows. Afterwards the frames have this memory again.
+#[test]
+fn frames_return_after_a_photo_that_shows_much_of_the_scene() {
+    const BUDGET: f64 = 128.0 * 1048576.0;
+    let folder = TempDir::new().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let (scene, alone, out, spill) = (path("scene"), path("alone"), path("out"), path("spill"));
+    let (width, height, points) = (96, 64, 50_000);
+    let size = CityOptions { width, height, points, tiles: [2, 4], ..CityOptions::default() };
+    let city = CityOptions { seed: 5, views: 24, overviews: 2, supersample: 1, ..size };
+    write_city(&scene, &city, &|_, _| {}).unwrap();
+    let flags = "--steps 60 --page-rows 64 --strategy none --test-every 0 --commit-every 0 --device cpu --log-every 1 --quiet \
+                 --image-cache 4MiB --prefetch-bytes 1MiB --sh-degree 1 --view-order shuffle";
+    let flags: Vec<&str> = flags.split_whitespace().collect();
+    let output = train(&[&[text(&scene), "--out", text(&alone)], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "128MiB"];
+    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let (frames, done) = (frames_logged(&out), summary(&out));
+    // The first step with the fewest frames is that of a photo from high above; few photos follow until all are ordinary.
+    let (wide, least) = frames.iter().enumerate().min_by_key(|(_, frames)| **frames).unwrap();
+    let again = frames[wide..].iter().max().unwrap();
+    assert!(2 * again >= 3 * least, "{least} frames at step {wide}, at most {again} after it: {frames:?}");
+    // The documented error is a tenth.
+    let peak = done["host_bytes_peak"].as_f64().unwrap();
+    assert!(peak <= 1.1 * BUDGET, "{:.1} MB at the peak, {frames:?}", peak / 1e6);
+    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
+    assert!(got == want, "another scene than in memory");
+}
+
 /// Just enough steps for the scene to grow beyond 160 MiB.
 fn growing_less() -> String {
     let all = "--steps 120";

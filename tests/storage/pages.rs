@@ -1,13 +1,14 @@
 //! Scenes in pages: events replayed late, by pages that split and widen, give the rows of events applied on time. The
 //! bounds of a page stay valid until the page is changed.
 
+use crate::support::apply_event::apply_event;
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::replay::{PageEdit, PendingEvents, apply_event};
+use gsscale::densify::replay::{PageEdit, PendingEvents};
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::densify::strategy::{DrawnRows, Effect, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
@@ -327,7 +328,8 @@ fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, 
         for step in 0..STEPS {
             pages.step(step, &log, &whole.root_from_uid, chance);
             assert!(pages.rows_bound >= pages.rows());
-            for (index, event) in whole.log.pending(log.len()).filter(|(_, e)| e.step == step).collect::<Vec<_>>() {
+            let pending = whole.log.events().iter().enumerate().skip(log.len());
+            for (index, &event) in pending.filter(|(_, e)| e.step == step) {
                 assert!(pages.histogram == whole.histograms[index], "what a round decides by, event {index}");
                 log.push(event);
                 pages.log_event(event);

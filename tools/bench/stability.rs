@@ -1,4 +1,4 @@
-//! `gsscale-bench stability`: what faults of photos, poses and points cost, and what the remedies win back.
+//! `gsscale-bench stability`: measures the loss of quality by faults of photos, poses and points, with and without remedies.
 
 use super::sweep::{MadeScene, Planned, Surroundings, Sweep, SweepArgs};
 use super::table::table;
@@ -47,7 +47,7 @@ const REMEDIES: [&str; 3] = [NO_REMEDY, "own", "all"];
 /// Change of a config.
 type Change = fn(&mut TrainConfig);
 
-/// Name, what is disturbed, and the remedy that is meant for it.
+/// Name of a disturbance, the disturbance, and its own remedy.
 const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
     (CLEAN, Disturbance::Nothing, None),
     ("exposure05", Disturbance::Exposure { stops: 0.5 }, Some(correct_exposure)),
@@ -181,7 +181,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     Ok(())
 }
 
-/// The config of all runs before remedies. The scenes that are written have photos of training size, and their own split.
+/// The config of all runs, without remedies. The disturbed scenes have photos of training size and their own split.
 fn base_config(given: &TrainConfig) -> TrainConfig {
     let plain = TrainConfig::default();
     TrainConfig {

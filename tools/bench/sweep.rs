@@ -111,7 +111,7 @@ pub struct Planned {
     pub label: String,
     /// All settings. The sweep replaces a spill directory that is not empty by one of its own.
     pub config: TrainConfig,
-    /// The scene, if it is another than that of the sweep.
+    /// The scene of the run, if it is not the scene of the sweep.
     pub scene: Option<MadeScene>,
 }
 
@@ -120,7 +120,7 @@ pub struct Planned {
 pub struct MadeScene {
     /// Its folder, which exists while the run lives.
     pub folder: PathBuf,
-    /// How it is made, whole: a part of the run's key in place of the folder.
+    /// A complete description of the scene, which stands for the folder in the run's key.
     pub how: String,
     /// Training photos that are wrong in it, by name.
     pub wrong: Vec<String>,

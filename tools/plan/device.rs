@@ -1,8 +1,9 @@
-//! What `--optimizer-on device` would move over a bus: replays the slots of a device as the frames of a cache, and prints a step's
-//! milliseconds by part.
+//! Predicts the transfers of `--optimizer-on device` over a bus: replays the slots of a device like the frames of a cache, and prints the
+//! milliseconds of a step by part.
 //!
 //! The figures are modelled, not measured: a copy takes the latency plus its bytes over the rate, payloads move while the GPU works, and
-//! everything else does not. The GPU's own time is given, or that of the timed steps.
+//! everything else does not. The GPU's own time comes from a flag or from the timed
+//! steps.
 //!
 //! Not here: frames and the drive.
 

@@ -1,4 +1,4 @@
-//! What `gsscale-plan` prints of its plans: JSON, or text with a table.
+//! The output of `gsscale-plan`: JSON, or text with a table.
 //!
 //! Not here: the plans.
 
@@ -45,7 +45,7 @@ fn text_of_forecast(scene: &Scene) -> String {
     let forecast = match &scene.forecast {
         Ok(forecast) => forecast,
         Err(_) if scene.frames_within.is_none() => return String::new(),
-        Err(why) => return format!("the whole run is not forecast: {why}\n"),
+        Err(why) => return format!("no forecast of the whole run: {why}\n"),
     };
     let drive = match forecast.tiers.frames {
         Some(_) => format!(

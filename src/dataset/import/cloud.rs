@@ -47,11 +47,6 @@ impl Cloud {
         Ok(Cloud { points: points.finish()? })
     }
 
-    /// Number of points.
-    pub fn len(&self) -> usize {
-        self.points.len()
-    }
-
     /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()

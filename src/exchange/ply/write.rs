@@ -6,8 +6,9 @@
 //! arguments alone; 3. the target is replaced as a whole, after the new bytes have reached the disk, or not at all; 4.
 //! a row with a non-finite value, before or after the change of frame, is left out and counted.
 //!
-//! The comments precede the `element` line, since readers give later ones to the element, not to the file. The viewer of
-//! the 3DGS code takes the third word of the third line for the number of rows, so that line is a comment `vertices N`.
+//! The comments precede the `element` line, because readers assign a later comment to the element, not to the file. The
+//! viewer of the 3DGS code takes the third word of the third line for the number of rows, so that line is a comment
+//! `vertices N`.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::PartFile;

@@ -1,4 +1,4 @@
-//! The 256 values that stand for all values of an attribute: where they lie closest, most values lie.
+//! The codebook of an attribute: 256 values, the nearest of which replaces each value. The codes are dense where values are dense.
 //!
 //! Invariants: 1. the smallest and the largest value are kept, so no value is off by more than half the distance between its
 //! neighbours in the codebook; 2. the codebook depends on the values alone, not on their order.
@@ -15,7 +15,7 @@ const ROUNDS: usize = 12;
 pub struct Codebook(Vec<f32>);
 
 impl Codebook {
-    /// For these values, which are finite; they are sorted.
+    /// The codebook of finite `values`, which this function sorts.
     pub fn of(values: &mut [f32]) -> Codebook {
         values.sort_unstable_by(f32::total_cmp);
         let (Some(&least), Some(&most)) = (values.first(), values.last()) else { return Codebook(vec![0.0; CODES]) };
@@ -46,7 +46,7 @@ impl Codebook {
         Codebook(codes)
     }
 
-    /// The code of the nearest value; the lower one of two.
+    /// The code of the nearest value; the lower code if two are equally near.
     pub fn code(&self, value: f32) -> u8 {
         let above = self.0.partition_point(|&v| v < value).min(CODES - 1);
         let below = above.saturating_sub(1);
@@ -54,13 +54,14 @@ impl Codebook {
         (if off(below) <= off(above) { below } else { above }) as u8
     }
 
-    /// The values by their codes.
+    /// The value of each code, ascending.
     pub fn values(&self) -> &[f32] {
         &self.0
     }
 }
 
-/// First codes: as dense as the cube root of the density of values, which is best for the squared error (Panter and Dite).
+/// Initial codes. Their density is proportional to the cube root of the density of values, which minimises the squared error (Panter
+/// and Dite).
 fn spread(values: &[f32], least: f32, most: f32) -> Vec<f32> {
     let (low, width) = (f64::from(least), (f64::from(most) - f64::from(least)) / BINS as f64);
     let mut counts = vec![0u32; BINS];
@@ -96,8 +97,8 @@ mod tests {
         let book = Codebook::of(&mut normal.clone());
         let error = |v: f32| f64::from(book.values()[usize::from(book.code(v))]) - f64::from(v);
         let mean_square = normal.iter().map(|&v| error(v).powi(2)).sum::<f64>() / normal.len() as f64;
-        // The best 256 values for a normal distribution: sqrt(3) pi / 2 / 256^2 = 4.2e-5 (Panter and Dite). A fourth more
-        // is left, since the two ends are kept and the rounds are few.
+        // The least error of 256 codes for a normal distribution is sqrt(3) pi / 2 / 256^2 = 4.2e-5 (Panter and Dite). The codebook
+        // exceeds it by a quarter, because it keeps both extremes and takes few rounds.
         assert!(mean_square < 5.5e-5, "{mean_square}");
         assert!(book.values().is_sorted());
         let reversed = Codebook::of(&mut normal.iter().rev().copied().collect::<Vec<_>>());

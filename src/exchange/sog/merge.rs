@@ -1,11 +1,11 @@
-//! Coarser levels: near Gaussians become one with their common mean and covariance.
+//! Coarser levels of detail: pairs of Gaussians near each other are merged.
 //!
-//! A Gaussian weighs its optical depth, -ln(1 - opacity), times the product of its two longest sigmas. Two of them become one
-//! with the mean, covariance and colours that their weights give. Its opacity follows from the sum of the weights. What a merge
-//! costs is Runnalls' bound on the divergence of the mixture (2007), on covariances that are not thinner than a part of the
-//! distance between the rows that remain, and the weighted square of the difference of colours.
+//! The weight of a Gaussian is its optical depth, -ln(1 - opacity), times the product of its two longest sigmas. A merged Gaussian has
+//! the weighted mean, covariance and colours of the pair. Its opacity follows from the sum of the weights. The cost of a merge is
+//! Runnalls' bound on the divergence of the mixture (2007) plus the weighted squared difference of the colours. For the bound,
+//! covariances are widened to a share of the distance between the rows that remain.
 //!
-//! In every pass the pairs with the least costs among near neighbours merge, at most a quarter of the rows; so detail stays longest.
+//! Every pass merges the pairs with the least costs among near neighbours, at most a quarter of the rows. So detail stays longest.
 //!
 //! Invariants: 1. rows that did not merge keep their bits; 2. the result depends on the rows and their order alone; all
 //! arithmetic is f64.
@@ -15,13 +15,13 @@ use super::symmetric::Symmetric;
 use crate::base::math::sigmoid;
 use crate::exchange::frames::ExportRow;
 
-/// Largest opacity that counts: renderers cut there.
+/// Largest opacity that counts: renderers clamp alpha there.
 const OPACITY_MAX: f64 = 0.99;
-/// Opacity of a Gaussian that viewers just draw.
+/// Least opacity that viewers draw.
 const OPACITY_MIN: f64 = 1.0 / 255.0;
-/// Thinnest covariance that counts, over the distance between the rows that remain.
+/// Sigma by which covariances are widened for the cost, over the distance between the rows that remain.
 const THINNEST: f64 = 0.1;
-/// Cost of a squared difference of constant bands of 1.
+/// Cost of a squared difference of 1 between two constant SH bands.
 const COLOUR_COST: f64 = 2.0;
 
 /// Memory that merging takes for each row, bytes: blobs before and after a pass, and pairs.
@@ -69,7 +69,7 @@ fn pass(blobs: Vec<Blob>, wanted: usize, floor: f64) -> Vec<Blob> {
     kept.map(|row| partner[row].map_or_else(|| blobs[row].clone(), |other| blobs[row].with(&blobs[other]))).collect()
 }
 
-/// What weighs in the cost of a pair, but for the costs of both alone.
+/// Cost of a merged pair. The cost of the merge is this less the costs of the two Gaussians alone.
 fn cost(a: &Blob, b: &Blob, floor: f64) -> f64 {
     let weight = a.weight + b.weight;
     let (_, covariance) = moments(a, b);
@@ -78,7 +78,7 @@ fn cost(a: &Blob, b: &Blob, floor: f64) -> f64 {
     weight * covariance.plus(floor).log_det() + COLOUR_COST * a.weight * b.weight / weight * apart
 }
 
-/// Variance of the thinnest covariance that counts.
+/// Variance by which covariances are widened for the cost.
 fn thinnest(blobs: &[Blob], most: usize) -> f64 {
     let side = |i: usize| {
         let at = blobs.iter().map(|blob| blob.mean[i]);
@@ -86,12 +86,12 @@ fn thinnest(blobs: &[Blob], most: usize) -> f64 {
         (high - low).max(0.0)
     };
     let longest = side(0).max(side(1)).max(side(2));
-    // Of rows on a surface.
+    // The distance of rows on a surface.
     let apart = longest / libm::sqrt(most as f64);
     (THINNEST * apart).powi(2).max(f64::MIN_POSITIVE)
 }
 
-/// A Gaussian with what merging needs.
+/// A Gaussian with the values that merging needs.
 #[derive(Clone)]
 struct Blob {
     row: ExportRow,
@@ -131,13 +131,13 @@ impl Blob {
     }
 }
 
-/// Product of the two longest.
+/// Product of the two longest sigmas.
 fn area(sigmas: [f64; 3]) -> f64 {
     let [a, b, c] = sigmas;
     (a * b).max(b * c).max(a * c).max(f64::MIN_POSITIVE)
 }
 
-/// Mean and covariance of two together.
+/// Weighted mean and covariance of a pair.
 fn moments(a: &Blob, b: &Blob) -> ([f64; 3], Symmetric) {
     let share = a.weight / (a.weight + b.weight);
     let apart: [f64; 3] = std::array::from_fn(|i| b.mean[i] - a.mean[i]);

@@ -1,4 +1,4 @@
-//! Rows in an order in which neighbours in space stand near each other: by halving along the longest axis.
+//! Orders rows so that neighbours in space are near each other: halves the rows along the longest axis again and again.
 //!
 //! Invariant: ranges of [`leaves`] are compact in the order that [`order`] gives, because both halve at the same places.
 

@@ -1,8 +1,7 @@
-//! The harmonics that stand for those of all rows: k-means in two levels, since one level would compare every row with
-//! thousands of centres.
+//! The palette of SH coefficients: k-means on two levels, because one level would compare every row with thousands of centres.
 //!
-//! Rows are first grouped around the square root of the number of centres; then each group gets its share of the centres, by its
-//! squared error, and is divided among them.
+//! The first level clusters all rows into as many groups as the square root of the number of centres. Each group then gets a share of
+//! the centres that is proportional to its squared error, and the second level clusters the rows of the group around these centres.
 //!
 //! Invariants: 1. the palette depends on the rows and their order alone: assignments are independent, sums go in the order of the
 //! rows; 2. a label names a centre.
@@ -14,17 +13,17 @@ const ROUNDS: usize = 6;
 /// Rows whose nearest centres one task finds.
 const TASK_ROWS: usize = 256;
 
-/// Centres, and which of them stands for each row.
+/// Centres, and the label of each row: the number of the centre that replaces its coefficients.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Palette {
-    /// One after another, `width` values each.
+    /// The centres, one after another, `width` values each.
     pub centres: Vec<f32>,
-    /// The number of a row's centre.
+    /// The label of each row.
     pub labels: Vec<u16>,
 }
 
 impl Palette {
-    /// Of at most `centres` (1 to 65,536) for rows of `width` finite values each.
+    /// A palette of at most `centres` (1 to 65,536) centres for rows of `width` finite values each.
     pub fn of(rows: &[f32], width: usize, centres: usize) -> Palette {
         let count = rows.len() / width;
         let wanted = centres.clamp(1, count.max(1));
@@ -53,7 +52,8 @@ impl Palette {
     }
 }
 
-/// Centres of each group: one for every group with rows, the others by squared error, never more than it has rows.
+/// Number of centres of each group: one for every group with rows, and the others by squared error. No group gets more centres than
+/// it has rows.
 fn shares(errors: &[f64], sizes: &[usize], wanted: usize) -> Vec<usize> {
     let total: f64 = errors.iter().sum();
     let used = sizes.iter().filter(|&&n| n > 0).count();
@@ -70,7 +70,7 @@ fn squared_error(rows: &[f32], centre: &[f32]) -> f64 {
     rows.chunks_exact(centre.len()).map(|row| row.iter().zip(centre).map(off).sum::<f64>()).sum()
 }
 
-/// Rows of each of `groups`, in their order.
+/// The rows of each of `groups` groups, ascending.
 fn sorted_by(members: &[u32], groups: usize) -> Vec<Vec<u32>> {
     let mut rows = vec![Vec::new(); groups];
     for (row, &group) in members.iter().enumerate() {
@@ -79,7 +79,7 @@ fn sorted_by(members: &[u32], groups: usize) -> Vec<Vec<u32>> {
     rows
 }
 
-/// Divides rows on all threads.
+/// Clusters rows on all threads.
 fn cluster(rows: &[f32], width: usize, centres: usize) -> (Vec<f32>, Vec<u32>) {
     lloyd(rows, width, centres, |centres, labels| {
         let tasks = labels.par_chunks_mut(TASK_ROWS).zip(rows.par_chunks(TASK_ROWS * width));
@@ -87,7 +87,7 @@ fn cluster(rows: &[f32], width: usize, centres: usize) -> (Vec<f32>, Vec<u32>) {
     })
 }
 
-/// Divides rows on this thread.
+/// Clusters rows on this thread.
 fn cluster_alone(rows: &[f32], width: usize, centres: usize) -> (Vec<f32>, Vec<u32>) {
     lloyd(rows, width, centres, |centres, labels| assign(rows, centres, labels))
 }
@@ -121,7 +121,7 @@ fn lloyd(rows: &[f32], width: usize, centres: usize, assign: impl Fn(&Transposed
     (values, labels)
 }
 
-/// Centres as one row for each coefficient, over which a loop vectorises, and half of their squared lengths.
+/// Centres, transposed so that loops over centres vectorise (one row for each coefficient), and half of their squared lengths.
 struct Transposed {
     width: usize,
     coefficients: Vec<f32>,

@@ -7,7 +7,7 @@ use crate::scene::rotation::Rotation;
 /// Sweeps of Jacobi's method; each squares the error.
 const SWEEPS: usize = 8;
 
-/// xx, xy, xz, yy, yz, zz.
+/// The entries xx, xy, xz, yy, yz, zz.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Symmetric([f64; 6]);
 
@@ -20,20 +20,20 @@ impl Symmetric {
         Symmetric([at(0, 0), at(0, 1), at(0, 2), at(1, 1), at(1, 2), at(2, 2)])
     }
 
-    /// With `value` more on the diagonal.
+    /// This matrix plus `value` times the identity.
     #[must_use]
     pub fn plus(&self, value: f64) -> Symmetric {
         let [a, b, c, d, e, f] = self.0;
         Symmetric([a + value, b, c, d + value, e, f + value])
     }
 
-    /// `share` of this and the rest of `other`.
+    /// `share` times this matrix plus (1 - `share`) times `other`.
     #[must_use]
     pub fn mixed(&self, other: &Symmetric, share: f64) -> Symmetric {
         Symmetric(std::array::from_fn(|i| share * self.0[i] + (1.0 - share) * other.0[i]))
     }
 
-    /// With `factor` v v^T more.
+    /// This matrix plus `factor` times v v^T.
     #[must_use]
     pub fn with_offset(&self, [x, y, z]: [f64; 3], factor: f64) -> Symmetric {
         let outer = [x * x, x * y, x * z, y * y, y * z, z * z];

@@ -1,11 +1,13 @@
 //! Writes Gaussians to a folder of SOGs with levels of detail.
 //!
-//! Rows are taken in groups, in the order in which they come. A group is put in order of space and cut into leaves; its rows are
-//! one file of the finest level. Each leaf is merged to a fourth, a sixteenth and a sixty-fourth of its rows, which gather in
-//! the open file of their level. Giants, whose boxes would make every leaf near, are kept apart and always shown.
+//! The writer takes rows in groups, in the order in which they come. It sorts a group by position, cuts it into leaves and writes its
+//! rows as one file of the finest level. It merges each leaf to a quarter, a sixteenth and a sixty-fourth of its rows and adds these to
+//! the open file of their level. Giants go to a folder of their own, which viewers always show: in a leaf, the box of a giant would
+//! contain every camera.
 //!
 //! Invariants: 1. memory is bounded by [`memory_bytes`] for any number of rows; 2. the bytes depend on the rows, their order and
-//! the metadata alone, not on the parts in which rows come; 3. the folder appears as a whole; 4. every name in it is one of ours.
+//! the metadata alone, not on the parts in which rows come; 3. the folder appears as a whole; 4. [`is_of_sog`] accepts
+//! every file in the folder.
 
 use super::chunk::{META_FILE, PICTURES, write_chunk};
 use super::merge::{MERGE_ROW_BYTES, merged};
@@ -21,9 +23,9 @@ use crate::scene::columns::Columns;
 use rayon::prelude::*;
 use std::path::{Component, Path, PathBuf};
 
-/// Levels, the finest counted.
+/// Number of levels, including the finest.
 const LEVELS: usize = LEVELS_MAX;
-/// Rows of a level for each row of the next one.
+/// Rows of a level for each row of the next coarser level.
 const COARSER: usize = 4;
 /// Rows of a group, which is a file of the finest level.
 const GROUP_ROWS: usize = 1 << 16;
@@ -40,11 +42,11 @@ const BOX_SIGMAS: f64 = 2.0;
 /// Folder of the giants.
 const GIANTS_FOLDER: &str = "env";
 
-/// Most memory that a writer takes beside the rows that it is given, bytes.
+/// Most memory of a writer beside its input rows, bytes.
 pub fn memory_bytes() -> u64 {
     let group_leaves = GROUP_ROWS / LEAF_ROWS;
     let coarser = GROUP_ROWS / 2 + (LEVELS - 1) * (FULL_ROWS + LEAF_ROWS);
-    // A file's harmonics twice, pictures, codebooks.
+    // Two copies of the SH coefficients of a file, pictures, codebooks.
     let encoding = GROUP_ROWS * 500;
     let merging = rayon::current_num_threads().min(group_leaves) * LEAF_ROWS * MERGE_ROW_BYTES;
     let rows = GROUP_ROWS + coarser + GIANTS_MAX;
@@ -54,7 +56,7 @@ pub fn memory_bytes() -> u64 {
 /// The folder that a path of a `lod-meta.json` names.
 ///
 /// # Errors
-/// The path names no folder of its own.
+/// The path names no folder.
 pub fn folder_of_tree(path: &Path) -> InputResult<&Path> {
     let folder = path.parent().unwrap_or(Path::new(""));
     match folder.components().next_back() {
@@ -110,7 +112,7 @@ impl SogWriter {
     /// both have the same axes.
     ///
     /// # Errors
-    /// The disk fails, or `path` names a folder with files of others.
+    /// The disk fails, or the folder `path` holds files that are not of an export.
     pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SogWriter> {
         let to_file = ExportRows::new(meta);
         let unit = if to_file.frame() == ExportFrame::Local { meta.scale } else { 1.0 };
@@ -205,7 +207,7 @@ impl SogWriter {
 impl GaussianSink for SogWriter {
     fn write(&mut self, columns: &Columns) -> InputResult<()> {
         if columns.sh_degree > self.sh_degree {
-            return Err(InputError::new(&self.path, "rows with more bands than announced", "report this as a bug"));
+            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
         }
         for row in 0..columns.rows() {
             self.given += 1;

@@ -4,8 +4,8 @@
 //! beside the target first, [`pack`]ed but for their positions, whose number of fractional bits follows from the largest one. At
 //! the end the temporary file is read once for each attribute.
 //!
-//! Invariants: 1. memory beyond the given rows is a few buffers of 1 MiB; 2. the temporary file goes whatever happens; 3. a row
-//! with a value that is not finite, or with a coordinate beyond 8 million, is left out and counted.
+//! Invariants: 1. memory beyond the given rows is a few buffers of 1 MiB; 2. the temporary file is removed, also after
+//! errors; 3. a row with a value that is not finite, or with a coordinate beyond 8 million, is left out and counted.
 
 use super::pack::{self, POSITION_BYTES};
 use crate::base::error::{InputError, InputResult};
@@ -110,7 +110,7 @@ impl SpzWriter {
 impl GaussianSink for SpzWriter {
     fn write(&mut self, columns: &Columns) -> InputResult<()> {
         if columns.sh_degree > self.sh_degree {
-            return Err(InputError::new(&self.path, "rows with more bands than announced", "report this as a bug"));
+            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
         }
         let mut bytes = Vec::new();
         for row in 0..columns.rows() {

@@ -135,13 +135,6 @@ impl EvictOrder {
         Some(Candidate { page, next_use, last_use })
     }
 
-    /// Removes and returns the page that is evicted first.
-    pub fn take_first(&mut self) -> Option<Candidate> {
-        let first = self.first()?;
-        self.remove(first.page);
-        Some(first)
-    }
-
     /// The key of the page that is evicted first, to compare two orders of one policy.
     pub(super) fn first_key(&mut self) -> Option<Key> {
         while let Some(&key) = self.heap.peek() {
@@ -192,7 +185,9 @@ mod tests {
             for (page, (next_use, last_use)) in (0..).map(PageNo).zip(uses) {
                 order.insert(Candidate { page, next_use, last_use });
             }
-            std::iter::from_fn(|| order.take_first()).map(|c| c.page.0).collect::<Vec<_>>()
+            std::iter::from_fn(|| order.first().map(|c| c.page).filter(|&page| order.remove(page)))
+                .map(|page| page.0)
+                .collect::<Vec<_>>()
         };
         assert_eq!(order(EvictPolicy::FarthestNextUse), [3, 1, 2, 4, 0]);
         assert_eq!(order(EvictPolicy::LeastRecentlyUsed), [0, 2, 4, 3, 1]);

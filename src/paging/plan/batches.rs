@@ -22,12 +22,8 @@ pub fn walk(pages: &[PageNo], frames: usize) -> impl Iterator<Item = &[PageNo]> 
     pages.chunks(per_batch).chain(pages.chunks(per_batch).rev().skip(1))
 }
 
-/// How many batches [`walk`] has.
-pub fn accesses(pages: usize, frames: usize) -> usize {
-    (2 * pages.div_ceil(pages_per_batch(pages, frames))).saturating_sub(1)
-}
-
-/// Of views with these numbers of pages: how many need several batches, and the most batches of one of them, 1 at least.
+/// For views with these numbers of pages: the number of views that need several batches, and the most batches of a view
+/// (at least 1).
 pub fn cut_views(pages: impl Iterator<Item = usize>, frames: usize, pages_most: usize) -> (usize, usize) {
     pages.fold((0, 1), |(views, most), pages| {
         let batches = pages.div_ceil(pages_per_batch(pages, frames).min(pages_most).max(1));
@@ -49,9 +45,6 @@ mod tests {
         assert_eq!(numbers(6), [0, 3, 6, 3, 0]);
         assert_eq!(numbers(2), [0, 1, 2, 3, 4, 5, 6, 5, 4, 3, 2, 1, 0]);
         assert_eq!(numbers(1), numbers(2));
-        for frames in 1..9 {
-            assert_eq!(walk(&pages, frames).count(), accesses(7, frames));
-            assert_eq!(walk(&[], frames).count(), accesses(0, frames));
-        }
+        assert_eq!(walk(&[], 1).count(), 0);
     }
 }

@@ -16,10 +16,11 @@ use crate::paging::frames::evict::{Candidate, EvictOrder, EvictPolicy, NEVER};
 use std::fmt;
 use std::ops::Range;
 
-/// A page that is not needed for so many steps may be evicted for a page that the next step would wait for: at most one
-/// more read in so many steps. With frames for a tenth of a large survey, of which a view needs 5 % of the pages, 4, 16 and 40
-/// steps read 4.3, 1.7 and 1.4 % more than necessary (measured while only the next step was planned anew: .3 % since), and
-/// steps waited for 2.5, 3.1 and 3.1 % of their pages; with less reading 40 was the fastest, in small surveys as well.
+/// A page that is not needed for this number of steps may be evicted for a page that the next step would wait for. That
+/// costs at most one more read in this number of steps. With frames for a tenth of a large survey, of which a view needs
+/// 5 % of the pages, 4, 16 and 40 steps read 4.3, 1.7 and 1.4 % more than necessary (measured while only the next step
+/// was planned anew: .3 % since), and steps waited for 2.5, 3.1 and 3.1 % of their pages; with less reading 40 was the
+/// fastest, in small surveys as well.
 pub const FAR_STEPS: u32 = 40;
 
 /// Steps before its own in which a page may be read: how far a run looks ahead.
@@ -98,8 +99,8 @@ impl CacheModel {
         CacheModel { reads_ahead: true, ..self }
     }
 
-    /// Replaces what the cache holds, keeping allocations: `free` frames without a page, the pages `present` that `step`
-    /// needs, and the other pages in memory, `idle`.
+    /// Replaces the content of the cache and keeps allocations: `free` frames without a page, the pages `present` that
+    /// `step` needs, and the other pages in memory, `idle`.
     pub fn restart(
         &mut self,
         step: u32,

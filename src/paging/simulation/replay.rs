@@ -4,11 +4,12 @@
 //! [`EvictPolicy::FarthestNextUse`], without reading ahead, and with a plan that looks at least two epochs ahead, it reads
 //! Belady's bound: no cache with that many frames can read fewer pages for the same views in the same order.
 //!
-//! The model of time: one drive serves one request after the other, reads in the order of steps. Each read is preceded by the
-//! write-back of the page that is evicted for it. A page is evicted at the end of the step that last needs it, but at most
-//! [`STEPS_AHEAD`] steps before the one that it is evicted for, and any frame serves any read. A step takes the same time
-//! everywhere. The run waits for what is still missing when a step could start. A replay that reads ahead evicts pages as a run
-//! does. Not modelled: how many bytes may be in flight, and when in a step the run looks what has ended.
+//! The model of time: one drive serves one request after the other, reads in the order of steps. Each read is preceded by
+//! the write-back of the page that is evicted for it. A page is evicted at the end of the step that last needs it, but at
+//! most [`STEPS_AHEAD`] steps before the step that needs its frame, and any frame serves any read. A step takes the same
+//! time everywhere. The run waits for what is still missing when a step could start. A replay that reads ahead evicts pages
+//! as a run does. Not modelled: the limit on bytes in flight, and the moments in a step at which the run polls for
+//! completed transfers.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
 //! page moves, whole pages only; every evicted page was changed and is written, unless its share says otherwise.
@@ -26,7 +27,7 @@ use std::ops::Range;
 /// Steps of the window whose heaviest place is reported.
 pub const WINDOW_STEPS: usize = 20;
 
-/// What is simulated.
+/// The run to simulate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplayOptions {
     /// Frames of the cache.
@@ -37,7 +38,7 @@ pub struct ReplayOptions {
     pub reads_ahead: bool,
     /// Steps to go through.
     pub steps: u32,
-    /// Bytes that the plan may take: fewer let it look less far.
+    /// Bytes that the plan may take: with fewer bytes it looks ahead less far.
     pub plan_bytes: u64,
 }
 
@@ -48,19 +49,19 @@ pub struct StepTraffic {
     pub batches: u32,
     /// Pages needed, by each batch.
     pub pages: u32,
-    /// Of these, pages that were read for it.
+    /// Pages among them that were read for the step.
     pub pages_read: u32,
-    /// Bytes of these.
+    /// Bytes of the pages that were read.
     pub bytes_read: u64,
-    /// Of these, bytes of the pages that are needed before any other page has to leave: a run that has just made its pages
-    /// has them in memory.
+    /// Bytes among them of pages that are needed before the first eviction: a run that has just made its pages has these
+    /// in memory.
     pub bytes_first: u64,
-    /// The number of these pages.
+    /// Number of pages that are needed before the first eviction.
     pub pages_first: u32,
-    /// Bytes of the pages that left for it.
+    /// Bytes of the pages that were evicted for the step.
     pub bytes_written: u64,
-    /// Frames whose pages leave for this step or one of the next [`STEPS_AHEAD`], and that are free for it from this one's
-    /// begin on, and not before.
+    /// Frames that become free at the begin of this step: their pages are evicted for this step or one of the next
+    /// [`STEPS_AHEAD`].
     pub frames_freed: u32,
 }
 
@@ -149,8 +150,8 @@ impl<'a> Coming<'a> {
         self.step_from_batch[batch as usize]
     }
 
-    /// Plans what fits of the next two epochs after `batch`: each page is needed in every epoch, so its next use lies less than two
-    /// epochs ahead. `false` when no batch is left.
+    /// Plans the next two epochs after `batch`, as far as they fit: each page is needed in every epoch, so its next use
+    /// lies less than two epochs ahead. `false` when no batch is left.
     fn extend(&mut self, plan: &mut Plan, batch: u32) -> bool {
         let now = self.step_from_batch.get(batch as usize).copied().unwrap_or(self.next_step);
         // The run ends; what would come after it is not needed by anyone.
@@ -175,7 +176,7 @@ impl<'a> Coming<'a> {
     }
 }
 
-/// What a drive does and how long a step takes without it.
+/// Rates of a drive, and the time of a step without the drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveModel {
     /// Bytes per second.

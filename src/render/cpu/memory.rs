@@ -13,14 +13,16 @@
 //! At most 152 bytes a row are held at once, instead of 192, and 12 bytes for each row of one batch, whose colours are taken
 //! from the packed splats. Sums of weights, where a strategy collects them, come on top.
 //!
-//! Invariants: 1. no result depends on whether a view is crowded; 2. other views keep all buffers, so they allocate
-//! nothing once a view of their size was rendered.
+//! Between views, the owner of a renderer can free all buffers that grow with rows: frames of pages need the memory of a
+//! view that is far wider than the coming ones.
+//!
+//! Invariants: 1. no result depends on whether a view is crowded, nor on when buffers are freed; 2. views that are not crowded
+//! keep all buffers, so they allocate nothing once a view of their size was rendered.
 
 use super::CpuRenderer;
 use crate::kernels::fold::{FootprintGradients, Partial, WeightPartial};
-use crate::kernels::splats::Packed;
-#[cfg(test)]
-use crate::kernels::splats::{Span, Splat};
+use crate::kernels::project_fwd::Projected;
+use crate::kernels::splats::{Packed, Span, Splat};
 use std::ops::Range;
 use std::sync::atomic::AtomicU64;
 
@@ -29,9 +31,18 @@ pub(super) const LIST_BYTES: u64 = (size_of::<AtomicU64>() + size_of::<Partial>(
 
 /// Most bytes that a crowded view holds for a visible row, beside lists, pixels and weights: conic, radii, opacity and depth
 /// order; packed splat, span and count; gradients of the splat, and the count of a range.
-#[cfg(test)]
 pub(super) const CROWDED_ROW_BYTES: usize =
     (12 + 8 + 4 + 4) + (size_of::<Splat>() + size_of::<Span>() + 4) + (8 + 12 + 12 + 4) + 4;
+
+/// Bytes that a view with room holds for a visible row on top: keys of the sort, depth, projected mean and colour.
+const ROOMY_ROW_BYTES: usize = 16 + 4 + 8 + 12;
+/// Bytes that a crowded view holds on top for a row of one batch: colour.
+const BATCH_ROW_BYTES: usize = 12;
+
+/// Buffers keep at most an eighth to spare ([`crate::base::room`]).
+const SPARE_SHARE: u64 = 8;
+/// Bytes of the depth sort that do not grow with rows: its tables.
+const SORT_TABLES_BYTES: u64 = 256 << 10;
 
 impl CpuRenderer {
     /// Most intersections that are listed at once.
@@ -64,7 +75,7 @@ impl CpuRenderer {
         }
     }
 
-    /// Frees what the packed splats hold too.
+    /// Frees the buffers whose content the packed splats repeat.
     pub(super) fn free_after_pack(&mut self) {
         self.note_bytes();
         if self.is_crowded {
@@ -85,7 +96,30 @@ impl CpuRenderer {
 
     /// Notes the bytes held now.
     pub(super) fn note_bytes(&mut self) {
+        self.row_bytes_most = self.row_bytes_most.max(self.bytes_of_rows());
         self.bytes_most = self.bytes_most.max(self.scratch_bytes());
+    }
+
+    /// The most bytes that a view with `rows` visible rows, in one batch, holds in buffers that grow with rows, if these buffers
+    /// are empty before the view.
+    pub(super) fn bytes_for_rows(&self, rows: u64) -> u64 {
+        let is_crowded = self.isects_most().is_some_and(|most| rows > most);
+        let weights = if self.weighs_next { size_of::<[f32; 2]>() } else { 0 };
+        let row_bytes = CROWDED_ROW_BYTES + weights + if is_crowded { BATCH_ROW_BYTES } else { ROOMY_ROW_BYTES };
+        (rows + rows / SPARE_SHARE) * row_bytes as u64 + SORT_TABLES_BYTES
+    }
+
+    /// Frees all buffers that grow with rows.
+    pub(super) fn free_all_rows(&mut self) {
+        self.projected = Projected::default();
+        self.colors = Vec::new();
+        self.depth_sort.free();
+        self.order = Vec::new();
+        self.packed = Packed::default();
+        self.range_counts = Vec::new();
+        self.weights = Vec::new();
+        self.footprints = FootprintGradients::default();
+        (self.bytes_most, self.row_bytes_most) = (0, 0);
     }
 
     /// Host memory that this renderer holds now, bytes.
@@ -93,7 +127,8 @@ impl CpuRenderer {
         self.bytes_of_rows() + self.bytes_of_lists_and_pixels()
     }
 
-    fn bytes_of_rows(&self) -> u64 {
+    /// Host memory in buffers that grow with the rows of a view, held now, bytes.
+    pub(super) fn bytes_of_rows(&self) -> u64 {
         let (p, f) = (&self.projected, &self.footprints);
         let Packed { splats, spans, counts, .. } = &self.packed;
         self.depth_sort.bytes()

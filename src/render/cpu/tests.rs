@@ -80,7 +80,7 @@ fn bits_of_batches(renderer: &mut CpuRenderer, rows: &Columns, camera: &Camera, 
     renderer.picture().unwrap();
     let rgb = (0..3 * camera.pixels()).map(|i| (i % 251) as u8).collect();
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-    let loss = LossOptions::new(0.2, SsimPadding::Valid, SimdPath::best());
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
     renderer.loss(&target, &loss).unwrap();
     renderer.picture_back().unwrap();
     let mut all = vec![Vec::new(); 9];
@@ -156,6 +156,28 @@ fn a_crowded_view_gives_buffers_up_and_keeps_its_bits() {
         }
         renderer.set_list_bytes(None);
         assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[60_000]), "with room again");
+    }
+}
+
+/// A renderer says before a view what the rows of the view will take, and gives this memory back.
+#[test]
+fn memory_of_rows_is_stated_before_a_view_and_freed_after_it() {
+    let (rows, camera) = scene(60_000, 123, 77);
+    for list_bytes in [None, Some(7_500 * (LIST_BYTES + 8))] {
+        let mut renderer = CpuRenderer::new();
+        renderer.set_list_bytes(list_bytes);
+        renderer.weigh_rows(true).unwrap();
+        let stated = renderer.host_bytes_for_rows(60_000);
+        let one = bits_of_batches(&mut renderer, &rows, &camera, &[60_000]);
+        let held = renderer.host_bytes_of_rows();
+        assert!(held <= stated, "{held} bytes, {stated} stated, lists {list_bytes:?}");
+        // A first allocation spares nothing, and a crowded view does not hold its largest buffers at one time.
+        assert!(stated <= held + held / 3, "{stated} bytes stated, {held} held, lists {list_bytes:?}");
+        let beside = renderer.host_bytes() - held;
+        renderer.free_rows();
+        assert_eq!(renderer.host_bytes_of_rows(), 0);
+        assert!(renderer.host_bytes() <= beside, "{} bytes, {beside} beside the rows", renderer.host_bytes());
+        assert!(one == bits_of_batches(&mut renderer, &rows, &camera, &[60_000]), "lists {list_bytes:?}");
     }
 }
 

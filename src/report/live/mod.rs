@@ -1,12 +1,12 @@
-//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that one moves.
+//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that the viewer moves.
 //!
-//! The run and the server share a [`Live`]: the server notes which picture the page wants, the run draws the latest wish between two
-//! steps and leaves the PNG. Curves are read from the run's `metrics.jsonl`, so the run does no work for them.
+//! The run and the server share a [`Live`]. The server stores the latest request for a picture. The run draws the picture between two
+//! steps and stores its PNG. The server reads curves from the run's `metrics.jsonl`, so they cost the run nothing.
 //!
 //! Not here: drawing, and how often the run does it (`train::run::live`).
 //!
-//! Invariants: 1. nothing that a page sends changes a result: it can only ask for pictures; 2. the server reads one file, that of the
-//! metrics; 3. a page that is gone costs the run at most one picture.
+//! Invariants: 1. a page can only request pictures, so no request changes a result; 2. the server reads one file, the metrics; 3. a
+//! page that was closed costs the run at most one picture.
 
 #[cfg(feature = "serve")]
 mod server;
@@ -21,7 +21,7 @@ use std::time::{Duration, Instant};
 /// Widest picture, pixels.
 pub const WIDTH_MOST: u32 = 1280;
 
-/// A camera that moves around what a training view looks at.
+/// A camera on an orbit around the point that a training view looks at.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Orbit {
@@ -31,7 +31,7 @@ pub struct Orbit {
     pub turn: f32,
     /// Turn around the horizontal, degrees.
     pub tilt: f32,
-    /// Distance to the pivot, over that of the view.
+    /// Distance to the pivot, over the distance of the training view.
     pub distance: f32,
     /// Width of the picture, pixels.
     pub width: u32,
@@ -44,7 +44,7 @@ impl Default for Orbit {
 }
 
 impl Orbit {
-    /// The nearest orbit that can be drawn; numbers that are not finite become those of the default.
+    /// The nearest orbit that can be drawn. A number that is not finite becomes the default.
     pub fn bounded(self) -> Orbit {
         let or = |value: f32, default: f32| if value.is_finite() { value } else { default };
         Orbit {
@@ -57,7 +57,7 @@ impl Orbit {
     }
 }
 
-/// How far the run is.
+/// Progress of the run.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Status {
     /// Steps done.
@@ -74,7 +74,7 @@ pub struct Status {
     pub picture_percent: u32,
 }
 
-/// A wish for a picture.
+/// The number of a request for a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Ticket(u64);
 
@@ -96,7 +96,7 @@ struct Shared {
     has_drawn: Condvar,
 }
 
-/// What a run and the server of its page share.
+/// The state that a run and the server of its page share.
 #[derive(Debug, Clone)]
 pub struct Live(Arc<Shared>);
 
@@ -128,7 +128,7 @@ impl Live {
         Err(InputError::new("--serve", problem, "build it with the default features, or leave --serve out"))
     }
 
-    /// Where the page is.
+    /// Address of the page.
     pub fn address(&self) -> SocketAddr {
         self.0.address
     }
@@ -137,22 +137,22 @@ impl Live {
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Names the file of the run's metrics.
+    /// Sets the path of the run's metrics.
     pub fn set_metrics(&self, metrics: PathBuf) {
         self.state().metrics = Some(metrics);
     }
 
-    /// Says how far the run is.
+    /// Sets the progress of the run.
     pub fn set_status(&self, status: Status) {
         self.state().status = status;
     }
 
-    /// The latest picture that a page wants and nobody has drawn.
+    /// The latest request that is not answered yet.
     pub fn wanted(&self) -> Option<(Ticket, Orbit)> {
         self.state().wanted
     }
 
-    /// Leaves the picture of a wish as PNG, or why there is none. Older wishes are answered with it too.
+    /// Answers a request, and all older ones, with a PNG or the reason why the picture could not be drawn.
     pub fn show(&self, ticket: Ticket, picture: Result<Vec<u8>, String>) {
         let mut state = self.state();
         if state.wanted.is_some_and(|(wanted, _)| wanted <= ticket) {
@@ -162,7 +162,7 @@ impl Live {
         self.0.has_drawn.notify_all();
     }
 
-    /// Asks for a picture and waits for it. `None` if the run draws none within `patience`.
+    /// Requests a picture and waits for the answer. `None` if there is none within `patience`.
     pub fn ask(&self, orbit: Orbit, patience: Duration) -> Option<Result<Vec<u8>, String>> {
         let mut state = self.state();
         let ticket = Ticket(state.last.0 + 1);
@@ -207,13 +207,13 @@ mod tests {
     }
 
     #[test]
-    fn orbits_that_cannot_be_drawn_become_those_that_can() {
+    fn an_orbit_that_cannot_be_drawn_becomes_the_nearest_one_that_can() {
         let absurd = Orbit { view: 9, turn: f32::NAN, tilt: 1e9, distance: f32::INFINITY, width: 1 << 30 };
         assert_eq!(absurd.bounded(), Orbit { view: 9, turn: 0.0, tilt: 180.0, distance: 1.0, width: WIDTH_MOST });
     }
 
     #[test]
-    fn the_latest_wish_answers_the_older_ones() {
+    fn the_latest_request_answers_the_older_ones() {
         let shared = Shared {
             address: SocketAddr::from(([127, 0, 0, 1], 0)),
             state: Mutex::default(),

@@ -1,4 +1,4 @@
-//! The server of the live page: four addresses, all of them to read.
+//! The server of the live page: four addresses, all read-only.
 //!
 //! | address | answer |
 //! | --- | --- |
@@ -20,7 +20,7 @@ use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::path::Path;
 use std::time::Duration;
 
-/// How long a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
+/// Longest time that a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// Most bytes of metrics in one answer.
 const METRICS_BYTES: u64 = 4 << 20;
@@ -41,19 +41,19 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
             axum::serve(listener, app).await
         });
         if let Err(error) = served {
-            eprintln!("warning: the live page is gone: {error}");
+            eprintln!("warning: the live page has stopped: {error}");
         }
     })?;
     Ok(())
 }
 
-/// Refuses requests for a name that is not this machine's, to a page on the loopback: a page of another site would otherwise read it
-/// by giving its own name the address of the loopback (DNS rebinding).
+/// Refuses a request to a loopback address whose host name is not this machine's. Otherwise a page of another site could read the
+/// answer by resolving its own name to the loopback address (DNS rebinding).
 async fn check_host(State(live): State<Live>, request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
     match is_own_host(live.address(), host) {
         true => next.run(request).await,
-        false => (StatusCode::FORBIDDEN, "this page has another address").into_response(),
+        false => (StatusCode::FORBIDDEN, "this page answers only requests to its own address").into_response(),
     }
 }
 
@@ -105,7 +105,7 @@ async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Respon
     match asked {
         Ok(Some(Ok(png))) => fresh("image/png", png),
         Ok(Some(Err(why))) => (StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
-        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time; it may be busy").into_response(),
+        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time: it may be busy").into_response(),
     }
 }
 

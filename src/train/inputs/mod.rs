@@ -1,4 +1,4 @@
-//! What a run is given: the prepared dataset and its print, first Gaussians from files, the threads and renderer of the
+//! Inputs of a run: the prepared dataset and its digests, first Gaussians from files, the threads and renderer of the
 //! machine, signals.
 
 pub mod dataset_print;

@@ -1,4 +1,4 @@
-//! What a run writes down as it goes: metrics, progress on the terminal, facts about a finished run.
+//! Logs of a run: metrics, progress on the terminal, facts about a finished run.
 //!
 //! Not here: results (`run::run_folder`), pictures and pages of the report ([`crate::report`]).
 

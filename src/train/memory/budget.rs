@@ -1,12 +1,12 @@
 //! The memory budget of a growing scene: how many frames remain beside the other memory of a run, and when a scene in
 //! memory no longer fits (`outgrown` then starts paging).
 //!
-//! Invariants: 1. the number of frames follows from bytes: the budget minus what the run holds beside its frames. It
-//! never follows from a page count guessed at the start. A frame takes memory once a page fills it; 2. frames shrink
-//! before the step that needs their memory, by the largest growth that its view may have had since the last step;
-//! frames removed for growth that did not come return; 3. possible growth never stops a run: a step gets the frames
-//! that it needs while the run's current memory leaves room for them. A run without --host-mem exceeds its first share
-//! for them, up to the available memory of the machine; 4. no bit of the result depends on the budget.
+//! Invariants: 1. the number of frames follows from bytes: the budget minus what the run holds beside its frames. It never
+//! follows from a page count guessed at the start. A frame takes memory once a page fills it; 2. frames shrink before the
+//! step that needs their memory, by the largest growth that its view may have had since the last step; frames that were
+//! removed for growth that did not happen are added again; 3. possible growth never stops a run: a step gets the frames
+//! that it needs while the run's current memory leaves room for them. For such frames, a run without --host-mem exceeds its
+//! first share, up to the available memory of the machine; 4. no bit of the result depends on the budget.
 
 use super::estimate::{INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, obtainable_bytes};
 use super::staging::{PLAN_BYTES, PLAN_BYTES_LEAST, with_staging};

@@ -1,4 +1,4 @@
-//! What the training views need: the view with most pages, and the views that are cut into batches.
+//! Pages of the training views: the view with the most pages, and the views that are cut into batches.
 //!
 //! Invariant: needs follow from the bounds of the pages alone; no page is read.
 

@@ -1,5 +1,5 @@
-//! The device memory of a run, before its first step: the table beside that of host memory, and the refusal of a budget below
-//! the least.
+//! The device memory of a run, before its first step: the table beside that of host memory, and the refusal of a budget
+//! below the minimum.
 //!
 //! Not here: the sums ([`crate::render::device_needs`]).
 

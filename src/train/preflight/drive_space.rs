@@ -93,9 +93,9 @@ pub(crate) struct StepWrites {
     pub of_step: [f64; 2],
 }
 
-/// The bytes that a run with `frames` frames, possibly more than pages, writes whose pages become `growth` times as many: by
-/// simulation of a few epochs with the pages of now. At the end as many frames hold fewer of the pages, and a view takes more
-/// of them.
+/// The bytes that a step writes in a run with `frames` frames (possibly more than pages) whose number of pages grows by
+/// the factor `growth`. Simulates a few epochs with the current pages. At the end the same number of frames holds a
+/// smaller share of the pages, and a view needs more pages.
 pub(crate) fn step_writes(
     config: &TrainConfig,
     dataset: &Dataset,

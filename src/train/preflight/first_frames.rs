@@ -2,7 +2,8 @@
 //!
 //! Not here: frames of a scene that has grown (`fitting`).
 //!
-//! Invariant: a budget that holds no batch of the largest view is refused, with the least budget that would do.
+//! Invariant: a budget that holds no batch of the largest view is refused, and the error names the smallest budget that
+//! suffices.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};
@@ -118,8 +119,8 @@ pub(super) fn frames_of_budget(
     Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
 }
 
-/// Makes the estimate of a scene that has grown obey `budget` as the run will: by fewer frames, and where these do not hold the
-/// largest view of then (`need`), by views in batches. Returns the number of frames.
+/// Reduces the estimate of a grown scene to `budget` as the run will do: by fewer frames and, if these do not hold the largest view of
+/// the grown scene (`need`), by views in batches. Returns the number of frames.
 pub(super) fn obey(config: &TrainConfig, need: &LargestNeed, budget: u64, memory: &mut MemoryEstimate) -> u64 {
     let FirstFrames { frames, pages_most } = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
         let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
@@ -131,7 +132,7 @@ pub(super) fn obey(config: &TrainConfig, need: &LargestNeed, budget: u64, memory
     frames
 }
 
-/// Takes the rows of a view, and the copies of a round, in batches of `pages_most` pages.
+/// Reduces the estimate to batches of `pages_most` pages: rows of a view, and copies of a round.
 pub(super) fn in_batches(config: &TrainConfig, memory: &mut MemoryEstimate, pages_most: usize, frame_bytes: u64) {
     let pages = pages_most as u64;
     let working = pages.saturating_mul(page_working(config)).min(memory.working);

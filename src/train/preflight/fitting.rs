@@ -1,5 +1,6 @@
 //! Adjusts the number of frames between steps and raises the budget, as [`crate::train::memory::budget`] computes them.
 
+use crate::base::allocator::return_small_blocks;
 use crate::base::units::format_bytes;
 use crate::paging::error::PagingError;
 use crate::scene::camera::Camera;
@@ -11,6 +12,12 @@ use crate::train::step::working_set::WorkingSet;
 
 /// The number of frames rises only by more than 1/16, to avoid small changes at every step.
 const FRAME_RISE_SHARE: usize = 16;
+
+/// Renderer and working set keep the memory of a view that is up to this many times wider than the coming one, since most
+/// views differ by less and an allocation takes time.
+const WIDER_KEPT: u64 = 4;
+/// Memory below this share of the budget is never freed: frames would gain little.
+const KEPT_SHARE: u64 = 16;
 
 impl Trainer {
     /// Keeps the run within this budget from now on by adjusting its number of frames.
@@ -27,8 +34,8 @@ impl Trainer {
         ViewMemory { now, at_last }
     }
 
-    /// Memory of a view whose pages hold `rows` rows, in one batch: what is held already, unless no view with as many rows was
-    /// one batch so far.
+    /// Memory of a view whose pages hold `rows` rows, in one batch: the memory held now, if a view of that many rows has
+    /// been one batch before.
     fn view_memory_of(&self, rows: u64) -> ViewMemory {
         let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
         if rows <= self.whole_rows {
@@ -40,6 +47,32 @@ impl Trainer {
         ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
     }
 
+    /// Prepares memory for a view whose pages hold `rows` rows: frees what only far wider views need in the renderer and the
+    /// working set, so that frames can have it, and expects what the renderer will need if no view as wide was rendered since.
+    fn expect_rows(&mut self, rows: u64, budget: HostBudget) {
+        let visible = (rows as f64 * self.visible_share) as u64;
+        let due = self.renderer.host_bytes_for_rows(visible);
+        let is_too_large =
+            |held: u64, due: u64| held > due.saturating_mul(WIDER_KEPT) && held > budget.bytes / KEPT_SHARE;
+        if is_too_large(self.renderer.host_bytes_of_rows(), due) {
+            self.renderer.free_rows();
+            self.rendered_rows = 0;
+        }
+        let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree()) as u64;
+        if is_too_large(self.working.bytes() as u64, working_due) && self.working.shrink_to(visible as usize) {
+            self.whole_rows = 0;
+        }
+        self.row_bytes_due = if rows <= self.rendered_rows { 0 } else { due };
+    }
+
+    /// [`Trainer::fit_frames`] for the camera that sees the most pages, before pictures outside of steps.
+    pub(crate) fn fit_widest<'a>(&mut self, cameras: impl IntoIterator<Item = &'a Camera>) {
+        if self.budget.is_some() && !self.is_in_memory() {
+            let widest = cameras.into_iter().max_by_key(|camera| self.scene.pager.pages_of_view(camera).len());
+            widest.into_iter().for_each(|camera| self.fit_frames(camera));
+        }
+    }
+
     /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
     /// fit in one batch is cut into batches that do.
     pub(crate) fn fit_frames(&mut self, camera: &Camera) {
@@ -48,6 +81,7 @@ impl Trainer {
         let index = self.scene.pager.index();
         let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
         let needed = pages.len();
+        self.expect_rows(rows, budget);
         let view = self.view_memory_of(rows);
         let mut frames = budget.frames(&self.scene, view, needed);
         self.pages_most = usize::MAX;
@@ -68,6 +102,9 @@ impl Trainer {
             pager.allow_frames(frames);
         } else {
             pager.limit_frames(frames);
+            if frames < now - now / FRAME_RISE_SHARE {
+                return_small_blocks();
+            }
         }
     }
 

@@ -27,10 +27,11 @@ const ADDED_BY_A_ROUND: f64 = 20_000.0;
 const ROUND_STEPS: f64 = 33.0;
 /// Rounds that are further apart add more: their number grows with this power of the steps between them.
 const ROUND_POWER: f64 = 0.4;
-/// Most Gaussians that a round adds, as a share of those that are there: what the first rounds of a scene of few points add.
+/// Most Gaussians that a round adds, as a share of the existing ones: the share that the first rounds of a scene with few
+/// points add.
 const ADDED_MOST: f64 = 0.6;
-/// Gaussians that a run decides for, over the first ones: 1.0 on seneca and brighton, 2.8 on sheffield_cross, see "A count that the
-/// program decides" in `benches/RESULTS.md`.
+/// The number of Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.8 on sheffield_cross,
+/// see "A count that the program decides" in `benches/RESULTS.md`.
 const DECIDED: f64 = 2.0;
 /// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power of
 /// their number.
@@ -40,10 +41,10 @@ pub const STEP_GROWTH: f64 = 0.54;
 const ROW_SECONDS: f64 = 0.4e-6;
 /// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache.
 const STEP_OVER_RENDERING: f64 = 1.35;
-/// Pages of a grown scene over those that its Gaussians would fill as the first ones are filled, at most: .96 in sheffield_cross_395 and
+/// Most pages of a grown scene, over the pages that its Gaussians would take at the fill of the first pages: .96 in sheffield_cross_395 and
 /// .99 in seneca (`gsscale-ckpt ls` after `--max-resolution 200 --steps 40 --keep-checkpoint`).
 const MORE_PAGES: f64 = 1.1;
-/// Bytes of a store's map and its other small files without pages, and of a version of a page in it, with room.
+/// Bytes of a store's map and its other small files without pages, and bytes of the map for each version of a page, with a margin.
 const MAP_BYTES: u64 = 2 << 20;
 const MAP_PAGE_BYTES: u64 = 1024;
 /// Bytes of a Gaussian in a PLY beside its harmonics: position, normal, opacity, scale, rotation.
@@ -58,19 +59,19 @@ pub enum Reach {
     Cap,
     /// A guess: there is no cap.
     Guess,
-    /// The number at the start: the run would decide it, and has too few photos for that.
+    /// The number at the start: the run has too few photos to decide another one.
     Kept,
     /// A guess: the run decides the count as it trains ([`crate::densify::growth`]).
     Decided,
 }
 
-/// The number of Gaussians that a run of `rows` will reach after `steps_done` of its steps, and how that is known. A guess is at most a
-/// Gaussian for each of the `pixels` of the training photos: what has no pixel of its own has no gradient that splits it for long.
+/// The number of Gaussians that a run with `rows` Gaussians after `steps_done` steps will reach, and how that is known. A guess is at most one
+/// Gaussian for each of the `pixels` of the training photos: a Gaussian without a pixel of its own soon has no gradient that splits it.
 /// A run that decides its count rarely changes it after the first of its `checks`.
 pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32, checks: &[GrowthCheck]) -> (u64, Reach) {
     let last = config.refine_stop.min(config.steps);
     let first = config.refine_start.max(steps_done);
-    // Rounds come at the multiples of their distance between the two, without these.
+    // Rounds come at the multiples of `every` strictly between `first` and `last`.
     let every = config.refine_every.max(1);
     let rounds = (last.saturating_sub(1) / every).saturating_sub(first / every);
     if !config.strategy.grows() || rounds == 0 {
@@ -87,7 +88,7 @@ pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32, chec
     }
 }
 
-/// The number of Gaussians that `rows` become in so many rounds without a cap.
+/// The number of Gaussians that `rows` become in `rounds` rounds without a cap.
 fn guess(rows: u64, rounds: u32, every: u32) -> u64 {
     let of_round = ADDED_BY_A_ROUND * (f64::from(every) / ROUND_STEPS).powf(ROUND_POWER);
     let mut now = rows as f64;
@@ -127,8 +128,6 @@ pub struct Forecast {
     pub bytes_written: f64,
     /// Most bytes that commits write.
     pub commit_bytes_most: f64,
-    /// Seconds of a step with the Gaussians of now.
-    pub step_seconds: f64,
     /// Seconds of all steps.
     pub seconds: f64,
 }
@@ -184,7 +183,6 @@ impl Forecast {
             ply_bytes: ply_bytes(config, last),
             bytes_written: 0.0,
             commit_bytes_most: commit_bytes(config, state_bytes, seconds),
-            step_seconds,
             seconds,
         };
         if !is_in_memory {

@@ -32,6 +32,9 @@ const GROWTH_UNLIKELY: f64 = 20.0;
 const PROBE_BATCH_SHARE: u64 = 16;
 /// Bytes that a renderer holds for a row in view at least, beside intersections.
 const SPLAT_BYTES: u64 = 150;
+/// A view whose rows take more than this share of the budget, of 4, is measured in batches: program, photos and lists of
+/// intersections need the rest.
+const PROBE_WHOLE_OF_4: u64 = 3;
 
 /// Pages, frames and drive space of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -163,7 +166,7 @@ pub fn allow_largest_view(
     let most = if config.host_mem.0 == 0 { host_mem.and(obtainable_bytes()).max(host_mem) } else { host_mem };
     let mut frames = needed;
     let of_page = frame_bytes + page_working(config) + u64::from(config.page_rows) * SPLAT_BYTES;
-    if let Some(budget) = most.filter(|budget| needed * of_page > *budget) {
+    if let Some(budget) = most.filter(|budget| needed * of_page > budget / 4 * PROBE_WHOLE_OF_4) {
         let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
         if (fewer as u64) < needed {
             (frames, trainer.pages_most) = (fewer as u64, pages);

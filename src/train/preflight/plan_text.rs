@@ -17,10 +17,10 @@ const ENDURANCE_BYTES: f64 = 300e12;
 
 /// Columns of a terminal.
 const COLUMNS: usize = 80;
-/// Before the text of a plan's lines, below their heads.
+/// Indent of wrapped lines: the width of the first column.
 const INDENT: &str = "        ";
 
-/// What becomes of the number of Gaussians, in the words of a forecast.
+/// The growth of the number of Gaussians, as text of a plan.
 pub fn growth(forecast: &Forecast) -> String {
     let last = format_grouped(forecast.gaussians[1]);
     match forecast.reach {
@@ -88,8 +88,8 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
     text
 }
 
-/// The text with lines of at most 80 columns, as far as they have a comma, a semicolon, a colon or a bracket to be broken at; the rest of a line
-/// is indented.
+/// Wraps the lines of a text at 80 columns, and indents the rest of each. Lines break only behind a comma, a semicolon or a colon, or
+/// before a bracket; a line without such a place stays long.
 pub fn folded(text: &str) -> String {
     let mut lines = Vec::new();
     for line in text.lines() {
@@ -105,8 +105,7 @@ pub fn folded(text: &str) -> String {
     lines.join("\n")
 }
 
-/// The byte at which a line is broken: behind the last mark, or before the last bracket, that the columns hold; inside brackets only
-/// where there is no other place.
+/// The byte at which a line is wrapped: the last such place within the columns; inside brackets only if there is no other place.
 fn break_of(line: &str) -> Option<usize> {
     let is_break = |at: &usize| {
         let (before, after) = line.split_at(*at);

@@ -114,7 +114,7 @@ pub fn estimate(
     Ok((memory, ViewTimes { seconds, visible_share: visible as f64 / rows.max(1) as f64 }))
 }
 
-/// Bytes of what a run knows of the blocks of its photos, with the two copies that a commit makes.
+/// Bytes of the states of blocks of photos, with the two copies that a commit makes.
 fn blocks_bytes(config: &TrainConfig, dataset: &Dataset) -> u64 {
     let of_view = |view: usize| {
         let Camera { width, height, .. } = dataset.views[view].camera;

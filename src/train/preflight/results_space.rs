@@ -1,8 +1,8 @@
-//! The drive of the results: whether it holds them.
+//! Checks the free space of the drive that gets the results.
 //!
 //! Not here: the drive of the pages ([`super::drive_space`]).
 //!
-//! Invariant: a drive that cannot hold the result of the first Gaussians is refused; one that may not hold the growth is a warning.
+//! Invariant: a drive that cannot hold a PLY of the first Gaussians is refused. A drive that may not hold the grown scene gives a warning.
 
 use super::forecast::{Forecast, ply_bytes};
 use crate::base::error::{InputError, InputResult};
@@ -13,7 +13,7 @@ use crate::page::folder::file_system::free_bytes;
 use crate::train::inputs::places::drive_of;
 use std::path::Path;
 
-/// Refuses a drive that cannot hold the results of the first Gaussians, and warns of one that may not hold those of the end: the PLY and, for
+/// Refuses a drive that cannot hold a PLY of the first Gaussians. Warns if the drive may not hold the results of the end: the PLY and, for
 /// a run in memory, its checkpoint. A drive that does not report its free space passes.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! appearance.json: what a run has found of its photos and cameras, as plain numbers for people and other programs.
+//! appearance.json: the trained corrections of photos and cameras, as plain numbers for people and other programs.
 
 use crate::appearance::model::CHANNEL_VALUES;
 use crate::base::error::{InputError, InputResult};
@@ -13,6 +13,8 @@ use std::path::Path;
 struct AppearanceFile {
     /// `exposure` or `full`.
     model: &'static str,
+    /// Training photos whose exposure started from EXIF data.
+    exposures_from_exif: u32,
     /// The training photos, in the order of their names.
     images: Vec<ImageValues>,
     /// The cameras; empty without vignetting.
@@ -26,7 +28,7 @@ struct ImageValues {
     exposure: f64,
     /// Row-major 3x3 matrix on (R/S - 1/3, G/S - 1/3, 1) with S = R + G + B.
     homography: [f64; 9],
-    /// Steps that have seen the photo.
+    /// Steps that have seen the photo; an exposure from EXIF data counts as one.
     sightings: u32,
 }
 
@@ -64,6 +66,7 @@ pub(super) fn write_appearance(path: &Path, dataset: &Dataset, trainer: &Trainer
     };
     let file = AppearanceFile {
         model: mode.name(),
+        exposures_from_exif: trainer.first_exposures(),
         images: views.into_iter().map(of_image).collect(),
         cameras: trainer
             .cameras_of(dataset)

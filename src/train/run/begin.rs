@@ -244,6 +244,7 @@ pub(super) fn plan_and_train(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
+    trainer.begin_exposures(dataset).iter().for_each(|warning| eprintln!("warning: {warning}"));
     let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver))?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
@@ -303,8 +304,13 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: 
         Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
         Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
     };
+    let photos = match trainer.first_exposures() {
+        0 => String::new(),
+        count => format!("photos  {count} exposures start from EXIF data\n"),
+    };
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
+         {photos}\
          start   {} Gaussians, SH degree {}{growth}\n\
          run     {} steps on {} threads ({}), rendered by {}{results}\n\
          commit  {commits}\n\

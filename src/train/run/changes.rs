@@ -14,8 +14,8 @@ use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};
 use serde::Deserialize;
 use std::path::Path;
 
-/// For each newer key, the value that means: as before the key existed. A key that is missing here counts as changed when a run
-/// of an older program resumes.
+/// For each newer key, the value under which a run behaves as before the key existed. A key that is missing in this list counts as
+/// changed when a run of an older program resumes.
 const BEFORE_ITS_TIME: [(&str, &str); 7] = [
     ("appearance", "off"),
     ("robust-views", "false"),

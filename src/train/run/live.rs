@@ -1,8 +1,8 @@
 //! Pictures for the live page of a run ([`crate::report::live`]), drawn between steps.
 //!
 //! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
-//! most 5 % of the time, after the first; 3. a picture that cannot be drawn is an answer to the page, never the end
-//! of the run.
+//! most 5 % of the time, after the first; 3. a picture that cannot be drawn gives the page an error and does not end
+//! the run.
 
 use crate::base::trace;
 use crate::dataset::loader::Dataset;
@@ -23,7 +23,7 @@ const PICTURE_PERCENT: u32 = 5;
 /// Time between two reports of the status.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
 
-/// The live page of a run, and what it has cost.
+/// The live page of a run, and the time that its pictures took.
 #[derive(Debug)]
 pub struct LivePage {
     live: Live,
@@ -34,7 +34,7 @@ pub struct LivePage {
 }
 
 impl LivePage {
-    /// No time is spent yet.
+    /// A page whose pictures have taken no time yet.
     pub fn new(live: Live) -> LivePage {
         LivePage { live, began: Instant::now(), spent: Duration::ZERO, told: None }
     }
@@ -46,7 +46,7 @@ impl LivePage {
 }
 
 impl Trainer {
-    /// Tells the page how far the run is, and draws the picture that it wants.
+    /// Reports the progress to the page, and draws the picture that the page requests.
     pub(super) fn show_live(&mut self, dataset: &Dataset, page: &mut LivePage, psnr: f64) {
         if page.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
             page.told = Some(Instant::now());
@@ -78,13 +78,14 @@ impl Trainer {
         let base = &dataset.views[view].camera;
         let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
         let camera = orbit_camera(base, pivot, self.options.up, orbit);
+        self.fit_widest([&camera]);
         let render = self.render_options();
         let now = (&mut self.scene, self.state.step, &mut self.working);
         draw(now, &mut *self.renderer, &camera, &render)?;
         Ok(self.renderer.image()?)
     }
 
-    /// Median depth of the pages that a camera sees, local units; `None` if none is before it.
+    /// Median depth of the pages that a camera sees, local units; `None` if no page is in front of the camera.
     fn median_depth(&self, camera: &Camera) -> Option<f32> {
         let index = self.scene.pager.index();
         let [_, _, axis] = camera.viewmat;
@@ -97,7 +98,7 @@ impl Trainer {
     }
 }
 
-/// The camera of an orbit around the point `pivot` before `base`, with `up` as the direction that points up if it is known.
+/// The camera of an orbit around the point `pivot`, which lies in front of `base`. `up` is the direction that points up, if it is known.
 fn orbit_camera(base: &Camera, pivot: f32, up: Option<[f64; 3]>, orbit: Orbit) -> Camera {
     let row = |i: usize| Vec3::new(base.viewmat[i][0], base.viewmat[i][1], base.viewmat[i][2]);
     let (right, down, forward) = (row(0), row(1), row(2));

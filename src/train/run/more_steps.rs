@@ -5,9 +5,8 @@
 //! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
 //! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]).
 //!
-//! Invariants: 1. the earlier result stays, under the name of its step, and as the result until the new one replaces it; 2. nothing is
-//! named before the scene was found; 3. a
-//! run that is cut off before its first commit goes on from the same PLY when it is asked again.
+//! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
+//! is renamed before the scene was found; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
 
 use super::begin::{clear_spill_dir, first_trainer, plan_and_train};
 use super::changes::with_absolute_paths;
@@ -59,7 +58,7 @@ impl Finished<'_> {
         machine::set_up(&self.config)?;
         if !scene.exists() {
             let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
-            return Err(InputError::new(scene, "the scene of this run is not there", remedy).into());
+            return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
         }
         let kept = keep_result(out, summary.steps)?;
         eprintln!(
@@ -100,8 +99,8 @@ fn metrics_until(out: &Path, step: u32) -> u64 {
     metrics.split_inclusive('\n').take_while(is_past).map(|line| line.len() as u64).sum()
 }
 
-/// Keeps the result of `step` in `out` under the name of its step as well; returns that path. The result stays where viewers look for it
-/// until the new one replaces it as a whole.
+/// Gives the result of `step` in `out` a second name, that of its step; returns that path. The first name stays, where viewers look for
+/// it, until the new result replaces it as a whole.
 fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
     let (result, kept) = (out.join(PLY_FILE), out.join(saved_ply_name(step)));
     if is_same(&result, &kept) {
@@ -125,7 +124,7 @@ fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
     Ok(kept)
 }
 
-/// Whether both are names of one file.
+/// Whether both paths name one file.
 #[cfg(unix)]
 fn is_same(a: &Path, b: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;

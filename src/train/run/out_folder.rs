@@ -103,7 +103,7 @@ fn run_in(out: &Path) -> RunId {
 fn check_above(out: &Path) -> InputResult<()> {
     match out.ancestors().find(|above| above.exists()) {
         Some(above) if !above.is_dir() => {
-            let problem = format!("it is no folder and cannot become one: {} is a file", above.display());
+            let problem = format!("the folder cannot be made: {} is a file", above.display());
             Err(InputError::new(out, problem, "choose another --out"))
         }
         _ => Ok(()),

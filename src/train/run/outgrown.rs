@@ -1,5 +1,5 @@
-//! Scenes that outgrow their memory. A scene in memory starts paging to the drive of its checkpoint. A run that ends for want of
-//! memory commits first, and its error names the photo and enough memory.
+//! Scenes that outgrow their memory. A scene in memory starts paging to the drive of its checkpoint. A run that ends for
+//! lack of memory commits first, and its error names the photo and the memory that suffices.
 //!
 //! Not here: views in batches (`step`), frames of a growing scene (`fitting`).
 //!

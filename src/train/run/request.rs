@@ -1,4 +1,4 @@
-//! A run as a user asks for it, and how it ended.
+//! The request for a run, and its outcome.
 
 use super::out_folder::Existing;
 use crate::config::file::TrainConfig;

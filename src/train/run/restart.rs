@@ -1,9 +1,9 @@
-//! Goes on with a run in the same process after its device was lost: from its last commit, with the device opened anew.
+//! Restarts a run in the same process after its device was lost: opens the device again and goes on from the last commit.
 //!
-//! A driver that was reset or updated, or a device that was unplugged for a moment, then costs the steps since that commit.
+//! So a reset or update of the driver, or a device that was unplugged for a moment, costs the steps since that commit only.
 //!
-//! Invariants: 1. a run that goes on this way ends with the same bytes as one that was resumed by hand ([`super::resume`]), so as one
-//! that was never interrupted; 2. other errors end the run.
+//! Invariants: 1. a restarted run ends with the bytes of a resumed run ([`super::resume`]), which are those of an
+//! uninterrupted run; 2. other errors end the run.
 
 use super::request::RunOutcome;
 use super::resume::{ResumeRequest, resume};

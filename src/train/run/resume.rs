@@ -258,7 +258,7 @@ pub(super) fn goal(
     changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
         let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
-        return Err(InputError::new(scene, "the scene of this run is not there", remedy).into());
+        return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
     let start = Start::look(scene, config, &request.out, host_budget(config))?;
     let print = dataset_print(&start)?;

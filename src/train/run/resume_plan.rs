@@ -1,8 +1,8 @@
-//! What `--resume` would do, as its dry run says it.
+//! The text that a dry run of `--resume` prints: what the resume would do.
 //!
 //! Not here: resuming ([`super::resume`]), which makes the same checks.
 //!
-//! Invariant: no file is changed, also where the run trains at this moment.
+//! Invariant: no file is changed, even while another process trains the run.
 
 use super::out_folder;
 use super::resume::{Earlier, ResumeRequest, check_restart, goal, read_summary, result_to_continue, stored_folder};

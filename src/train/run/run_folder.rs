@@ -215,7 +215,10 @@ fn save_result(
     format.write_transform(&other, &meta, exported.frame)?;
     if exported.rows < written.rows {
         let lost = written.rows - exported.rows;
-        eprintln!("warning: {lost} Gaussians lie beyond the reach of {}", other.display());
+        eprintln!(
+            "warning: {} cannot hold {lost} Gaussians: they lie outside the range of its format",
+            other.display()
+        );
     }
     if let (Some(levels), false) = (exported.levels, request.quiet) {
         eprintln!("{}: {levels}", other.display());

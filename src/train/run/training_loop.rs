@@ -97,7 +97,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Whether the loop leaves the scene alone between the next step and the one after it.
+    /// Whether the loop neither reads nor changes the scene between the next step and the one after it.
     fn nothing_follows_next_step(&self, outputs: &LoopOutputs<'_>) -> bool {
         let (done, options) = (self.state.step + 1, &self.options);
         let due = |every: u32| every > 0 && done.is_multiple_of(every);

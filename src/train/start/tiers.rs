@@ -55,7 +55,7 @@ pub struct Tiers {
     pub engine: String,
     /// Codec of stored pages.
     pub codec: Codec,
-    /// By as many bytes the files of the pages grow at once.
+    /// Bytes by which the files of the pages grow at once.
     pub segment_bytes: u64,
     /// Messages about the drive and the choice of the engine.
     pub notes: Vec<String>,

@@ -42,6 +42,7 @@ impl Trainer {
     /// Mean over the held-out views of the decibels lost without the faintest quarter; 0 if no view counts.
     fn mean_loss(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<f64, TrainError> {
         let views: Vec<usize> = self.held_out.positions().iter().map(|&at| self.train_views[at]).collect();
+        self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let render = self.render_options();
         let mut losses = Vec::with_capacity(views.len());
         for (i, &view) in views.iter().enumerate() {

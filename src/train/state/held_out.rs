@@ -1,12 +1,12 @@
 //! Training views that are held out while the run decides its count.
 //!
-//! Some evenly spread training views are not trained on as long as the scene may grow; in the turn of each, the next view
-//! is trained. From then on they are training views like all others. The views of the evaluation have no part in this.
+//! As long as the scene may grow, some evenly spread training views are not trained on; in the turn of such a view, the run
+//! trains the view after it. Afterwards they are training views like all others. Evaluation views have no part in this.
 //!
 //! Not here: the checks that they serve (`growth_checks`).
 //!
-//! Where training views are too few to hold some out, nothing says what more Gaussians bring, and the run keeps the number
-//! that it starts with.
+//! With too few training views to hold some out, the gain from more Gaussians is unknown, and the run keeps the number that
+//! it starts with.
 //!
 //! Invariant: which view a step trains on is a function of the step and the views.
 
@@ -16,7 +16,7 @@ use crate::dataset::loader::Dataset;
 use crate::densify::strategy::Strategy;
 use std::sync::Arc;
 
-/// Of so many training views one is held out, if that makes at least [`VIEWS_LEAST`] and at most [`VIEWS_MOST`].
+/// One in this many training views is held out, if that makes at least [`VIEWS_LEAST`] and at most [`VIEWS_MOST`].
 const ONE_OF: usize = 16;
 const VIEWS_LEAST: usize = 3;
 const VIEWS_MOST: usize = 16;

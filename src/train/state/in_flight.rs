@@ -1,9 +1,9 @@
-//! Steps of a run whose pages lie on a device: when a step is recorded while the one before it is in flight.
+//! Decides when a step is recorded while the step before it is in flight, for runs whose pages lie on a device.
 //!
 //! Not here: how a step is recorded and taken over (`step::device_flights`, which also lists where the pipeline drains).
 //!
-//! Invariants: 1. a step is recorded ahead only if nothing that the host decides lies between it and the step before; 2. a trainer
-//! whose caller has not said that nothing follows ([`Trainer::goes_ahead`]) has no step in flight between two calls.
+//! Invariants: 1. a step is recorded ahead only if nothing that the host decides lies between it and the step before; 2. between two
+//! calls of the trainer no step is in flight, unless its caller has promised not to touch the scene ([`Trainer::goes_ahead`]).
 
 use super::trainer::Trainer;
 use crate::base::trace;
@@ -25,7 +25,8 @@ impl Trainer {
         self.device.as_ref().is_some_and(|tier| tier.in_flight() > 0)
     }
 
-    /// Takes the present step on a device that holds the pages, and records the next one before it waits for this one if it may.
+    /// Takes the current step on a device that holds the pages. Records the next step before it waits for the current one, if the next step
+    /// may be recorded ahead.
     pub(super) fn step_on_device(
         &mut self,
         (dataset, targets): (&Dataset, &TargetCache),
@@ -55,14 +56,14 @@ impl Trainer {
         train_step(scene, working, &mut rows, (step, camera), (&render, comparison), collects, self.pages_most)
     }
 
-    /// Whether pictures are compared with photos as they are, so that no step needs its picture on the host.
+    /// Whether pictures are compared with photos without correction or masks, so that no step needs its picture on the host.
     fn compares_plainly(&self) -> bool {
         let options = &self.options;
         let is_plain = !options.appearance.is_on() && !options.robust_pixels && !options.robust_views;
         is_plain && !options.strategy.needs_weights()
     }
 
-    /// Records the step `ahead` steps from now, which compares with `target`. False where that cannot be done now.
+    /// Records the step `ahead` steps from now, whose photo is `target`. False if the step cannot be recorded now.
     fn record(&mut self, dataset: &Dataset, (ahead, target): (u32, &Target)) -> Result<bool, TrainError> {
         let views = self.coming_views(ahead + 2);
         let Some(&view) = views.get(ahead as usize) else { return Ok(false) };
@@ -87,7 +88,7 @@ impl Trainer {
         tier.record(&mut self.scene, &mut *self.renderer, &to_record)
     }
 
-    /// Records the step behind the one in flight, if it may be. What keeps its pages from memory is said when the step is due.
+    /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
     fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let may_record = self.device.as_ref().is_some_and(DeviceTier::may_record);
         if !may_record || !self.goes_ahead || !self.decides_nothing_after(self.state.step) {
@@ -104,7 +105,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Whether no event follows 0-based `step`, and its outcome, whatever it is, ends no run.
+    /// Whether no event follows 0-based `step`, and no outcome of the step can end the run.
     fn decides_nothing_after(&self, step: u32) -> bool {
         let strategy = &self.options.strategy;
         let reads = strategy.reads_histogram(step) || strategy.growth_check(step).is_some();

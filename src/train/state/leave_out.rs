@@ -1,4 +1,4 @@
-//! What a view would lose without its faintest Gaussians: the picture is drawn twice, with all rows, and without the
+//! The decibels that a view loses without its faintest Gaussians. The view is drawn twice: with all rows, and without the
 //! quarter of the drawn rows that have the least blending weight in this view.
 //!
 //! The loss says how crowded the scene is. Where Gaussians are scarce, even the faintest carry detail; where they abound,
@@ -20,7 +20,7 @@ use crate::train::step::pages::PagedScene;
 use crate::train::step::view::{batches, begin};
 use crate::train::step::working_set::WorkingSet;
 
-/// One row of so many of the drawn ones is left out.
+/// One in this many drawn rows is left out.
 const LEFT_OUT_OF: usize = 4;
 
 /// What a view needs to be drawn and compared.

@@ -8,9 +8,11 @@
 
 use super::trainer::Trainer;
 use crate::appearance::AppearanceMode;
+use crate::appearance::first_values::first_exposures;
 use crate::appearance::model::CHANNEL_VALUES;
 use crate::appearance::picture::Look;
 use crate::appearance::state::AppearanceState;
+use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::outliers::blocks::{BlockState, STEPS_AFTER_RESET, counts_masked_blocks, first_look_at_blocks};
 use crate::poses::state::{PoseState, first_step, rate_at};
@@ -21,6 +23,22 @@ use crate::train::log::report::OutlierView;
 use crate::train::step::comparison::{BlocksBefore, Comparison};
 use crate::train::step::soundness::warn_of_outliers;
 use crate::train::step::train_step::StepOutcome;
+use rayon::prelude::*;
+
+/// Photos that a warning names.
+const NAMED: usize = 3;
+
+/// The warning that the EXIF data of photos cannot be read: each a view and the reason.
+fn damaged_exif(dataset: &Dataset, damaged: &[(usize, &str)]) -> Option<String> {
+    let (&(first, why), rest) = damaged.split_first()?;
+    let name = |view: usize| dataset.views[view].name.as_str();
+    let others = rest.iter().take(NAMED - 1).map(|&(view, _)| format!(", {}", name(view))).collect::<String>();
+    let more = match rest.len().saturating_sub(NAMED - 1) {
+        0 => String::new(),
+        more => format!(", and {more} more"),
+    };
+    Some(format!("damaged EXIF data are ignored: {} ({why}){others}{more}", name(first)))
+}
 
 impl Trainer {
     /// The correction of a view as it is now; `None` if the run corrects nothing.
@@ -28,6 +46,36 @@ impl Trainer {
         let mode = self.options.appearance;
         let of_view = (view, self.camera_groups.get(view).copied()?);
         mode.is_on().then(|| (mode, self.state.appearance.look(mode, of_view, camera)))
+    }
+
+    /// Starts the exposures of training photos from their EXIF data, if the run trains exposures, has none yet, and more than
+    /// half of the photos state one. A function of the files alone. Returns warnings for the user.
+    pub(crate) fn begin_exposures(&mut self, dataset: &Dataset) -> Vec<String> {
+        if !self.options.appearance.is_on() || !self.state.appearance.is_new() {
+            return Vec::new();
+        }
+        let read = |&view: &usize| {
+            let photo = &dataset.views[view].photo;
+            photo.header.exif.map_or(Ok(None), |place| exif::brightness(&photo.image_path, place))
+        };
+        let read: Vec<Result<Option<f64>, String>> = self.train_views.par_iter().map(read).collect();
+        let damaged = self.train_views.iter().zip(&read);
+        let damaged = damaged.filter_map(|(&view, read)| Some((view, read.as_ref().err()?.as_str())));
+        let mut warnings: Vec<String> = damaged_exif(dataset, &damaged.collect::<Vec<_>>()).into_iter().collect();
+        let brightness: Vec<Option<f64>> = read.into_iter().map(Result::unwrap_or_default).collect();
+        let known = brightness.iter().flatten().count();
+        if let Some(exposures) = first_exposures(&brightness) {
+            let exposures = self.train_views.iter().zip(exposures).filter_map(|(&view, first)| Some((view, first?)));
+            self.state.appearance.begin_with(exposures);
+            self.state.first_exposures = known as u32;
+        } else if known > 0 {
+            warnings.push(format!(
+                "only {known} of {} training photos state their exposure in EXIF data: exposures are trained from zero, \
+                 because a start from EXIF data takes more than half of the photos",
+                brightness.len()
+            ));
+        }
+        warnings
     }
 
     /// Stores what a step that was taken has found for the photo of its view.
@@ -98,6 +146,11 @@ impl Trainer {
     /// The values of photos and cameras; empty if the run corrects nothing.
     pub fn appearance(&self) -> &AppearanceState {
         &self.state.appearance
+    }
+
+    /// Photos whose exposure started from EXIF data.
+    pub fn first_exposures(&self) -> u32 {
+        self.state.first_exposures
     }
 
     /// The motions of cameras; empty if the run refines no poses.

@@ -75,13 +75,17 @@ pub struct Trainer {
     pub(crate) pages_most: usize,
     /// The most rows in the pages of a view that was one batch, since the working set was allocated.
     pub(crate) whole_rows: u64,
+    /// The most rows in the pages of a view since the renderer freed its rows, and the bytes that the rows of the coming view
+    /// need in the renderer.
+    pub(crate) rendered_rows: u64,
+    pub(crate) row_bytes_due: u64,
     /// The largest share of the rows in its pages that a view has drawn so far.
     pub(crate) visible_share: f64,
     /// The steps since a row was last rewritten.
     pub(super) idle: Idle,
     /// The caller does nothing with the scene between the step that it takes and the next one, which may be recorded ahead.
     pub(crate) goes_ahead: bool,
-    /// What kept a step from being recorded ahead.
+    /// The error that kept a step from being recorded ahead.
     pub(super) ahead_failed: Option<TrainError>,
     /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
     pub(super) rows_of_views: Vec<u32>,
@@ -163,6 +167,8 @@ impl Trainer {
             budget: None,
             pages_most: usize::MAX,
             whole_rows: 0,
+            rendered_rows: 0,
+            row_bytes_due: 0,
             visible_share: 0.0,
             idle: Idle::default(),
             goes_ahead: false,
@@ -222,9 +228,10 @@ impl Trainer {
         &self.order
     }
 
-    /// Bytes held for one view: rows of the working set; renderer and picture.
+    /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
     pub fn view_bytes(&self) -> [u64; 2] {
-        [self.working.bytes() as u64, self.renderer.host_bytes() + self.working.correction.bytes()]
+        let due = self.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
+        [self.working.bytes() as u64, self.renderer.host_bytes() + due + self.working.correction.bytes()]
     }
 
     /// The options.
@@ -354,8 +361,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Copies back what is newer on a device than in memory, so that the pages and their histogram are those of the last
-    /// step. Nothing for a run that updates in host memory.
+    /// Copies back the pages that are newer on a device than in memory, so that the pages and their histogram are those
+    /// of the last step. Nothing for a run that updates in host memory.
     ///
     /// # Errors
     /// The device failed: the run can go on from its last commit only.
@@ -367,9 +374,10 @@ impl Trainer {
         }
     }
 
-    /// Notes how many of the rows in the pages of a view were drawn, and whether the view was one batch.
+    /// Stores how many of the rows in the pages of a view were drawn, and whether the view was one batch.
     fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
         self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
+        self.rendered_rows = self.rendered_rows.max(in_pages as u64);
         self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
     }
 
@@ -430,6 +438,7 @@ impl Trainer {
         self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();
+        self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let request = EvalRequest {
             views: &views,
             ssim: self.options.ssim_variant,

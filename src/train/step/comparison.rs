@@ -1,12 +1,12 @@
-//! What happens between the picture of a view and the gradient of its splats: the one place for the training step and
-//! the rehearsal.
+//! Correction, masks and loss: all that happens between the picture of a view and the gradient of its splats, in training steps and in
+//! the rehearsal before the first step.
 //!
-//! A second loss term is added in `Comparison::loss_and_back`, as the correction of the picture is ([`crate::appearance`]);
-//! what it needs is a field of [`Comparison`], so that step and rehearsal pass it on unchanged.
+//! A second loss term goes into `Comparison::loss_and_back`, beside the correction of the picture ([`crate::appearance`]).
+//! Its inputs are a field of [`Comparison`], so that step and rehearsal pass them on unchanged.
 //!
 //! Invariants: 1. the rehearsal allocates what a step allocates, because both run this code; 2. without a correction the
 //! picture stays where the renderer keeps it, and masks of blocks only read it; 3. the loss, its gradient and the errors that
-//! rows are weighed by are those of the corrected picture; 4. nothing here changes the values of a correction or what is known of
+//! rows are weighed by are those of the corrected picture; 4. nothing here changes the values of a correction or the state of
 //! blocks: the trainer reads `found` and `found_blocks` after the step and stores them only if the step is taken.
 
 use crate::appearance::AppearanceMode;
@@ -26,7 +26,7 @@ pub struct Comparison<'a> {
     pub loss: LossOptions,
     /// The correction of the picture, and which of its values are trained; `None` without correction.
     pub look: Option<(AppearanceMode, Look)>,
-    /// What is known of the blocks of the photo; `None` without masks of blocks.
+    /// The state of the blocks of the photo; `None` without masks of blocks.
     pub blocks: Option<BlocksBefore<'a>>,
     /// Only the loss is measured: the view is not trained on.
     pub is_left_out: bool,
@@ -37,18 +37,18 @@ pub struct Comparison<'a> {
 pub struct BlocksBefore<'a> {
     /// The blocks after the last look at them; empty before the first.
     pub states: &'a [BlockState],
-    /// The picture says nothing now, such as after an opacity reset: the masks stay as they are.
+    /// The masks stay as they are, because the picture is unusable for a judgement (for example after an opacity reset).
     pub are_kept: bool,
     /// All blocks count in this step, masked or not.
     pub all_count: bool,
 }
 
-/// What a correction and masks of blocks need beside the picture, and what they have found.
+/// Buffers and results of a correction and of masks of blocks.
 #[derive(Debug, Clone, Default)]
 pub struct Correction {
     /// The picture as it was drawn, `[3][height][width]`.
     drawn: Vec<f32>,
-    /// What the last picture says of the values of its photo.
+    /// The values that fit the photo best under the last picture.
     pub found: Option<Found>,
     /// The blocks of the photo after a look at the last picture; `None` without one.
     pub found_blocks: Option<Vec<BlockState>>,

@@ -1,19 +1,20 @@
-//! Copies for the next step while the device computes this one: payloads that the next view needs and the device lacks go up, and
-//! pages that make room for them come back.
+//! Prefetch for the next step while the device computes this one: uploads payloads that the next view needs and the device
+//! lacks, and reads back the pages that are evicted for them.
 //!
 //! ```text
 //! host    rows in │ begin_ahead: read-backs begin │ loss, gradients begin │ load_ahead: frames filled, payloads up │ wait, update
 //! device          │ picture ....................... loss .................. gradients .............................│ update
 //! ```
 //!
-//! The list of a next view's pages follows from the bounds before this step, so it may name too few or too many. What a step touches
-//! follows from the bounds at that step ([`DeviceTier::load`]): a page that the list lacks is copied then, and a page too many changes no
-//! bit.
+//! The list of the next view's pages is computed from the bounds before this step, so it may lack pages or have superfluous ones. The
+//! pages that a step touches follow from the bounds at that step ([`DeviceTier::load`]): a missing page is copied then, and a superfluous
+//! page changes no bit.
 //!
 //! Not here: copies for the present step (`device_tier`).
 //!
-//! Invariants: 1. no page of this view or of the next one makes room; 2. a copy that finds no memory or no slot is left to the next step;
-//! 3. a page that comes back is in [`DeviceTier::leaving`] alone, neither held nor released, until its frame is filled.
+//! Invariants: 1. no page of this view or of the next one is evicted; 2. a copy for which there is no memory or no slot is
+//! left to the next step; 3. a page that is read back is in [`DeviceTier::leaving`] alone, neither held nor released, until
+//! its frame is filled.
 
 use super::device_tier::{DeviceTier, device_of};
 use super::pages::PagedScene;
@@ -34,8 +35,8 @@ fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
 }
 
 impl DeviceTier {
-    /// Chooses the pages that 0-based `step`, the next one, needs for `camera` and the device lacks, and begins the copies back of those
-    /// that make room for them. Does not wait.
+    /// Chooses the pages that 0-based `step`, the next one, needs for `camera` and the device lacks, and begins to read
+    /// back the pages that are evicted for them. Does not wait.
     pub(super) fn begin_ahead(
         &mut self,
         scene: &mut PagedScene,

@@ -7,11 +7,11 @@
 //! ```
 //!
 //! The gate on the device (`kernels::gate`) lets a step write only if its lists had room and its numbers are sound. A step that is not
-//! taken, and the step behind it, have changed nothing; they are given up, and the first is taken again by waiting for each of its
-//! numbers ([`super::train_step`]), which repairs lists and decides what is skipped.
+//! taken, and the step behind it, change nothing. Both are given up. The first is taken again by the path that waits for each number
+//! ([`super::train_step`]), which enlarges lists and decides what is skipped.
 //!
 //! # Where the pipeline drains
-//! A step is recorded while another is in flight only where nothing that the host decides by the other's outcome lies between:
+//! A step is recorded while another is in flight only if the host decides nothing by the outcome of the other step in between:
 //!
 //! | what | who holds back |
 //! | --- | --- |
@@ -23,9 +23,9 @@
 //! | pages of the view have no slot and no slot is free, or there are too few frames for two views | this file |
 //! | memory for the step is short, or its view is several batches | the renderer; this file tries again some steps later |
 //!
-//! The pages of a step behind another are listed by bounds that are as wide as the other step can make them
-//! ([`crate::optim::one_step`]). So the list has all pages that the exact bounds name; a page too many has no row in view and stays as it
-//! is. Whoever finishes the other step looks whether that held.
+//! The list of pages of a step behind another comes from bounds that are as wide as the other step can make them
+//! ([`crate::optim::one_step`]). So the list contains all pages that the exact bounds give. Any other page in the list has no row in view
+//! and does not change. [`DeviceTier::finish`] of the other step checks that no page is missing.
 //!
 //! Invariants: 1. the bytes of the result are those of a run that waits; 2. at most two steps are in flight; 3. a page of a
 //! step in flight is pinned in its slot and in its frame, and is neither held nor released; 4. a step that was not taken leaves pages,
@@ -48,9 +48,9 @@ use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use std::collections::BTreeSet;
 
-/// Steps after one that lacked memory in which none is recorded.
+/// After a step that lacked memory, no step is recorded for this number of steps.
 const STEPS_WITHOUT: u32 = 16;
-/// Rows beside the likely ones that a list has room for.
+/// Spare room of a list, rows, beyond the number that is expected.
 const ROWS_MORE: u64 = 256;
 
 /// A step to record.
@@ -79,7 +79,7 @@ pub struct StepToRecord<'a> {
 }
 
 impl StepToRecord<'_> {
-    /// Room for the rows of the view, of `in_pages` rows in its pages: an eighth more than the view, or any view, has listed.
+    /// Capacity for the listed rows of the view, whose pages hold `in_pages` rows: an eighth more than this view, or any view, has listed.
     fn rows_room(&self, in_pages: u64) -> u32 {
         let likely = match self.rows_before {
             0 => (in_pages as f64 * self.share) as u64,
@@ -89,7 +89,7 @@ impl StepToRecord<'_> {
     }
 }
 
-/// An error after which pages that exist on the device alone may be changed.
+/// An error after which the pages of the device may hold half a step.
 fn torn(error: impl Into<TrainError>) -> TrainError {
     match error.into() {
         torn @ TrainError::Torn { .. } => torn,
@@ -108,8 +108,8 @@ impl DeviceTier {
         self.in_flight() < self.flights.most
     }
 
-    /// The pages that `camera` may need once the steps in flight are done, by bounds as wide as one of these, taken after `now` steps,
-    /// can make them; ascending by id.
+    /// The pages that `camera` may need once the steps in flight are done, ascending by id. The bounds are widened by the
+    /// most that a step after `now` steps can move them.
     pub(super) fn pages_behind(&self, scene: &PagedScene, camera: &Camera, now: u32) -> Vec<PageNo> {
         let mut pages = scene.pager.pages_of_view(camera);
         if self.flights.pages.is_empty() {
@@ -144,7 +144,7 @@ impl DeviceTier {
     /// that cannot be done now.
     ///
     /// # Errors
-    /// Pages could not be had, with nothing changed; the device failed ([`TrainError::Torn`]).
+    /// A page could not be read, and nothing has changed; or the device failed ([`TrainError::Torn`]).
     pub fn record(
         &mut self,
         scene: &mut PagedScene,
@@ -240,8 +240,8 @@ impl DeviceTier {
         Ok(true)
     }
 
-    /// Waits for the first step in flight and takes over what it did to its pages. `None` if the step was not taken: then no step is in
-    /// flight any more, and nothing has changed.
+    /// Waits for the first step in flight and takes over its effect on its pages. `None` if the step was not taken: no step is in flight
+    /// any more then, and nothing has changed.
     ///
     /// # Errors
     /// The device failed ([`TrainError::Torn`]).
@@ -264,21 +264,21 @@ impl DeviceTier {
         Ok(Some(outcome))
     }
 
-    /// Gives up the steps in flight behind one that was not taken, and opens the gate.
+    /// Gives up the steps in flight behind a step that was not taken, and opens the gate.
     fn give_up(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
         let _span = trace::span("give up").with("behind", self.in_flight() as u64);
         while let Some(behind) = self.flights.steps.pop_front() {
             let done = device_of(renderer)?.finish_step()?;
             self.release_flight(scene, &behind.pages);
             if done.closed == 0 {
-                let problem = "a step was taken behind one that was not";
+                let problem = "a step was taken after a step that was given up";
                 return Err(InputError::new("the device", problem, "report this as a bug").into());
             }
         }
         Ok(device_of(renderer)?.open_gate()?)
     }
 
-    /// Notes what a step did to its pages.
+    /// Takes over the effect of a step on its pages: bounds, dirty marks, counts.
     fn take_over(&mut self, scene: &mut PagedScene, flight: &Flight, done: &StepDone) -> StepOutcome {
         let mut outcome = StepOutcome {
             loss: done.loss,
@@ -303,7 +303,7 @@ impl DeviceTier {
         outcome
     }
 
-    /// A step in flight ends: pages that no other one uses are held, or released.
+    /// Ends a step in flight: pages that no other step in flight uses are held or released.
     fn release_flight(&mut self, scene: &mut PagedScene, pages: &[PageNo]) {
         let mut done = Vec::new();
         for page in pages {
@@ -316,7 +316,7 @@ impl DeviceTier {
         self.release(scene, done);
     }
 
-    /// Fails if the step in flight behind the one that has ended lacks a page that its view needs.
+    /// Fails if the next step in flight lacks a page that its view needs.
     fn check_list_behind(&self, scene: &PagedScene) -> Result<(), TrainError> {
         let Some(behind) = self.flights.steps.front() else { return Ok(()) };
         let needed = scene.pager.pages_of_view(&behind.camera);

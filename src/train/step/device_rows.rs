@@ -1,5 +1,5 @@
-//! Gather and update on a device that holds the pages ([`DeviceTier`]): what crosses the bus in a step are the payloads of
-//! the pages that the device lacks, one table of the optimizer, and some 50 bytes a page back.
+//! Gather and update on a device that holds the pages ([`DeviceTier`]). A step uploads the payloads of the pages that the
+//! device lacks and one table of the optimizer, and downloads some 50 bytes a page.
 //!
 //! Not here: which page lies in which slot (`device_tier`), steps that are recorded without waiting (`device_flights`), the stages
 //! (`render`).

@@ -1,12 +1,12 @@
-//! The pages of a run on a device: which page lies in which slot, which slots are newer than their frames, and what was copied.
+//! The cache of pages on a device: which page lies in which slot, which slots are newer than their frames, and traffic counters.
 //!
 //! A device is one more level of the cache of [`crate::paging`], with the same table of frames and the same order of
 //! eviction. A page that lies on the device has its frame as well while a step works on it, and until its slot was copied
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: steps in flight (`device_flights`); copies for the next step beside this one's compute (`device_ahead`). What they leave to do is copied when a step needs
-//! it, and the step waits.
+//! Not here: steps in flight (`device_flights`); copies for the next step while the device computes this one
+//! (`device_ahead`). A page that neither file has copied ahead is copied on demand, and the step waits.
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
@@ -32,10 +32,10 @@ use std::collections::BTreeMap;
 
 /// The share of the device memory of a run that slots may take; views keep the rest.
 pub const SLOTS_SHARE: u64 = 2;
-/// Slots that a growing scene adds at once, in parts of those it has.
+/// A growing scene adds its number of slots over this number at once.
 const MORE_SLOTS_SHARE: usize = 4;
 
-/// What was copied between frames and slots.
+/// Traffic between frames and slots.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SlotTraffic {
     /// Payloads copied to the device.
@@ -94,7 +94,8 @@ pub(crate) fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
 }
 
-/// How many slots for payloads of at most `payload` bytes a device memory of `device_mem` bytes holds, beside what a view takes.
+/// Number of slots, for payloads of at most `payload` bytes, in a device memory of `device_mem` bytes beside the memory
+/// of a view.
 pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
     usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
 }
@@ -224,7 +225,7 @@ impl DeviceTier {
         Ok(pinned)
     }
 
-    /// Copies held pages back until at most `most` are held, those that are needed last first, but none of `kept`.
+    /// Copies held pages back until at most `most` are held, the pages with the farthest next use first, but none of `kept`.
     fn drain_to(
         &mut self,
         scene: &mut PagedScene,
@@ -296,8 +297,8 @@ impl DeviceTier {
         copied
     }
 
-    /// Copies all held pages back, and adds what the device counted to the histogram: the scene is as though the host had taken
-    /// all steps.
+    /// Copies all held pages back and adds the counts of the device to the histogram. The scene is then as if the host
+    /// had taken all steps.
     ///
     /// # Errors
     /// The device failed; the pages that are still held exist there alone.
@@ -310,7 +311,7 @@ impl DeviceTier {
         self.take_bins(scene, renderer)
     }
 
-    /// Adds what the device counted to the histogram.
+    /// Adds the counts of the device to the histogram.
     ///
     /// # Errors
     /// The device failed.

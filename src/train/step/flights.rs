@@ -1,4 +1,4 @@
-//! The steps in flight on a device that holds the pages: which they are, and the pages that they have pinned.
+//! The list of steps in flight on a device that holds the pages, and the pages that they have pinned.
 //!
 //! Not here: how steps are recorded, taken over and given up (`device_flights`).
 //!
@@ -26,7 +26,7 @@ pub(super) struct Flight {
 /// The steps in flight and their pages.
 #[derive(Debug)]
 pub(super) struct Flights {
-    /// The first first.
+    /// In the order of their steps.
     pub steps: VecDeque<Flight>,
     /// Each page with the number of steps in flight that use it.
     pub pages: BTreeMap<PageNo, (PinnedPage, usize)>,

@@ -11,7 +11,6 @@ use super::working_set::WorkingSet;
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
 use crate::config::limits::RunOptions;
-use crate::dataset::import::{ImportOptions, PointSource, import_points};
 use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::densify::strategy::{Effect, Strategy, effect_of};
@@ -33,7 +32,6 @@ use crate::scene::partition::{first_fill, partition};
 use crate::scene::rows::{Rows, RowsNow};
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
-use crate::train::error::not_stored;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -138,33 +136,8 @@ impl PagedScene {
         Ok(scene)
     }
 
-    /// Creates the pages of the first Gaussians from points that may exceed memory; the result equals
-    /// [`PagedScene::new`] for the same points.
-    ///
-    /// # Errors
-    /// The points cannot be read, or a page could not be stored.
-    pub fn import(
-        source: &dyn PointSource,
-        import: &ImportOptions<'_>,
-        pager: Pager,
-        options: &RunOptions,
-    ) -> Result<PagedScene, TrainError> {
-        let mut scene = PagedScene::empty(pager, options);
-        let mut failed = None;
-        let imported = import_points(source, import, &mut |page| {
-            let id = page.id;
-            let mut state = page.into_state();
-            state.raise_sh_degree(scene.rules.sh_degree);
-            scene.insert_first_page(id, &state).map_err(|error| not_stored(failed.insert(error)))
-        });
-        match failed {
-            Some(error) => Err(error.into()),
-            None => Ok(imported.map(|_| scene)?),
-        }
-    }
-
     /// A scene without pages.
-    pub(crate) fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
+    pub fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
         let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
@@ -190,7 +163,10 @@ impl PagedScene {
     }
 
     /// Adds a page of first Gaussians.
-    pub(crate) fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
+    ///
+    /// # Errors
+    /// The page could not be stored.
+    pub fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
         let meta = self.rules.meta(id, state);
         self.pager.insert(meta, |payload| {
             write_page(state, payload);

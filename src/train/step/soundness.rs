@@ -1,5 +1,5 @@
-//! Watches that a run trains something: warns of skipped rows and steps, and stops a run that diverged or in which
-//! nothing counts, with the cause.
+//! Checks that training has an effect: warns of skipped rows and steps, and stops a run that has diverged or whose photos
+//! are all masked. The error names the cause.
 //!
 //! Invariants: 1. nothing here changes a number of the result: a run is stopped or goes on; 2. a run that stops here
 //! keeps its last commit and writes its last good step.
@@ -51,8 +51,7 @@ fn no_gaussian_left(dataset: &Dataset) -> InputError {
 /// Counts the skipped rows and steps of a step in `state`, and warns of the first. `init_ply` is the file from which the
 /// run started, or empty.
 ///
-/// # Errors
-/// This is one of [`UNSOUND_STEPS_MAX`] unsound steps in a row.
+/// # Errors This step is the last of [`UNSOUND_STEPS_MAX`] unsound steps in a row.
 pub(crate) fn note_soundness(
     state: &mut TrainerState,
     outcome: &StepOutcome,

@@ -1,5 +1,5 @@
-//! Faults of recorded steps, to test that a step which is not taken leaves no trace: `GSSCALE_STEP_FAULT` names steps whose lists get no
-//! room, or whose gate is closed as by a loss that is not finite. `GSSCALE_STEPS_IN_FLIGHT` says how many steps may be in flight.
+//! Injected faults of recorded steps, to test that a step that is not taken leaves no trace. `GSSCALE_STEP_FAULT` names steps whose lists
+//! have no room, or whose gate closes as for a loss that is not finite. `GSSCALE_STEPS_IN_FLIGHT` limits the steps in flight.
 //!
 //! Not here: faults of devices (`gpu::injected`).
 //!
@@ -10,14 +10,14 @@ const FAULTS: &str = "GSSCALE_STEP_FAULT";
 /// Environment variable of the steps in flight: 0 for steps that wait for each of their numbers, 1, or 2.
 const IN_FLIGHT: &str = "GSSCALE_STEPS_IN_FLIGHT";
 
-/// What goes wrong with a recorded step.
+/// A fault of a recorded step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StepFault {
-    /// The list of its rows has room for one.
+    /// Its list of rows has room for one row.
     Rows,
-    /// So have the lists of its tiles.
+    /// Its lists of tiles have room for one intersection.
     Isects,
-    /// Its gate is closed whatever it finds.
+    /// Its gate closes whatever its numbers are.
     Closed,
 }
 
@@ -26,7 +26,7 @@ pub(super) enum StepFault {
 pub(super) struct StepFaults(Vec<(StepFault, u32)>);
 
 impl StepFaults {
-    /// Parses text such as `rows@12,closed@13`; what is not understood is left out.
+    /// Parses text such as `rows@12,closed@13`; ignores anything else.
     fn parse(text: &str) -> StepFaults {
         let fault = |part: &str| {
             let (kind, step) = part.trim().split_once('@')?;

@@ -24,10 +24,10 @@ use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
 use std::collections::VecDeque;
 
-/// More than one row in so many with unusable gradients skip a step.
+/// A step is skipped if more than one in this many rows has unusable gradients.
 pub(super) const ROWS_PER_UNUSABLE: u64 = 10_000;
 
-/// Whether so many of the rows of a view are too many to go on without them.
+/// Whether a step is skipped because `unusable` of the `rows` rows of its view have unusable gradients.
 fn are_too_many(unusable: u64, rows: usize) -> bool {
     unusable.saturating_mul(ROWS_PER_UNUSABLE) > rows as u64
 }
@@ -41,7 +41,7 @@ pub enum Skipped {
     Gradients(u64),
 }
 
-/// What a step did.
+/// The outcome of a step.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct StepOutcome {
     /// Loss of the view.
@@ -56,7 +56,7 @@ pub struct StepOutcome {
     pub batches: usize,
     /// Rows that the optimizer rewrote.
     pub updated: u64,
-    /// Rows left as they were because a gradient or a result was not finite.
+    /// Rows that kept their values because a gradient or a result was not finite.
     pub rows_skipped: u64,
     /// Why nothing was changed; `None` for a step that was taken.
     pub skipped: Option<Skipped>,
@@ -77,7 +77,7 @@ impl StepOutcome {
 /// renders them forward and backward, updates the rows, and releases the pages. A batch has at most `pages_most` pages.
 ///
 /// # Errors
-/// Pages could not be had, or the renderer failed; the rows are as they were before the step, except under
+/// A page could not be read, or the renderer failed. The rows are as they were before the step, except under
 /// [`TrainError::Torn`].
 pub fn train_step(
     scene: &mut PagedScene,
@@ -103,7 +103,7 @@ pub fn train_step(
     done.map(|()| outcome)
 }
 
-/// A batch whose rows are in.
+/// A batch after the pass in: the renderer has its rows.
 struct Batch {
     /// Pages with rows, ascending by id, with the parts of pages that split.
     pages: Vec<PageNo>,
@@ -111,7 +111,7 @@ struct Batch {
     row_from_working: Vec<u32>,
 }
 
-/// A step under way.
+/// A step in progress.
 struct Passes<'a> {
     scene: &'a mut PagedScene,
     working: &'a mut WorkingSet,
@@ -243,8 +243,8 @@ impl Passes<'_> {
         Ok(())
     }
 
-    /// One batch of the pass out, which is the first of them where its pages are still pinned. Whether the step ends here because
-    /// it is skipped.
+    /// One batch of the pass out: the first batch if its pages are still pinned. Returns whether the step ends here because it is
+    /// skipped.
     fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
         let is_first = self.batches.len() + 1 == self.outcome.batches;
         if !is_first {
@@ -283,7 +283,7 @@ impl Passes<'_> {
         Ok(are_too_many(unusable, self.outcome.rows).then_some(Skipped::Gradients(unusable)))
     }
 
-    /// Begins reads during the pass in: of the next batch, or of the next steps where there is none.
+    /// Begins reads during the pass in: of the next batch or, after the last batch, of the next steps.
     fn prefetch(&mut self, coming: &VecDeque<PageNo>, per_batch: usize) {
         if coming.is_empty() && self.batches.is_empty() {
             return self.scene.pager.prefetch(self.step);
@@ -292,7 +292,7 @@ impl Passes<'_> {
         self.scene.pager.prefetch_batch(&next);
     }
 
-    /// Begins reads during the pass out: of the batch before, or of the next steps where there is none.
+    /// Begins reads during the pass out: of the preceding batch or, at the first batch, of the next steps.
     fn prefetch_before_last(&mut self) {
         // While a batch is taken out, it is no longer in the list.
         let is_out = usize::from(self.outcome.batches != self.batches.len());

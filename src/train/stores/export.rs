@@ -1,4 +1,5 @@
-//! Exports the Gaussians of a generation as a PLY, SPZ or SOG, page by page, with the trainer's writers, and the transform beside it.
+//! Exports the Gaussians of a generation as a PLY, SPZ or SOG, page by page, with the writers of the trainer, and the file
+//! of its transform.
 //!
 //! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
 //! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection

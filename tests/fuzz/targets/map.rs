@@ -246,6 +246,7 @@ fn sample() -> RunState {
                 first: 7,
                 checks: vec![GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 }],
             },
+            first_exposures: 2,
         },
         events,
         histogram: vec![(3, 1), (32767, 9)],

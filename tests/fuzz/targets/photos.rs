@@ -1,8 +1,10 @@
-//! JPEG and PNG: headers, and decoding within the announced size.
+//! JPEG and PNG: headers, EXIF data, and decoding within the announced size.
 
 use crate::Target;
 use crate::allocation::peak_of;
+use crate::exif::{Settings, with_exif};
 use crate::scene_folder::scratch;
+use gsscale::dataset::exif::brightness;
 use gsscale::dataset::masks::MaskSource;
 use gsscale::dataset::model::{Intrinsics, Lens};
 use gsscale::dataset::photo::{Alpha, PhotoSource, decode};
@@ -24,15 +26,18 @@ pub fn photo() -> Target {
     let rgb = image::DynamicImage::from(rgb);
     let mut tiny = Vec::new();
     image::codecs::png::PngEncoder::new(&mut tiny).write_image(&[9; 8], 2, 2, ExtendedColorType::La8).unwrap();
+    let settings = Settings { seconds: 0.004, aperture: 2.8, iso: 640 }.tiff();
     let seeds = vec![
         encoded(&rgb, ImageFormat::Jpeg),
         encoded(&rgb.to_luma8().into(), ImageFormat::Jpeg),
         encoded(&rgb, ImageFormat::Png),
         encoded(&rgb.to_rgba8().into(), ImageFormat::Png),
         encoded(&rgb.to_rgb16().into(), ImageFormat::Png),
+        with_exif(&encoded(&rgb, ImageFormat::Jpeg), &settings),
+        with_exif(&tiny, &settings),
         tiny,
     ];
-    let words = &["IEND", "IDAT", "IHDR", "tRNS", "PLTE", "acTL", "iCCP", "eXIf"];
+    let words = &["IEND", "IDAT", "IHDR", "tRNS", "PLTE", "acTL", "iCCP", "eXIf", "Exif\0\0", "II*\0", "MM\0*"];
     Target { name: "photo", run, seeds, words, cases: 4_000, memory: [16 << 20, 64] }
 }
 
@@ -46,6 +51,10 @@ fn run(input: &[u8]) {
     };
     let (width, height) = (header.width, header.height);
     assert!(width > 0 && height > 0);
+    if let Some(place) = header.exif {
+        let is_sound = |stops: Option<f64>| stops.is_none_or(f64::is_finite);
+        assert!(brightness(&path, place).map_or_else(|why| !why.is_empty(), is_sound));
+    }
     if header.decode_bytes > DECODE_BYTES_MAX {
         return;
     }

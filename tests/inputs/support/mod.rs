@@ -1,5 +1,8 @@
-//! Where the photo scenes are.
+//! Where the photo scenes are, EXIF data, rows of exported files.
 
+#[allow(dead_code)] // the programs use all of it
+#[path = "../../support/exif.rs"]
+pub mod exif;
 #[path = "../../support/shared.rs"]
 pub mod shared;
 

@@ -2,9 +2,10 @@
 //! "never", gradients from 1 to 1e-14, two values of eps, two learning-rate schedules.
 
 use super::torch32::Torch32;
+use crate::support::dense_adam::{DenseAdam, Real};
 use crate::support::fixture::Fixture;
 use gsscale::base::simd::SimdPath;
-use gsscale::optim::adam::{AdamConfig, DenseAdam, Real};
+use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;

@@ -4,9 +4,10 @@
 //! `GSSCALE_PRINT=1` with `--nocapture` prints the errors by schedule.
 
 use super::torch32::Torch32;
+use crate::support::dense_adam::DenseAdam;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::optim::adam::{AdamConfig, DenseAdam};
+use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};

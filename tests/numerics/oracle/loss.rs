@@ -16,7 +16,7 @@ fn supported_paths() -> impl Iterator<Item = SimdPath> {
 }
 
 fn options(ssim_lambda: f32, padding: SsimPadding, simd: SimdPath) -> LossOptions {
-    LossOptions::new(ssim_lambda, padding, simd)
+    LossOptions { ssim_lambda, padding, simd }
 }
 
 /// `[H, W, 3]` to `[3, H, W]`.
@@ -52,7 +52,7 @@ fn values_and_gradients_match_the_fixtures() {
         let (rgb, gt) = (planar(&fixture.f32("img")), planar(&fixture.f32("gt")));
         let pair = ImagePair { width, height, rgb: &rgb, reference: Reference::Planar(&gt), mask: None, clamp: false };
         let lambda = fixture.f64("lambda")[0] as f32;
-        let (mut loss, mut v) = (ImageLoss::new(), Vec::new());
+        let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
         for path in supported_paths() {
             let context = format!("{file} {}", path.name());
             let mut run = |lambda, padding| {
@@ -94,7 +94,7 @@ fn metrics_match_the_fixture_with_an_8_bit_photo() {
     let image = Image { width, height, rgb: planar(&fixture.f32("img")) };
     let psnr = metrics::psnr(&image, &target);
     assert!((psnr - fixture.f64("val_psnr_clamped")[0]).abs() < 1e-4, "psnr {psnr}");
-    let (mut loss, mut v) = (ImageLoss::new(), Vec::new());
+    let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
     for (padding, name) in [(SsimPadding::Same, "val_loss_same"), (SsimPadding::Valid, "val_loss_valid")] {
         let value = loss.value_and_gradient(&image, &target, &options(0.2, padding, SimdPath::best()), &mut v);
         assert_value(&fixture, name, value.loss, "8-bit");
@@ -119,7 +119,7 @@ fn clamped_psnr_matches_every_fixture() {
         let gt = planar(&gt).iter().map(|v| v.clamp(0.0, 1.0)).collect::<Vec<_>>();
         let pair =
             ImagePair { width, height, rgb: &clamped, reference: Reference::Planar(&gt), mask: None, clamp: false };
-        let value = ImageLoss::new().pair_value_and_gradient(
+        let value = ImageLoss::default().pair_value_and_gradient(
             &pair,
             &options(0.2, SsimPadding::Same, SimdPath::best()),
             &mut Vec::new(),
@@ -229,7 +229,7 @@ fn odd_sizes_and_masks_match_the_definition() {
         for masked in [false, true] {
             let case = Case::new(width, height, masked);
             for padding in [SsimPadding::Same, SsimPadding::Valid] {
-                let (mut loss, mut v) = (ImageLoss::new(), Vec::new());
+                let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
                 let options = options(0.3, padding, SimdPath::best());
                 let got = loss.value_and_gradient(&case.image(), &case.target, &options, &mut v);
                 let context = format!("{width}x{height} masked {masked} {padding:?}");
@@ -263,7 +263,7 @@ fn gradients_match_finite_differences_of_the_definition() {
         let n = width * height;
         let mut v = Vec::new();
         let options = options(0.3, padding, SimdPath::best());
-        ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+        ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
         let largest = v.iter().fold(0.0f64, |m, &g| m.max(f64::from(g).abs()));
         for i in (0..3 * n).step_by(3 * n / 24) {
             let (place, c) = (i % n, i / n);
@@ -293,7 +293,7 @@ fn bits(case: &Case, path: SimdPath) -> (Vec<u32>, [u64; 4], u64) {
     let mut v = Vec::new();
     let options = options(0.2, SsimPadding::Valid, path);
     let LossValue { loss, l1, ssim, mse } =
-        ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+        ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
     let reflect = mean_ssim(&ImagePair::new(&case.image(), &case.target), SsimVariant::Reflect, path);
     let v = v.iter().map(|g| g.to_bits()).collect();
     (v, [loss, l1, ssim, mse].map(f64::to_bits), reflect.to_bits())
@@ -329,7 +329,7 @@ fn a_wholly_masked_picture_has_no_loss() {
     case.target.mask = Some(vec![0; 300]);
     let mut v = vec![7.0; 5];
     let options = options(0.2, SsimPadding::Valid, SimdPath::best());
-    let value = ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+    let value = ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
     assert_eq!(value, LossValue { loss: 0.0, l1: 0.0, ssim: 1.0, mse: 0.0 });
     assert_eq!(v, vec![0.0; 900]);
 }
@@ -341,7 +341,7 @@ fn a_border_alone_leaves_l1() {
     case.target.mask = Some((0..300).map(|i| u8::from(border(i))).collect());
     let mut v = Vec::new();
     let options = options(0.2, SsimPadding::Valid, SimdPath::best());
-    let value = ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+    let value = ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
     assert_eq!(value.ssim, 1.0);
     // 0.8 in f64 from an f32 lambda.
     assert!((value.loss - 0.8 * value.l1).abs() < 1e-7 && value.l1 > 0.0);
@@ -363,7 +363,7 @@ fn broken_pictures_give_a_broken_loss_and_masked_ones_do_not() {
                 let mut case = clean.clone();
                 case.rgb[place] = bad;
                 let mut v = Vec::new();
-                let value = ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+                let value = ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
                 (value.loss.is_finite(), v.iter().all(|g| g.is_finite()))
             };
             assert_eq!(run(masked), (true, true));
@@ -383,7 +383,7 @@ fn small_and_empty_pictures_have_a_loss() {
         let run = |padding| {
             let mut v = Vec::new();
             let options = options(0.2, padding, SimdPath::best());
-            let value = ImageLoss::new().value_and_gradient(&case.image(), &case.target, &options, &mut v);
+            let value = ImageLoss::default().value_and_gradient(&case.image(), &case.target, &options, &mut v);
             (value, v)
         };
         let (same, valid) = (run(SsimPadding::Same), run(SsimPadding::Valid));

@@ -292,7 +292,7 @@ fn a_short_training_run_follows_the_reference() {
     let rgb = file.f64("target").iter().map(|x| (x * 255.0).round() as u8).collect();
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let options = RenderOptions { sh_degree: 1, ..RenderOptions::default() };
-    let loss = LossOptions::new(0.2, SsimPadding::Same, options.simd);
+    let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Same, simd: options.simd };
     let mut renderer = CpuRenderer::new();
     let mut grads = Gradients::default();
     let mut adams = parameters(&mut rows).map(|(values, _)| Adam::new(values));

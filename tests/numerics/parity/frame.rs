@@ -110,8 +110,8 @@ fn assert_same(what: &str, got: &Results, want: &Results) {
     for column in Column::ALL {
         let (g, w) = (got.grads.columns.column(column), want.grads.columns.column(column));
         let error = l2(g, w);
-        println!("{what}: {} {error:.1e}", column.name());
-        assert!(error < GRADIENT_L2, "{what}: {} {error}", column.name());
+        println!("{what}: {column:?} {error:.1e}");
+        assert!(error < GRADIENT_L2, "{what}: {column:?} {error}");
     }
     let error = l2(got.grads.means2d.as_flattened(), want.grads.means2d.as_flattened());
     assert!(error < GRADIENT_L2, "{what}: means2d {error}");
@@ -244,7 +244,7 @@ fn sums_of_intersections_in_windows_give_the_same_bits() {
         let (g, w) = (got.grads.columns.column(column), want.grads.columns.column(column));
         let moved: Vec<usize> = (0..g.len()).filter(|&i| g[i].to_bits() != w[i].to_bits()).collect();
         let first = moved.first().map(|&i| (i, g[i], w[i]));
-        assert!(moved.is_empty(), "{}: {} of {} values differ, first {first:?}", column.name(), moved.len(), g.len());
+        assert!(moved.is_empty(), "{column:?}: {} of {} values differ, first {first:?}", moved.len(), g.len());
     }
     assert!(bits(&got) == bits(&want) && got.value == want.value && got.grads.radii == want.grads.radii);
 }

@@ -19,7 +19,7 @@ fn devices() -> impl Iterator<Item = Gpu> {
 }
 
 fn options(ssim_lambda: f32, padding: SsimPadding) -> LossOptions {
-    LossOptions::new(ssim_lambda, padding, SimdPath::best())
+    LossOptions { ssim_lambda, padding, simd: SimdPath::best() }
 }
 
 /// A smooth photo and a picture that resembles it, with noise.
@@ -41,7 +41,7 @@ fn pair(width: u32, height: u32) -> (Image, Target) {
 
 fn on_cpu(image: &Image, target: &Target, options: &LossOptions) -> (LossValue, Vec<f32>) {
     let mut v_rgb = Vec::new();
-    let value = ImageLoss::new().value_and_gradient(image, target, options, &mut v_rgb);
+    let value = ImageLoss::default().value_and_gradient(image, target, options, &mut v_rgb);
     (value, v_rgb)
 }
 

@@ -1,8 +1,10 @@
-//! Small scenes, the programs as processes, a browser, small drives, limits on memory, a device.
+//! Small scenes, EXIF data, the programs as processes, a browser, small drives, limits on memory, a device.
 
 #[path = "../../support/bench.rs"]
 pub mod bench;
 pub mod browser;
+#[path = "../../support/exif.rs"]
+pub mod exif;
 #[cfg(unix)]
 #[allow(dead_code)] // the storage tests use all of it
 #[path = "../../support/faulty_engine.rs"]

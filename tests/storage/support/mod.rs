@@ -1,5 +1,7 @@
 //! An engine that fails on purpose, and tests that run in a process of their own.
 
+#[path = "../../support/apply_event.rs"]
+pub mod apply_event;
 #[cfg(unix)]
 #[path = "../../support/child.rs"]
 pub mod child;
