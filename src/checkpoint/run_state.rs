@@ -5,10 +5,8 @@
 //! never a panic.
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
-//! [`crate::page::format::encoding`] writes them. Version 7 lacks the count of first exposures and the motions of poses. Version 6
-//! also lacks blocks of photos, version 5 outliers and checks of growth, and version 4 appearance. A missing value is read as that
-//! of a run without it. No program was released with versions 1 to 3. A new value is a field of [`TrainerState`], a place at the end
-//! of `encode` and `decode`, and a new version.
+//! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
+//! `decode`, and a new version. Only the newest version is read: none before it was released.
 
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
@@ -23,14 +21,6 @@ use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
 pub const VERSION: u32 = 8;
-/// The version before first exposures and poses: the same values without these two, the last of the list.
-const WITHOUT_POSES: u32 = 7;
-/// The version before blocks of photos: the same values without these and what came later.
-const WITHOUT_BLOCKS: u32 = 6;
-/// The version before outliers and checks of growth: the same values without these two and what came later.
-const WITHOUT_OUTLIERS: u32 = 5;
-/// The version before appearance: the same values without appearance and what came later.
-const WITHOUT_APPEARANCE: u32 = 4;
 
 /// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -170,19 +160,6 @@ pub struct RunState {
     pub traffic: PagerStats,
 }
 
-/// The values at the end that a state of an earlier version lacks, as those of a run without.
-fn lacking_in(version: u32) -> Result<Vec<u8>, EncodingError> {
-    let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-    let blocks = BlockOutliers::default();
-    let before = match version {
-        WITHOUT_APPEARANCE => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
-        WITHOUT_OUTLIERS => encoding::to_bytes(&(outliers, growth, blocks))?,
-        WITHOUT_BLOCKS => encoding::to_bytes(&blocks)?,
-        _ => Vec::new(),
-    };
-    Ok([before, encoding::to_bytes(&(0u32, PoseState::default()))?].concat())
-}
-
 /// Why bytes are not the state of a run.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum RunStateError {
@@ -231,13 +208,10 @@ impl RunState {
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        let state = match version {
-            VERSION => RunState::decode(body)?,
-            WITHOUT_POSES | WITHOUT_BLOCKS | WITHOUT_OUTLIERS | WITHOUT_APPEARANCE => {
-                RunState::decode(&[body, &lacking_in(version)?].concat())?
-            }
-            other => return Err(RunStateError::Version(other)),
-        };
+        if version != VERSION {
+            return Err(RunStateError::Version(version));
+        }
+        let state = RunState::decode(body)?;
         state.check()?;
         Ok(state)
     }
@@ -430,30 +404,9 @@ mod tests {
     fn states_come_back_and_other_versions_do_not() {
         let mut bytes = sample().to_bytes().unwrap();
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
-        for other in [WITHOUT_APPEARANCE - 1, VERSION + 1] {
+        for other in [VERSION - 1, VERSION + 1] {
             bytes[..4].copy_from_slice(&other.to_le_bytes());
             assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
-        }
-    }
-
-    #[test]
-    fn states_of_earlier_versions_come_back_without_later_values() {
-        let state = sample();
-        let (outliers, growth) = (ViewOutliers::default(), GrowthState::default());
-        let of_7 = TrainerState { first_exposures: 0, poses: PoseState::default(), ..state.trainer.clone() };
-        let of_6 = TrainerState { blocks: BlockOutliers::default(), ..of_7.clone() };
-        let of_5 = TrainerState { outliers, growth, ..of_6.clone() };
-        let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        let of_versions =
-            [(WITHOUT_POSES, of_7), (WITHOUT_BLOCKS, of_6), (WITHOUT_OUTLIERS, of_5), (WITHOUT_APPEARANCE, of_4)];
-        for (version, trainer) in of_versions {
-            let lacking = lacking_in(version).unwrap();
-            let without = RunState { trainer, ..state.clone() };
-            let mut bytes = without.to_bytes().unwrap();
-            assert!(bytes.ends_with(&lacking));
-            bytes.truncate(bytes.len() - lacking.len());
-            bytes[..4].copy_from_slice(&version.to_le_bytes());
-            assert_eq!(RunState::from_bytes(&bytes), Ok(without));
         }
     }
 
