@@ -377,8 +377,24 @@ mod tests {
                 growth: GrowthState {
                     first: 7,
                     checks: vec![
-                        GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 },
-                        GrowthCheck { step: 8, gaussians: 10, lost: -0.5, pays_from: 0.5, allowed: 10 },
+                        GrowthCheck {
+                            step: 5,
+                            gaussians: 7,
+                            psnr: 20.0,
+                            lost: 0.5,
+                            pays_from: 0.25,
+                            is_trial: false,
+                            allowed: 10,
+                        },
+                        GrowthCheck {
+                            step: 8,
+                            gaussians: 10,
+                            psnr: 21.0,
+                            lost: -0.5,
+                            pays_from: 0.5,
+                            is_trial: false,
+                            allowed: 10,
+                        },
                     ],
                 },
                 blocks: looked_at(),

@@ -246,6 +246,10 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts
 }
 
+/// Of a run whose scene doubled on trial.
+const TRIALS: &str = " This loss did not pay, but was near enough for a trial: the scene doubled, and doubled again at the next check \
+    as long as the held-out photos had gained.";
+
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {
     let checks = summary["growth"].as_array().map_or(&[][..], Vec::as_slice);
@@ -254,8 +258,9 @@ fn add_growth(page: &mut Page, summary: &Value) {
     page.paragraph(&format!(
         "The run decided that up to {} Gaussians pay (--quality). The chart shows what training photos that were held out lost, in \
          each check, without the quarter of the Gaussians that weighs least in them. The scene grows if that loss exceeds the \
-         threshold from which growth pays.",
-        short(allowed)
+         threshold from which growth pays.{}",
+        short(allowed),
+        if checks.iter().any(|check| check["is_trial"] == true) { TRIALS } else { "" }
     ));
     let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();
     let chart =
@@ -263,7 +268,9 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let chart = chart.with("growth pays from", of("pays_from"), Mark::Line).zero_based();
     let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
     let caption = "Mean over the held-out training photos at each check.".to_string();
-    page.charts(&[(chart.svg(), caption), (rows.svg(), "What each check allowed.".to_string())]);
+    let psnr = Chart::new("PSNR of held-out training photos", "step", "dB").with("", of("psnr"), Mark::LineAndDots);
+    let allowed = (rows.svg(), "What each check allowed.".to_string());
+    page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
 }
 
 /// A chart of the exposures of the photos, if the run has trained them.

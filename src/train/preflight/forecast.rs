@@ -305,7 +305,15 @@ mod tests {
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
         assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (82_642, Reach::Decided));
         assert_eq!(reach(&decides, 41_321, 50_000, 0, &[]), (50_000, Reach::Decided), "no more than pixels");
-        let check = GrowthCheck { step: 1001, gaussians: 41_000, lost: 0.4, pays_from: 0.1, allowed: 165_284 };
+        let check = GrowthCheck {
+            step: 1001,
+            gaussians: 41_000,
+            psnr: 20.0,
+            lost: 0.4,
+            pays_from: 0.1,
+            is_trial: false,
+            allowed: 165_284,
+        };
         assert_eq!(reach(&decides, 60_000, PIXELS, 1001, &[check]), (165_284, Reach::Decided));
         assert_eq!(reach(&TrainConfig { max_gaussians: 9, ..decides }, 5, PIXELS, 0, &[]), (9, Reach::Cap));
     }

@@ -1,4 +1,5 @@
-//! The checks of a run that decides its count: what the held-out training views lose without their faintest Gaussians.
+//! The checks of a run that decides its count: how good the held-out training views are, and what they lose without their faintest
+//! Gaussians.
 //!
 //! Not here: the decision ([`crate::densify::growth`]), the views (`held_out`), the loss of one of them (`leave_out`).
 //!
@@ -32,19 +33,21 @@ impl Trainer {
         }
         let started = Instant::now();
         self.drain()?;
-        let lost = self.mean_loss(dataset, targets)?;
+        let values = self.mean_values(dataset, targets)?;
         let count = [self.scene.rows_bound(), self.state.growth.allowed()];
-        self.state.growth.checks.push(rule.check(number, step, count, lost));
+        let check = rule.check((number, step), count, values, &self.state.growth.checks);
+        self.state.growth.checks.push(check);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(())
     }
 
-    /// Mean over the held-out views of the decibels lost without the faintest quarter; 0 if no view counts.
-    fn mean_loss(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<f64, TrainError> {
+    /// PSNR of the held-out views, and the decibels that these lose without their faintest quarter: means over the views; 0 if no view
+    /// counts.
+    fn mean_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<[f64; 2], TrainError> {
         let views: Vec<usize> = self.held_out.positions().iter().map(|&at| self.train_views[at]).collect();
         self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let render = self.render_options();
-        let mut losses = Vec::with_capacity(views.len());
+        let mut values: Vec<[f64; 2]> = Vec::with_capacity(views.len());
         for (i, &view) in views.iter().enumerate() {
             targets.prefetch(&views[i..views.len().min(i + 2)]);
             let target = targets.get(view)?;
@@ -62,8 +65,9 @@ impl Trainer {
             };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let [whole, without] = psnr_without_faint(now, &mut *self.renderer, &compared)?;
-            losses.push(whole - without);
+            values.push([whole, whole - without]);
         }
-        Ok(losses.iter().sum::<f64>() / losses.len().max(1) as f64)
+        let count = values.len().max(1) as f64;
+        Ok([0, 1].map(|k| values.iter().map(|of_view| of_view[k]).sum::<f64>() / count))
     }
 }

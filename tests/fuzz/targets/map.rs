@@ -244,7 +244,15 @@ fn sample() -> RunState {
             poses: PoseState::new(2),
             growth: GrowthState {
                 first: 7,
-                checks: vec![GrowthCheck { step: 5, gaussians: 7, lost: 0.5, pays_from: 0.25, allowed: 10 }],
+                checks: vec![GrowthCheck {
+                    step: 5,
+                    gaussians: 7,
+                    psnr: 20.0,
+                    lost: 0.5,
+                    pays_from: 0.25,
+                    is_trial: true,
+                    allowed: 10,
+                }],
             },
             first_exposures: 2,
         },
