@@ -6,8 +6,9 @@
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
 //! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
-//! `decode`, and a new version. Only the newest version is read: none before it was released.
+//! `decode`, a new version, and a line in [`super::older_states`].
 
+use super::older_states::{OlderGrowth, lacking_in};
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
@@ -17,6 +18,7 @@ use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
 use crate::poses::state::PoseState;
 use crate::scene::events::{Event, EventKind, EventLog};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
@@ -208,10 +210,13 @@ impl RunState {
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        if version != VERSION {
-            return Err(RunStateError::Version(version));
-        }
-        let state = RunState::decode(body)?;
+        let state = match version {
+            VERSION => RunState::decode::<GrowthState>(body)?,
+            older => {
+                let lacking = lacking_in(older)?.ok_or(RunStateError::Version(version))?;
+                RunState::decode::<OlderGrowth>(&[body, &lacking].concat())?
+            }
+        };
         state.check()?;
         Ok(state)
     }
@@ -231,15 +236,15 @@ impl RunState {
         ))
     }
 
-    /// The counterpart of [`RunState::encode`].
-    fn decode(bytes: &[u8]) -> Result<RunState, EncodingError> {
+    /// The counterpart of [`RunState::encode`], with checks of growth as `G`.
+    fn decode<G: DeserializeOwned + Into<GrowthState>>(bytes: &[u8]) -> Result<RunState, EncodingError> {
         let (
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
             (appearance, outliers, growth, blocks, first_exposures, poses),
-        ) = encoding::from_bytes(bytes)?;
+        ): (_, _, _, _, (_, _, G, _, _, _)) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer = TrainerState {
             step,
@@ -250,7 +255,7 @@ impl RunState {
             test,
             appearance,
             outliers,
-            growth,
+            growth: growth.into(),
             blocks,
             first_exposures,
             poses,
@@ -311,7 +316,8 @@ impl RunState {
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
+pub(super) mod tests {
+    use super::super::older_states::OLDEST;
     use super::*;
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
@@ -337,7 +343,7 @@ mod tests {
         poses
     }
 
-    fn sample() -> RunState {
+    pub(in crate::checkpoint) fn sample() -> RunState {
         let thresholds =
             RoundThresholds { grow_grad2d: f32::INFINITY, split_scale: 0.5, prune_opacity: -0.0, prune_scale: 2.0 };
         let events = [
@@ -420,7 +426,7 @@ mod tests {
     fn states_come_back_and_other_versions_do_not() {
         let mut bytes = sample().to_bytes().unwrap();
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
-        for other in [VERSION - 1, VERSION + 1] {
+        for other in [OLDEST - 1, VERSION + 1] {
             bytes[..4].copy_from_slice(&other.to_le_bytes());
             assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
         }

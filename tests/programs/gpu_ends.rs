@@ -56,14 +56,15 @@ fn a_device_that_is_lost_with_steps_in_flight_loses_the_steps_since_the_last_com
     assert!(bench.run("alone", "2", "", SELDOM));
     let want = bench.result("alone");
     let submissions = bench.spans("alone").iter().filter(|s| s.name == "submit").count();
-    // The fault strikes every device that a process opens, at this submission.
+    // The fault strikes every device that a process opens, at this submission. How far a restart comes depends on the last commit, whose time is
+    // that of the machine, so more restarts are allowed than usual.
     let mut lost_in_flight = 0;
     for at in [4, 5, 7].map(|tenths| submissions * tenths / 10) {
         let name = format!("lost{at}");
-        let mut run = bench.command(&name, &[SELDOM, &["--restarts", "3"]].concat());
+        let mut run = bench.command(&name, &[SELDOM, &["--restarts", "9"]].concat());
         let output = run.env("GSSCALE_GPU_FAULT", format!("lost@{at}")).output().unwrap();
         let said = stderr(&output);
-        assert!(output.status.success() && said.contains("(restart 1 of at most 3)"), "{said}");
+        assert!(output.status.success() && said.contains("(restart 1 of at most 9)"), "{said}");
         same(&bench.result(&name), &want, &name);
         // Every step that is recorded is finished or given up, unless the device is lost.
         let spans = bench.spans(&name);
