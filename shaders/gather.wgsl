@@ -1,6 +1,7 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
 // camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
-// `bounds` finds the bounds of a page after its update. `survey` finds what decides whether a round edits rows of a page. Where the host does not wait for the numbers of rows, `place` finds where
+// `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score and the lowest opacity of a page, from
+// which the host decides whether a round edits rows. Where the host does not wait for the numbers of rows, `place` finds where
 // the list of each page begins, and `pad` fills the room behind the last row. The twin of src/kernels/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this

@@ -3,7 +3,7 @@
 //! Version 7 lacks first exposures, poses and the trials of growth. Version 6 also lacks blocks of photos, version 5 outliers and checks of
 //! growth, version 4 appearance. Versions 1 to 3 are not read: no program that others use wrote them.
 //!
-//! Invariants: 1. missing values stand at the end of the layout, so an older state with [`lacking_in`] behind it has the layout of
+//! Invariants: 1. missing values stand at the end of the layout, so an older state with [`missing_values`] behind it has the layout of
 //! today, but for the checks of growth ([`OlderGrowth`]); 2. nothing here writes a state.
 
 use crate::appearance::state::AppearanceState;
@@ -39,7 +39,7 @@ struct OlderCheck {
 /// A run that has begun to decide without trials goes on without trials.
 impl From<OlderGrowth> for GrowthState {
     fn from(older: OlderGrowth) -> GrowthState {
-        let of_today = |OlderCheck { step, gaussians, lost, pays_from, allowed }| GrowthCheck {
+        let with_trial_fields = |OlderCheck { step, gaussians, lost, pays_from, allowed }| GrowthCheck {
             step,
             gaussians,
             psnr: 0.0,
@@ -48,12 +48,12 @@ impl From<OlderGrowth> for GrowthState {
             is_trial: false,
             allowed,
         };
-        GrowthState { first: older.first, checks: older.checks.into_iter().map(of_today).collect() }
+        GrowthState { first: older.first, checks: older.checks.into_iter().map(with_trial_fields).collect() }
     }
 }
 
-/// The values that a state of this version lacks; `None` for a version that is not read.
-pub(super) fn lacking_in(version: u32) -> Result<Option<Vec<u8>>, EncodingError> {
+/// The encoded values that a state of this version lacks, in the order of the layout; `None` for a version that is not read.
+pub(super) fn missing_values(version: u32) -> Result<Option<Vec<u8>>, EncodingError> {
     let (outliers, growth, blocks) = (ViewOutliers::default(), GrowthState::default(), BlockOutliers::default());
     let before = match version {
         OLDEST => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
@@ -88,7 +88,7 @@ mod tests {
         let bytes = state.to_bytes().unwrap();
         let at = bytes.windows(today.len()).rposition(|part| part == today).unwrap();
         let mut bytes = [&version.to_le_bytes(), &bytes[4..at], &older, &bytes[at + today.len()..]].concat();
-        let lacking = lacking_in(version).unwrap().unwrap();
+        let lacking = missing_values(version).unwrap().unwrap();
         assert!(bytes.ends_with(&lacking));
         bytes.truncate(bytes.len() - lacking.len());
         bytes

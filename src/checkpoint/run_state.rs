@@ -8,7 +8,7 @@
 //! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
 //! `decode`, a new version, and a line in [`super::older_states`].
 
-use super::older_states::{OlderGrowth, lacking_in};
+use super::older_states::{OlderGrowth, missing_values};
 use crate::appearance::state::AppearanceState;
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
@@ -213,8 +213,8 @@ impl RunState {
         let state = match version {
             VERSION => RunState::decode::<GrowthState>(body)?,
             older => {
-                let lacking = lacking_in(older)?.ok_or(RunStateError::Version(version))?;
-                RunState::decode::<OlderGrowth>(&[body, &lacking].concat())?
+                let missing = missing_values(older)?.ok_or(RunStateError::Version(version))?;
+                RunState::decode::<OlderGrowth>(&[body, &missing].concat())?
             }
         };
         state.check()?;

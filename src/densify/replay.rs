@@ -61,7 +61,7 @@ pub struct Replay {
     pub reset_rows: usize,
 }
 
-/// What is known of the rows of a page whose payload is elsewhere. No row has a blending weight.
+/// Bounds on the rows of a page whose payload lies on a device. No row has a blending weight.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PageFacts {
     /// At least the mean growth score of every row.

@@ -20,15 +20,15 @@ const PER_UNIT: f64 = (1u64 << 40) as f64;
 const STORED_MOST: f64 = 1.0;
 /// Largest shift, as a share of the scene's scale, and largest turn, radians.
 pub const MOST: f64 = 0.02;
-/// Lengths of all steps of a pose together, if all were of the first rate: what one way takes, and some turns.
-const WAY: f64 = 0.032;
-/// Largest first rate. With fewer than eight visits to a photo, a pose does not arrive.
+/// Total length of the steps of a pose at the first rate: the largest motion, and a margin for changes of direction.
+const PATH_LENGTH: f64 = 0.032;
+/// Largest first rate. With fewer than eight visits, a pose cannot cover [`PATH_LENGTH`].
 const RATE_MOST: f64 = 4e-3;
 /// The last rate, as a share of the first.
 const RATE_LAST: f64 = 0.1;
 /// Adam's decay of the gradient and of its square.
 const BETAS: [f64; 2] = [0.8, 0.95];
-/// Share of a run, and passes over the photos, before poses are refined: the scene must say where its photos are.
+/// Share of a run, and passes over the photos, before poses are refined: an untrained scene gives motions that fit noise.
 const BEGIN_SHARE: u32 = 10;
 const BEGIN_PASSES: u32 = 2;
 
@@ -64,7 +64,7 @@ pub fn first_step(steps: u32, views: usize) -> u32 {
 /// The length of a step of a pose at 0-based `step`: the fewer visits a photo has in a run, the longer is each step.
 pub fn rate_at(step: u32, steps: u32, views: usize) -> f64 {
     let left = steps.saturating_sub(first_step(steps, views)).max(1);
-    let first = (WAY * views as f64 / f64::from(left)).min(RATE_MOST);
+    let first = (PATH_LENGTH * views as f64 / f64::from(left)).min(RATE_MOST);
     let progress = f64::from(step) / f64::from(steps.max(1));
     first * (1.0 + (RATE_LAST - 1.0) * progress.min(1.0))
 }
