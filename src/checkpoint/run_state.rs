@@ -6,7 +6,7 @@
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
 //! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
-//! `decode`, a new version, and a line in [`super::older_states`].
+//! `decode`, a new version, and a line in `older_states`.
 
 use super::older_states::{OlderGrowth, missing_values};
 use crate::appearance::state::AppearanceState;
