@@ -9,7 +9,6 @@ use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::densify::strategy::StrategyName;
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
@@ -177,7 +176,6 @@ fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
     let keys = TrainOverrides {
         steps: keys.steps.or(Some(4000)),
         max_gaussians: keys.max_gaussians.or(Some(150_000)),
-        strategy: keys.strategy.or(Some(StrategyName::LongAxis)),
         eval_every: keys.eval_every.or(Some(1000)),
         ..keys.clone()
     };

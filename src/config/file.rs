@@ -187,9 +187,9 @@ config_keys! {
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
     "Densification" {
-        /// default (gsplat's: clone, split, prune, reset), long-axis (split along the longest axis; at --max-gaussians, or
-        /// at the number that --quality decides, remove the Gaussians that contribute least), or none
-        strategy: StrategyName = StrategyName::Default => Numbers;
+        /// long-axis (split along the longest axis; at --max-gaussians, or at the number that --quality decides, remove the
+        /// Gaussians that contribute least), default (that of gsplat: clone, split, prune, reset), or none
+        strategy: StrategyName = StrategyName::LongAxis => Numbers;
         /// With --strategy long-axis, grow first the Gaussians with the largest screen-space gradient (gradient), with the
         /// largest squared error in the pixels that they cover (error), or with the largest geometric mean of both (mixed)
         growth_score: GrowthScore = GrowthScore::Gradient => Numbers;

@@ -6,7 +6,11 @@
 //! fit under the cap. Its recycling takes whole bins of the histogram of mean blending weights from the bottom, at most
 //! a share of the rows that enough views weighed since the last round: where views come in spatial groups, every region
 //! then loses its share when the views come to it. The capacity that removed rows free is used only by later rounds,
-//! when the removals have been applied, so the cap holds at every step. There are no opacity resets.
+//! when the removals have been applied, so the cap holds at every step. There are no opacity resets. Where the run allows fewer rows
+//! than there are, a round takes the surplus from the weighed rows in the same way.
+//!
+//! Where views come region by region, a round sees the scores of a few regions. Growth then spreads over whole epochs
+//! ([`LongAxisStrategy::share_of_room`]): otherwise the regions of the first rounds would take the room of all others.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
@@ -65,14 +69,38 @@ impl LongAxisStrategy {
         step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
     }
 
+    /// Share of the room under the cap that the round after this step may take, if an epoch of `epoch` steps visits one region after
+    /// the other (0: any stretch of views shows all regions).
+    ///
+    /// Growth begins with the first whole epoch after `refine_start`. The rounds of an epoch take equal parts of the room at
+    /// its beginning, and the last one takes what is left. Where no whole epoch fits before `refine_stop`, all rounds share.
+    fn share_of_room(&self, step: u32, epoch: u32) -> f64 {
+        if epoch <= self.refine_every {
+            return 1.0;
+        }
+        let [step, epoch, start, stop] = [step, epoch, self.refine_start, self.refine_stop].map(u64::from);
+        let first = start.next_multiple_of(epoch);
+        let end = match first + epoch <= stop {
+            true if step <= first => return 0.0,
+            true => (first + (step - first).next_multiple_of(epoch)).min(stop - 1),
+            false => stop - 1,
+        };
+        let every = u64::from(self.refine_every);
+        1.0 / (end / every + 1 - step / every).max(1) as f64
+    }
+
     /// The round after this step. The last round removes nothing by weight, since no round would give the places away.
-    pub fn round(&self, step: u32, RowCount { rows, allowed }: RowCount, histogram: &GradHistogram) -> LongAxisRound {
+    pub fn round(&self, step: u32, count: RowCount, histogram: &GradHistogram) -> LongAxisRound {
+        let RowCount { rows, allowed, regional_epoch } = count;
         let cap = self.max_gaussians.min(allowed);
         let is_full = rows as f64 >= FULL_FROM * cap as f64;
         let is_last = step.saturating_add(self.refine_every) >= self.refine_stop;
-        let removed = if is_full && !is_last { (self.recycle * histogram.weighed_rows() as f64) as u64 } else { 0 };
+        let surplus = rows.saturating_sub(allowed) as f64 / rows.max(1) as f64;
+        let recycled = if is_full && !is_last { self.recycle } else { 0.0 };
+        let removed = (surplus.max(recycled) * histogram.weighed_rows() as f64) as u64;
+        let room = self.share_of_room(step, regional_epoch) * cap.saturating_sub(rows) as f64;
         LongAxisRound {
-            split_from_bin: histogram.split_bin(cap.saturating_sub(rows)),
+            split_from_bin: histogram.split_bin(room.round() as u64),
             remove_below_bin: if removed > 0 { histogram.remove_bin(removed) } else { 0 },
             remove_views: WEIGHED_VIEWS,
             prune_opacity: self.prune_opa,
@@ -88,7 +116,7 @@ impl LongAxisStrategy {
             GrowthScore::Error => error,
             GrowthScore::Mixed => (gradient() * error).sqrt(),
         };
-        (score, (self.recycle > 0.0).then_some(weight))
+        (score, (self.recycle > 0.0 || self.growth.is_some()).then_some(weight))
     }
 }
 
@@ -278,6 +306,21 @@ mod tests {
     }
 
     #[test]
+    fn rows_beyond_what_the_run_allows_go_even_in_the_last_round() {
+        let strategy = LongAxisStrategy { recycle: 0.0, max_gaussians: u64::MAX, ..strategy(GrowthScore::Gradient, 0) };
+        let (state, histogram) = drawn(&LongAxisStrategy { recycle: 0.02, ..strategy }, 1000, 4);
+        for step in [700, 2300] {
+            let round = strategy.round(step, RowCount { allowed: 500, ..RowCount::unlimited(1000) }, &histogram);
+            let removed = (0..1000).filter(|&row| round.fate(&facts(&state, row)) == Fate::Prune).count();
+            // A bin of large weights holds several rows.
+            assert!((480..=500).contains(&removed), "{removed}");
+            assert_eq!(round.promised(1000, &histogram), 0, "nothing grows");
+        }
+        let round = strategy.round(700, RowCount { allowed: 1000, ..RowCount::unlimited(1000) }, &histogram);
+        assert_eq!(round.remove_below_bin, 0);
+    }
+
+    #[test]
     fn faint_rows_go_and_bounds_of_pages_know_it() {
         let strategy = strategy(GrowthScore::Mixed, 1000);
         let round = strategy.round(700, RowCount::unlimited(10), &GradHistogram::default());
@@ -285,6 +328,32 @@ mod tests {
         assert_eq!((of(logit(0.004)), of(logit(0.006))), (Fate::Prune, Fate::Keep));
         let keeps = |lowest_opacity: f32| round.keeps_all(&Extremes { lowest_opacity, sigma_max: 1e9 });
         assert!(keeps(logit(0.006)) && !keeps(logit(0.004)));
+    }
+
+    #[test]
+    fn growth_spreads_over_epochs_that_visit_one_region_after_the_other() {
+        let strategy = strategy(GrowthScore::Gradient, 2000);
+        let grown = |epoch: u32| {
+            let mut rows = 1000.0;
+            let take = |step: u32| {
+                let taken = strategy.share_of_room(step, epoch) * (2000.0 - rows);
+                rows += taken;
+                taken
+            };
+            (0..4000).filter(|&step| strategy.is_round(step)).map(take).collect::<Vec<f64>>()
+        };
+        let are_near = |got: &[f64], want: f64| got.iter().all(|got| (got - want).abs() < 1e-9);
+        // Rounds follow steps 600, 700, .. 2300. A shuffle, and an epoch within a round, take all room at once.
+        assert!(are_near(&[grown(0)[0], grown(100)[0]], 1000.0));
+        // An epoch of 800 steps begins at step 800: eight rounds, 900 to 1600, take an eighth each.
+        let eight = grown(800);
+        assert!(
+            are_near(&eight[..3], 0.0) && are_near(&eight[3..11], 125.0) && are_near(&eight[11..], 0.0),
+            "{eight:?}"
+        );
+        // No whole epoch of 1300 steps fits: all 18 rounds share.
+        assert!(are_near(&grown(1300), 1000.0 / 18.0));
+        assert!(are_near(&grown(50_000), 1000.0 / 18.0));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Statistics of rows since the last round, and their histogram: sums of growth scores (for the default strategy, of the
+//! Statistics of rows since the last round, and their histogram: sums of growth scores (for the strategy `default`, of the
 //! gradient norms of projected means) and, for strategies that remove rows by it, mean blending weights.
 //!
 //! Invariants: 1. only drawn rows change; 2. gradients are in NDC units, so thresholds do not depend on the image size;

@@ -62,12 +62,14 @@ pub struct RowCount {
     pub rows: u64,
     /// The most rows that the run allows at this step. If the strategy has a cap of its own, the smaller of the two applies.
     pub allowed: u64,
+    /// Steps of an epoch whose views come region by region; 0 if any stretch of views shows all regions.
+    pub regional_epoch: u32,
 }
 
 impl RowCount {
     /// Rows without a limit.
     pub fn unlimited(rows: u64) -> RowCount {
-        RowCount { rows, allowed: u64::MAX }
+        RowCount { rows, allowed: u64::MAX, regional_epoch: 0 }
     }
 }
 
@@ -146,7 +148,7 @@ impl Strategy for NoStrategy {
 /// The values of a row at the time of the event, as input of [`Round::fate`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RowFacts {
-    /// Sum of the growth scores since the last round; for the default strategy, of gradient norms, NDC units.
+    /// Sum of the growth scores since the last round; for the strategy `default`, of gradient norms, NDC units.
     pub grad2d: f32,
     /// Views that drew the row since the last round, and its weight in them ([`crate::scene::sightings`]).
     pub count: u32,

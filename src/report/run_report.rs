@@ -248,7 +248,7 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
 
 /// Of a run whose scene doubled on trial.
 const TRIALS: &str = " This loss did not pay, but was near enough for a trial: the scene doubled, and doubled again at the next check \
-    as long as the held-out photos had gained.";
+    as long as the held-out photos had gained. A doubling without such a gain was undone.";
 
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {

@@ -169,7 +169,7 @@ pub struct Rows<'a> {
     pub stamp: &'a [u32],
     /// Identities.
     pub uid: &'a [u64],
-    /// Sums of growth scores since the last round; for the default strategy, of gradient norms.
+    /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
     pub grad2d: &'a [f32],
     /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
     pub count: &'a [u32],
@@ -190,7 +190,7 @@ pub struct RowsMut<'a> {
     pub stamp: &'a mut [u32],
     /// Identities.
     pub uid: &'a mut [u64],
-    /// Sums of growth scores since the last round; for the default strategy, of gradient norms.
+    /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
     pub grad2d: &'a mut [f32],
     /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
     pub count: &'a mut [u32],

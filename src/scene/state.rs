@@ -22,7 +22,7 @@ pub struct SceneState {
     pub stamp: Vec<u32>,
     /// Identity, kept when the row moves: the initial index, or a hash of (parent, event, child).
     pub uid: Vec<u64>,
-    /// Sum of the growth scores since the last round; for the default strategy, of the norms of the screen-space mean
+    /// Sum of the growth scores since the last round; for the strategy `default`, of the norms of the screen-space mean
     /// gradients (NDC units).
     pub grad2d: Vec<f32>,
     /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).

@@ -98,6 +98,11 @@ impl ViewOrder {
         self.order
     }
 
+    /// Steps of an epoch if its views come region by region; 0 for a shuffle, any stretch of which shows all regions.
+    pub fn regional_epoch(&self) -> u32 {
+        if self.order == Order::Shuffle { 0 } else { self.views as u32 }
+    }
+
     fn draw(&mut self, epoch: u64) {
         self.epoch = epoch;
         self.drawn.clear();

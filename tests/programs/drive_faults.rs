@@ -2,7 +2,7 @@
 //! and keeps its last commit; corrupted bytes are reported by name and never used.
 
 use crate::support::faulty_engine::{Fault, Faults, FaultyEngine, Operation};
-use crate::support::scenes::{CLASSIC, stderr, summary, text, train};
+use crate::support::scenes::{classic, stderr, summary, text, train};
 use crate::support::small_drive::Small;
 use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
@@ -368,7 +368,7 @@ fn args<'a>(scene: &'a Path, out: &'a Path, spill: &'a Path) -> Vec<&'a str> {
     let mut args = vec![text(scene), "--out", text(out), "--spill-dir", text(spill), "--spill-codec", "raw"];
     args.extend(["--steps", "60", "--page-rows", "32", "--refine-start", "1000", "--max-gaussians", "7000"]);
     args.extend(["--view-order", "groups:4", "--test-every", "24", "--device", "cpu", "--log-every", "7"]);
-    args.extend(CLASSIC);
+    args.extend(classic(&args));
     args
 }
 

@@ -2,7 +2,7 @@
 //! in flight, whatever goes wrong with a step, and what a trace shows of them.
 
 use crate::support::gpu;
-use crate::support::scenes::{CLASSIC, stderr, summary, text, wide_city};
+use crate::support::scenes::{classic, stderr, summary, text, wide_city};
 use gsscale::gpu::GpuOptions;
 use gsscale::page::format::slot_header::checksum;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
@@ -84,7 +84,7 @@ impl Bench {
         let mut run = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
         // Flags with their values; the last one has none.
         let others = RUN.chunks(2).filter(|flag| !more.contains(&flag[0])).flatten();
-        run.args(of_run).arg("--keep-checkpoint").args(others).args(CLASSIC).args(more);
+        run.args(of_run).arg("--keep-checkpoint").args(others).args(classic(more)).args(more);
         run
     }
 

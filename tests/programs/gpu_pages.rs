@@ -2,7 +2,7 @@
 //! slots, frames, threads and engines, after kills and after a lost device; what crosses the bus; what is refused.
 
 use crate::support::gpu;
-use crate::support::scenes::{CLASSIC, city, psnr, stderr, summary, text, train, wide_city};
+use crate::support::scenes::{city, classic, psnr, stderr, summary, text, train, wide_city};
 use gsscale::gpu::GpuOptions;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -114,7 +114,7 @@ fn a_run_that_is_killed_with_pages_newer_on_the_device_ends_with_the_same_bytes(
     run(&scene, &alone, GROWING, &[]);
     let begin = |args: &[&str]| {
         let program = env!("CARGO_BIN_EXE_gsscale-train");
-        Command::new(program).args(args).args(CLASSIC).stderr(Stdio::null()).spawn().unwrap()
+        Command::new(program).args(args).args(classic(args)).stderr(Stdio::null()).spawn().unwrap()
     };
     let of_run = [text(&scene), "--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0.05"];
     let mut child = begin(&[&of_run[..], GROWING].concat());
@@ -147,7 +147,7 @@ fn run_with_losses(scene: &Path, [out, spill]: [&Path; 2], fault: &str, more: &[
     Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
         .args([text(scene), "--out", text(out), "--spill-dir", text(spill), "--commit-every", "0.005"])
         .args(GROWING)
-        .args(CLASSIC)
+        .args(classic(more))
         .args(more)
         .env("GSSCALE_GPU_FAULT", fault)
         .output()
@@ -185,7 +185,11 @@ fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
     // A run in memory begins again, three times at most.
     let out = folder.path().join("out4");
     let mut again = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    again.args([text(&scene), "--out", text(&out)]).args(GROWING).args(CLASSIC).env("GSSCALE_GPU_FAULT", "lost@40");
+    again
+        .args([text(&scene), "--out", text(&out)])
+        .args(GROWING)
+        .args(classic(GROWING))
+        .env("GSSCALE_GPU_FAULT", "lost@40");
     let output = again.output().unwrap();
     let said = stderr(&output);
     let restarts = said.matches("the run goes on in this process").count();

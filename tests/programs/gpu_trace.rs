@@ -2,7 +2,7 @@
 //! take their time, that neither changes a byte of the result, and what is refused.
 
 use crate::support::gpu;
-use crate::support::scenes::{CLASSIC, city, stderr, text, train, wide_city};
+use crate::support::scenes::{city, classic, stderr, text, train, wide_city};
 use gsscale::gpu::GpuOptions;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -30,7 +30,7 @@ fn spans(path: &Path) -> Vec<Span> {
 /// A run on an emulated bus.
 fn on_bus(bus: &str, args: &[&str]) -> Output {
     let program = env!("CARGO_BIN_EXE_gsscale-train");
-    Command::new(program).args(args).args(CLASSIC).env("GSSCALE_EMULATE_BUS", bus).output().unwrap()
+    Command::new(program).args(args).args(classic(args)).env("GSSCALE_EMULATE_BUS", bus).output().unwrap()
 }
 
 #[test]

@@ -2,7 +2,7 @@
 //! choice of device with its reason.
 
 use crate::support::gpu;
-use crate::support::scenes::{CLASSIC, city, eval, psnr, stderr, summary, text, told, train, wide_city};
+use crate::support::scenes::{city, classic, eval, psnr, stderr, summary, text, told, train, wide_city};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::photo::decode;
@@ -236,7 +236,7 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
         .args(of_run)
         .args(of_drive)
         .args(["--restarts", "0"])
-        .args(CLASSIC)
+        .args(classic(&of_run))
         .env("GSSCALE_GPU_FAULT", "lost@150")
         .output()
         .unwrap();

@@ -1,6 +1,6 @@
 //! The live page (`--serve`): what it answers, that it changes no byte of the result, and what is refused.
 
-use crate::support::scenes::{CLASSIC, city, stderr, text, train, wide_city};
+use crate::support::scenes::{city, classic, stderr, text, train, wide_city};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::Path;
@@ -19,7 +19,7 @@ struct Served {
 fn begin(args: &[&str]) -> Served {
     let mut child = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
         .args(args)
-        .args(CLASSIC)
+        .args(classic(args))
         .args(["--serve", "127.0.0.1:0"])
         .stderr(Stdio::piped())
         .spawn()

@@ -213,15 +213,18 @@ impl TextModel {
     }
 }
 
-/// Keeps lengths and rates as the flags of a test and the defaults say, whatever its number of steps.
-pub const CLASSIC: [&str; 2] = ["--schedule", "classic"];
+/// Keeps lengths, rates and densification as the flags of a test and gsplat's defaults say, whatever the number of steps.
+const CLASSIC: [[&str; 2]; 2] = [["--schedule", "classic"], ["--strategy", "default"]];
 
-/// Runs `gsscale-train` with these arguments, and with [`CLASSIC`] unless they name a schedule or resume a run, which
-/// keeps its own.
+/// The flags of [`CLASSIC`] that these arguments leave open. A run that is resumed keeps its own.
+pub fn classic(args: &[&str]) -> Vec<&'static str> {
+    let is_open = |flag: &&[&str; 2]| !args.contains(&flag[0]) && !args.contains(&"--resume");
+    CLASSIC.iter().filter(is_open).flatten().copied().collect()
+}
+
+/// Runs `gsscale-train` with these arguments and [`classic`].
 pub fn train(args: &[&str]) -> Output {
-    let is_set = args.contains(&CLASSIC[0]) || args.contains(&"--resume");
-    let schedule: &[&str] = if is_set { &[] } else { &CLASSIC };
-    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(schedule).output().unwrap()
+    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(classic(args)).output().unwrap()
 }
 
 /// Standard output, then standard error.

@@ -34,8 +34,7 @@ impl Trainer {
         let started = Instant::now();
         self.drain()?;
         let values = self.mean_values(dataset, targets)?;
-        let count = [self.scene.rows_bound(), self.state.growth.allowed()];
-        let check = rule.check((number, step), count, values, &self.state.growth.checks);
+        let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
         self.state.growth.checks.push(check);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(())

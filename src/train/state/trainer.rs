@@ -397,7 +397,8 @@ impl Trainer {
         }
         self.check_growth(step, dataset, targets)?;
         let scale = self.options.scene_scale;
-        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed() };
+        let regional_epoch = self.order.regional_epoch();
+        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed(), regional_epoch };
         let kinds = self.options.strategy.events_after(step, scale, count, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);

@@ -1,6 +1,6 @@
 //! Runs that are stopped early, and the output of `gsscale-ckpt` on their stores.
 
-use crate::support::scenes::{CLASSIC, stderr, text, train};
+use crate::support::scenes::{classic, stderr, text, train};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
@@ -190,7 +190,7 @@ impl Bench {
 
 fn spawn(args: &[&str]) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    command.args(args).args(CLASSIC).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+    command.args(args).args(classic(args)).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
 /// Sends SIGTERM and waits.

@@ -1,6 +1,6 @@
 //! A small scene and runs on it in which rounds, resets and raises of the SH degree each happen several times.
 
-use crate::support::scenes::{CLASSIC, stderr, summary, text, train};
+use crate::support::scenes::{classic, stderr, summary, text, train};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use serde_json::Value;
 use std::io::Read;
@@ -175,7 +175,7 @@ impl Bench {
 
 fn spawn(args: &[&str]) -> Child {
     let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    command.args(args).args(CLASSIC).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+    command.args(args).args(classic(args)).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
 }
 
 pub fn ply(out: &Path) -> Vec<u8> {
