@@ -71,7 +71,7 @@ fn dry_run_plan_and_run_say_the_same() {
     // Smaller pages take more memory than their rows.
     let in_memory = ["--page-rows", "256"];
     let growth = "--threads 1 --device cpu --refine-start 20 --refine-every 20 --refine-stop 80 --steps 100 \
-                  --image-cache 4MiB --view-order groups:4";
+                  --image-cache 4MiB --view-order groups:4 --strategy default";
     let growth: Vec<&str> = growth.split_whitespace().collect();
     for (name, flags) in [
         ("on a drive, capped", [&growth[..], &on_drive, &["--max-gaussians", "12000"]].concat()),
