@@ -129,7 +129,7 @@ fn steps<R: Renderer>(
     let (mut step, mut hash, mut counts, mut counted) = (0, Hash::default(), Counts::default(), false);
     let mut round = |counted: bool| {
         for (camera, target) in &views {
-            let how = (&options.render, &Comparison::new(target, options.loss));
+            let how = (&options.render, &mut Comparison::new(target, options.loss));
             let done = train_step(
                 &mut scene,
                 &mut working,

@@ -169,7 +169,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
             for (camera, target) in &views {
                 renderer.begin = Some(Instant::now());
                 let at = (step, camera);
-                let how = (&options.render, &Comparison::new(target, options.loss));
+                let how = (&options.render, &mut Comparison::new(target, options.loss));
                 let done =
                     train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };

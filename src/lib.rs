@@ -33,6 +33,7 @@
 //! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
 //! | [`poses`] | where the cameras of photos really stand: a small motion of each, its gradient from those of the rows, its values |
 //! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
+//! | [`photos`] | the one list of what a run learns of each photo: how each kind acts on a step, is saved, and shows in the report |
 //! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
@@ -54,11 +55,11 @@
 //! **A config key**
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
 //!    ([`config::key::Class`]).
+//!    `before` behind the class gives the value that means "as before the key existed", if there is one. Otherwise a run of an older
+//!    program resumes only with `--accept-changes`.
 //! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
 //! 3. `config/limits.rs`: puts the value into the options of the module that uses it. No module but `train` sees the config.
-//! 4. `train/run/changes.rs`, `BEFORE_ITS_TIME`: the value that means "as before the key existed", if there is one. Otherwise a run
-//!    of an older program resumes only with `--accept-changes`.
-//! 5. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
+//! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
 //!    file again, also after a change of a help text. Tests read the words of enumerations from
 //!    [`config::choice::choices`]. The lists below lead here wherever they add a key or a word.
 //!
@@ -84,21 +85,15 @@
 //! 5. Where the time of the term matters: instead of 1 and 2 the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl`
 //!    among the shaders.
 //!
-//! **Parameters of photos**
-//! 1. A file in `appearance/` for what acts on the picture, in `poses/` for what acts on the camera: the change, its
-//!    derivatives, its values by photo.
-//! 2. For the picture: `train/step/comparison.rs` applies the correction. What it needs is a field of
-//!    [`train::step::comparison::Comparison`]; what it finds is a field of
-//!    [`train::step::comparison::Correction`], which the step reads afterwards. `train/state/trainer.rs` and
-//!    `train/preflight/first_look.rs` fill the field, for steps and for the first rehearsal.
-//! 3. For the camera: `Trainer::camera` (`train/state/photos.rs`) is the one camera of plans and steps. A derivative comes from
-//!    the gradients of rows, in `train/step/batch.rs`, and waits for the end of the step in
-//!    [`train::step::working_set::WorkingSet`]. The renderer does not change.
-//! 4. Parameters that are trained are a resumable value, which `train/state/photos.rs` changes after a step that was not skipped.
-//!    `train/state/growth_checks.rs` corrects the pictures of held-out photos as well. `train/state/in_flight.rs` and
-//!    `config/check.rs` say what an optimizer on the device cannot do.
-//! 5. A file of the results: its name in `report/run_files.rs`, its writer beside `train/run/appearance_file.rs`, a call in
-//!    `train/run/run_folder.rs`, a paragraph in `report/run_report.rs`.
+//! **A parameter of photos**
+//! 1. A file in `photos/`: the values, their change of a picture, a photo or a camera, their derivatives, and what they learn, as
+//!    a [`photos::parameter::PhotoParameter`]; its [`photos::parameter::Kind`] names it for commits, and says what the report shows.
+//!    The trait's methods come in the order of a step; what is left out does nothing. Steps, the rehearsal, commits, resumes, the
+//!    forecast, `summary.json` and the report follow. `photos/appearance.rs` acts on pictures, `photos/poses.rs` on
+//!    cameras, `photos/masked_blocks.rs` on photos.
+//! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
+//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. With `before "off"` behind its class, runs of older
+//!    programs resume. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
@@ -110,8 +105,8 @@
 //!
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
-//!    `VERSION` and what the version before lacks, in `check` which values are impossible, and in `fitted_to` what a list of
-//!    another length becomes.
+//!    `VERSION` and what the version before lacks, and in `check` which values are impossible. A value by photo is a
+//!    parameter of photos instead.
 //! 2. `train/state/trainer.rs`: uses `self.state`. Commits and resumes need no change.
 //! 3. `tests/fuzz/targets/map.rs`: the sample state. Only a new format of slots needs a new fixture (`tests/programs/ckpt/fixture.rs`).
 //!
@@ -135,6 +130,7 @@ pub mod optim;
 pub mod outliers;
 pub mod page;
 pub mod paging;
+pub mod photos;
 pub mod poses;
 pub mod render;
 pub mod report;

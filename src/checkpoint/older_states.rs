@@ -1,22 +1,50 @@
 //! Run states of earlier program versions: what they lack. A value that is missing is read as that of a run without it.
 //!
-//! Version 7 lacks first exposures, poses and the trials of growth. Version 6 also lacks blocks of photos, version 5 outliers and checks of
-//! growth, version 4 appearance. Versions 1 to 3 are not read: no program that others use wrote them.
+//! Version 8 has a place in the layout for each kind of values of photos. Version 7 lacks first exposures, poses and the trials of
+//! growth. Version 6 also lacks blocks of photos, version 5 outliers and checks of growth, version 4 appearance. Versions 1 to 3 are
+//! not read: no program that others use wrote them.
 //!
-//! Invariants: 1. missing values stand at the end of the layout, so an older state with [`missing_values`] behind it has the layout of
-//! today, but for the checks of growth ([`OlderGrowth`]); 2. nothing here writes a state.
+//! Invariants: 1. up to version 8, missing values stand at the end of the layout, so an older state with [`missing_values`] behind it
+//! has the layout of version 8, but for the checks of growth ([`OlderGrowth`]); 2. nothing here writes a state.
 
+use super::run_state::End;
 use crate::appearance::state::AppearanceState;
 use crate::densify::growth::{GrowthCheck, GrowthState};
 use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
+use crate::photos::saved::Encoded;
 use crate::poses::state::PoseState;
 use serde::Deserialize;
 
 /// The oldest version that is read, and the newest one that lacks something.
 pub(super) const OLDEST: u32 = 4;
 pub(super) const NEWEST: u32 = 7;
+
+/// The end of the layout up to version 8, with checks of growth as `G`.
+#[derive(Deserialize)]
+#[cfg_attr(test, derive(serde::Serialize))]
+pub(super) struct OlderEnd<G> {
+    pub appearance: AppearanceState,
+    pub outliers: ViewOutliers,
+    pub growth: G,
+    pub blocks: BlockOutliers,
+    pub first_exposures: u32,
+    pub poses: PoseState,
+}
+
+impl<G: Into<GrowthState>> OlderEnd<G> {
+    /// The end of today's layout: values of photos under the names of their kinds.
+    pub(super) fn today(self) -> Result<End, EncodingError> {
+        let values = [
+            ("appearance", Encoded::of(&(self.appearance, self.first_exposures))?),
+            ("outliers", Encoded::of(&self.outliers)?),
+            ("blocks", Encoded::of(&self.blocks)?),
+            ("poses", Encoded::of(&self.poses)?),
+        ];
+        Ok((self.growth.into(), values.map(|(name, values)| (name.to_string(), values)).into()))
+    }
+}
 
 /// Checks of growth before trials.
 #[derive(Deserialize)]
@@ -69,8 +97,9 @@ pub(super) fn missing_values(version: u32) -> Result<Option<Vec<u8>>, EncodingEr
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::checkpoint::run_state::tests::sample;
-    use crate::checkpoint::run_state::{RunState, TrainerState};
+    use crate::checkpoint::run_state::RunState;
+    use crate::checkpoint::run_state::tests::{end_of_8, sample};
+    use serde::Serialize;
 
     fn older_growth(state: &GrowthState) -> OlderGrowth {
         let older = |check: &GrowthCheck| {
@@ -80,32 +109,41 @@ mod tests {
         OlderGrowth { first: state.first, checks: state.checks.iter().map(older).collect() }
     }
 
-    /// The bytes that a program of `version` would have written: those of today without what it lacked.
-    fn older_bytes(state: &RunState, version: u32) -> Vec<u8> {
-        let growth = &state.trainer.growth;
+    /// The sample as a program of `version` would have written it: today's bytes with another end.
+    fn older_bytes<G: Serialize>(end: &OlderEnd<G>, version: u32) -> Vec<u8> {
+        let state = sample();
         let [today, older] =
-            [encoding::to_bytes(growth), encoding::to_bytes(&older_growth(growth))].map(Result::unwrap);
+            [encoding::to_bytes(&(&state.trainer.growth, &state.photos)), encoding::to_bytes(end)].map(Result::unwrap);
         let bytes = state.to_bytes().unwrap();
-        let at = bytes.windows(today.len()).rposition(|part| part == today).unwrap();
-        let mut bytes = [&version.to_le_bytes(), &bytes[4..at], &older, &bytes[at + today.len()..]].concat();
-        let lacking = missing_values(version).unwrap().unwrap();
-        assert!(bytes.ends_with(&lacking));
-        bytes.truncate(bytes.len() - lacking.len());
+        let before = bytes[4..].strip_suffix(&today[..]).unwrap();
+        let mut bytes = [&version.to_le_bytes(), before, &older].concat();
+        if version <= NEWEST {
+            let lacking = missing_values(version).unwrap().unwrap();
+            assert!(bytes.ends_with(&lacking));
+            bytes.truncate(bytes.len() - lacking.len());
+        }
         bytes
     }
 
     #[test]
     fn states_of_earlier_versions_come_back_without_later_values() {
-        let state = sample();
-        let (outliers, blocks) = (ViewOutliers::default(), BlockOutliers::default());
-        let mut of_7 = TrainerState { first_exposures: 0, poses: PoseState::default(), ..state.trainer.clone() };
-        of_7.growth.checks.iter_mut().for_each(|check| check.psnr = 0.0);
-        let of_6 = TrainerState { blocks, ..of_7.clone() };
-        let of_5 = TrainerState { outliers, growth: GrowthState::default(), ..of_6.clone() };
-        let of_4 = TrainerState { appearance: AppearanceState::default(), ..of_5.clone() };
-        for (version, trainer) in (OLDEST..=NEWEST).zip([of_4, of_5, of_6, of_7]) {
-            let without = RunState { trainer, ..state.clone() };
-            assert_eq!(RunState::from_bytes(&older_bytes(&without, version)), Ok(without));
+        let read = |bytes: &[u8]| RunState::from_bytes(bytes).unwrap();
+        assert_eq!(read(&older_bytes(&end_of_8(), 8)), sample());
+        for version in OLDEST..=NEWEST {
+            let OlderEnd { appearance, outliers, growth, blocks, .. } = end_of_8();
+            let has = |since: u32| version >= since;
+            let end = OlderEnd {
+                appearance: if has(5) { appearance } else { AppearanceState::default() },
+                outliers: if has(6) { outliers } else { ViewOutliers::default() },
+                growth: older_growth(&if has(6) { growth } else { GrowthState::default() }),
+                blocks: if has(7) { blocks } else { BlockOutliers::default() },
+                first_exposures: 0,
+                poses: PoseState::default(),
+            };
+            let bytes = older_bytes(&end, version);
+            let mut state = sample();
+            (state.trainer.growth, state.photos) = end.today().unwrap();
+            assert_eq!(read(&bytes), state);
         }
     }
 }

@@ -6,23 +6,22 @@
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
 //! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
-//! `decode`, a new version, and a line in `older_states`.
+//! `decode`, a new version, and a line in `older_states`. A new kind of values of photos changes nothing here: these are encoded
+//! by [`crate::photos`], each kind under its name.
 
-use super::older_states::{OlderGrowth, missing_values};
-use crate::appearance::state::AppearanceState;
+use super::older_states::{OlderEnd, OlderGrowth, missing_values};
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
-use crate::outliers::blocks::BlockOutliers;
-use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
-use crate::poses::state::PoseState;
+use crate::photos;
+use crate::photos::saved::{SavedValues, ValuesError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 8;
+pub const VERSION: u32 = 9;
 
 /// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -105,39 +104,12 @@ pub struct TrainerState {
     pub train_seconds: f64,
     /// The last evaluation on the held-out views, if there was one.
     pub test: Option<LastTest>,
-    /// The values of photos and cameras.
-    pub appearance: AppearanceState,
-    /// State of the views whose photo contradicts the scene.
-    pub outliers: ViewOutliers,
     /// State of the decision about the count.
     pub growth: GrowthState,
-    /// The states of the blocks of photos, from which masks of moving objects follow.
-    pub blocks: BlockOutliers,
-    /// Photos whose exposure started from EXIF data.
-    pub first_exposures: u32,
-    /// The motions of cameras.
-    pub poses: PoseState,
 }
 
-impl TrainerState {
-    /// This state, for a trainer whose initial state is `fresh`. A list by view or by camera of another length than in `fresh` comes from
-    /// an older program or from other photos: that of `fresh` replaces it.
-    pub fn fitted_to(mut self, fresh: TrainerState) -> TrainerState {
-        if !self.appearance.is_as_large_as(&fresh.appearance) {
-            (self.appearance, self.first_exposures) = (fresh.appearance, fresh.first_exposures);
-        }
-        if !self.outliers.is_as_large_as(&fresh.outliers) {
-            self.outliers = fresh.outliers;
-        }
-        if !self.blocks.is_as_large_as(&fresh.blocks) {
-            self.blocks = fresh.blocks;
-        }
-        if !self.poses.is_as_large_as(&fresh.poses) {
-            self.poses = fresh.poses;
-        }
-        self
-    }
-}
+/// The end of the layout.
+pub(super) type End = (GrowthState, SavedValues);
 
 /// The state of a run between two steps, without its pages.
 #[derive(Debug, Clone, PartialEq)]
@@ -148,6 +120,8 @@ pub struct RunState {
     pub device: String,
     /// The state of the trainer.
     pub trainer: TrainerState,
+    /// What the run knows of its photos.
+    pub photos: SavedValues,
     /// The event log.
     pub events: Vec<Event>,
     /// Histogram since the last round: non-empty bins with their numbers of rows.
@@ -176,6 +150,15 @@ pub enum RunStateError {
     Impossible(&'static str),
 }
 
+impl From<ValuesError> for RunStateError {
+    fn from(error: ValuesError) -> RunStateError {
+        match error {
+            ValuesError::Encoding(error) => RunStateError::Encoding(error),
+            ValuesError::Impossible(what) => RunStateError::Impossible(what),
+        }
+    }
+}
+
 impl RunState {
     /// The state of a run of `rows` Gaussians without history: not trained yet, or history unknown.
     pub fn without_past(origin: Origin, device: String, rows: u64) -> RunState {
@@ -184,6 +167,7 @@ impl RunState {
             origin: Origin { dataset, ..origin },
             device,
             trainer: TrainerState::default(),
+            photos: SavedValues::default(),
             events: Vec::new(),
             histogram: Vec::new(),
             rows,
@@ -211,10 +195,11 @@ impl RunState {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
         let state = match version {
-            VERSION => RunState::decode::<GrowthState>(body)?,
+            VERSION => RunState::decode(body, Ok::<End, _>)?,
+            8 => RunState::decode(body, OlderEnd::<GrowthState>::today)?,
             older => {
                 let missing = missing_values(older)?.ok_or(RunStateError::Version(version))?;
-                RunState::decode::<OlderGrowth>(&[body, &missing].concat())?
+                RunState::decode(&[body, &missing].concat(), OlderEnd::<OlderGrowth>::today)?
             }
         };
         state.check()?;
@@ -223,44 +208,37 @@ impl RunState {
 
     /// The values in the order of the layout. Tuples add no byte; serde implements tuples of at most 16 values.
     fn encode(&self) -> Result<Vec<u8>, EncodingError> {
-        let RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic } = self;
+        let RunState { origin, device, trainer, photos, events, histogram, rows, .. } = self;
+        let RunState { rows_bound, metrics_bytes, traffic, .. } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
-        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, .. } = trainer;
-        let TrainerState { test, appearance, outliers, growth, blocks, first_exposures, poses, .. } = trainer;
+        let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, .. } = trainer;
+        let TrainerState { train_seconds, test, growth, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
-            (appearance, outliers, growth, blocks, first_exposures, poses),
+            (growth, photos),
         ))
     }
 
-    /// The counterpart of [`RunState::encode`], with checks of growth as `G`.
-    fn decode<G: DeserializeOwned + Into<GrowthState>>(bytes: &[u8]) -> Result<RunState, EncodingError> {
+    /// The counterpart of [`RunState::encode`]. `today` turns the end of the layout, as a version has it, into that of today.
+    fn decode<E: DeserializeOwned>(
+        bytes: &[u8],
+        today: impl Fn(E) -> Result<End, EncodingError>,
+    ) -> Result<RunState, EncodingError> {
         let (
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
-            (appearance, outliers, growth, blocks, first_exposures, poses),
-        ): (_, _, _, _, (_, _, G, _, _, _)) = encoding::from_bytes(bytes)?;
+            end,
+        ) = encoding::from_bytes(bytes)?;
+        let (growth, photos) = today(end)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
-        let trainer = TrainerState {
-            step,
-            rows_skipped,
-            steps_skipped,
-            steps_skipped_in_a_row,
-            train_seconds,
-            test,
-            appearance,
-            outliers,
-            growth: growth.into(),
-            blocks,
-            first_exposures,
-            poses,
-        };
-        Ok(RunState { origin, device, trainer, events, histogram, rows, rows_bound, metrics_bytes, traffic })
+        let trainer =
+            TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, growth };
+        Ok(RunState { origin, device, trainer, photos, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
 
     /// The events as a log.
@@ -304,13 +282,8 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        let TrainerState { appearance, outliers, growth, blocks, poses, .. } = &self.trainer;
-        let of_photos = appearance
-            .check()
-            .and_then(|()| outliers.check())
-            .and_then(|()| blocks.check())
-            .and_then(|()| poses.check());
-        of_photos.and_then(|()| growth.check(step)).or_else(refuse)
+        photos::check(&self.photos)?;
+        self.trainer.growth.check(step).or_else(refuse)
     }
 }
 
@@ -319,10 +292,14 @@ impl RunState {
 pub(super) mod tests {
     use super::super::older_states::OLDEST;
     use super::*;
+    use crate::appearance::state::AppearanceState;
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
-    use crate::outliers::blocks::look;
+    use crate::outliers::blocks::{BlockOutliers, look};
+    use crate::outliers::views::ViewOutliers;
+    use crate::photos::saved::Encoded;
     use crate::poses::gradient::MotionGradient;
+    use crate::poses::state::PoseState;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 
@@ -343,6 +320,40 @@ pub(super) mod tests {
         poses
     }
 
+    /// The end of the sample in version 8.
+    pub(in crate::checkpoint) fn end_of_8() -> OlderEnd<GrowthState> {
+        OlderEnd {
+            appearance: AppearanceState::new(&[0, 1, 0]),
+            outliers: ViewOutliers::new(3),
+            growth: GrowthState {
+                first: 7,
+                checks: vec![
+                    GrowthCheck {
+                        step: 5,
+                        gaussians: 7,
+                        psnr: 20.0,
+                        lost: 0.5,
+                        pays_from: 0.25,
+                        is_trial: false,
+                        allowed: 10,
+                    },
+                    GrowthCheck {
+                        step: 8,
+                        gaussians: 10,
+                        psnr: 21.0,
+                        lost: -0.5,
+                        pays_from: 0.5,
+                        is_trial: false,
+                        allowed: 10,
+                    },
+                ],
+            },
+            blocks: looked_at(),
+            first_exposures: 2,
+            poses: moved(),
+        }
+    }
+
     pub(in crate::checkpoint) fn sample() -> RunState {
         let thresholds =
             RoundThresholds { grow_grad2d: f32::INFINITY, split_scale: 0.5, prune_opacity: -0.0, prune_scale: 2.0 };
@@ -351,6 +362,7 @@ pub(super) mod tests {
             Event { step: 4, kind: EventKind::Densify(thresholds) },
             Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
         ];
+        let (growth, photos) = end_of_8().today().unwrap();
         RunState {
             origin: Origin {
                 config: "steps = 20\n".to_string(),
@@ -378,35 +390,9 @@ pub(super) mod tests {
                 steps_skipped_in_a_row: 1,
                 train_seconds: 0.1,
                 test: Some(LastTest { step: 8, views: 3, psnr: 21.5, ssim: 0.75 }),
-                appearance: AppearanceState::new(&[0, 1, 0]),
-                outliers: ViewOutliers::new(3),
-                growth: GrowthState {
-                    first: 7,
-                    checks: vec![
-                        GrowthCheck {
-                            step: 5,
-                            gaussians: 7,
-                            psnr: 20.0,
-                            lost: 0.5,
-                            pays_from: 0.25,
-                            is_trial: false,
-                            allowed: 10,
-                        },
-                        GrowthCheck {
-                            step: 8,
-                            gaussians: 10,
-                            psnr: 21.0,
-                            lost: -0.5,
-                            pays_from: 0.5,
-                            is_trial: false,
-                            allowed: 10,
-                        },
-                    ],
-                },
-                blocks: looked_at(),
-                first_exposures: 2,
-                poses: moved(),
+                growth,
             },
+            photos,
             events: events.to_vec(),
             histogram: vec![(3, 1), (32767, 9), (65535, 2)],
             rows: 10,
@@ -432,6 +418,13 @@ pub(super) mod tests {
         }
     }
 
+    /// Values of appearance after a change.
+    fn appearance(change: fn(&mut AppearanceState)) -> SavedValues {
+        let mut state = AppearanceState::new(&[0, 1, 0]);
+        change(&mut state);
+        [("appearance".to_string(), Encoded::of(&(state, 0u32)).unwrap())].into()
+    }
+
     #[test]
     fn impossible_states_are_refused() {
         let refused = |change: fn(&mut RunState)| {
@@ -452,9 +445,10 @@ pub(super) mod tests {
         refused(|s| s.traffic.other_stall_seconds = f64::INFINITY);
         refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { step: 10, ..t }));
         refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
-        refused(|s| s.trainer.appearance.images[0].values[0] = i32::MIN);
-        refused(|s| s.trainer.appearance.images[0].sightings = 1);
-        refused(|s| s.trainer.appearance.cameras[1].falloff[0][0] = f64::NAN);
+        refused(|s| s.photos = appearance(|state| state.images[0].values[0] = i32::MIN));
+        refused(|s| s.photos = appearance(|state| state.images[0].sightings = 1));
+        refused(|s| s.photos = appearance(|state| state.cameras[1].falloff[0][0] = f64::NAN));
+        refused(|s| s.photos = [("of a later program".to_string(), Encoded::default())].into());
         refused(|s| s.trainer.growth.checks.reverse());
         refused(|s| s.trainer.growth.checks[1].step = 10);
         refused(|s| s.trainer.growth.checks[0].lost = f64::NAN);

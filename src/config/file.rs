@@ -44,7 +44,7 @@ pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 /// Longest config file, bytes; a file with every key has some 8 KB.
 const FILE_BYTES_MAX: u64 = 1 << 20;
 macro_rules! config_keys {
-    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident; )+ })+) => {
+    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident $(before $before:literal)*; )+ })+) => {
         /// All keys of a run with their values.
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
@@ -74,7 +74,7 @@ macro_rules! config_keys {
 
         /// Every key, in order.
         pub const KEYS: &[Key] = &[$($(
-            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class },
+            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class, before: &[$($before),*] },
         )+)+];
     };
 }
@@ -157,7 +157,7 @@ config_keys! {
         /// Where the optimizer runs: host, or device (on the GPU that renders, in pages that stay there while --device-mem
         /// has room; with --optimizer deferred, --moments f32 and --growth-score gradient). The two round differently.
         /// auto is host, until device is faster on measured GPUs. A resumed run keeps its place
-        optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers;
+        optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers before "auto" before "host";
         /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk)
         moments: Moments = Moments::F32 => Numbers;
         /// Initial opacity
@@ -171,18 +171,18 @@ config_keys! {
         /// start from the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
-        appearance: AppearanceMode = AppearanceMode::Off => Numbers;
+        appearance: AppearanceMode = AppearanceMode::Off => Numbers before "off";
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
         /// The log and the report name such views with and without this key
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers before "false";
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
         /// side of a masked block is a 64th of the photo's longer side. At most a quarter of a photo is masked, from a tenth
         /// of the run on (step 500 at the latest). Masks of your own work better: see --masks
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers before "false";
         /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
         /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. poses.json has the
         /// refined ones. Not with --optimizer-on device
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers;
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers before "false";
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
@@ -198,7 +198,7 @@ config_keys! {
         /// With --strategy long-axis and no --max-gaussians: draft (few Gaussians), normal or archive (many). The run holds out
         /// some training photos during its first half (at most 1,700 steps). The scene grows as long as more Gaussians bring
         /// these photos enough decibels
-        quality: Quality = Quality::Normal => Numbers;
+        quality: Quality = Quality::Normal => Numbers before "normal";
         /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)
         [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
         /// Step after which densification rounds begin

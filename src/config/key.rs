@@ -1,4 +1,4 @@
-//! A key's heading in help, its meaning, and its class: the effect of a change.
+//! A key's heading in help, its meaning, its class (the effect of a change), and what it was before it existed.
 
 /// A key of the config.
 #[derive(Debug, Clone, Copy)]
@@ -11,6 +11,9 @@ pub struct Key {
     pub meaning: &'static str,
     /// The effect of a change.
     pub class: Class,
+    /// For a newer key, the values under which a run behaves as before the key existed. Without one, the key counts as changed when
+    /// a run of an older program resumes.
+    pub before: &'static [&'static str],
 }
 
 impl Key {

@@ -3,7 +3,6 @@
 
 use super::file::TrainConfig;
 use super::values::Up;
-use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
 use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
@@ -16,6 +15,7 @@ use crate::optim::adam::AdamConfig;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
+use crate::photos::PhotoOptions;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions};
@@ -62,14 +62,8 @@ pub struct RunOptions {
     pub ssim_variant: SsimVariant,
     /// Method of the colour-corrected PSNR; `None` for none.
     pub color_correct: Option<ColorCorrect>,
-    /// Which corrections of the picture are trained.
-    pub appearance: AppearanceMode,
-    /// Whether views that contradict the scene are left out.
-    pub robust_views: bool,
-    /// Whether blocks of photos that contradict the scene are masked.
-    pub robust_pixels: bool,
-    /// Whether the poses of training photos are refined.
-    pub refine_poses: bool,
+    /// What is learnt of each photo.
+    pub photos: PhotoOptions,
     /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
@@ -123,10 +117,7 @@ impl RunOptions {
             scene_scale,
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
-            appearance: config.appearance,
-            robust_views: config.robust_views,
-            robust_pixels: config.robust_pixels,
-            refine_poses: config.refine_poses,
+            photos: photo_options(config, scene_scale),
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),
@@ -143,6 +134,18 @@ impl RunOptions {
     pub fn sh_degree_at(&self, step: u32) -> u8 {
         let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
         raised.max(u32::from(self.sh_degree_start)).min(u32::from(self.sh_degree)) as u8
+    }
+}
+
+/// What a config asks to be learnt of each photo.
+fn photo_options(config: &TrainConfig, scene_scale: f32) -> PhotoOptions {
+    PhotoOptions {
+        appearance: config.appearance,
+        robust_views: config.robust_views,
+        robust_pixels: config.robust_pixels,
+        refine_poses: config.refine_poses,
+        steps: config.steps,
+        scene_scale,
     }
 }
 

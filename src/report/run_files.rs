@@ -19,10 +19,6 @@ pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
 pub const PAGES_FILE: &str = "pages.json";
-/// Exposure and colours of each photo, vignetting of each camera: what `--appearance` has found.
-pub const APPEARANCE_FILE: &str = "appearance.json";
-/// The poses of training photos as `--refine-poses` leaves them.
-pub const POSES_FILE: &str = "poses.json";
 /// Folder of the pictures of the held-out views.
 pub const PICTURES_FOLDER: &str = "renders/test";
 /// PSNR and SSIM of each held-out view, beside its picture.
@@ -44,6 +40,8 @@ pub enum RunFile {
     /// What `--export` writes beside [`PLY_FILE`], in any format. Nothing of a run is removed where a folder of an export holds
     /// files of others.
     Exports,
+    /// What a run has learnt of its photos: a file of each kind of parameters.
+    Photos,
     /// A folder tree of PNG files; other files in it are not ours.
     Pictures(&'static str),
 }
@@ -62,7 +60,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 16] = [
+pub const RUN_FILES: [(RunFile, Tells); 15] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
@@ -72,8 +70,7 @@ pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::Exports, Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),
-    (RunFile::File(APPEARANCE_FILE), Tells::Result),
-    (RunFile::File(POSES_FILE), Tells::Result),
+    (RunFile::Photos, Tells::Result),
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),

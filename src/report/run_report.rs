@@ -4,14 +4,11 @@
 //! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
 use super::chart::{Chart, Mark, smoothed};
-use super::html::{Cell, Page, slider};
+use super::html::{Page, slider};
 use super::numbers::short;
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
-use super::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, POSES_FILE, REPORT_FILE, SUMMARY_FILE,
-    VIEWS_FILE,
-};
+use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
@@ -21,16 +18,20 @@ use std::path::{Path, PathBuf};
 /// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
 /// Most points of a curve.
-const POINTS_MAX: usize = 600;
+pub const POINTS_MAX: usize = 600;
 /// Size limit of a text file, bytes.
 const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
-/// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its pictures.
+/// A part of a report that another room writes, from the folder of the run and its summary.
+pub type Section = fn(&mut Page, &Path, &Value);
+
+/// The report of the run in `folder` as HTML, with `sections` about its photos. `progress(done, all)` is called after each of its
+/// pictures.
 ///
 /// # Errors
 /// The folder holds no metrics, or a picture cannot be decoded.
-pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
+pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
     let scene = summary["scene"].as_str().unwrap_or("").to_string();
@@ -48,10 +49,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.heading("Memory and disk");
         page.charts(&tiers);
     }
-    add_appearance(&mut page, &folder.join(APPEARANCE_FILE));
-    add_poses(&mut page, &folder.join(POSES_FILE));
-    add_outliers(&mut page, &summary);
-    add_masked_share(&mut page, &summary);
+    sections.iter().for_each(|add| add(&mut page, folder, &summary));
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, folder, progress)?;
     page.heading("Config");
@@ -78,12 +76,12 @@ fn why_unfinished(folder: &Path, summary: &Value) -> Option<String> {
     Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
 }
 
-/// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].
+/// Writes the report of the run in `folder` into the folder; returns its path. `sections` and `progress` as for [`run_report`].
 ///
 /// # Errors
 /// As [`run_report`], or the folder cannot be written.
-pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
-    let html = run_report(folder, progress)?;
+pub fn write_run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
+    let html = run_report(folder, sections, progress)?;
     let path = folder.join(REPORT_FILE);
     write_whole(&path, html.as_bytes())?;
     Ok(path)
@@ -94,7 +92,8 @@ pub(super) fn read_text(path: &Path) -> Option<String> {
     (len <= TEXT_BYTES_MAX).then(|| std::fs::read_to_string(path).ok())?
 }
 
-pub(super) fn read_json(path: &Path) -> Option<Value> {
+/// A file of a run; `None` if it is missing, too large, or no JSON.
+pub fn read_json(path: &Path) -> Option<Value> {
     serde_json::from_str(&read_text(path)?).ok()
 }
 
@@ -271,85 +270,6 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let psnr = Chart::new("PSNR of held-out training photos", "step", "dB").with("", of("psnr"), Mark::LineAndDots);
     let allowed = (rows.svg(), "What each check allowed.".to_string());
     page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
-}
-
-/// A chart of the exposures of the photos, if the run has trained them.
-fn add_appearance(page: &mut Page, path: &Path) {
-    let values = read_json(path).unwrap_or(Value::Null);
-    let images = values["images"].as_array().map_or(&[][..], Vec::as_slice);
-    let stops = |(i, image): (usize, &Value)| Some((i as f64, image["exposure"].as_f64()?));
-    let points: Vec<(f64, f64)> = images.iter().enumerate().filter_map(stops).collect();
-    if points.is_empty() {
-        return;
-    }
-    page.heading("Appearance");
-    let stride = points.len().div_ceil(POINTS_MAX);
-    let points = points.into_iter().step_by(stride).collect();
-    let chart = Chart::new("Exposure", "photo, by name", "stops").with("", points, Mark::LineAndDots);
-    let first = match values["exposures_from_exif"].as_u64() {
-        None | Some(0) => String::new(),
-        Some(count) => format!(" {count} exposures started from EXIF data."),
-    };
-    let caption = format!(
-        "Exposure of each training photo against the mean of all, as trained.{first} appearance.json has the numbers."
-    );
-    page.charts(&[(chart.svg(), caption)]);
-}
-
-/// How far the run has moved the cameras of its photos, if it refines poses.
-fn add_poses(page: &mut Page, path: &Path) {
-    let file = read_json(path).unwrap_or(Value::Null);
-    let of = |what: &str, which: &str| file[what][which].as_f64();
-    let (Some(median), Some(largest), Some(scale)) =
-        (of("shift", "median"), of("shift", "largest"), file["scene_scale"].as_f64())
-    else {
-        return;
-    };
-    let [turn, most] = ["median", "largest"].map(|which| of("turn_degrees", which).unwrap_or_default());
-    page.heading("Poses");
-    page.paragraph(&format!(
-        "The run has refined the poses of {} training photos (--refine-poses): against the dataset their cameras moved by {:.2} % \
-         of the scene's scale (median; {:.2} % at most) and turned by {turn:.2} degrees ({most:.2} at most). poses.json has the \
-         refined poses.",
-        file["refined"],
-        100.0 * median / scale,
-        100.0 * largest / scale,
-    ));
-}
-
-/// The training views whose photo contradicts the scene, if there are any.
-fn add_outliers(page: &mut Page, summary: &Value) {
-    let views = summary["outlier_views"].as_array().map_or(&[][..], Vec::as_slice);
-    if views.is_empty() {
-        return;
-    }
-    page.heading("Photos that contradict the scene");
-    page.paragraph(
-        "These training photos differ from their pictures far more than others do: a wrong pose, another place, another \
-         exposure. Unexplained is the squared error over the variance of the photo; it is above 1 where a plain grey would be \
-         closer. Check these photos and their poses, or leave them out with --robust-views.",
-    );
-    let state = |view: &Value| if view["is_left_out"] == true { "left out" } else { "trained on" };
-    page.table(
-        views,
-        &[
-            ("photo", &|view| Cell::text(view["name"].as_str().unwrap_or_default())),
-            ("unexplained", &|view| Cell::number(view["unexplained"].as_f64(), 2)),
-            ("", &|view| Cell::text(state(view))),
-        ],
-    );
-}
-
-/// How much of the photos is masked because it shows what the scene does not, if the run masks such blocks.
-fn add_masked_share(page: &mut Page, summary: &Value) {
-    let Some(share) = summary["masked_share"].as_f64() else { return };
-    page.heading("Parts of photos that contradict the scene");
-    page.paragraph(&format!(
-        "At the end, {:.1} % of the area of the training photos did not count (--robust-pixels), because it differs from the \
-         pictures as cars, people or shadows that moved do. Much more than such things take suggests wrong poses or changing \
-         exposures.",
-        100.0 * share
-    ));
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

@@ -174,7 +174,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let how = (&options.render, &Comparison::new(&target, options.loss));
+        let how = (&options.render, &mut Comparison::new(&target, options.loss));
         train_step(
             &mut pages,
             &mut working,

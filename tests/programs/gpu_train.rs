@@ -285,7 +285,7 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
     for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
         let view = &dataset.views[view];
         let target = decode(&view.photo).unwrap();
-        let how = (&options.render, &Comparison::new(&target, options.loss));
+        let how = (&options.render, &mut Comparison::new(&target, options.loss));
         let at = (step as u32, &view.camera);
         let done =
             train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX).unwrap();

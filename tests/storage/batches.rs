@@ -83,7 +83,7 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-    let how = (&render, &Comparison::new(&target, options.loss));
+    let how = (&render, &mut Comparison::new(&target, options.loss));
     train_step(scene, &mut working, &mut HostRows::new(&mut renderer), (step, &camera), how, false, usize::MAX)
 }
 

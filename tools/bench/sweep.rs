@@ -13,6 +13,7 @@ use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::values::ByteSize;
+use gsscale::photos::outlier_views;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
@@ -274,7 +275,7 @@ impl Sweep {
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
-        record.outlier_views = summary.outlier_views.into_iter().map(|view| view.name).collect();
+        record.outlier_views = outlier_views::names_in(&read_json(&folder.join(SUMMARY_FILE))?);
         record.seconds = summary.train_seconds;
         record.cpu_seconds = summary.costs.train_cpu_seconds;
         record.stall_seconds = summary.costs.train_stall_seconds;

@@ -17,6 +17,7 @@ use crate::config::file::TrainConfig;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitError, Commits};
 use crate::paging::stats::SlotSpace;
+use crate::photos;
 use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
 use crate::train::log::report::MetricsLog;
@@ -253,7 +254,7 @@ impl Checkpoint {
         let cut = Instant::now();
         trainer.drain()?;
         let pager_seconds = trainer.scene.pager.commit_seconds();
-        let state = trainer.run_state(origin, metrics.sync()?);
+        let state = trainer.run_state(origin, metrics.sync()?)?;
         let run_state = bytes_of(&state)?;
         trainer.scene.pager.freeze()?;
         self.beside = Some(Beside { run_state, step: state.trainer.step, cut, waited: cut.elapsed(), pager_seconds });
@@ -304,7 +305,7 @@ impl Checkpoint {
         let Some(commits) = &mut self.commits else { return Ok(()) };
         let written = trainer.scene.pager.stats().bytes_written;
         trainer.scene.pager.flush()?;
-        let state = trainer.run_state(origin, metrics.sync()?);
+        let state = trainer.run_state(origin, metrics.sync()?)?;
         let note = format!("step {}", state.trainer.step);
         trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
         self.name = None;
@@ -354,31 +355,45 @@ fn is_late(beside: &Beside) -> bool {
     beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS
 }
 
+/// The error of a state that cannot be encoded.
+fn invalid(why: impl std::fmt::Display) -> CommitError {
+    CommitError::Contradiction(why.to_string())
+}
+
 fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
-    state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))
+    state.to_bytes().map_err(invalid)
 }
 
 impl Trainer {
     /// The run state between two steps, without the pages.
-    pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> RunState {
-        RunState {
+    ///
+    /// # Errors
+    /// A value cannot be encoded; none of a valid state.
+    pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> Result<RunState, CommitError> {
+        Ok(RunState {
             origin: origin.clone(),
             device: self.renderer.device(),
             trainer: self.state.clone(),
+            photos: photos::save(&self.photos).map_err(invalid)?,
             events: self.events().events().to_vec(),
             histogram: self.scene.histogram.filled(),
             rows: self.scene.rows(),
             rows_bound: self.scene.rows_bound(),
             metrics_bytes,
             traffic: self.scene.pager.stats(),
-        }
+        })
     }
 
     /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
     /// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
-    pub fn restore(&mut self, state: &RunState) {
-        self.state = state.trainer.clone().fitted_to(std::mem::take(&mut self.state));
+    ///
+    /// # Errors
+    /// No run can have written the values of photos; those of a decoded state are checked.
+    pub fn restore(&mut self, state: &RunState) -> Result<(), CommitError> {
+        photos::restore(&mut self.photos, &state.photos).map_err(invalid)?;
+        self.state = state.trainer.clone();
         self.scene.pager.restore_stats(state.traffic);
+        Ok(())
     }
 }
 

@@ -16,6 +16,8 @@ use crate::paging::stats::PagerStats;
 use crate::render::color_correct::ColorCorrect;
 use crate::train::step::device_tier::SlotTraffic;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -156,17 +158,6 @@ pub struct StepCosts {
     pub drive_bytes_peak: u64,
 }
 
-/// A training view whose photo contradicts the scene that the others agree on.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct OutlierView {
-    /// Its name.
-    pub name: String,
-    /// Share of the photo's variance that its picture leaves unexplained; above 1 where a grey picture would be closer.
-    pub unexplained: f64,
-    /// Whether the run has left it out (`--robust-views`).
-    pub is_left_out: bool,
-}
-
 /// Content of summary.json.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summary {
@@ -192,13 +183,10 @@ pub struct Summary {
     pub rows_skipped_non_finite: u64,
     /// Steps skipped because the loss was not finite, or gradients of more than .01 % of the Gaussians in view.
     pub steps_skipped_non_finite: u32,
-    /// Training views whose photo contradicts the scene, by name.
-    #[serde(skip_serializing_if = "Vec::is_empty", default)]
-    pub outlier_views: Vec<OutlierView>,
-    /// Share of the blocks of training photos that are masked because they show what the scene does not; absent without
-    /// `--robust-pixels`.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub masked_share: Option<f64>,
+    /// Figures of what the run has learnt of its photos ([`crate::photos`]). They are written only: a list of unknown names would
+    /// read those of other fields too.
+    #[serde(flatten, skip_deserializing)]
+    pub photos: BTreeMap<&'static str, Value>,
     /// Costs of the steps alone.
     #[serde(flatten)]
     pub costs: StepCosts,

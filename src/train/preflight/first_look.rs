@@ -6,12 +6,13 @@
 
 use super::plan;
 use super::probe::Probe;
-use crate::appearance::picture::{Lens, Look};
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::photos::first_parameters;
+use crate::photos::parameter::PhotoStep;
 use crate::render::RenderOptions;
 use crate::render::cpu::CpuRenderer;
 use crate::scene::image::Target;
@@ -25,7 +26,7 @@ use crate::train::memory::largest_view::largest_view;
 use crate::train::start::first_scene::Start;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::batch::HostRows;
-use crate::train::step::comparison::{BlocksBefore, Comparison};
+use crate::train::step::comparison::Comparison;
 use crate::train::step::pages::{PageRules, PagedScene};
 use crate::train::step::train_step::train_step;
 use crate::train::step::working_set::WorkingSet;
@@ -161,12 +162,13 @@ impl World<'_> {
         let mut working = WorkingSet::default();
         let rgb = vec![0; 3 * camera.pixels()];
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let mode = options.appearance;
-        let look = mode.is_on().then(|| (mode, Look { lens: Lens::of(&camera), ..Look::default() }));
-        let blocks = options.robust_pixels.then_some(BlocksBefore::default());
-        let comparison = Comparison { look, blocks, ..Comparison::new(&target, options.loss) };
+        let mut photos = first_parameters(&options.photos, &self.start.dataset);
+        let events = scene.events();
+        let at = PhotoStep { view, step: 0, camera: &camera, events, is_left_out: false, is_rehearsal: true };
+        photos.iter_mut().for_each(|parameter| parameter.begin_step(&at));
+        let mut comparison = Comparison { photos: &mut photos, ..Comparison::new(&target, options.loss) };
         let mut step = |number| {
-            let (what, how) = ((number, &camera), (&render, &comparison));
+            let (what, how) = ((number, &camera), (&render, &mut comparison));
             let began = Instant::now();
             train_step(&mut scene, &mut working, &mut HostRows::new(&mut *renderer), what, how, false, usize::MAX)?;
             Ok::<_, TrainError>(began.elapsed().as_secs_f64())

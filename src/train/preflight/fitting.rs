@@ -59,10 +59,18 @@ impl Trainer {
             self.rendered_rows = 0;
         }
         let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree()) as u64;
-        if is_too_large(self.working.bytes() as u64, working_due) && self.working.shrink_to(visible as usize) {
-            self.whole_rows = 0;
+        if is_too_large(self.working.bytes() as u64, working_due) {
+            self.shrink_working_set(visible as usize);
         }
         self.row_bytes_due = if rows <= self.rendered_rows { 0 } else { due };
+    }
+
+    /// Frees the memory of a working set that has room for many more than `rows` rows, and what photos take beside it.
+    fn shrink_working_set(&mut self, rows: usize) {
+        if self.working.shrink_to(rows) {
+            self.photos.iter_mut().for_each(|parameter| parameter.free_buffers());
+            self.whole_rows = 0;
+        }
     }
 
     /// [`Trainer::fit_frames`] for the camera that sees the most pages, before pictures outside of steps.
@@ -92,9 +100,7 @@ impl Trainer {
             // Between the passes, the batches keep the numbers of their rows in view.
             let numbers = (rows as f64 * self.visible_share) as u64 * size_of::<u32>() as u64;
             (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1] + numbers, row_bytes);
-            if self.working.shrink_to(self.pages_most.saturating_mul(self.options.page_rows)) {
-                self.whole_rows = 0;
-            }
+            self.shrink_working_set(self.pages_most.saturating_mul(self.options.page_rows));
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();

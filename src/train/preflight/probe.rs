@@ -4,8 +4,6 @@ use super::device_memory;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::outliers::blocks::BlockOutliers;
-use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
@@ -91,7 +89,7 @@ pub fn estimate(
     let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
     let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + config.export.memory_bytes();
-    let base = base + blocks_bytes(config, dataset);
+    let base = base + trainer.photos.iter().map(|parameter| parameter.value_bytes(dataset)).sum::<u64>();
     let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
         // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.
@@ -112,13 +110,4 @@ pub fn estimate(
         }
     });
     Ok((memory, ViewTimes { seconds, visible_share: visible as f64 / rows.max(1) as f64 }))
-}
-
-/// Bytes of the states of blocks of photos, with the two copies that a commit makes.
-fn blocks_bytes(config: &TrainConfig, dataset: &Dataset) -> u64 {
-    let of_view = |view: usize| {
-        let Camera { width, height, .. } = dataset.views[view].camera;
-        BlockOutliers::bytes_of_view(width, height)
-    };
-    if config.robust_pixels { 3 * dataset.train_views().into_iter().map(of_view).sum::<u64>() } else { 0 }
 }

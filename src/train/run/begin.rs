@@ -244,7 +244,7 @@ pub(super) fn plan_and_train(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
-    trainer.begin_exposures(dataset).iter().for_each(|warning| eprintln!("warning: {warning}"));
+    trainer.start_photos(dataset).iter().for_each(|warning| eprintln!("warning: {warning}"));
     let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver))?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
@@ -304,10 +304,8 @@ fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: 
         Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
         Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
     };
-    let photos = match trainer.first_exposures() {
-        0 => String::new(),
-        count => format!("photos  {count} exposures start from EXIF data\n"),
-    };
+    let of_photos = trainer.photos.iter().filter_map(|parameter| parameter.plan_text());
+    let photos: String = of_photos.map(|text| format!("photos  {text}\n")).collect();
     let text = format!(
         "scene   {}: {} views to train on, {} held out, at most {size}\n\
          {photos}\

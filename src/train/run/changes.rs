@@ -14,18 +14,6 @@ use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};
 use serde::Deserialize;
 use std::path::Path;
 
-/// For each newer key, the value under which a run behaves as before the key existed. A key that is missing in this list counts as
-/// changed when a run of an older program resumes.
-const BEFORE_ITS_TIME: [(&str, &str); 7] = [
-    ("appearance", "off"),
-    ("robust-views", "false"),
-    ("robust-pixels", "false"),
-    ("refine-poses", "false"),
-    ("quality", "normal"),
-    ("optimizer-on", "auto"),
-    ("optimizer-on", "host"),
-];
-
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
 /// (numbers, length, place of the checkpoint).
 ///
@@ -86,12 +74,12 @@ impl Changes {
         let (there, here) = (table(&then)?, table(config)?);
         let mut changes = Changes::default();
         for (name, now) in &here {
-            let Some(class) = KEYS.iter().find(|key| key.name() == *name).map(|key| key.class) else { continue };
+            let Some(&Key { class, before, .. }) = KEYS.iter().find(|key| key.name() == *name) else { continue };
             // A key unknown to the older commit counts as a difference, so that the user sees its default.
             // It counts as known if the programs of that time can only have done one thing.
             let was_done = |value: &toml::Value| {
                 let value = value.as_str().map_or_else(|| value.to_string(), String::from);
-                BEFORE_ITS_TIME.contains(&(name.as_str(), value.as_str()))
+                before.contains(&value.as_str())
             };
             let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
             if class.is_derived() || then == Some(now) {

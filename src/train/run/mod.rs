@@ -2,7 +2,6 @@
 //!
 //! [`begin`] is the page to read first.
 
-mod appearance_file;
 pub mod begin;
 mod changes;
 pub mod costs;
@@ -11,7 +10,6 @@ mod more_steps;
 pub mod out_folder;
 mod outgrown;
 pub mod page_map;
-mod poses_file;
 pub mod request;
 pub mod restart;
 pub mod resume;

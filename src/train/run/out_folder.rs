@@ -11,6 +11,7 @@ use crate::config::residence::checkpoint_folder;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
+use crate::photos;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
 use crate::train::error::TrainError;
 use crate::train::log::facts::read_resolved;
@@ -196,6 +197,7 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
         RunFile::Exports => exports(out).try_for_each(|(format, file)| format.remove(&file)),
+        RunFile::Photos => photos::files().try_for_each(|name| remove_file(&out.join(name))),
         RunFile::Pictures(folder) => {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
         }

@@ -5,13 +5,11 @@
 //! Invariants: 1. a run that is stopped or fails after its first step still writes the PLY of its last good step; 2. the
 //! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past.
 
-use super::appearance_file::write_appearance;
 use super::changes::with_absolute_paths;
 use super::costs::Meter;
 use super::live::LivePage;
 use super::out_folder;
 use super::page_map::write_page_map;
-use super::poses_file::write_poses;
 use super::request::{RunOutcome, RunRequest};
 use super::training_loop::LoopOutputs;
 use crate::base::error::{InputError, InputResult};
@@ -26,9 +24,8 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
-use crate::report::run_files::{
-    APPEARANCE_FILE, CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, POSES_FILE, SUMMARY_FILE,
-};
+use crate::photos;
+use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::error::TrainError;
@@ -40,6 +37,7 @@ use crate::train::log::report::{MetricsLog, StepCosts, Summary, TestMetrics, wri
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The past of a resumed run.
@@ -179,15 +177,14 @@ pub(super) fn train_into(
         test: tested.as_ref().ok().copied().flatten(),
         // A run without its evaluation is not finished: a resume evaluates it.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
-        outlier_views: trainer.outlier_views(dataset),
+        photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
     };
     write_summary(&out.join(SUMMARY_FILE), &summary)?;
     write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
-    write_appearance(&out.join(APPEARANCE_FILE), dataset, &trainer)?;
-    write_poses(&out.join(POSES_FILE), dataset, &trainer)?;
+    trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
     write_report(request)?;
     tested?;
     tiers.is_done = summary.finished;
@@ -251,7 +248,7 @@ fn write_report(request: &RunRequest) -> InputResult<()> {
         let count = || Count::new("pictures put into the report", all as u32, request.quiet);
         shown.get_or_init(count).show(done as u32);
     };
-    write_run_report(&request.out, &show)?;
+    write_run_report(&request.out, &photos::sections(), &show)?;
     Ok(())
 }
 
@@ -293,8 +290,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         finished: false,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
-        outlier_views: Vec::new(),
-        masked_share: trainer.masked_share(),
+        photos: BTreeMap::new(),
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
         tiers: trainer.tier_traffic(),

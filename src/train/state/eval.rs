@@ -243,7 +243,7 @@ pub fn evaluate_ply(
         pictures: extras.pictures,
         lpips: of_lpips,
         color_correct: run.color_correct,
-        appearance: run.appearance,
+        appearance: run.photos.appearance,
         progress: &|done| shown.show(done),
     };
     let (mut renderer, word) = machine::renderer(config)?;

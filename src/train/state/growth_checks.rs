@@ -45,6 +45,7 @@ impl Trainer {
     fn mean_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<[f64; 2], TrainError> {
         let views: Vec<usize> = self.held_out.positions().iter().map(|&at| self.train_views[at]).collect();
         self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
+        let corrects = self.photos.iter().any(|parameter| parameter.corrects());
         let render = self.render_options();
         let mut values: Vec<[f64; 2]> = Vec::with_capacity(views.len());
         for (i, &view) in views.iter().enumerate() {
@@ -60,7 +61,7 @@ impl Trainer {
                 loss: &self.options.loss,
                 pages_most: self.pages_most,
                 // A photo that was never trained on has no exposure yet.
-                correct: self.options.appearance.is_on().then_some(ColorCorrect::Affine),
+                correct: corrects.then_some(ColorCorrect::Affine),
             };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let [whole, without] = psnr_without_faint(now, &mut *self.renderer, &compared)?;

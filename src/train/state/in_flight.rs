@@ -31,14 +31,14 @@ impl Trainer {
         &mut self,
         (dataset, targets): (&Dataset, &TargetCache),
         view: usize,
-        comparison: &Comparison<'_>,
+        (target, is_left_out): (&Target, bool),
     ) -> Result<StepOutcome, TrainError> {
         let (step, render) = (self.state.step, self.render_options());
         if let Some(error) = self.ahead_failed.take() {
             return Err(error);
         }
         if !self.is_ahead() && self.compares_plainly() {
-            self.record(dataset, (0, comparison.target))?;
+            self.record(dataset, (0, target))?;
         }
         if self.is_ahead() {
             self.record_next(dataset, targets)?;
@@ -53,14 +53,13 @@ impl Trainer {
         let tier = DeviceTier::of_run(&mut self.device, scene, renderer, self.options.steps)?;
         let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         let (camera, collects) = (&dataset.views[view].camera, self.options.strategy.collects(step));
-        train_step(scene, working, &mut rows, (step, camera), (&render, comparison), collects, self.pages_most)
+        let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
+        train_step(scene, working, &mut rows, (step, camera), (&render, &mut comparison), collects, self.pages_most)
     }
 
     /// Whether pictures are compared with photos without correction or masks, so that no step needs its picture on the host.
     fn compares_plainly(&self) -> bool {
-        let options = &self.options;
-        let is_plain = !options.appearance.is_on() && !options.robust_pixels && !options.robust_views;
-        is_plain && !options.strategy.needs_weights()
+        !self.photos.iter().any(|parameter| parameter.needs_host()) && !self.options.strategy.needs_weights()
     }
 
     /// Records the step `ahead` steps from now, whose photo is `target`. False if the step cannot be recorded now.

@@ -10,7 +10,6 @@
 
 use super::eval::{EvalRequest, evaluate};
 use super::held_out::HeldOut;
-use crate::appearance::state::{AppearanceState, camera_groups};
 use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
@@ -19,11 +18,8 @@ use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::RowCount;
 use crate::optim::method::{Method, OptimizerPlace};
-use crate::outliers::blocks::BlockOutliers;
-use crate::outliers::views::ViewOutliers;
 use crate::paging::pager::{Pager, PagerConfig};
-use crate::poses::gradient::MotionSum;
-use crate::poses::state::PoseState;
+use crate::photos::{PhotoParameters, first_parameters};
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::camera::Camera;
@@ -35,7 +31,7 @@ use crate::train::error::TrainError;
 use crate::train::log::report::{TestMetrics, TierTraffic};
 use crate::train::memory::budget::HostBudget;
 use crate::train::step::batch::HostRows;
-use crate::train::step::comparison::{BlocksBefore, Comparison};
+use crate::train::step::comparison::Comparison;
 use crate::train::step::dense::settle_all;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::pages::PagedScene;
@@ -62,10 +58,10 @@ pub struct Trainer {
     pub(crate) train_views: Vec<usize>,
     /// Training views that the run decides its count by.
     pub(crate) held_out: HeldOut,
-    /// For each view, the number of its group of equal cameras; empty if the run corrects nothing.
-    pub(super) camera_groups: Vec<usize>,
+    /// What the run knows of its photos.
+    pub(crate) photos: PhotoParameters,
     pub(crate) working: WorkingSet,
-    /// Everything that a commit saves and a resume restores, besides the pages.
+    /// Everything that a commit saves and a resume restores, besides the pages and what is known of photos.
     pub(crate) state: TrainerState,
     /// A step failed after it had changed rows, so the state must not be committed.
     pub(crate) is_torn: bool,
@@ -143,26 +139,17 @@ impl Trainer {
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
-        let is_on = options.appearance.is_on();
-        let refined = if options.refine_poses { dataset.views.len() } else { 0 };
-        let camera_groups = camera_groups(dataset.views.iter().filter(|_| is_on).map(|view| &view.camera));
         Trainer {
             scene,
             order: view_order(options.view_order, options.seed, dataset),
             held_out: HeldOut::new(&options.strategy, train_views.len()),
             train_views,
+            photos: first_parameters(&options.photos, dataset),
             working: WorkingSet::default(),
             renderer,
             device: None,
             options,
-            state: TrainerState {
-                appearance: AppearanceState::new(&camera_groups),
-                outliers: ViewOutliers::new(dataset.views.len()),
-                blocks: BlockOutliers::new(dataset.views.len()),
-                poses: PoseState::new(refined),
-                ..TrainerState::default()
-            },
-            camera_groups,
+            state: TrainerState::default(),
             is_torn: false,
             budget: None,
             pages_most: usize::MAX,
@@ -196,12 +183,11 @@ impl Trainer {
             let camera = &self.camera(dataset, view);
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-            let look = self.look(view, camera);
-            let blocks = self.options.robust_pixels.then_some(BlocksBefore::default());
-            let comparison = Comparison { look, blocks, ..Comparison::new(&target, self.options.loss) };
+            self.begin_step_of_photo(view, camera, false, true);
+            let mut comparison = Comparison { photos: &mut self.photos, ..Comparison::new(&target, self.options.loss) };
             let now = (&mut self.scene, self.state.step, &mut self.working);
             let began = Instant::now();
-            let rows = rehearse(now, &mut *self.renderer, camera, (&render, &comparison), self.pages_most)?;
+            let rows = rehearse(now, &mut *self.renderer, camera, (&render, &mut comparison), self.pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
@@ -231,7 +217,8 @@ impl Trainer {
     /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
     pub fn view_bytes(&self) -> [u64; 2] {
         let due = self.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
-        [self.working.bytes() as u64, self.renderer.host_bytes() + due + self.working.correction.bytes()]
+        let photos: u64 = self.photos.iter().map(|parameter| parameter.buffer_bytes()).sum();
+        [self.working.bytes() as u64, self.renderer.host_bytes() + due + photos]
     }
 
     /// The options.
@@ -301,13 +288,9 @@ impl Trainer {
         drop(photo);
         let started = Instant::now();
         let render = self.render_options();
-        let look = self.look(view, &dataset.views[view].camera);
-        let is_left_out = self.options.robust_views && self.state.outliers.is_named(view);
-        let states = self.state.blocks.of_view(view).to_vec();
-        let blocks = if is_left_out { None } else { self.blocks_before(&states) };
-        let comparison = Comparison { target: &target, loss: self.options.loss, look, blocks, is_left_out };
+        let is_left_out = self.photos.iter().any(|parameter| parameter.leaves_out(view));
         let stepped = loop {
-            let stepped = self.attempt((dataset, targets), view, (&render, &comparison));
+            let stepped = self.attempt((dataset, targets), view, &render, (&target, is_left_out));
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
@@ -326,11 +309,8 @@ impl Trainer {
             settle_all(&mut self.scene, self.state.step + 1)?;
             self.is_torn = false;
         }
-        self.learn_appearance(view, &outcome);
-        self.learn_blocks(view, &outcome);
-        self.learn_pose(view, &outcome);
+        self.end_step_of_photo(view, &outcome, &target, dataset);
         self.state.step += 1;
-        self.judge_views(view, &outcome, &target, dataset);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(outcome)
     }
@@ -340,16 +320,19 @@ impl Trainer {
         &mut self,
         inputs: (&Dataset, &TargetCache),
         view: usize,
-        how: (&RenderOptions, &Comparison<'_>),
+        render: &RenderOptions,
+        (target, is_left_out): (&Target, bool),
     ) -> Result<StepOutcome, TrainError> {
-        if self.options.optimizer_on == OptimizerPlace::Device {
-            return self.step_on_device(inputs, view, how.1);
-        }
         let (step, camera) = (self.state.step, &self.camera(inputs.0, view));
-        self.working.motion = self.refines_pose(how.1).then(MotionSum::default);
+        self.begin_step_of_photo(view, camera, is_left_out, false);
+        if self.options.optimizer_on == OptimizerPlace::Device {
+            return self.step_on_device(inputs, view, (target, is_left_out));
+        }
+        let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
         let collects = self.options.strategy.collects(step);
         let mut rows = HostRows::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
+        let how = (render, &mut comparison);
         train_step(scene, working, &mut rows, (step, camera), how, collects, self.pages_most)
     }
 
@@ -446,7 +429,7 @@ impl Trainer {
             pictures,
             lpips: None,
             color_correct: self.options.color_correct,
-            appearance: self.options.appearance,
+            appearance: self.options.photos.appearance,
             progress,
         };
         let now = (&mut self.scene, self.state.step, &mut self.working);

@@ -114,6 +114,11 @@ pub trait RowBackend {
         working: &mut WorkingSet,
     ) -> Result<(), TrainError>;
 
+    /// Whether the working set has the rows of a batch and their gradients after [`RowBackend::rows_out`].
+    fn has_gradients(&self) -> bool {
+        false
+    }
+
     /// Applies the gradients to the pages: optimizer, bounds and, if `collects`, densification statistics.
     ///
     /// # Errors
@@ -160,6 +165,10 @@ impl RowBackend for HostRows<'_> {
         self.renderer
     }
 
+    fn has_gradients(&self) -> bool {
+        true
+    }
+
     /// The frames hold the rows.
     fn before_events(&mut self, _: &PagedScene, _: &mut [PinnedPage]) -> Result<(), TrainError> {
         Ok(())
@@ -182,19 +191,15 @@ impl RowBackend for HostRows<'_> {
         scene: &mut PagedScene,
         (batch, is_again): (usize, bool),
         pinned: &[PinnedPage],
-        AtStep { step, camera }: AtStep<'_>,
+        AtStep { step, .. }: AtStep<'_>,
         working: &mut WorkingSet,
     ) -> Result<(), TrainError> {
-        let WorkingSet { row_from_working, columns, gradients, motion, .. } = working;
+        let WorkingSet { row_from_working, columns, gradients } = working;
         if is_again {
             let rules = &scene.rules;
             catch_up::gather(&row_tables(pinned), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
         }
-        self.renderer.rows_out(batch, columns, gradients)?;
-        if let Some(motion) = motion {
-            motion.add(columns, &gradients.columns, camera, scene.rules.sh_degree());
-        }
-        Ok(())
+        Ok(self.renderer.rows_out(batch, columns, gradients)?)
     }
 
     fn update(
@@ -206,7 +211,7 @@ impl RowBackend for HostRows<'_> {
         working: &WorkingSet,
         collects: bool,
     ) -> Result<UpdateCounts, TrainError> {
-        let WorkingSet { row_from_working, columns, gradients, .. } = working;
+        let WorkingSet { row_from_working, columns, gradients } = working;
         let size = [camera.width, camera.height];
         let input = StepGradients { step, rows: row_from_working, columns, gradients, size };
         let counts = update_pages(scene, pinned, &input, collects);

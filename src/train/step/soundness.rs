@@ -13,8 +13,6 @@ use crate::train::error::TrainError;
 
 /// Consecutive unsound steps that end a run.
 const UNSOUND_STEPS_MAX: u32 = 3;
-/// Most names of views that a message lists.
-const NAMES_LISTED: usize = 20;
 
 /// The steps since a row was last rewritten, in this process.
 #[derive(Debug, Clone, Copy, Default)]
@@ -89,25 +87,6 @@ pub(crate) fn note_soundness(
     };
     let (problem, count) = (problem_of(outcome), state.steps_skipped_in_a_row);
     Err(TrainError::NonFinite { problem, step, view: view.to_string(), count, remedy })
-}
-
-/// Names views that have become outliers.
-pub(crate) fn warn_of_outliers(found: &[usize], step: u32, are_left_out: bool, dataset: &Dataset) {
-    if found.is_empty() {
-        return;
-    }
-    let names: Vec<&str> = found.iter().take(NAMES_LISTED).map(|&view| dataset.views[view].name.as_str()).collect();
-    let more = found.len().saturating_sub(NAMES_LISTED);
-    let names = names.join(", ") + &if more > 0 { format!(" and {more} more") } else { String::new() };
-    let (are, remedy) = match are_left_out {
-        true => ("are left out from here on", "check them"),
-        false => ("contradict the scene", "check them, or leave such views out with --robust-views"),
-    };
-    eprintln!(
-        "warning: step {step}: the photos of {} {are}, because they differ from their pictures far more than \
-         others do (a wrong pose, another place, another exposure); {remedy}: {names}",
-        if found.len() == 1 { String::from("a view") } else { format!("{} views", found.len()) }
-    );
 }
 
 impl Idle {

@@ -84,7 +84,7 @@ pub fn train_step(
     working: &mut WorkingSet,
     backend: &mut dyn RowBackend,
     (step, camera): (u32, &Camera),
-    (render, comparison): (&RenderOptions, &Comparison<'_>),
+    (render, comparison): (&RenderOptions, &mut Comparison<'_>),
     collects: bool,
     pages_most: usize,
 ) -> Result<StepOutcome, TrainError> {
@@ -92,11 +92,11 @@ pub fn train_step(
     let pages = scene.pager.begin_view(step, camera)?;
     let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
     let pages_most = pages_most.min(backend.pages_per_batch(pages.len()));
-    let mut passes = Passes { scene, working, backend, step, camera, batches, pinned, outcome };
+    let mut passes = Passes { scene, working, backend, step, camera, comparison, batches, pinned, outcome };
     let done = passes
         .rows_in(pages, pages_most, render)
-        .and_then(|()| passes.picture(comparison))
-        .and_then(|()| if comparison.is_left_out { passes.leave_out() } else { passes.rows_out(collects) });
+        .and_then(|()| passes.picture())
+        .and_then(|()| if passes.comparison.is_left_out { passes.leave_out() } else { passes.rows_out(collects) });
     passes.release();
     let outcome = passes.outcome;
     scene.pager.end_batches();
@@ -112,12 +112,13 @@ struct Batch {
 }
 
 /// A step in progress.
-struct Passes<'a> {
+struct Passes<'a, 'c> {
     scene: &'a mut PagedScene,
     working: &'a mut WorkingSet,
     backend: &'a mut dyn RowBackend,
     step: u32,
     camera: &'a Camera,
+    comparison: &'a mut Comparison<'c>,
     /// Batches whose rows the renderer has and whose gradients are still due.
     batches: Vec<Batch>,
     /// The pages of the last of them, where they are pinned.
@@ -125,7 +126,7 @@ struct Passes<'a> {
     outcome: StepOutcome,
 }
 
-impl Passes<'_> {
+impl Passes<'_, '_> {
     /// The pass in: brings the pages up to date with all events, batch by batch, and hands their rows to the renderer. The last
     /// batch stays pinned.
     fn rows_in(&mut self, pages: Vec<PageNo>, pages_most: usize, render: &RenderOptions) -> Result<(), TrainError> {
@@ -193,7 +194,7 @@ impl Passes<'_> {
     }
 
     /// Renders the picture of all splats, and takes its loss back to the splats.
-    fn picture(&mut self, comparison: &Comparison<'_>) -> Result<(), TrainError> {
+    fn picture(&mut self) -> Result<(), TrainError> {
         let _span = trace::span("picture and loss");
         self.backend.renderer().picture()?;
         // A device may be at work on the picture.
@@ -201,8 +202,8 @@ impl Passes<'_> {
         if self.batches.len() == 1 {
             self.backend.beside_picture(self.scene)?;
         }
-        comparison.loss_and_back(self.backend.renderer(), &mut self.working.correction)?;
-        if self.batches.len() > 1 && !comparison.is_left_out {
+        self.comparison.loss_and_back(self.backend.renderer())?;
+        if self.batches.len() > 1 && !self.comparison.is_left_out {
             // A drive that is full is found while the step can still be given up.
             let of_view: usize = self.batches.iter().map(|batch| batch.pages.len()).sum();
             self.scene.pager.reserve_slots(of_view + self.backend.pages_held())?;
@@ -256,6 +257,11 @@ impl Passes<'_> {
         let (number, at) = (self.batches.len(), AtStep { step: self.step, camera: self.camera });
         let span = trace::span("rows out");
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
+        if self.backend.has_gradients() {
+            let (WorkingSet { columns, gradients, .. }, degree) = (&*self.working, self.scene.rules.sh_degree());
+            let parameters = self.comparison.photos.iter_mut();
+            parameters.for_each(|parameter| parameter.rows_out(columns, &gradients.columns, self.camera, degree));
+        }
         drop(span);
         if is_first {
             self.read_loss()?;

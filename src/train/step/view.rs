@@ -45,7 +45,7 @@ pub fn rehearse(
     (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
     renderer: &mut dyn Renderer,
     camera: &Camera,
-    (options, comparison): (&RenderOptions, &Comparison<'_>),
+    (options, comparison): (&RenderOptions, &mut Comparison<'_>),
     pages_most: usize,
 ) -> Result<usize, TrainError> {
     let pages = scene.pager.pages_of_view(camera);
@@ -58,7 +58,7 @@ pub fn rehearse(
         rows += working.row_from_working.len();
     }
     renderer.picture()?;
-    comparison.loss_and_back(renderer, &mut working.correction)?;
+    comparison.loss_and_back(renderer)?;
     for (i, batch) in batches.iter().enumerate().rev() {
         if i + 1 < batches.len() {
             scene.gather_pages(batch, camera, now, working)?;

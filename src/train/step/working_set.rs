@@ -1,7 +1,5 @@
 //! The working set: the rows of one batch of a view and their gradients during a step.
 
-use super::comparison::Correction;
-use crate::poses::gradient::MotionSum;
 use crate::render::Gradients;
 use crate::scene::columns::{Columns, row_width};
 
@@ -14,10 +12,6 @@ pub struct WorkingSet {
     pub columns: Columns,
     /// Gradients of the step.
     pub gradients: Gradients,
-    /// Of the picture of the view, if it is corrected.
-    pub correction: Correction,
-    /// The derivative of the loss by the motion of the camera, where the step is to find it.
-    pub motion: Option<MotionSum>,
 }
 
 impl WorkingSet {

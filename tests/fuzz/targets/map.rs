@@ -26,6 +26,7 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::stats::PagerStats;
+use gsscale::photos::saved::Encoded;
 use gsscale::poses::state::PoseState;
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use redb::StorageBackend;
@@ -211,6 +212,12 @@ fn sample() -> RunState {
         Event { step: 4, kind: EventKind::Densify(thresholds) },
         Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
     ];
+    let values = [
+        ("appearance", Encoded::of(&(AppearanceState::new(&[0, 0]), 2u32))),
+        ("outliers", Encoded::of(&ViewOutliers::new(2))),
+        ("blocks", Encoded::of(&BlockOutliers::new(2))),
+        ("poses", Encoded::of(&PoseState::new(2))),
+    ];
     RunState {
         origin: Origin {
             config: "steps = 20\n".to_string(),
@@ -238,10 +245,6 @@ fn sample() -> RunState {
             steps_skipped_in_a_row: 1,
             train_seconds: 0.1,
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
-            appearance: AppearanceState::new(&[0, 0]),
-            outliers: ViewOutliers::new(2),
-            blocks: BlockOutliers::new(2),
-            poses: PoseState::new(2),
             growth: GrowthState {
                 first: 7,
                 checks: vec![GrowthCheck {
@@ -254,8 +257,8 @@ fn sample() -> RunState {
                     allowed: 10,
                 }],
             },
-            first_exposures: 2,
         },
+        photos: values.map(|(name, values)| (name.to_string(), values.unwrap())).into(),
         events,
         histogram: vec![(3, 1), (32767, 9)],
         rows: 10,

@@ -1,0 +1,100 @@
+//! What a run knows of each photo, and how it acts on the steps that see the photo: the one list of [`KINDS`].
+//!
+//! A kind is a file of this folder: a [`PhotoParameter`] and its [`Kind`]. The trainer, the run state, the forecast, the summary and
+//! the report walk the list, and name no kind. The values and their mathematics lie in rooms of their own where they fill
+//! more than a file ([`crate::appearance`], [`crate::poses`], [`crate::outliers`]).
+//!
+//! A kind that is off is not in the list of a run. The kinds that judge photos are always in it.
+//!
+//! Not here: evaluation, which fits exposures without a run (`train::state::eval`), and which optimizer a kind needs
+//! (`config::check`).
+//!
+//! Invariants: 1. a step that was skipped teaches nothing but the error of its view; 2. what is known after a step is a function of
+//! steps and photos alone, and lies in the saved values, so a resumed run knows the same; 3. the order of the list changes no
+//! step: all corrections of a picture come before all looks at it.
+
+mod appearance;
+mod masked_blocks;
+pub mod outlier_views;
+pub mod parameter;
+mod poses;
+pub mod saved;
+
+use crate::appearance::AppearanceMode;
+use crate::dataset::loader::Dataset;
+use crate::page::format::encoding::EncodingError;
+use crate::report::run_report::Section;
+use crate::scene::camera::Camera;
+use parameter::{Kind, PhotoParameter};
+use saved::{SavedValues, ValuesError};
+
+/// What the user asked for, and what the kinds need of the other options of a run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PhotoOptions {
+    /// Which corrections of the picture are trained.
+    pub appearance: AppearanceMode,
+    /// Whether views that contradict the scene are left out.
+    pub robust_views: bool,
+    /// Whether blocks of photos that contradict the scene are masked.
+    pub robust_pixels: bool,
+    /// Whether the poses of training photos are refined.
+    pub refine_poses: bool,
+    /// Steps of the run.
+    pub steps: u32,
+    /// Scene scale, local units.
+    pub scene_scale: f32,
+}
+
+/// All kinds, in the order of their sections in the report.
+pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outlier_views::KIND, masked_blocks::KIND];
+
+/// The parameters of a run.
+pub type PhotoParameters = Vec<Box<dyn PhotoParameter>>;
+
+/// The parameters of a run of these options that has seen nothing.
+pub fn first_parameters(options: &PhotoOptions, dataset: &Dataset) -> PhotoParameters {
+    KINDS.iter().filter_map(|kind| (kind.first)(options, dataset)).collect()
+}
+
+/// The camera of a view as steps see it: its pose in the dataset, moved by the parameters.
+pub fn camera(parameters: &PhotoParameters, dataset: &Dataset, view: usize) -> Camera {
+    parameters.iter().fold(dataset.views[view].camera, |camera, parameter| parameter.camera(view, camera))
+}
+
+/// The values as a commit holds them.
+///
+/// # Errors
+/// A value cannot be encoded; none of a valid kind.
+pub fn save(parameters: &PhotoParameters) -> Result<SavedValues, EncodingError> {
+    parameters.iter().map(|parameter| Ok((parameter.name().to_string(), parameter.save()?))).collect()
+}
+
+/// Restores saved values. Values that are missing, or of other photos, stay as at a start.
+///
+/// # Errors
+/// As [`check`].
+pub fn restore(parameters: &mut PhotoParameters, saved: &SavedValues) -> Result<(), ValuesError> {
+    let saved_of = |name: &str| saved.get(name);
+    parameters.iter_mut().try_for_each(|p| saved_of(p.name()).map_or(Ok(()), |bytes| p.restore(bytes)))
+}
+
+/// Checks values from a file.
+///
+/// # Errors
+/// They are of a kind that this program does not know, or values that no run can have written.
+pub fn check(saved: &SavedValues) -> Result<(), ValuesError> {
+    saved.iter().try_for_each(|(name, bytes)| match KINDS.iter().find(|kind| kind.name == name) {
+        Some(kind) => (kind.check)(bytes),
+        None => Err(ValuesError::Impossible("it has values of photos of a kind that this program does not know")),
+    })
+}
+
+/// The files that kinds write into the folder of a run.
+pub fn files() -> impl Iterator<Item = &'static str> {
+    KINDS.iter().filter_map(|kind| kind.file)
+}
+
+/// What the report of a run says about each kind.
+pub fn sections() -> Vec<Section> {
+    KINDS.iter().map(|kind| kind.section).collect()
+}

@@ -1,0 +1,188 @@
+//! The seam: what a kind of parameters of photos can do in a run.
+//!
+//! A step calls [`PhotoParameter::begin_step`], then [`PhotoParameter::correct`] and [`PhotoParameter::compared`] between the
+//! picture and its loss, [`PhotoParameter::back`] and [`PhotoParameter::rows_out`] on the way of the gradient, and
+//! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on.
+//!
+//! Invariants: 1. values change in `start`, `end_step` and `restore` alone, so that a step can be repeated or rehearsed; 2. what
+//! a kind does not override does nothing.
+
+use super::PhotoOptions;
+use super::saved::{Encoded, ValuesError};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
+use crate::dataset::loader::Dataset;
+use crate::page::format::encoding::EncodingError;
+use crate::report::run_report::Section;
+use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
+use crate::scene::events::EventLog;
+use crate::scene::image::Target;
+use serde::Serialize;
+use serde_json::Value;
+use std::path::Path;
+
+/// A kind of parameters.
+pub struct Kind {
+    /// Its name in commits; see [`PhotoParameter::name`].
+    pub name: &'static str,
+    /// The file that it writes into the folder of a run.
+    pub file: Option<&'static str>,
+    /// Its parameters in a run that has seen nothing; `None` in a run without it.
+    pub first: fn(&PhotoOptions, &Dataset) -> Option<Box<dyn PhotoParameter>>,
+    /// Checks saved values.
+    pub check: fn(&Encoded) -> Result<(), ValuesError>,
+    /// What the report of a run says about it.
+    pub section: Section,
+}
+
+/// A coming step, or the rehearsal of one.
+#[derive(Debug, Clone, Copy)]
+pub struct PhotoStep<'a> {
+    /// The view.
+    pub view: usize,
+    /// Steps done.
+    pub step: u32,
+    /// The camera of the step.
+    pub camera: &'a Camera,
+    /// The events so far.
+    pub events: &'a EventLog,
+    /// Only the loss is measured: the view is not trained on.
+    pub is_left_out: bool,
+    /// Nothing is kept: the step only has to take the memory and the time of a step that uses all of the kind.
+    pub is_rehearsal: bool,
+}
+
+/// A step that was done.
+#[derive(Debug, Clone, Copy)]
+pub struct PhotoOutcome<'a> {
+    /// The view.
+    pub view: usize,
+    /// The step, from 0.
+    pub step: u32,
+    /// The step has changed nothing.
+    pub is_skipped: bool,
+    /// Mean squared error of the picture.
+    pub mse: f64,
+    /// The photo.
+    pub photo: &'a Target,
+    /// The dataset, for names.
+    pub dataset: &'a Dataset,
+}
+
+/// The parameters of one kind: their values for all photos, and their buffers for a step.
+pub trait PhotoParameter {
+    /// The name of the kind in commits. It stands for the layout of its values: another layout needs another name.
+    fn name(&self) -> &'static str;
+
+    /// The values as a commit holds them.
+    ///
+    /// # Errors
+    /// The values cannot be encoded.
+    fn save(&self) -> Result<Encoded, EncodingError>;
+
+    /// Restores saved values, unless they are of another number of photos.
+    ///
+    /// # Errors
+    /// No run can have written the values.
+    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError>;
+
+    /// Sets start values from the dataset, unless values were restored. Returns warnings for the user.
+    fn start(&mut self, _: &Dataset) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// What the plan of a run says about photos.
+    fn plan_text(&self) -> Option<String> {
+        None
+    }
+
+    /// The camera of a view, from the camera before it.
+    fn camera(&self, _view: usize, camera: Camera) -> Camera {
+        camera
+    }
+
+    /// Whether a view is compared with its photo, but not trained on.
+    fn leaves_out(&self, _view: usize) -> bool {
+        false
+    }
+
+    /// Whether pictures are corrected.
+    fn corrects(&self) -> bool {
+        false
+    }
+
+    /// Whether the host acts between picture and gradient, so that a device cannot be given steps ahead.
+    fn needs_host(&self) -> bool {
+        self.corrects()
+    }
+
+    /// Prepares for a step, and forgets what an earlier attempt has found.
+    fn begin_step(&mut self, _: &PhotoStep<'_>) {}
+
+    /// Corrects the picture `[3][height][width]` before it is compared with the photo.
+    fn correct(&mut self, _picture: &mut [f32], _photo: &Target) {}
+
+    /// Whether this step looks at the corrected picture.
+    fn looks(&self) -> bool {
+        false
+    }
+
+    /// The photo to compare with, after a look at the corrected picture if it [`PhotoParameter::looks`] at one.
+    fn compared<'a>(&'a mut self, _picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+        photo
+    }
+
+    /// Turns the gradient with respect to the picture after [`PhotoParameter::correct`] into that before it.
+    fn back(&mut self, _photo: &Target, _v_rgb: &mut [f32]) {}
+
+    /// Takes the gradients of the rows of a batch, drawn with bands up to `sh_degree`. Not called with rows on a device.
+    fn rows_out(&mut self, _rows: &Columns, _gradients: &Columns, _camera: &Camera, _sh_degree: u8) {}
+
+    /// Learns from a step. Returns warnings for the user.
+    fn end_step(&mut self, _: &PhotoOutcome<'_>) -> Vec<String> {
+        Vec::new()
+    }
+
+    /// Bytes of the buffers for a step.
+    fn buffer_bytes(&self) -> u64 {
+        0
+    }
+
+    /// Frees the buffers for a step.
+    fn free_buffers(&mut self) {}
+
+    /// Bytes that the values take in the course of a run, with the copies of a commit, where the forecast counts them.
+    fn value_bytes(&self, _: &Dataset) -> u64 {
+        0
+    }
+
+    /// Figures for summary.json, by name.
+    fn figures(&self, _: &Dataset) -> Vec<(&'static str, Value)> {
+        Vec::new()
+    }
+
+    /// Writes the values as people and other programs read them into the folder of the run.
+    ///
+    /// # Errors
+    /// The folder cannot be written.
+    fn write_file(&self, _folder: &Path, _: &Dataset) -> InputResult<()> {
+        Ok(())
+    }
+}
+
+/// Writes a file of values.
+///
+/// # Errors
+/// The folder cannot be written.
+pub fn write_values(path: &Path, values: &impl Serialize) -> InputResult<()> {
+    let text = serde_json::to_string_pretty(values).map_err(|e| InputError::io(path, "writing", &e.into()))?;
+    write_whole(path, (text + "\n").as_bytes())
+}
+
+/// The training photos in the order of their names, as files list them.
+pub fn views_by_name(dataset: &Dataset) -> Vec<usize> {
+    let mut views = dataset.train_views();
+    views.sort_by(|&a, &b| dataset.views[a].name.cmp(&dataset.views[b].name));
+    views
+}
