@@ -1,6 +1,6 @@
 //! Run states of earlier program versions: what they lack. A value that is missing is read as that of a run without it.
 //!
-//! Version 8 has a place in the layout for each kind of values of photos. Version 7 lacks first exposures, poses and the trials of
+//! Version 8 has a place in the layout for each kind of values of photos, and checks of growth look at held-out views only. Version 7 lacks first exposures, poses and the trials of
 //! growth. Version 6 also lacks blocks of photos, version 5 outliers and checks of growth, version 4 appearance. Versions 1 to 3 are
 //! not read: no program that others use wrote them.
 //!
@@ -54,6 +54,43 @@ pub(super) struct OlderGrowth {
     checks: Vec<OlderCheck>,
 }
 
+/// Checks of growth up to version 8.
+#[derive(Deserialize)]
+#[cfg_attr(test, derive(serde::Serialize))]
+pub(super) struct GrowthOf8 {
+    first: u64,
+    checks: Vec<CheckOf8>,
+}
+
+#[derive(Deserialize)]
+#[cfg_attr(test, derive(serde::Serialize))]
+struct CheckOf8 {
+    step: u32,
+    gaussians: u64,
+    psnr: f64,
+    lost: f64,
+    pays_from: f64,
+    is_trial: bool,
+    allowed: u64,
+}
+
+/// Only a first check looks at trained views, so it does not matter later that they seem no better.
+impl From<GrowthOf8> for GrowthState {
+    fn from(older: GrowthOf8) -> GrowthState {
+        let with_trained = |CheckOf8 { step, gaussians, psnr, lost, pays_from, is_trial, allowed }| GrowthCheck {
+            step,
+            gaussians,
+            psnr,
+            trained_psnr: psnr,
+            lost,
+            pays_from,
+            is_trial,
+            allowed,
+        };
+        GrowthState { first: older.first, checks: older.checks.into_iter().map(with_trained).collect() }
+    }
+}
+
 #[derive(Deserialize)]
 #[cfg_attr(test, derive(serde::Serialize))]
 struct OlderCheck {
@@ -71,6 +108,7 @@ impl From<OlderGrowth> for GrowthState {
             step,
             gaussians,
             psnr: 0.0,
+            trained_psnr: 0.0,
             lost,
             pays_from,
             is_trial: false,
@@ -101,6 +139,14 @@ mod tests {
     use crate::checkpoint::run_state::tests::{end_of_8, sample};
     use serde::Serialize;
 
+    fn growth_of_8(state: &GrowthState) -> GrowthOf8 {
+        let of_8 = |check: &GrowthCheck| {
+            let &GrowthCheck { step, gaussians, psnr, lost, pays_from, is_trial, allowed, .. } = check;
+            CheckOf8 { step, gaussians, psnr, lost, pays_from, is_trial, allowed }
+        };
+        GrowthOf8 { first: state.first, checks: state.checks.iter().map(of_8).collect() }
+    }
+
     fn older_growth(state: &GrowthState) -> OlderGrowth {
         let older = |check: &GrowthCheck| {
             let &GrowthCheck { step, gaussians, lost, pays_from, allowed, .. } = check;
@@ -128,7 +174,9 @@ mod tests {
     #[test]
     fn states_of_earlier_versions_come_back_without_later_values() {
         let read = |bytes: &[u8]| RunState::from_bytes(bytes).unwrap();
-        assert_eq!(read(&older_bytes(&end_of_8(), 8)), sample());
+        let OlderEnd { appearance, outliers, growth, blocks, first_exposures, poses } = end_of_8();
+        let of_8 = OlderEnd { appearance, outliers, growth: growth_of_8(&growth), blocks, first_exposures, poses };
+        assert_eq!(read(&older_bytes(&of_8, 8)), sample());
         for version in OLDEST..=NEWEST {
             let OlderEnd { appearance, outliers, growth, blocks, .. } = end_of_8();
             let has = |since: u32| version >= since;

@@ -9,7 +9,7 @@
 //! `decode`, a new version, and a line in `older_states`. A new kind of values of photos changes nothing here: these are encoded
 //! by [`crate::photos`], each kind under its name.
 
-use super::older_states::{OlderEnd, OlderGrowth, missing_values};
+use super::older_states::{GrowthOf8, OlderEnd, OlderGrowth, missing_values};
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
 use crate::page::format::encoding::{self, EncodingError};
@@ -196,7 +196,7 @@ impl RunState {
         let version = u32::from_le_bytes(*version);
         let state = match version {
             VERSION => RunState::decode(body, Ok::<End, _>)?,
-            8 => RunState::decode(body, OlderEnd::<GrowthState>::today)?,
+            8 => RunState::decode(body, OlderEnd::<GrowthOf8>::today)?,
             older => {
                 let missing = missing_values(older)?.ok_or(RunStateError::Version(version))?;
                 RunState::decode(&[body, &missing].concat(), OlderEnd::<OlderGrowth>::today)?
@@ -320,7 +320,7 @@ pub(super) mod tests {
         poses
     }
 
-    /// The end of the sample in version 8.
+    /// The end of the sample in version 8, with the checks of growth of today.
     pub(in crate::checkpoint) fn end_of_8() -> OlderEnd<GrowthState> {
         OlderEnd {
             appearance: AppearanceState::new(&[0, 1, 0]),
@@ -332,6 +332,7 @@ pub(super) mod tests {
                         step: 5,
                         gaussians: 7,
                         psnr: 20.0,
+                        trained_psnr: 20.0,
                         lost: 0.5,
                         pays_from: 0.25,
                         is_trial: false,
@@ -341,6 +342,7 @@ pub(super) mod tests {
                         step: 8,
                         gaussians: 10,
                         psnr: 21.0,
+                        trained_psnr: 21.0,
                         lost: -0.5,
                         pays_from: 0.5,
                         is_trial: false,

@@ -246,8 +246,8 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
 }
 
 /// Of a run whose scene doubled on trial.
-const TRIALS: &str = " This loss did not pay, but was near enough for a trial: the scene doubled, and doubled again at the next check \
-    as long as the held-out photos had gained. A doubling without such a gain was undone.";
+const TRIALS: &str = " This loss did not pay, but the photos trained on were hardly better than those held out, so the scene doubled on \
+    trial, and doubled again at the next check as long as that held or the held-out photos gained. Otherwise the last doubling was undone.";
 
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {
@@ -267,7 +267,8 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let chart = chart.with("growth pays from", of("pays_from"), Mark::Line).zero_based();
     let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
     let caption = "Mean over the held-out training photos at each check.".to_string();
-    let psnr = Chart::new("PSNR of held-out training photos", "step", "dB").with("", of("psnr"), Mark::LineAndDots);
+    let psnr = Chart::new("PSNR of training photos", "step", "dB").with("held out", of("psnr"), Mark::LineAndDots);
+    let psnr = psnr.with("trained on", of("trained_psnr"), Mark::LineAndDots);
     let allowed = (rows.svg(), "What each check allowed.".to_string());
     page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
 }

@@ -5,10 +5,12 @@
 //!
 //! Invariants: 1. a check changes no row; 2. a check that failed is still due.
 
-use super::leave_out::{Compared, psnr_without_faint};
+use super::leave_out::{Compared, Now, psnr_of_view, psnr_without_faint};
 use super::trainer::Trainer;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::growth::GrowthValues;
+use crate::render::Renderer;
 use crate::render::color_correct::ColorCorrect;
 use crate::train::error::TrainError;
 use std::time::Instant;
@@ -33,21 +35,35 @@ impl Trainer {
         }
         let started = Instant::now();
         self.drain()?;
-        let values = self.mean_values(dataset, targets)?;
+        let values = self.growth_values(dataset, targets)?;
         let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
         self.state.growth.checks.push(check);
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(())
     }
 
-    /// PSNR of the held-out views, and the decibels that these lose without their faintest quarter: means over the views; 0 if no view
-    /// counts.
-    fn mean_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<[f64; 2], TrainError> {
-        let views: Vec<usize> = self.held_out.positions().iter().map(|&at| self.train_views[at]).collect();
+    /// What the check measures; 0 if no view counts.
+    fn growth_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<GrowthValues, TrainError> {
+        let positions = self.held_out.positions();
+        // The view after a held-out one is trained on in its place, so twice as often as others.
+        let trained: Vec<usize> = positions.iter().map(|&at| (at + 2) % self.train_views.len()).collect();
+        let [held_out, trained] = [positions, &trained].map(|at| at.iter().map(|&at| self.train_views[at]).collect());
+        let [psnr, lost] = self.mean_psnr(held_out, psnr_without_faint, (dataset, targets))?;
+        let [trained_psnr] = self.mean_psnr(trained, psnr_of_view, (dataset, targets))?;
+        Ok(GrowthValues { psnr, trained_psnr, lost: psnr - lost })
+    }
+
+    /// Means of values of these views.
+    fn mean_psnr<const N: usize>(
+        &mut self,
+        views: Vec<usize>,
+        of_view: impl Fn(Now<'_>, &mut dyn Renderer, &Compared<'_>) -> Result<[f64; N], TrainError>,
+        (dataset, targets): (&Dataset, &TargetCache),
+    ) -> Result<[f64; N], TrainError> {
         self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let corrects = self.photos.iter().any(|parameter| parameter.corrects());
         let render = self.render_options();
-        let mut values: Vec<[f64; 2]> = Vec::with_capacity(views.len());
+        let mut values: Vec<[f64; N]> = Vec::with_capacity(views.len());
         for (i, &view) in views.iter().enumerate() {
             targets.prefetch(&views[i..views.len().min(i + 2)]);
             let target = targets.get(view)?;
@@ -64,10 +80,9 @@ impl Trainer {
                 correct: corrects.then_some(ColorCorrect::Affine),
             };
             let now = (&mut self.scene, self.state.step, &mut self.working);
-            let [whole, without] = psnr_without_faint(now, &mut *self.renderer, &compared)?;
-            values.push([whole, whole - without]);
+            values.push(of_view(now, &mut *self.renderer, &compared)?);
         }
         let count = values.len().max(1) as f64;
-        Ok([0, 1].map(|k| values.iter().map(|of_view| of_view[k]).sum::<f64>() / count))
+        Ok(std::array::from_fn(|k| values.iter().map(|of_view| of_view[k]).sum::<f64>() / count))
     }
 }

@@ -35,12 +35,29 @@ pub(super) struct Compared<'a> {
     pub correct: Option<ColorCorrect>,
 }
 
+/// The scene after so many steps, and room for the rows of a view.
+pub(super) type Now<'a> = (&'a mut PagedScene, u32, &'a mut WorkingSet);
+
+/// PSNR of a view with all rows, dB.
+///
+/// # Errors
+/// Pages could not be had, or the renderer failed.
+pub(super) fn psnr_of_view(
+    (scene, now, working): Now<'_>,
+    renderer: &mut dyn Renderer,
+    view: &Compared<'_>,
+) -> Result<[f64; 1], TrainError> {
+    let pages = scene.pager.pages_of_view(view.camera);
+    let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(view.pages_most));
+    Ok([Draw { scene, now, working, renderer, view, batches: &batches }.picture(None)?])
+}
+
 /// PSNR of a view with all rows, and without the faintest quarter of the rows drawn, dB.
 ///
 /// # Errors
 /// Pages could not be had, or the renderer failed.
 pub(super) fn psnr_without_faint(
-    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
+    (scene, now, working): Now<'_>,
     renderer: &mut dyn Renderer,
     view: &Compared<'_>,
 ) -> Result<[f64; 2], TrainError> {

@@ -251,6 +251,7 @@ fn sample() -> RunState {
                     step: 5,
                     gaussians: 7,
                     psnr: 20.0,
+                    trained_psnr: 20.0,
                     lost: 0.5,
                     pays_from: 0.25,
                     is_trial: true,
