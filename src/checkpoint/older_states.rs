@@ -7,13 +7,12 @@
 //! Invariants: 1. up to version 8, missing values stand at the end of the layout, so an older state with [`missing_values`] behind it
 //! has the layout of version 8, but for the checks of growth ([`OlderGrowth`]); 2. nothing here writes a state.
 
-use super::run_state::End;
 use crate::appearance::state::AppearanceState;
 use crate::densify::growth::{GrowthCheck, GrowthState};
 use crate::outliers::blocks::BlockOutliers;
 use crate::outliers::views::ViewOutliers;
 use crate::page::format::encoding::{self, EncodingError};
-use crate::photos::saved::Encoded;
+use crate::photos::saved::{Encoded, SavedValues};
 use crate::poses::state::PoseState;
 use serde::Deserialize;
 
@@ -35,7 +34,7 @@ pub(super) struct OlderEnd<G> {
 
 impl<G: Into<GrowthState>> OlderEnd<G> {
     /// The end of today's layout: values of photos under the names of their kinds.
-    pub(super) fn today(self) -> Result<End, EncodingError> {
+    pub(super) fn today(self) -> Result<(GrowthState, SavedValues), EncodingError> {
         let values = [
             ("appearance", Encoded::of(&(self.appearance, self.first_exposures))?),
             ("outliers", Encoded::of(&self.outliers)?),

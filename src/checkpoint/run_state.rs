@@ -109,7 +109,7 @@ pub struct TrainerState {
 }
 
 /// The end of the layout.
-pub(super) type End = (GrowthState, SavedValues);
+type End = (GrowthState, SavedValues);
 
 /// The state of a run between two steps, without its pages.
 #[derive(Debug, Clone, PartialEq)]
