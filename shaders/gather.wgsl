@@ -2,7 +2,7 @@
 // camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
 // `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score and the lowest opacity of a page, from
 // which the host decides whether a round edits rows. Where the host does not wait for the numbers of rows, `place` finds where
-// the list of each page begins, and `pad` fills the room behind the last row. The twin of src/kernels/gather.rs.
+// the list of each page begins, and `pad` fills the room behind the last row. The twin of tests/numerics/twins/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
 // file, so that one compiled formula decides what is seen, drawn, updated and bounded.

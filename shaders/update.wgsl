@@ -1,6 +1,6 @@
 // Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `judge`
 // finds whether the gradients of a row are usable, column by column; `step` rewrites a column of the rows whose gradients
-// all are; `finish` counts, stamps and collects statistics. The twin of src/kernels/update.rs.
+// all are; `finish` counts, stamps and collects statistics. The twin of tests/numerics/twins/update.rs.
 //
 // `clear_statistics` takes the place of a round that edits no row.
 //

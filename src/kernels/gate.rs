@@ -1,4 +1,5 @@
-//! Stage "gate": whether a step that was recorded without waiting may change rows. The twin of `shaders/gate.wgsl`.
+//! Stage "gate": whether a step that was recorded without waiting may change rows. `shaders/gate.wgsl` decides; the numbers that
+//! it reads and writes are here.
 //!
 //! A device works on a step behind the gate while the host records the next one. A step may change rows only if all earlier steps
 //! did, its lists had room, its loss is finite, and few of its rows have unusable gradients.
@@ -62,20 +63,3 @@ pub const LIST: u32 = 8;
 pub const LOSS: u32 = 16;
 /// Too many rows have unusable gradients.
 pub const GRADIENTS: u32 = 32;
-
-/// Decides about a step whose numbers are those of `measured` (its `closed` is not read), behind a gate of the bits `gate`.
-pub fn decide(u: &GateUniforms, gate: u32, measured: &StepVerdict) -> StepVerdict {
-    let is_no_number = |bits: u32| !f32::from_bits(bits).is_finite();
-    let reasons = [
-        (BY_EARLIER, gate != 0),
-        (ROWS, measured.rows > u.rows_room),
-        (ISECTS, measured.isects > u.isects_room),
-        (LIST, measured.list_max > u.list_room),
-        (GRADIENTS, measured.unusable > measured.rows / u.rows_per_unusable.max(1)),
-        // The sum of squared differences, the second, is reported and not trained on.
-        (LOSS, u.has_loss != 0 && (is_no_number(measured.sums[0]) || is_no_number(measured.sums[2]))),
-    ];
-    let closed = reasons.iter().filter(|(_, holds)| *holds).fold(0, |bits, (reason, _)| bits | reason);
-    let sums = if u.has_loss != 0 { measured.sums } else { [0; 4] };
-    StepVerdict { closed, sums, ..*measured }
-}

@@ -1,10 +1,12 @@
 //! The stages of the pipeline on the CPU, one file each, on plain slices. Knows no files, GPU types or optimizer.
+//!
+//! Of the stages that only devices run (gather, update, gate) the structs and tables are here; their twins on slices are in
+//! `tests/numerics/twins`.
 
 pub mod constants;
 pub mod deferred;
 pub mod fold;
 pub mod gate;
-pub mod gather;
 pub mod image_loss;
 mod image_pair;
 pub mod isect_emit;
@@ -31,4 +33,3 @@ pub mod uniforms;
 pub mod uniforms_pages;
 #[cfg(feature = "gpu")]
 pub mod uniforms_tiles;
-pub mod update;

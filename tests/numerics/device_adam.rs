@@ -1,13 +1,15 @@
 //! The f32 form of deferred Adam that devices compute, by its twin, against dense Adam in f64 over 50,000 steps.
 
 use crate::support::dense_adam::DenseAdam;
+use crate::twins::deferred::TableWords;
+use crate::twins::gather::{GatherInput, gather};
+use crate::twins::page_words::{Table, Words};
+use crate::twins::update::{UpdateInput, finish, judge, step};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::deferred::DeferredTables;
-use gsscale::kernels::gather::{GatherInput, gather};
-use gsscale::kernels::page_words::{DevicePage, PageResult, Table};
+use gsscale::kernels::page_words::{DevicePage, PageResult};
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
-use gsscale::kernels::update::{UpdateInput, finish, judge, step};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
@@ -40,6 +42,7 @@ fn the_form_of_devices_follows_dense_adam() {
         let adam = DeferredAdam::new(rates, config, SimdPath::best());
         let numbers = adam.numbers(STEPS).unwrap();
         let tables = DeferredTables::new(&numbers);
+        let tables = TableWords::from(&tables);
         let mut state = SceneState::from_columns(Columns::zeros(PERIODS.len(), 0));
         let mut draws = Stream::new(9, Purpose::Test, 0, 0);
         for column in Column::ALL {
@@ -67,7 +70,7 @@ fn the_form_of_devices_follows_dense_adam() {
                     uniforms: &uniforms,
                     pages: &pages,
                     slab: &slab,
-                    tables: &tables,
+                    tables,
                     recent: &numbers_now.recent,
                 };
                 let mut values = vec![0.0; rows.len() * width];
@@ -88,18 +91,16 @@ fn the_form_of_devices_follows_dense_adam() {
             }
             for (column, values, grads) in parts {
                 let uniforms = of_step.of_column(&numbers_now, column, column.width(0), 0);
-                let input =
-                    UpdateInput { uniforms: &uniforms, pages: &pages, rows: &rows, tables: &tables, largest: &largest };
+                let input = UpdateInput { uniforms: &uniforms, pages: &pages, rows: &rows, tables, largest: &largest };
                 step(&input, &values, &grads, &mut slab);
             }
-            let input =
-                UpdateInput { uniforms: &of_step, pages: &pages, rows: &rows, tables: &tables, largest: &largest };
+            let input = UpdateInput { uniforms: &of_step, pages: &pages, rows: &rows, tables, largest: &largest };
             let mut results = [<PageResult as bytemuck::Zeroable>::zeroed()];
             finish(&input, &vec![[0.0; 4]; rows.len()], &mut slab, &mut results, &mut []);
             assert_eq!((results[0].updated as usize, results[0].skipped), (rows.len(), 0));
             rows.iter().for_each(|[_, row]| updates[*row as usize] += 1);
             if (now + 1) % 997 == 0 || now + 1 == STEPS {
-                check(&adam, &tables, (&slab, &pages[0]), &dense, &updates, now + 1);
+                check(&adam, tables, (&slab, &pages[0]), &dense, &updates, now + 1);
             }
         }
     }
@@ -112,7 +113,7 @@ fn the_form_of_devices_follows_dense_adam() {
 /// which six standard deviations are allowed.
 fn check(
     adam: &DeferredAdam,
-    tables: &DeferredTables,
+    tables: TableWords<'_>,
     (slab, page): (&[u32], &DevicePage),
     dense: &[DenseAdam<f64>; 6],
     updates: &[u32],

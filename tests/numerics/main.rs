@@ -18,6 +18,7 @@ mod parity;
 mod poison;
 mod poses;
 mod shaders;
+mod twins;
 mod upright;
 mod visibility;
 mod weights;

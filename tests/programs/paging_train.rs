@@ -20,6 +20,10 @@ const EVENTS: &[&str] = &["--refine-start", "100", "--refine-every", "50", "--re
 const MORE_EVENTS: &[&str] =
     &["--refine-start", "20", "--refine-every", "25", "--reset-every", "45", "--sh-every", "30"];
 
+/// Every event at least twice within 80 steps.
+const CLOSE_EVENTS: &[&str] =
+    &["--refine-start", "15", "--refine-every", "20", "--reset-every", "30", "--sh-every", "25"];
+
 /// Where pages are kept, and how they get there.
 #[derive(Debug, Clone)]
 struct How {
@@ -64,8 +68,8 @@ fn frames_engines_and_threads_change_no_bit() {
     let Some(scene) = real_scene("seneca") else { return };
     let folder = TempDir::new().unwrap();
     let is_full = std::env::var_os("GSSCALE_PAGING_FULL").is_some();
-    let steps = if is_full { "600" } else { "120" };
-    let events = if is_full { EVENTS } else { MORE_EVENTS };
+    let steps = if is_full { "600" } else { "80" };
+    let events = if is_full { EVENTS } else { CLOSE_EVENTS };
     let base = [&["--data-factor", "4", "--page-rows", "128", "--steps", steps], COMMON, events].concat();
     let in_memory = How { frames: 0, io: "", threads: "2", more: &[] };
     let (want, whole) = run(folder.path(), &scene, &base, &in_memory);

@@ -71,14 +71,14 @@ fn one_point(
                 seen.push((j, there));
             }
         }
-        let color = tone(scene.shade(&ray, &hit, 1.0 / k.fx).light);
         let enough = seen.len() >= 2;
-        found = Some((hit, seen, color));
+        found = Some((ray, hit, seen));
         if enough {
             break;
         }
     }
-    let (hit, mut seen, color) = found?;
+    let (ray, hit, mut seen) = found?;
+    let color = tone(scene.shade(&ray, &hit, 1.0 / k.fx).light);
     seen.sort_unstable_by_key(|&(j, _)| j);
     let position = disturbed(&hit, shot, 1.0 / k.fx, &mut draws);
     let mut observations = Vec::with_capacity(seen.len());

@@ -8,7 +8,7 @@ use super::texture::{Look, Place};
 use super::trace::Grid;
 use super::world::World;
 use glam::{DVec3, Vec3};
-use rayon::prelude::*;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Side of a cell of the sky map, metres.
 const SKY_CELL: f64 = 1.0;
@@ -35,13 +35,19 @@ pub(super) struct Scene {
     sky: SkyMap,
 }
 
-/// For each square metre: the height of its top, and the share of the sky that the top sees.
+/// For each square metre: the height of its top, and the share of the sky that the top sees. Both are found where light is
+/// first asked for: photos show a small part of a large city.
 struct SkyMap {
     low: f64,
     cells: usize,
-    height: Vec<f32>,
-    open: Vec<f32>,
+    directions: [DVec3; SKY_RAYS],
+    /// Bits of floats, or [`UNKNOWN`]. A value depends on its place alone, so threads that find it at once find the same.
+    height: Vec<AtomicU32>,
+    open: Vec<AtomicU32>,
 }
+
+/// A NaN that no height and no share has.
+const UNKNOWN: u32 = u32::MAX;
 
 /// The first place on a ray.
 #[derive(Debug, Clone, Copy)]
@@ -65,10 +71,10 @@ pub(super) struct Sample {
 const SKY: Sample = Sample { light: Vec3::new(0.55, 0.68, 0.85), surface: u32::MAX };
 
 impl Scene {
-    /// Builds the grid and the sky map.
+    /// Builds the grid, and a sky map of which nothing is known.
     pub(super) fn new(world: World) -> Scene {
         let grid = Grid::new(&world.solids);
-        let sky = SkyMap::new(&world, &grid);
+        let sky = SkyMap::new(&world);
         Scene { world, grid, sun: sun(), sky }
     }
 
@@ -135,7 +141,7 @@ impl Scene {
             in_sun = !self.grid.blocked(&self.world.solids, &away, 1e4);
         }
         let direct = if in_sun { n.dot(self.sun).max(0.0) as f32 } else { 0.0 };
-        let open = self.sky.open_at(hit.point + hit.normal * 0.7);
+        let open = self.sky.open_at(self, hit.point + hit.normal * 0.7);
         let up = (0.5 + 0.5 * n.z) as f32;
         let ambient = SKY_LIGHT * (open * up) + GROUND_LIGHT * ((1.0 - up) * (0.4 + 0.6 * open));
         let mut light = look.albedo * (SUN_LIGHT * direct + ambient);
@@ -203,31 +209,36 @@ fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) ->
 }
 
 impl SkyMap {
-    fn new(world: &World, grid: &Grid) -> SkyMap {
+    fn new(world: &World) -> SkyMap {
         let half = world.half() + 25.0;
         let cells = (2.0 * half / SKY_CELL) as usize + 1;
-        let directions = sky_directions();
-        let rows: Vec<(Vec<f32>, Vec<f32>)> = (0..cells)
-            .into_par_iter()
-            .map(|j| {
-                (0..cells)
-                    .map(|i| {
-                        let (x, y) = (i as f64 * SKY_CELL - half, j as f64 * SKY_CELL - half);
-                        let height = grid.top_at(&world.solids, x, y);
-                        let from = DVec3::new(x, y, height + 0.1);
-                        let free = |d: &&DVec3| !grid.blocked(&world.solids, &Ray::new(from, **d), SKY_REACH);
-                        let open = directions.iter().filter(free).count() as f32 / SKY_RAYS as f32;
-                        (height as f32, open)
-                    })
-                    .unzip()
-            })
-            .collect();
-        let (height, open): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
-        SkyMap { low: -half, cells, height: height.concat(), open: open.concat() }
+        let unknown = || std::iter::repeat_with(|| AtomicU32::new(UNKNOWN)).take(cells * cells).collect();
+        SkyMap { low: -half, cells, directions: sky_directions(), height: unknown(), open: unknown() }
+    }
+
+    fn place(&self, c: usize) -> [f64; 2] {
+        [c % self.cells, c / self.cells].map(|i| i as f64 * SKY_CELL + self.low)
+    }
+
+    fn height(&self, scene: &Scene, c: usize) -> f32 {
+        known(&self.height[c], || {
+            let [x, y] = self.place(c);
+            scene.grid.top_at(&scene.world.solids, x, y) as f32
+        })
+    }
+
+    fn open(&self, scene: &Scene, c: usize) -> f32 {
+        known(&self.open[c], || {
+            let [x, y] = self.place(c);
+            let solids = &scene.world.solids;
+            let from = DVec3::new(x, y, scene.grid.top_at(solids, x, y) + 0.1);
+            let free = |d: &&DVec3| !scene.grid.blocked(solids, &Ray::new(from, **d), SKY_REACH);
+            self.directions.iter().filter(free).count() as f32 / SKY_RAYS as f32
+        })
     }
 
     /// The share of the sky that a point sees, weighted by the cosine to the vertical.
-    fn open_at(&self, p: DVec3) -> f32 {
+    fn open_at(&self, scene: &Scene, p: DVec3) -> f32 {
         let (x, y) = ((p.x - self.low) / SKY_CELL, (p.y - self.low) / SKY_CELL);
         let last = (self.cells - 1) as f64;
         if !(x > 0.0 && y > 0.0 && x < last && y < last) {
@@ -240,17 +251,33 @@ impl SkyMap {
         for (dj, wy) in [(0, 1.0 - fy), (1, fy)] {
             for (di, wx) in [(0, 1.0 - fx), (1, fx)] {
                 let c = (j + dj) * self.cells + i + di;
-                let above = z - self.height[c];
+                let above = z - self.height(scene, c);
                 // A corner whose top is above the point does not count.
                 let usable = (1.5 + above).clamp(0.0, 1.0) * wx * wy;
+                if usable == 0.0 {
+                    continue;
+                }
                 let rise = (above / 16.0).clamp(0.0, 1.0);
-                sum += usable * (self.open[c] + (1.0 - self.open[c]) * rise);
+                let open = self.open(scene, c);
+                sum += usable * (open + (1.0 - open) * rise);
                 weight += usable;
             }
         }
         // The value below a crown or an eave, where no corner counts.
         let covered = 0.45;
         (sum + covered * 0.05) / (weight + 0.05)
+    }
+}
+
+/// The value in a cell, found first if it is unknown.
+fn known(cell: &AtomicU32, find: impl FnOnce() -> f32) -> f32 {
+    match cell.load(Ordering::Relaxed) {
+        UNKNOWN => {
+            let value = find();
+            cell.store(value.to_bits(), Ordering::Relaxed);
+            value
+        }
+        bits => f32::from_bits(bits),
     }
 }
 

@@ -1,10 +1,10 @@
 //! gate, and the parts of gather that a step without waits needs: the device decides and lists as the twins do.
 
 use crate::support::gpu::open;
+use crate::twins::{self, gather};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, groups_1d};
 use gsscale::kernels::gate::{self, GateUniforms, StepVerdict};
-use gsscale::kernels::gather;
 use gsscale::kernels::page_words::DevicePage;
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers};
 use gsscale::optim::adam::AdamConfig;
@@ -66,7 +66,7 @@ fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer) -> Vec<T> {
 fn a_gate_closes_for_every_reason_and_stays_closed() {
     let gpu = open(&GpuOptions::default());
     for (i, (u, before, measured, closed)) in cases().into_iter().enumerate() {
-        let want = gate::decide(&u, before, &measured);
+        let want = twins::gate::decide(&u, before, &measured);
         assert_eq!(want.closed, closed, "case {i}");
         let Some(gpu) = &gpu else { continue };
         let mut recorder = gpu.begin("gate");

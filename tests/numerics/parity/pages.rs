@@ -4,15 +4,15 @@
 //! place, so 3e-6 of the movement; a value has one rounding of its own.
 
 use crate::support::gpu::open;
+use crate::twins::gather::{self, GatherInput};
+use crate::twins::update::{self, UpdateInput};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::stats::GradHistogram;
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, Source, groups_1d};
 use gsscale::kernels::deferred::DeferredTables;
-use gsscale::kernels::gather::{self, GatherInput};
 use gsscale::kernels::page_words::{DevicePage, PageResult, PageSurvey};
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
-use gsscale::kernels::update::{self, UpdateInput};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
@@ -134,7 +134,7 @@ fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let uniforms = GatherUniforms::new(&camera(), &numbers, world.now, &SPLITS, pages.len() as u32);
     let rows: usize = PAGES.iter().sum();
     let (mut counts, mut found) = (vec![0; pages.len()], vec![0; rows]);
-    let (tables, recent) = (&tables, &step.recent[..]);
+    let (tables, recent) = ((&tables).into(), &step.recent[..]);
     let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
     gather::cull(&input, &mut counts, &mut found);
     let listed = gather::place(&mut pages, &counts);
@@ -289,7 +289,7 @@ fn updated_by_twin(
     let mut largest = vec![0; list.len()];
     let parts = parts(world.layouts[0].sh_degree);
     parts.iter().zip(grads).for_each(|((_, width, _), grads)| update::judge(*width, grads, &mut largest));
-    let (pages, rows, tables, largest) = (&pages[..], list, &tables, &largest[..]);
+    let (pages, rows, tables, largest) = (&pages[..], list, (&tables).into(), &largest[..]);
     for (((column, width, first), values), grads) in parts.into_iter().zip(values).zip(grads) {
         let uniforms = uniforms.of_column(&step, column, width, first);
         let input = UpdateInput { uniforms: &uniforms, pages, rows, tables, largest };
@@ -449,7 +449,7 @@ fn surveys_hold_all_rows_and_only_statistics_are_cleared() {
     let (mut slab, pages) = world.slab();
     let uniforms = GatherUniforms::new(&camera(), &numbers, 700, &SPLITS, pages.len() as u32);
     let uniforms = uniforms.of_column(&numbers, Column::Opacities, 1, 0);
-    let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables: &tables, recent: &[] };
+    let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables: (&tables).into(), recent: &[] };
     let mut twin = vec![<PageSurvey as bytemuck::Zeroable>::zeroed(); pages.len()];
     gather::survey(&input, &mut twin);
     for (state, survey) in world.states.iter().zip(&twin) {

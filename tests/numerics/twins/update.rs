@@ -14,13 +14,14 @@
 //! Invariants: 1. a row is rewritten as a whole or not at all; 2. nothing that is not finite enters a payload; 3. growth
 //! scores go to the same bins as on the CPU.
 
-use super::deferred::{DeferredTables, flush};
-use super::page_words::{DevicePage, PageResult, Table};
-use super::uniforms_pages::UpdateUniforms;
-use crate::base::math::LARGEST_GRAD;
-use crate::scene::columns::Column;
-use crate::scene::rows::mean_grad2d;
-use crate::scene::sightings::{is_full, with_view};
+use super::deferred::{TableWords, flush};
+use super::page_words::{Table, Words};
+use gsscale::base::math::LARGEST_GRAD;
+use gsscale::kernels::page_words::{DevicePage, PageResult};
+use gsscale::kernels::uniforms_pages::UpdateUniforms;
+use gsscale::scene::columns::Column;
+use gsscale::scene::rows::mean_grad2d;
+use gsscale::scene::sightings::{is_full, with_view};
 
 /// What the stage reads beside the slab.
 #[derive(Debug, Clone, Copy)]
@@ -32,7 +33,7 @@ pub struct UpdateInput<'a> {
     /// Listed rows: number of the page, number of the row in it.
     pub rows: &'a [[u32; 2]],
     /// Tables of the run.
-    pub tables: &'a DeferredTables,
+    pub tables: TableWords<'a>,
     /// `[listed row]`: the largest magnitude of a gradient, bits.
     pub largest: &'a [u32],
 }
@@ -145,7 +146,7 @@ fn collect(
     true
 }
 
-/// Bin of a mean score: as `crate::densify::stats`.
+/// Bin of a mean score: as `gsscale::densify::stats`.
 fn bin(sum: f32, count: u32) -> usize {
     (mean_grad2d(sum, count).to_bits() >> 16) as usize
 }

@@ -17,15 +17,16 @@
 //! Invariants: 1. listed rows ascend by page and row; 2. a row that the projection would draw is listed; 3. bounds hold
 //! for every later step, in the arithmetic of a device; 4. no row has a larger mean score or a lower opacity than a survey says.
 
-use super::deferred::{DeferredTables, FOR_EVER};
-use super::page_words::{DevicePage, PageResult, PageSurvey, Table};
-use super::uniforms_pages::GatherUniforms;
-use crate::base::math::exp32;
-use crate::scene::columns::Column;
-use crate::scene::optimizer_numbers::SeriesSums;
-use crate::scene::rows::mean_grad2d;
+use super::deferred::{FOR_EVER, TableWords};
+use super::page_words::{Table, Words};
+use gsscale::base::math::exp32;
+use gsscale::kernels::page_words::{DevicePage, PageResult, PageSurvey};
+use gsscale::kernels::uniforms_pages::GatherUniforms;
+use gsscale::scene::columns::Column;
+use gsscale::scene::optimizer_numbers::SeriesSums;
+use gsscale::scene::rows::mean_grad2d;
 
-/// Slacks of bounds: see `crate::optim::bounds`. That of values is twice the CPU's, for devices that divide and take
+/// Slacks of bounds: see `gsscale::optim::bounds`. That of values is twice the CPU's, for devices that divide and take
 /// roots less exactly.
 const MOVEMENT_SLACK: f32 = 1e-3;
 const VALUE_SLACK: f32 = 16.0 * 0.5 * f32::EPSILON;
@@ -51,7 +52,7 @@ pub struct GatherInput<'a> {
     /// Words of the slab.
     pub slab: &'a [u32],
     /// Tables of the run.
-    pub tables: &'a DeferredTables,
+    pub tables: TableWords<'a>,
     /// Sums of this step by missed steps.
     pub recent: &'a [SeriesSums],
 }
