@@ -18,6 +18,7 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod gpu_bytes;
 mod gpu_ends;
 mod gpu_events;
 mod gpu_flights;
