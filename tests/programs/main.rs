@@ -23,6 +23,7 @@ mod gpu_ends;
 mod gpu_events;
 mod gpu_flights;
 mod gpu_pages;
+mod gpu_quality;
 mod gpu_trace;
 mod gpu_train;
 mod growing;
