@@ -72,6 +72,15 @@ impl Driver {
         done
     }
 
+    /// The error that was reported, if any. A lost device may refuse what it is given before it reports the loss; the loss is the error then.
+    pub(super) fn check(&self) -> GpuResult<()> {
+        if self.faults.is_reported() {
+            // Without work the device reports its loss. An error of the wait itself says less than those.
+            let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
+        }
+        self.faults.check()
+    }
+
     /// Waits until the device has finished `submission`; errors that no report explains name `stage`.
     pub(super) fn wait(&self, stage: &str, submission: Option<wgpu::SubmissionIndex>) -> GpuResult<()> {
         let _span = trace::span("wait").of("for", stage);

@@ -360,7 +360,7 @@ impl Recorder<'_> {
         self.inject_fault();
         let encoder = std::mem::replace(&mut self.work.encoder, gpu.driver.encoder(self.work.name));
         let commands = encoder.finish();
-        gpu.driver.faults.check()?;
+        gpu.driver.check()?;
         let written = lock(&gpu.uniforms).write(&mut self.work.uniforms);
         gpu.uploaded.fetch_add(written, Ordering::Relaxed);
         let mut belt = lock(&gpu.belt);
@@ -373,7 +373,7 @@ impl Recorder<'_> {
         }
         // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped.
         let polled = gpu.driver.device.poll(wgpu::PollType::Poll);
-        gpu.driver.faults.check()?;
+        gpu.driver.check()?;
         polled.map_err(|e| GpuError::validation(self.work.name, e))?;
         lock(&gpu.profiler).collect(4)?;
         Ok(Submission { index, name: self.work.name })

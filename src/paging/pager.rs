@@ -182,6 +182,15 @@ impl Pager {
         }
     }
 
+    /// Lists the pages of some coming steps anew, by the bounds as they are now, for a tier above. Where pages leave memory, prefetch does
+    /// it.
+    pub fn refresh_plan(&mut self, step: u32) {
+        if self.config.plan_bytes > 0 && self.frames.frames_max() == usize::MAX {
+            self.look_ahead.refresh(step, self.index.metas());
+            self.apply_changed_uses();
+        }
+    }
+
     /// Sets when pages move.
     pub fn set_transfers(&mut self, transfers: Transfers) {
         self.transfers = transfers;

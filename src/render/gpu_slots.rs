@@ -6,11 +6,14 @@
 
 use super::pages::DeviceSlot;
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Readback};
+use std::collections::VecDeque;
 
 /// Bytes that a slot is a multiple of: the largest alignment that a device may require of a binding.
 const SLOT_STEP: u64 = 256;
 /// Most bytes of slots that are read back at once.
 const READ_BYTES: u64 = 8 << 20;
+/// Most bytes of slots whose reads have begun and not ended.
+const UNDER_WAY_BYTES: u64 = 64 << 20;
 /// Reads beside the work on a view take at most this part of the memory that the view leaves.
 const READ_SHARE: u64 = 8;
 
@@ -28,8 +31,8 @@ struct Slab {
 pub struct Slots {
     slot_bytes: u64,
     slabs: Vec<Slab>,
-    /// Reads that have begun and not ended, with the slots that they read.
-    under_way: Vec<(DeviceSlot, Readback)>,
+    /// Reads that have begun and not ended, with the slots that they read, in the order of their beginning.
+    under_way: VecDeque<(DeviceSlot, Readback)>,
 }
 
 impl Slots {
@@ -131,34 +134,34 @@ impl Slots {
     /// wait.
     ///
     /// # Errors
-    /// The device failed, a slot does not exist, or earlier reads have not ended.
+    /// The device failed, or a slot does not exist.
     pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[(DeviceSlot, usize)]) -> GpuResult<usize> {
-        if !self.under_way.is_empty() {
-            return Err(wrong_slots("reads that have not ended"));
-        }
-        let most = (READ_BYTES.min(gpu.room() / READ_SHARE) / self.slot_bytes) as usize;
+        let reading = self.under_way.len() as u64 * self.slot_bytes;
+        let most = UNDER_WAY_BYTES.saturating_sub(reading).min(gpu.room() / READ_SHARE) / self.slot_bytes;
+        let before = self.under_way.len();
         let mut recorder = gpu.begin("pages");
-        for (slot, bytes) in slots.iter().take(most) {
+        for (slot, bytes) in slots.iter().take(most as usize) {
             match recorder.read_back("pages", &self.view(*slot, *bytes)?) {
-                Ok(read) => self.under_way.push((*slot, read)),
+                Ok(read) => self.under_way.push_back((*slot, read)),
                 Err(error) if error.lacks_room() => break,
                 Err(error) => return Err(error),
             }
         }
         gpu.submit(recorder)?;
-        Ok(self.under_way.len())
+        Ok(self.under_way.len() - before)
     }
 
-    /// Ends the reads that have begun, into the payloads of the same slots. Waits for them alone.
+    /// Ends the reads that began first, into the payloads of the same slots. Waits for them alone.
     ///
     /// # Errors
     /// The device failed, or other slots were begun.
     pub fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
-        let under_way = std::mem::take(&mut self.under_way);
-        if !under_way.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(slot, _)| slot)) {
+        let count = payloads.len().min(self.under_way.len());
+        let ending: Vec<(DeviceSlot, Readback)> = self.under_way.drain(..count).collect();
+        if !ending.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(slot, _)| slot)) {
             return Err(wrong_slots("slots whose reads have not begun"));
         }
-        under_way.into_iter().zip(payloads).try_for_each(|((_, read), (_, payload))| read.copy_to(payload))
+        ending.into_iter().zip(payloads).try_for_each(|((_, read), (_, payload))| read.copy_to(payload))
     }
 
     fn read_some(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {

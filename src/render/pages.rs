@@ -131,14 +131,15 @@ pub trait PageRenderer: Renderer {
     fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
 
     /// Begins to copy slots back, each with the bytes of its payload, as they are after the work submitted so far; returns how many, from
-    /// the first. Fewer than all, even none, where memory is short. Does not wait.
+    /// the first. Fewer than all, even none, where memory is short. Does not wait. The slots may be given other payloads at once: the
+    /// device copies in the order of the calls.
     ///
     /// # Errors
-    /// The device failed, or copies that were begun before are not finished.
+    /// The device failed.
     fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError>;
 
-    /// Ends the copies that [`PageRenderer::begin_reads`] began, into payloads in the same order. Waits for the copies, not for work
-    /// submitted after them. Whatever happens, no copy is under way afterwards.
+    /// Ends the copies that [`PageRenderer::begin_reads`] began first, into payloads in the same order. Waits for the copies, not for work
+    /// submitted after them. Whatever happens, none of these copies is under way afterwards.
     ///
     /// # Errors
     /// The device failed.

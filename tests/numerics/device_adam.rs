@@ -1,30 +1,39 @@
-//! The f32 form of deferred Adam that devices compute, by its twin, against dense Adam in f64 over 50,000 steps.
+//! The f32 form of deferred Adam that devices compute, by its twin and on a device, against dense Adam in f64 over 50,000 steps.
 
 use crate::support::dense_adam::DenseAdam;
+use crate::support::gpu::open;
 use crate::twins::deferred::TableWords;
 use crate::twins::gather::{GatherInput, gather};
 use crate::twins::page_words::{Table, Words};
 use crate::twins::update::{UpdateInput, finish, judge, step};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::gpu::{Buffer, Gpu, GpuOptions};
 use gsscale::kernels::deferred::DeferredTables;
 use gsscale::kernels::page_words::{DevicePage, PageResult};
 use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::render::gpu_pages::{DevicePages, PageBatch, PageTable, UpdateBuffers};
+use gsscale::render::gpu_rows::{DeviceColumns, RowSource, footprint_bytes};
+use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::page_layout::{capacity_bytes, write_page};
+use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
 
 const STEPS: u32 = 50_000;
 /// A row has a gradient once in so many steps.
 const PERIODS: [u32; 12] = [1, 1, 2, 3, 7, 40, 199, 201, 399, 401, 3000, 20_000];
+const ROWS: usize = PERIODS.len();
+/// Values are compared once in so many steps: a prime, so that every row is met at many ages.
+const CHECKED: u32 = 997;
 const SPLITS: SplitNumbers = SplitNumbers { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
 
+/// Sees all rows, which move some units at most.
 fn camera() -> Camera {
-    let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+    let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1000.0]];
     let (width, height) = (16, 16);
     Camera { viewmat, fx: 8.0, fy: 8.0, cx: 8.0, cy: 8.0, width, height, near_plane: 0.01, far_plane: 1e10 }
 }
@@ -35,35 +44,98 @@ fn gradient(row: usize, draws: &mut Stream) -> f32 {
     (draws.normal() * size) as f32
 }
 
-#[test]
-fn the_form_of_devices_follows_dense_adam() {
-    for eps in [1e-15, 1e-8] {
-        let (rates, config) = (Rates::new(1.0, STEPS), AdamConfig { eps, ..AdamConfig::default() });
+/// The columns of rows without colour bands.
+fn columns() -> impl Iterator<Item = Column> {
+    Column::ALL.into_iter().filter(|column| column.width(0) > 0)
+}
+
+/// Dense Adam in f64, with the gradients of every step.
+struct Dense {
+    adam: DeferredAdam,
+    columns: [DenseAdam<f64>; 6],
+    draws: Stream,
+    /// By row.
+    updates: [u32; ROWS],
+}
+
+impl Dense {
+    /// Before the first of `steps` steps, and the rows as a page has them.
+    fn new(eps: f64, steps: u32) -> (Dense, Vec<u64>, PageLayout) {
+        let (rates, config) = (Rates::new(1.0, steps), AdamConfig { eps, ..AdamConfig::default() });
         let adam = DeferredAdam::new(rates, config, SimdPath::best());
-        let numbers = adam.numbers(STEPS).unwrap();
-        let tables = DeferredTables::new(&numbers);
-        let tables = TableWords::from(&tables);
-        let mut state = SceneState::from_columns(Columns::zeros(PERIODS.len(), 0));
+        let mut state = SceneState::from_columns(Columns::zeros(ROWS, 0));
         let mut draws = Stream::new(9, Purpose::Test, 0, 0);
         for column in Column::ALL {
             state.columns.column_mut(column).fill_with(|| draws.range(-2.0, 2.0) as f32);
         }
         let exact = |column| state.columns.column(column).iter().map(|x| f64::from(*x)).collect();
-        let mut dense = Column::ALL.map(|column| DenseAdam::<f64>::new(config, exact(column)));
-        let mut words = vec![0u64; capacity_bytes(PERIODS.len(), 0).div_ceil(8)];
+        let columns = Column::ALL.map(|column| DenseAdam::<f64>::new(config, exact(column)));
+        let mut words = vec![0u64; capacity_bytes(ROWS, 0).div_ceil(8)];
         let layout = write_page(&state, bytemuck::cast_slice_mut(&mut words));
+        (Dense { adam, columns, draws, updates: [0; ROWS] }, words, layout)
+    }
+
+    /// Takes step `now`. Returns the rows that have a gradient, and by column the gradients of all rows.
+    fn step(&mut self, now: u32) -> (Vec<usize>, Vec<Vec<f32>>) {
+        let rows: Vec<usize> = (0..ROWS).filter(|row| now % PERIODS[*row] == 0).collect();
+        let mut of_columns = Vec::new();
+        for column in columns() {
+            let width = column.width(0);
+            let mut grads = vec![0.0; ROWS * width];
+            for row in &rows {
+                grads[row * width..][..width].fill_with(|| gradient(*row, &mut self.draws));
+            }
+            let exact: Vec<f64> = grads.iter().map(|g| f64::from(*g)).collect();
+            self.columns[column as usize].step(&exact, self.adam.rates().at(column, now));
+            of_columns.push(grads);
+        }
+        rows.iter().for_each(|row| self.updates[*row] += 1);
+        (rows, of_columns)
+    }
+
+    /// Compares the values after `now` steps, `got(column, row, element)`.
+    ///
+    /// The limit is 1 unit in the last place of the value and 3e-6 of a rate for a row without updates since. Each update adds a
+    /// rounding of the value to nearest, half a unit with either sign, and some roundings of its own movement: a random walk, of
+    /// which six standard deviations are allowed.
+    fn check(&self, now: u32, mut got: impl FnMut(Column, usize, usize) -> f32) {
+        for column in columns() {
+            let rate = self.adam.rates().base(column);
+            for (row, updates) in self.updates.iter().enumerate() {
+                for e in 0..column.width(0) {
+                    let (got, want) =
+                        (got(column, row, e), self.columns[column as usize].values[row * column.width(0) + e]);
+                    // Values pass through larger ones on their way: 2 at the start, and what the rates allow later.
+                    let unit = f64::from(f32::EPSILON) * want.abs().max(2.0);
+                    let walk = 1.0 + 6.0 * f64::from(*updates).sqrt() * 0.29;
+                    let limit = (unit + 3e-6 * rate) * walk;
+                    let error = (f64::from(got) - want).abs();
+                    assert!(error <= limit, "{column:?} row {row} step {now}: {got} {want}, {error:e} of {limit:e}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_form_of_devices_follows_dense_adam() {
+    for eps in [1e-15, 1e-8] {
+        let (mut dense, words, layout) = Dense::new(eps, STEPS);
+        let adam = dense.adam.clone();
+        let numbers = adam.numbers(STEPS).unwrap();
+        let tables = DeferredTables::new(&numbers);
+        let tables = TableWords::from(&tables);
         let mut slab: Vec<u32> = bytemuck::cast_slice(&words).to_vec();
         let pages = [DevicePage::new(layout, 0, 0, 0)];
-        let mut updates = [0u32; PERIODS.len()];
         for now in 0..STEPS {
-            let rows: Vec<[u32; 2]> =
-                (0..PERIODS.len()).filter(|row| now % PERIODS[*row] == 0).map(|row| [0, row as u32]).collect();
+            let (with_gradient, of_columns) = dense.step(now);
+            let rows: Vec<[u32; 2]> = with_gradient.iter().map(|row| [0, *row as u32]).collect();
             let numbers_now = adam.at(now).numbers();
             let gathers = GatherUniforms::new(&camera(), &numbers, now, &SPLITS, 1);
             let of_step = UpdateUniforms::new(&camera(), &numbers_now, false);
             let mut largest = vec![0; rows.len()];
             let mut parts = Vec::new();
-            for column in Column::ALL.into_iter().filter(|c| c.width(0) > 0) {
+            for (column, of_column) in columns().zip(of_columns) {
                 let width = column.width(0);
                 let uniforms = gathers.of_column(&numbers, column, width, 0);
                 let input = GatherInput {
@@ -75,17 +147,8 @@ fn the_form_of_devices_follows_dense_adam() {
                 };
                 let mut values = vec![0.0; rows.len() * width];
                 gather(&input, &rows, &mut values);
-                let grads: Vec<f32> = rows
-                    .iter()
-                    .flat_map(|[_, row]| [*row as usize].repeat(width))
-                    .map(|row| gradient(row, &mut draws))
-                    .collect();
-                let mut all = vec![0.0; PERIODS.len() * width];
-                for (i, [_, row]) in rows.iter().enumerate() {
-                    let to = &mut all[*row as usize * width..][..width];
-                    to.iter_mut().zip(&grads[i * width..]).for_each(|(to, g)| *to = f64::from(*g));
-                }
-                dense[column as usize].step(&all, rates.at(column, now));
+                let grads: Vec<f32> =
+                    with_gradient.iter().flat_map(|row| &of_column[row * width..][..width]).copied().collect();
                 judge(width, &grads, &mut largest);
                 parts.push((column, values, grads));
             }
@@ -98,44 +161,113 @@ fn the_form_of_devices_follows_dense_adam() {
             let mut results = [<PageResult as bytemuck::Zeroable>::zeroed()];
             finish(&input, &vec![[0.0; 4]; rows.len()], &mut slab, &mut results, &mut []);
             assert_eq!((results[0].updated as usize, results[0].skipped), (rows.len(), 0));
-            rows.iter().for_each(|[_, row]| updates[*row as usize] += 1);
-            if (now + 1) % 997 == 0 || now + 1 == STEPS {
-                check(&adam, tables, (&slab, &pages[0]), &dense, &updates, now + 1);
+            if (now + 1) % CHECKED == 0 || now + 1 == STEPS {
+                let recent = adam.at(now + 1).numbers().recent;
+                dense.check(now + 1, |column, row, e| {
+                    let of = |table| f32::from_bits(slab[pages[0].row_at(column, table, row) + e]);
+                    let past = [of(Table::Values), of(Table::ExpAvg), of(Table::ExpAvgSq)];
+                    let (stamp, rate) = (slab[pages[0].stamp_at(row)], adam.rates().base(column) as f32);
+                    tables.evaluate(past, stamp, now + 1, &recent, column == Column::Means, rate)
+                });
             }
         }
     }
 }
 
-/// Compares the values after `now` steps.
-///
-/// The limit is 1 unit in the last place of the value and 3e-6 of a rate for a row without updates since. Each update adds a
-/// rounding of the value to nearest, half a unit with either sign, and some roundings of its own movement: a random walk, of
-/// which six standard deviations are allowed.
-fn check(
-    adam: &DeferredAdam,
-    tables: TableWords<'_>,
-    (slab, page): (&[u32], &DevicePage),
-    dense: &[DenseAdam<f64>; 6],
-    updates: &[u32],
-    now: u32,
-) {
-    let recent = adam.at(now).numbers().recent;
-    for column in Column::ALL.into_iter().filter(|c| c.width(0) > 0) {
-        let rate = adam.rates().base(column);
-        for (row, updates) in updates.iter().enumerate() {
-            for e in 0..column.width(0) {
-                let of = |table| f32::from_bits(slab[page.row_at(column, table, row) + e]);
-                let past = [of(Table::Values), of(Table::ExpAvg), of(Table::ExpAvgSq)];
-                let stamp = slab[page.stamp_at(row)];
-                let got = tables.evaluate(past, stamp, now, &recent, column == Column::Means, rate as f32);
-                let want = dense[column as usize].values[row * column.width(0) + e];
-                // Values pass through larger ones on their way: 2 at the start, and what the rates allow later.
-                let unit = f64::from(f32::EPSILON) * want.abs().max(2.0);
-                let walk = 1.0 + 6.0 * f64::from(*updates).sqrt() * 0.29;
-                let limit = (unit + 3e-6 * rate) * walk;
-                let error = (f64::from(got) - want).abs();
-                assert!(error <= limit, "{column:?} row {row} step {now}: {got} {want}, {error:e} of {limit:e}");
-            }
+/// A page in a slot of a device, all of whose rows are listed at every step.
+struct OnDevice {
+    gpu: Gpu,
+    pages: DevicePages,
+    slot: SlotPage,
+    listed: (PageBatch, PageTable),
+    values: DeviceColumns,
+    grads: DeviceColumns,
+    /// Of rows that are not drawn.
+    footprints: Buffer,
+    largest: Buffer,
+}
+
+impl OnDevice {
+    fn new(gpu: Gpu, dense: &Dense, words: &[u64], layout: PageLayout, steps: u32) -> OnDevice {
+        let numbers = dense.adam.numbers(steps).unwrap();
+        let rules = PageRules { payload_bytes: layout.bytes(), numbers, splits: SPLITS };
+        let mut pages = DevicePages::new(&gpu, &rules).unwrap();
+        pages.slots.add(&gpu, 1).unwrap();
+        let slot = SlotPage { slot: DeviceSlot(0), layout };
+        pages.slots.write(&gpu, &[(slot.slot, &bytemuck::cast_slice(words)[..layout.bytes()])]).unwrap();
+        let view = pages.begin(&gpu, &camera(), &dense.adam.at(0).numbers()).unwrap();
+        let listed = pages.list(&gpu, &view, &[slot]).unwrap();
+        assert_eq!(listed.0.rows as usize, ROWS, "a row is out of view");
+        let [values, grads] = [0; 2].map(|_| DeviceColumns::new(&gpu, ROWS as u32, 0).unwrap());
+        let mut recorder = gpu.begin("adam");
+        let footprints = recorder.buffer_zeroed("footprints", footprint_bytes(false) * ROWS as u64).unwrap();
+        gpu.submit(recorder).unwrap();
+        let largest = gpu.buffer("largest", 4 * ROWS as u64).unwrap();
+        OnDevice { pages, slot, listed, values, grads, footprints, largest, gpu }
+    }
+
+    /// Takes a step; with `is_checked` returns what it did to the page.
+    fn step(&self, adam: &DeferredAdam, now: u32, of_columns: &[Vec<f32>], is_checked: bool) -> Option<PageResult> {
+        let OnDevice { gpu, pages, values, grads, footprints, largest, .. } = self;
+        let view = pages.begin(gpu, &camera(), &adam.at(now).numbers()).unwrap();
+        let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
+        let mut recorder = gpu.begin("adam");
+        source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
+        for ((buffer, _), of_column) in grads.columns().zip(of_columns) {
+            recorder.upload(&buffer.view(), of_column).unwrap();
+        }
+        let results = recorder.buffer_zeroed("results", size_of::<PageResult>() as u64).unwrap();
+        let buffers = UpdateBuffers { values, grads, footprints, largest, results: &results, collects: false };
+        pages.update(gpu, &mut recorder, &source, &(0..ROWS), &buffers).unwrap();
+        gpu.submit(recorder).unwrap();
+        is_checked.then(|| pages.results(gpu, &source, &results).unwrap()[0])
+    }
+
+    /// The values after `now` steps, by column, as the device evaluates them.
+    fn values(&self, adam: &DeferredAdam, now: u32) -> Vec<Vec<f32>> {
+        let OnDevice { gpu, pages, values, .. } = self;
+        let view = pages.begin(gpu, &camera(), &adam.at(now).numbers()).unwrap();
+        let mut recorder = gpu.begin("adam");
+        let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
+        source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
+        let reads: Vec<_> =
+            values.columns().map(|(buffer, _)| recorder.read_back("adam", &buffer.view()).unwrap()).collect();
+        gpu.submit(recorder).unwrap();
+        reads.into_iter().map(|read| read.to_vec().unwrap()).collect()
+    }
+}
+
+/// `steps` steps on a device.
+fn follows_on_a_device(eps: f64, steps: u32) {
+    let Some(gpu) = open(&GpuOptions::default()) else { return };
+    let (mut dense, words, layout) = Dense::new(eps, steps);
+    let on = OnDevice::new(gpu, &dense, &words, layout, steps);
+    for now in 0..steps {
+        let (rows, of_columns) = dense.step(now);
+        let is_checked = (now + 1) % CHECKED == 0 || now + 1 == steps;
+        if let Some(result) = on.step(&dense.adam, now, &of_columns, is_checked) {
+            assert_eq!((result.updated as usize, result.skipped), (rows.len(), 0));
+            let values = on.values(&dense.adam, now + 1);
+            let of = |column| columns().position(|other| other == column).unwrap();
+            dense.check(now + 1, |column, row, e| values[of(column)][row * column.width(0) + e]);
         }
     }
+    // The device has written the page, and nothing but the page.
+    let mut payload = vec![0u64; layout.bytes().div_ceil(8)];
+    let bytes = &mut bytemuck::cast_slice_mut(&mut payload)[..layout.bytes()];
+    on.pages.slots.read(&on.gpu, &mut [(on.slot.slot, bytes)]).unwrap();
+    assert!(payload != words, "no row was written");
+}
+
+/// The tables of the run and all their ways: rows that sleep longer than the sum of recent steps reaches, and small second moments.
+#[test]
+fn a_device_follows_dense_adam() {
+    follows_on_a_device(1e-15, 2_000);
+}
+
+/// As long as a run. `cargo nextest run --test numerics --run-ignored only -E 'test(a_device_follows_dense_adam_over_a_run)'`
+#[test]
+#[ignore = "takes minutes on a software driver"]
+fn a_device_follows_dense_adam_over_a_run() {
+    [1e-15, 1e-8].into_iter().for_each(|eps| follows_on_a_device(eps, STEPS));
 }

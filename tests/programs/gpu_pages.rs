@@ -230,15 +230,10 @@ fn a_step_with_all_pages_on_the_device_moves_no_row() {
         );
     }
     assert!(loaded(59) > loaded(30), "every page had a slot");
-    // No order of eviction loads less than the bound. Loads ahead of their use keep the pages of two views at once, which costs
-    // 6 to 17 % more loads than loads on demand where slots hold two to three views (benches/RESULTS.md).
-    let slots = &lines[59]["slots"];
-    let [all, fewest] = ["bytes_loaded", "bytes_loaded_fewest"].map(|key| slots[key].as_u64().unwrap());
-    assert!((fewest..fewest + fewest / 4).contains(&all), "{all} bytes of at least {fewest}: {slots}");
     // The host's optimizer sums small second moments in f64, and divides exactly.
     let (device, host) = (psnr(&on_device), psnr(&on_host));
     println!("test PSNR after 60 steps: {device:.3} dB on the device, {host:.3} dB on the host");
-    assert!((device - host).abs() < 0.1, "{device} dB on the device, {host} dB on the host");
+    assert!((device - host).abs() < 0.05, "{device} dB on the device, {host} dB on the host");
     assert!(host > metrics(&on_host)[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
 }
 

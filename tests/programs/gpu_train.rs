@@ -53,11 +53,10 @@ fn a_gpu_trains_as_the_cpu_does() {
     assert!(words.contains(&device.summary().name), "{said}");
     let resolved = std::fs::read_to_string(on_gpu.join("config.toml")).unwrap();
     assert!(resolved.contains(&device.summary().name), "{resolved}");
-    // Rounding differences grow with every step, in both directions; after a thousand steps PSNR must agree within 0.1
-    // dB.
+    // Rounding differences grow with every step, in both directions. Growth would multiply them: `gpu_quality`.
     let (want, got) = (psnr(&on_cpu), psnr(&on_gpu));
     println!("test PSNR after 60 steps: {want:.3} dB on the CPU, {got:.3} dB on the GPU");
-    assert!((want - got).abs() < 0.1, "{got} dB, on the CPU {want} dB");
+    assert!((want - got).abs() < 0.05, "{got} dB, on the CPU {want} dB");
     let lines = metrics(&on_gpu);
     assert!(want > metrics(&on_cpu)[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
     for line in &lines {

@@ -92,14 +92,6 @@ pub trait RowBackend {
         working: &mut WorkingSet,
     ) -> Result<usize, TrainError>;
 
-    /// The device is at work on the picture of a view of one batch: copies for the next step may begin. Does not wait.
-    ///
-    /// # Errors
-    /// The device failed.
-    fn beside_picture(&mut self, _: &mut PagedScene) -> Result<(), TrainError> {
-        Ok(())
-    }
-
     /// Takes the gradients of the splats back to the rows of a batch, by its number; where its pages were pinned again, the
     /// rows are gathered again.
     ///

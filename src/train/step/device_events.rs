@@ -25,20 +25,21 @@ use crate::kernels::page_words::PageSurvey;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::SlotPage;
 use crate::render::{RenderError, Renderer};
+use crate::scene::page_meta::PageMeta;
 use crate::train::error::TrainError;
 
 /// What a device found out about a page, with what the index of pages says.
-fn facts(page: &PinnedPage, survey: &PageSurvey) -> PageFacts {
+fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
     let lowest_opacity = f32::from_bits(survey.lowest_opacity);
     PageFacts {
         largest_mean: f32::from_bits(survey.largest_mean),
-        extremes: Extremes { lowest_opacity, sigma_max: page.meta.bounds.sigma_max },
-        sh_degree: page.meta.sh_degree,
+        extremes: Extremes { lowest_opacity, sigma_max: page.bounds.sigma_max },
+        sh_degree: page.sh_degree,
     }
 }
 
 /// What a page would be like that no round edits.
-fn best_facts(page: &PinnedPage) -> PageFacts {
+fn best_facts(page: &PageMeta) -> PageFacts {
     facts(page, &PageSurvey { largest_mean: 0, lowest_opacity: f32::INFINITY.to_bits(), pad: [0; 2] })
 }
 
@@ -48,6 +49,12 @@ fn unless_short<T>(done: Result<T, RenderError>) -> Result<Option<T>, TrainError
         Err(RenderError::Device(error)) if error.lacks_room() => Ok(None),
         done => Ok(Some(done?)),
     }
+}
+
+/// Whether the events that a page is behind in certainly edit its rows, so that its payload in a slot serves no step any more.
+pub(super) fn are_edits_due(scene: &PagedScene, page: PageNo) -> bool {
+    let page = &scene.pager.index()[page.index()];
+    scene.rules.is_behind(page) && !scene.rules.pending().only_clears(page.events_applied as usize, &best_facts(page))
 }
 
 impl DeviceTier {
@@ -87,7 +94,7 @@ impl DeviceTier {
         let in_slot = |page: &PinnedPage| Some(SlotPage { slot: *slots.memory(page.page)?, layout: page.layout() });
         let (mut pages, mut in_slots) = (Vec::new(), Vec::new());
         for page in pinned.iter_mut().filter(|page| page.meta.rows > 0 && scene.rules.is_behind(&page.meta)) {
-            if let Some(slot) = in_slot(page).filter(|_| only_clears(page, &best_facts(page))) {
+            if let Some(slot) = in_slot(page).filter(|_| only_clears(page, &best_facts(&page.meta))) {
                 pages.push(page);
                 in_slots.push(slot);
             }
@@ -100,7 +107,7 @@ impl DeviceTier {
         let Some(surveys) = unless_short(device.survey(&in_slots))? else { return Ok(()) };
         let of_pages = pages.into_iter().zip(in_slots).zip(&surveys);
         let (cleared, in_slots): (Vec<&mut PinnedPage>, Vec<SlotPage>) = of_pages
-            .filter(|((page, _), survey)| only_clears(page, &facts(page, survey)))
+            .filter(|((page, _), survey)| only_clears(page, &facts(&page.meta, survey)))
             .map(|(page_in_slot, _)| page_in_slot)
             .unzip();
         if cleared.is_empty() || unless_short(device.clear_statistics(&in_slots))?.is_none() {

@@ -20,9 +20,14 @@
 //! | a step was unsound or changed no row: further ones may end the run | the trainer |
 //! | corrections of pictures, masks of blocks, views that may be left out | the trainer |
 //! | a page of the view has events to apply | this file |
-//! | pages of the view have no slot and no slot is free, or there are too few frames for two views | this file |
+//! | a page of the view is leaving its slot, or there are too few frames for two views | this file |
 //! | the view is several batches | this file |
+//! | the step before was not taken | this file |
 //! | memory for the step is short | the renderer; this file tries again some steps later |
+//!
+//! Payloads that the device lacks go up when a step is recorded, into slots of pages that leave behind the steps in flight
+//! (`device_leaving`). So the order of eviction is that of a run that waits. A step that was not taken, and the step behind it, are taken
+//! again with other pages in slots: a page of them goes up again if it has left, and so does the page that leaves for it.
 //!
 //! A view of several batches gives each slot to several pages within its step. The host copies a page back before the slot takes
 //! the next one, so it waits several times in such a step whatever is recorded. A step recorded behind it would need slots for its own pages
@@ -36,6 +41,7 @@
 //! step in flight is pinned in its slot and in its frame, and is neither held nor released; 4. a step that was not taken leaves pages,
 //! statistics and bounds as they were.
 
+use super::device_leaving::Leaves;
 use super::device_tier::{DeviceTier, device_of};
 use super::flights::Flight;
 use super::pages::PagedScene;
@@ -45,7 +51,7 @@ use crate::base::error::InputError;
 use crate::base::ids::PageNo;
 use crate::base::trace;
 use crate::paging::pinned::PinnedPage;
-use crate::render::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
+use crate::render::pages::{RecordedUpdate, StepDone, StepJob};
 use crate::render::{LossOptions, RenderError, RenderOptions, Renderer};
 use crate::scene::camera::Camera;
 use crate::scene::frustum::Frustum;
@@ -57,6 +63,17 @@ use std::collections::BTreeSet;
 const STEPS_WITHOUT: u32 = 16;
 /// Spare room of a list, rows, beyond the number that is expected.
 const ROWS_MORE: u64 = 256;
+
+/// What became of a step to record.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Recorded {
+    /// It is in flight.
+    Done,
+    /// There is no memory for what must leave behind the step in flight: the step can be recorded when that one is finished.
+    TooEarly,
+    /// Memory is short.
+    Short,
+}
 
 /// A step to record.
 #[derive(Debug, Clone, Copy)]
@@ -108,9 +125,9 @@ impl DeviceTier {
         self.flights.steps.len()
     }
 
-    /// Whether one more step may be in flight.
+    /// Whether one more step may be in flight. None behind a step that may well not be taken: both would be taken again.
     pub fn may_record(&self) -> bool {
-        self.in_flight() < self.flights.most
+        self.in_flight() < if self.flights.is_sure { self.flights.most } else { self.flights.most.min(1) }
     }
 
     /// The pages that `camera` may need once the steps in flight are done, ascending by id. The bounds are widened by the
@@ -138,11 +155,11 @@ impl DeviceTier {
         {
             return false;
         }
-        let others = self.flights.pages.keys().filter(|page| !pages.contains(page)).count();
-        let missing = pages.iter().filter(|page| self.slots.state(**page).is_none()).count();
-        // A step behind another one must not wait: frames for both and as many again, and free slots.
+        let others = self.flights.pages.keys().filter(|page| !pages.contains(page)).count() + self.pages_leaving();
+        // A step behind another one must not wait: frames for both and as many again, and no frame that is still to be filled.
         self.flights.steps.is_empty()
-            || (scene.pager.frames_max() >= 2 * (others + pages.len()) && self.slots.free_frames() >= missing)
+            || (scene.pager.frames_max() >= 2 * (others + pages.len())
+                && !pages.iter().any(|page| self.is_leaving(*page)))
     }
 
     /// Records a step on the pages of a device, without waiting for anything that the device computes. False, with nothing changed, where
@@ -166,14 +183,16 @@ impl DeviceTier {
         self.pin_flight(scene, renderer, step.step, &pages)?;
         scene.pager.prefetch(step.step);
         match self.record_pinned(scene, renderer, &pages, step) {
-            Ok(true) => {
-                self.flights.steps.push_back(Flight { camera: *step.camera, pages });
+            Ok(Recorded::Done) => {
+                self.flights.steps.push_back(Flight { step: step.step, camera: *step.camera, pages });
                 scene.pager.prefetch(step.step);
                 Ok(true)
             }
-            Ok(false) => {
+            Ok(other) => {
                 self.release_flight(scene, &pages);
-                self.flights.not_before = step.step.saturating_add(STEPS_WITHOUT);
+                if other == Recorded::Short {
+                    self.flights.not_before = step.step.saturating_add(STEPS_WITHOUT);
+                }
                 Ok(false)
             }
             Err(error) => {
@@ -208,13 +227,14 @@ impl DeviceTier {
         renderer: &mut dyn Renderer,
         pages: &[PageNo],
         step: &StepToRecord<'_>,
-    ) -> Result<bool, TrainError> {
-        let _span = trace::span("record step").with("recorded", u64::from(step.step));
+    ) -> Result<Recorded, TrainError> {
+        let (recorded, of_view) = (u64::from(step.step), pages.len() as u64);
+        let _span = trace::span("record step").with("recorded", recorded).with("pages", of_view);
         let flying = std::mem::take(&mut self.flights.pages);
         let pinned: Vec<&PinnedPage> = pages.iter().filter_map(|page| flying.get(page)).map(|(page, _)| page).collect();
-        let in_slots = self.load(scene, renderer, &pinned);
+        let in_slots = self.load_behind(scene, renderer, step.step, &pinned);
         self.flights.pages = flying;
-        let in_slots: Vec<SlotPage> = in_slots?;
+        let Some(in_slots) = in_slots? else { return Ok(Recorded::TooEarly) };
         let rows_in_pages: u64 = in_slots.iter().map(|page| page.layout.rows as u64).sum();
         let strikes = |fault: StepFault| self.flights.faults.strikes(fault, step.step);
         let (rows_room, closes) = (step.rows_room(rows_in_pages), strikes(StepFault::Closed));
@@ -227,22 +247,22 @@ impl DeviceTier {
             isects_most: if strikes(StepFault::Isects) { 1 } else { u32::MAX },
         };
         if !device_of(renderer)?.record_picture(&job)? {
-            return Ok(false);
+            return Ok(Recorded::Short);
         }
         scene.pager.prefetch(step.step);
-        if let Some(next) = step.next {
-            self.begin_ahead(scene, renderer, next)?;
-        }
         let StepToRecord { target, loss, collects, .. } = *step;
         let rows_per_unusable = ROWS_PER_UNUSABLE as u32;
         let update = RecordedUpdate { target, loss, collects, rows_per_unusable, closes };
         if !device_of(renderer)?.record_update(&update)? {
-            return Ok(false);
+            return Ok(Recorded::Short);
         }
-        if let Some((next, _)) = step.next {
-            self.load_ahead(scene, renderer, next)?;
+        if let Some((next, camera)) = step.next {
+            let of_next = self.pages_behind(scene, camera, step.step);
+            // Pages of a step that may well be taken again stay.
+            let leaves = if self.flights.is_sure { Leaves::Used } else { Leaves::Unused };
+            self.load_ahead(scene, renderer, (next, &of_next), leaves)?;
         }
-        Ok(true)
+        Ok(Recorded::Done)
     }
 
     /// Waits for the first step in flight and takes over its effect on its pages. `None` if the step was not taken: no step is in flight
@@ -258,27 +278,38 @@ impl DeviceTier {
         let done = device_of(renderer)?.finish_step().map_err(torn)?;
         let needs = RenderError::OutOfOrder { call: "finish", needs: "record" };
         let flight = self.flights.steps.pop_front().ok_or_else(|| torn(needs))?;
+        self.flights.is_sure = done.closed == 0;
         if done.closed != 0 {
-            self.release_flight(scene, &flight.pages);
-            self.give_up(scene, renderer).map_err(torn)?;
+            self.give_up(scene, renderer, &flight).map_err(torn)?;
             return Ok(None);
         }
         let outcome = self.take_over(scene, &flight, &done);
+        self.finish_leaving(scene, renderer, flight.step, &mut [])?;
         self.release_flight(scene, &flight.pages);
         self.check_list_behind(scene)?;
         Ok(Some(outcome))
     }
 
-    /// Gives up the steps in flight behind a step that was not taken, and opens the gate.
-    fn give_up(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
+    /// Gives up a step that was not taken and the steps in flight behind it, and opens the gate.
+    fn give_up(
+        &mut self,
+        scene: &mut PagedScene,
+        renderer: &mut dyn Renderer,
+        flight: &Flight,
+    ) -> Result<(), TrainError> {
         let _span = trace::span("give up").with("behind", self.in_flight() as u64);
-        while let Some(behind) = self.flights.steps.pop_front() {
-            let done = device_of(renderer)?.finish_step()?;
-            self.release_flight(scene, &behind.pages);
-            if done.closed == 0 {
-                let problem = "a step was taken after a step that was given up";
-                return Err(InputError::new("the device", problem, "report this as a bug").into());
-            }
+        let behind = std::mem::take(&mut self.flights.steps);
+        let mut taken = 0;
+        for _ in &behind {
+            taken += usize::from(device_of(renderer)?.finish_step()?.closed == 0);
+        }
+        self.finish_leaving(scene, renderer, u32::MAX, &mut [])?;
+        for given_up in std::iter::once(flight).chain(&behind) {
+            self.release_flight(scene, &given_up.pages);
+        }
+        if taken > 0 {
+            let problem = "a step was taken after a step that was given up";
+            return Err(InputError::new("the device", problem, "report this as a bug").into());
         }
         Ok(device_of(renderer)?.open_gate()?)
     }

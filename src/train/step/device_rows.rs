@@ -7,6 +7,7 @@
 //! Invariant: an update that failed is [`TrainError::Torn`]: pages that exist on the device alone may be changed.
 
 use super::batch::{AtStep, RowBackend, UpdateCounts};
+use super::device_leaving::Leaves;
 use super::device_tier::{DeviceTier, device_of};
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
@@ -24,10 +25,12 @@ const SLOTS_AHEAD_SHARE: usize = 4;
 pub struct DeviceRows<'a> {
     tier: &'a mut DeviceTier,
     renderer: &'a mut dyn Renderer,
-    /// Number and camera of the next step.
-    next: Option<(u32, &'a Camera)>,
-    /// Number of the next step, whose payloads go up beside the update of the last batch.
-    beside_update: Option<u32>,
+    /// This step.
+    step: u32,
+    /// The camera of the next step.
+    next: Option<&'a Camera>,
+    /// The pages that the next step needs, by the bounds before this step; known in the last batch of the pass out.
+    of_next: Option<Vec<PageNo>>,
 }
 
 impl<'a> DeviceRows<'a> {
@@ -42,23 +45,29 @@ impl<'a> DeviceRows<'a> {
         (step, next): (u32, Option<&'a Camera>),
     ) -> Result<DeviceRows<'a>, TrainError> {
         tier.begin_step(scene, renderer, step)?;
-        Ok(DeviceRows { tier, renderer, next: next.map(|camera| (step + 1, camera)), beside_update: None })
+        Ok(DeviceRows { tier, renderer, step, next, of_next: None })
     }
 
-    /// Updates the pages of a batch in their slots; payloads of the next step go up while the device does it.
+    /// Copies payloads of the next step up.
+    fn load_ahead(&mut self, scene: &PagedScene, leaves: Leaves) -> Result<(), TrainError> {
+        let Some(of_next) = &self.of_next else { return Ok(()) };
+        self.tier.load_ahead(scene, self.renderer, (self.step + 1, of_next), leaves)
+    }
+
+    /// Updates the pages of a batch in their slots; payloads of the next step go up behind that.
     fn update_slots(
         &mut self,
         scene: &mut PagedScene,
         batch: usize,
-        pinned: &[PinnedPage],
+        pinned: &mut [PinnedPage],
         collects: bool,
     ) -> Result<Vec<PageResult>, TrainError> {
-        let pages = self.tier.loaded(pinned);
+        let pages = self.tier.loaded(pinned.iter());
         device_of(self.renderer)?.begin_update(batch, &pages, collects)?;
-        if let Some(step) = self.beside_update.take() {
-            self.tier.load_ahead(scene, self.renderer, step)?;
-        }
-        Ok(device_of(self.renderer)?.finish_update()?)
+        self.load_ahead(scene, Leaves::Used)?;
+        let results = device_of(self.renderer)?.finish_update()?;
+        self.tier.finish_leaving(scene, self.renderer, self.step, pinned)?;
+        Ok(results)
     }
 }
 
@@ -110,10 +119,6 @@ impl RowBackend for DeviceRows<'_> {
         Ok(device_of(self.renderer)?.pages_in(&pages, &step)?)
     }
 
-    fn beside_picture(&mut self, scene: &mut PagedScene) -> Result<(), TrainError> {
-        self.next.map_or(Ok(()), |next| self.tier.begin_ahead(scene, self.renderer, next))
-    }
-
     fn rows_out(
         &mut self,
         scene: &mut PagedScene,
@@ -122,21 +127,17 @@ impl RowBackend for DeviceRows<'_> {
         _: AtStep<'_>,
         _: &mut WorkingSet,
     ) -> Result<(), TrainError> {
-        // The last batch of the pass out: the step needs no other page any more.
-        let next = self.next.filter(|_| batch == 0);
         if is_again {
             self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
-            if let Some(next) = next {
-                self.tier.begin_ahead(scene, self.renderer, next)?;
-                self.beside_update = Some(next.0);
-            }
         }
         device_of(self.renderer)?.pages_out(batch)?;
-        match next.filter(|_| !is_again) {
-            // The device is at work on the gradients, which only `loss_value` and what follows wait for.
-            Some((step, _)) => self.tier.load_ahead(scene, self.renderer, step),
-            None => Ok(()),
+        // The last batch of the pass out: the step needs no other page any more.
+        if batch == 0 {
+            let behind = self.step;
+            self.of_next = self.next.map(|camera| self.tier.pages_behind(scene, camera, behind));
         }
+        // The device is at work on the gradients, which only `loss_value` and what follows wait for.
+        if is_again { Ok(()) } else { self.load_ahead(scene, Leaves::Unused) }
     }
 
     fn update(

@@ -5,13 +5,15 @@
 //! back: a page whose slot is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes
 //! nor evicts it.
 //!
-//! Not here: pages that events change (`device_events`); steps in flight (`device_flights`); copies for the next step while the
-//! device computes this one (`device_ahead`). A page that neither file has copied ahead is copied on demand, and the step waits.
+//! Not here: pages that events change (`device_events`); steps in flight (`device_flights`); how a batch gets its slots (`device_loads`);
+//! copies for the next step while the device computes this one (`device_ahead`); pages that leave their slots behind work under way
+//! (`device_leaving`).
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
 //! copies change no bit of a page; 3. commits, evaluations and exports see pages only after [`DeviceTier::drain`].
 
 use super::flights::Flights;
+use super::leaving::Leaving;
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
 use crate::base::trace;
@@ -24,11 +26,11 @@ use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::frames::table::FrameTable;
 use crate::paging::pinned::PinnedPage;
 use crate::paging::plan::bound::FewestReads;
-use crate::render::pages::{DeviceSlot, PageRenderer, PageRules, SlotPage};
+use crate::render::pages::{DeviceSlot, PageRenderer, PageRules};
 use crate::render::{RenderError, Renderer};
 use crate::train::error::TrainError;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 /// The share of the device memory of a run that slots may take; views keep the rest.
 pub const SLOTS_SHARE: u64 = 2;
@@ -63,22 +65,30 @@ pub struct SlotTraffic {
     pub bytes_loaded_fewest: u64,
 }
 
+/// The slot of a page that a step uses.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SlotInUse {
+    pub slot: DeviceSlot,
+    /// Whether the slot is newer than the frame.
+    pub is_newer: bool,
+    /// Bytes of the payload.
+    pub bytes: usize,
+}
+
 /// The pages of a run on a device.
 #[derive(Debug)]
 pub struct DeviceTier {
     pub(crate) slots: FrameTable<DeviceSlot>,
     /// Slots that have been given out, so that each is given out once.
-    given: u32,
+    pub(super) given: u32,
     /// Most slots that there may be.
     slots_most: usize,
     /// Pages whose slot is newer than their frame, pinned in the pager, outside of the batch of a step.
     pub(crate) held: BTreeMap<PageNo, PinnedPage>,
-    /// Pages that the next step needs and the device lacks, from `begin_ahead` to `load_ahead`.
-    pub(crate) coming: Vec<PageNo>,
-    /// Pages whose slots are being copied back, with their slots, from `begin_ahead` to `finish_leaving`.
-    pub(super) leaving: Vec<(PinnedPage, DeviceSlot)>,
-    /// Slots of the batch of a step, and whether they are newer than the frames.
-    in_use: BTreeMap<PageNo, (DeviceSlot, bool)>,
+    /// Pages whose slots were given to others and whose frames are still to be filled, in the order of their copies back.
+    pub(super) leaving: VecDeque<Leaving>,
+    /// Slots of the batch of a step, or of the steps in flight.
+    pub(super) in_use: BTreeMap<PageNo, SlotInUse>,
     pub(crate) traffic: SlotTraffic,
     /// Steps in flight.
     pub(super) flights: Flights,
@@ -104,12 +114,12 @@ pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
 }
 
 /// There is no slot for a page of a batch.
-fn no_slot(device: &dyn PageRenderer) -> TrainError {
+pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
 }
 
 /// Bytes of a page's payload.
-fn payload_bytes(page: &PinnedPage) -> usize {
+pub(super) fn payload_bytes(page: &PinnedPage) -> usize {
     page.layout().bytes()
 }
 
@@ -134,8 +144,7 @@ impl DeviceTier {
             given: 0,
             slots_most: slots_most as usize,
             held: BTreeMap::new(),
-            coming: Vec::new(),
-            leaving: Vec::new(),
+            leaving: VecDeque::new(),
             in_use: BTreeMap::new(),
             traffic: SlotTraffic::default(),
             flights,
@@ -201,8 +210,11 @@ impl DeviceTier {
         renderer: &mut dyn Renderer,
         step: u32,
     ) -> Result<(), TrainError> {
-        self.coming.clear();
-        self.finish_leaving(scene, renderer)?;
+        // Copies back that began behind a step in flight are not waited for.
+        if self.in_flight() == 0 {
+            self.finish_leaving(scene, renderer, u32::MAX, &mut [])?;
+        }
+        scene.pager.refresh_plan(step);
         self.slots.begin_step(step);
         self.fit(scene, renderer)
     }
@@ -218,7 +230,7 @@ impl DeviceTier {
     ) -> Result<Vec<PinnedPage>, TrainError> {
         let (own, others): (Vec<PageNo>, Vec<PageNo>) = pages.iter().partition(|page| self.held.contains_key(page));
         // As many frames again as the batch has pages: for pages that split, and for reads ahead.
-        let in_flight = self.flights.pages();
+        let in_flight = self.flights.pages() + self.pages_leaving();
         let most = scene.pager.frames_max().saturating_sub(in_flight + others.len() + pages.len()).max(own.len());
         self.drain_to(scene, renderer, most, pages)?;
         scene.pager.set_held(in_flight + self.held.len() - own.len());
@@ -246,7 +258,7 @@ impl DeviceTier {
     }
 
     /// Copies these held pages back to their frames and unpins them. Their slots stay, and equal the frames.
-    fn drain_pages(
+    pub(super) fn drain_pages(
         &mut self,
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
@@ -268,21 +280,9 @@ impl DeviceTier {
         renderer: &mut dyn Renderer,
         pages: impl Iterator<Item = &'a mut PinnedPage>,
     ) -> Result<(), TrainError> {
-        let slots = &mut self.slots;
-        let in_slots: Vec<_> = pages.map(|page| (slots.begin_write(page.page), page)).collect();
-        let in_slots = in_slots.into_iter().map(|(slot, page)| (page, slot));
-        self.fill_frames(in_slots, |copies| Ok(device_of(renderer)?.read_slots(copies)?))
-    }
-
-    /// Fills the frames of pages, whose slots are being written back, with what `read` finds in the slots.
-    pub(super) fn fill_frames<'a>(
-        &mut self,
-        pages: impl Iterator<Item = (&'a mut PinnedPage, DeviceSlot)>,
-        read: impl FnOnce(&mut [(DeviceSlot, &mut [u8])]) -> Result<(), TrainError>,
-    ) -> Result<(), TrainError> {
         let (mut moved, mut copies) = (Vec::new(), Vec::new());
-        for (page, slot) in pages {
-            let bytes = payload_bytes(page);
+        for page in pages {
+            let (slot, bytes) = (self.slots.begin_write(page.page), payload_bytes(page));
             moved.push((page.page, slot));
             copies.push((slot, &mut page.payload_mut()[..bytes]));
         }
@@ -291,7 +291,7 @@ impl DeviceTier {
         }
         let bytes: usize = copies.iter().map(|(_, payload)| payload.len()).sum();
         let _span = trace::span("drain").with("pages", moved.len() as u64).with("bytes", bytes as u64);
-        let copied = read(&mut copies);
+        let copied = device_of(renderer).and_then(|device| Ok(device.read_slots(&mut copies)?));
         for (page, slot) in &moved {
             self.slots.finish_write(*page, *slot, copied.is_ok());
         }
@@ -309,7 +309,7 @@ impl DeviceTier {
         if self.in_flight() > 0 {
             return Err(RenderError::OutOfOrder { call: "drain", needs: "finish of every step in flight" }.into());
         }
-        self.finish_leaving(scene, renderer)?;
+        self.finish_leaving(scene, renderer, u32::MAX, &mut [])?;
         self.drain_to(scene, renderer, 0, &[])?;
         self.take_bins(scene, renderer)
     }
@@ -323,134 +323,18 @@ impl DeviceTier {
         Ok(())
     }
 
-    /// Puts the pages of a batch into slots; payloads that are missing are copied there.
-    pub(crate) fn load(
-        &mut self,
-        scene: &mut PagedScene,
-        renderer: &mut dyn Renderer,
-        pinned: &[&PinnedPage],
-    ) -> Result<Vec<SlotPage>, TrainError> {
-        let (mut missing, mut hits) = (Vec::new(), 0);
-        let with_rows = || pinned.iter().copied().filter(|page| page.meta.rows > 0);
-        let needed = with_rows().map(|page| (page.page, payload_bytes(page) as u64));
-        self.fewest.step(self.slots.frames_max(), needed);
-        for page in with_rows() {
-            // A step in flight may have pinned the slot already.
-            if !self.in_use.contains_key(&page.page) {
-                match self.slots.pin(page.page, true) {
-                    Some(in_slot) => drop(self.in_use.insert(page.page, in_slot)),
-                    None => {
-                        missing.push(page);
-                        continue;
-                    }
-                }
-            }
-            hits += 1;
-        }
-        self.traffic.hits += hits;
-        self.make_room(scene, renderer, missing.len())?;
-        let mut copies = Vec::new();
-        for page in missing {
-            let Some(slot) = self.new_slot(page.page, scene.pager.next_use(page.page)) else {
-                return Err(no_slot(device_of(renderer)?));
-            };
-            self.slots.pin(page.page, true);
-            self.in_use.insert(page.page, (slot, false));
-            copies.push((slot, &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]));
-        }
-        if !copies.is_empty() {
-            let written = device_of(renderer).and_then(|device| Ok(device.write_slots(&copies)?));
-            if let Err(error) = written {
-                self.forget(&copies);
-                return Err(error);
-            }
-            self.traffic.loads += copies.len() as u64;
-            self.traffic.bytes_loaded += copies.iter().map(|(_, payload)| payload.len() as u64).sum::<u64>();
-        }
-        let in_slot =
-            |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.0, layout: page.layout() });
-        Ok(with_rows().filter_map(in_slot).collect())
-    }
-
-    /// A free slot for the payload of a page, which is to be copied there; `None` where no slot is free.
-    pub(super) fn new_slot(&mut self, page: PageNo, next_use: u32) -> Option<DeviceSlot> {
-        let given = &mut self.given;
-        let slot = self.slots.begin_load(page, next_use, || {
-            *given += 1;
-            DeviceSlot(*given - 1)
-        })?;
-        self.slots.finish_load(page, slot);
-        Some(slot)
-    }
-
-    /// Gives up slots that were not filled.
-    fn forget(&mut self, copies: &[(DeviceSlot, &[u8])]) {
-        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other == slot);
-        let pages: Vec<PageNo> =
-            self.in_use.iter().filter(|(_, (slot, _))| unfilled(slot)).map(|(page, _)| *page).collect();
-        for page in pages {
-            if let Some((slot, _)) = self.in_use.remove(&page) {
-                self.slots.unpin(page, slot, false);
-                self.slots.evict(page);
-            }
-        }
-    }
-
-    /// The pages of a batch in the slots that [`DeviceTier::load`] gave them.
-    pub(super) fn loaded(&self, pinned: &[PinnedPage]) -> Vec<SlotPage> {
-        let in_slot =
-            |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.0, layout: page.layout() });
-        pinned.iter().filter_map(in_slot).collect()
-    }
-
-    /// Empties slots until `wanted` are free: of the pages that are needed last, by the plan.
-    fn make_room(
-        &mut self,
-        scene: &mut PagedScene,
-        renderer: &mut dyn Renderer,
-        wanted: usize,
-    ) -> Result<(), TrainError> {
-        if self.slots.free_frames() >= wanted {
-            return Ok(());
-        }
-        self.plan_uses(scene);
-        // All of them are read together, so the step waits once.
-        let mut newer = Vec::new();
-        while self.slots.free_frames() + newer.len() < wanted {
-            let Some(victim) = self.slots.victim() else { break };
-            match victim.dirty {
-                true => newer.push((victim.page, self.slots.begin_write(victim.page))),
-                false => self.slots.evict(victim.page),
-            }
-        }
-        newer.iter().for_each(|(page, slot)| self.slots.finish_write(*page, *slot, false));
-        let newer: Vec<PageNo> = newer.into_iter().map(|(page, _)| page).collect();
-        self.drain_pages(scene, renderer, &newer)?;
-        newer.into_iter().for_each(|page| self.slots.evict(page));
-        match self.slots.free_frames() < wanted {
-            true => Err(no_slot(device_of(renderer)?)),
-            false => Ok(()),
-        }
-    }
-
-    /// Takes over from the plan when the pages in slots are needed next.
-    pub(super) fn plan_uses(&mut self, scene: &PagedScene) {
-        let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
-        pages.into_iter().for_each(|page| self.slots.set_next_use(page, scene.pager.next_use(page)));
-    }
-
-    /// Notes that an update has changed a page of the batch in its slot.
+    /// Notes that an update has changed a page of the batch in its slot. A page that has left the slot since is no page of it any more.
     pub(crate) fn changed(&mut self, page: PageNo) {
-        if let Some((_, is_newer)) = self.in_use.get_mut(&page) {
-            *is_newer = true;
+        if let Some(in_use) = self.in_use.get_mut(&page) {
+            in_use.is_newer = true;
         }
     }
 
-    /// Takes the pages of a batch back: those that are newer on the device stay pinned in the pager.
+    /// Takes the pages of a batch back: those that are newer on the device, or leaving, stay pinned in the pager.
     pub(super) fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
         for page in &pinned {
-            if let Some((slot, is_newer)) = self.in_use.remove(&page.page) {
-                self.slots.unpin(page.page, slot, is_newer);
+            if let Some(in_use) = self.in_use.remove(&page.page) {
+                self.slots.unpin(page.page, in_use.slot, in_use.is_newer);
             }
         }
         let (held, others): (Vec<_>, Vec<_>) = pinned.into_iter().partition(|page| self.slots.is_dirty(page.page));
@@ -458,6 +342,7 @@ impl DeviceTier {
             scene.pager.note_meta(&page);
             self.held.insert(page.page, page);
         }
+        let others = self.keep_leaving(scene, others);
         scene.pager.release(others);
     }
 }

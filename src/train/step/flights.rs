@@ -17,6 +17,8 @@ pub const STEPS_IN_FLIGHT: usize = 2;
 /// A step that is recorded and not finished.
 #[derive(Debug)]
 pub(super) struct Flight {
+    /// Its number, 0-based.
+    pub step: u32,
     /// Its camera.
     pub camera: Camera,
     /// Its pages, ascending by id.
@@ -34,6 +36,8 @@ pub(super) struct Flights {
     pub not_before: u32,
     /// The most steps in flight.
     pub most: usize,
+    /// Whether the step that was finished last was taken. If not, or before the first one, the predicted sizes of lists are doubtful.
+    pub is_sure: bool,
     /// How far an update moves bounds.
     pub one_step: OneStep,
     /// Injected faults.
@@ -44,7 +48,15 @@ impl Flights {
     /// No step in flight yet, for a run whose updates move bounds by at most `one_step`.
     pub fn new(one_step: OneStep) -> Flights {
         let (most, faults) = (steps_in_flight(STEPS_IN_FLIGHT), StepFaults::from_environment());
-        Flights { steps: VecDeque::new(), pages: BTreeMap::new(), not_before: 0, most, one_step, faults }
+        Flights {
+            steps: VecDeque::new(),
+            pages: BTreeMap::new(),
+            not_before: 0,
+            most,
+            is_sure: false,
+            one_step,
+            faults,
+        }
     }
 
     /// Pages that steps in flight have pinned.

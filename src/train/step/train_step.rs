@@ -199,9 +199,6 @@ impl Passes<'_, '_> {
         self.backend.renderer().picture()?;
         // A device may be at work on the picture.
         self.prefetch_before_last();
-        if self.batches.len() == 1 {
-            self.backend.beside_picture(self.scene)?;
-        }
         self.comparison.loss_and_back(self.backend.renderer())?;
         if self.batches.len() > 1 && !self.comparison.is_left_out {
             // A drive that is full is found while the step can still be given up.

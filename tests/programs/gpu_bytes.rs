@@ -1,0 +1,90 @@
+//! Bytes that go up to a device that holds a part of the pages (`--optimizer-on device`), through the real binary: in every step hardly
+//! more than any order of eviction needs, and at most two payloads for each page of a step that is taken again.
+
+use super::gpu_flights::{Bench, same};
+use gsscale::scene::page_layout::capacity_bytes;
+use std::fmt::Write;
+
+/// No events: a payload goes up only because the device lacks it.
+const STEADY: &[&str] = &["--strategy", "none", "--sh-every", "0"];
+/// Upper bound on what a step takes up beside payloads: its photo, as often as the step is taken, and tables, lists and uniforms.
+const OTHERS: u64 = 3 * 4 * 48 * 36 + (128 << 10);
+
+/// Payload bytes that went up to the end of each step, and the fewest of any order of eviction.
+fn loaded(bench: &Bench, name: &str) -> Vec<[u64; 2]> {
+    let of = |line: &serde_json::Value, key: &str| line["slots"][key].as_u64().unwrap();
+    let lines = bench.metrics(name);
+    lines.iter().map(|line| ["bytes_loaded", "bytes_loaded_fewest"].map(|key| of(line, key))).collect()
+}
+
+#[test]
+fn in_every_step_hardly_more_than_the_fewest_bytes_went_up() {
+    let Some(bench) = Bench::new() else { return };
+    // Slots for a view, for two views and for more; with steps in flight and without.
+    let cases = [
+        ("5MiB", "shuffle", "2"),
+        ("5MiB", "groups:4", "2"),
+        ("4MiB", "shuffle", "2"),
+        ("7MiB", "groups:4", "2"),
+        ("5MiB", "shuffle", "0"),
+    ];
+    for (i, (device_mem, order, in_flight)) in cases.into_iter().enumerate() {
+        let name = format!("case{i}");
+        let more = [STEADY, &["--view-order", order, "--device-mem", device_mem]].concat();
+        assert!(bench.run(&name, in_flight, "", &more));
+        let (steps, last) = (loaded(&bench, &name), bench.metrics(&name).pop().unwrap());
+        let (slots, pages) = (&last["slots"], last["pages"].as_u64().unwrap());
+        println!("{device_mem}, {order}, {in_flight} in flight: {slots}");
+        assert!(slots["slots"].as_u64().unwrap() < pages && slots["loads"].as_u64().unwrap() > 2 * pages, "{slots}");
+        let replays = bench.spans(&name).iter().filter(|s| s.name == "give up" && s.args["behind"] != 0).count();
+        assert_eq!(replays, 0, "steps were taken again with another one behind them, which costs payloads");
+        for (step, [all, _]) in steps.iter().enumerate() {
+            // When a step ends, the payloads of two more may have gone up.
+            let [_, fewest] = steps[(step + 2).min(steps.len() - 1)];
+            assert!(*all as f64 <= 1.02 * fewest as f64, "{name} step {step}: {all} bytes of at least {fewest}");
+        }
+        let share = slots["loads_ahead"].as_f64().unwrap() / slots["loads"].as_f64().unwrap();
+        assert!(share > 0.5, "{name}: {share} of the payloads went up beside the step before");
+    }
+}
+
+#[test]
+fn a_step_that_is_taken_again_takes_up_at_most_two_payloads_for_each_of_its_pages() {
+    let Some(bench) = Bench::new() else { return };
+    let more = [STEADY, &["--view-order", "shuffle", "--device-mem", "5MiB"]].concat();
+    assert!(bench.run("sound", "2", "", &more));
+    let spans = bench.spans("sound");
+    let behind = spans.iter().filter(|s| s.name == "finish step" && s.args["in_flight"].as_u64() == Some(2));
+    let mut faults = String::new();
+    for (i, span) in behind.step_by(4).enumerate() {
+        write!(faults, "{}@{},", ["rows", "isects", "closed"][i % 3], span.step).unwrap();
+    }
+    assert!(bench.run("faults", "2", &faults, &more));
+    same(&bench.result("faults"), &bench.result("sound"), &faults);
+    // The pages of the steps that were given up: those that were not taken, and those behind them.
+    let spans = bench.spans("faults");
+    let pages_of = |step: u64| {
+        let recorded = spans.iter().filter(|s| s.name == "record step" && s.args["recorded"].as_u64() == Some(step));
+        recorded.filter_map(|s| s.args["pages"].as_u64()).max().unwrap()
+    };
+    let (mut given_up, mut replayed) = (0, 0);
+    for span in spans.iter().filter(|s| s.name == "give up") {
+        given_up += 1;
+        replayed += (0..=span.args["behind"].as_u64().unwrap()).map(|next| pages_of(span.step + next)).sum::<u64>();
+    }
+    let [sound, faulty] = ["sound", "faults"].map(|name| loaded(&bench, name));
+    let extra = faulty.last().unwrap()[0] - sound.last().unwrap()[0];
+    let most = 2 * replayed * capacity_bytes(32, 3) as u64;
+    println!("{given_up} replays of {replayed} pages took {extra} bytes up, of at most {most}");
+    assert!(given_up > 8 && extra > 0 && extra <= most, "{given_up} replays, {extra} bytes of at most {most}");
+    // Nothing else goes up.
+    for (name, steps) in [("sound", sound), ("faults", faulty)] {
+        for (i, line) in bench.metrics(name).iter().enumerate().skip(1) {
+            let (up, payloads) = (line["bytes_uploaded"].as_u64().unwrap(), steps[i][0] - steps[i - 1][0]);
+            assert!(
+                (payloads..payloads + OTHERS).contains(&up),
+                "{name} step {i}: {up} bytes up, {payloads} of payloads"
+            );
+        }
+    }
+}
