@@ -75,7 +75,7 @@ impl Dense {
 
     /// Takes step `now`. Returns the rows that have a gradient, and by column the gradients of all rows.
     fn step(&mut self, now: u32) -> (Vec<usize>, Vec<Vec<f32>>) {
-        let rows: Vec<usize> = (0..ROWS).filter(|row| now % PERIODS[*row] == 0).collect();
+        let rows: Vec<usize> = (0..ROWS).filter(|row| now.is_multiple_of(PERIODS[*row])).collect();
         let mut of_columns = Vec::new();
         for column in columns() {
             let width = column.width(0);
