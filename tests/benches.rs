@@ -6,6 +6,9 @@
 #[path = "../benches/bounded.rs"]
 mod bounded;
 #[allow(dead_code)] // its `main`
+#[path = "../benches/bus.rs"]
+mod bus;
+#[allow(dead_code)] // its `main`
 #[path = "../benches/commit.rs"]
 mod commit;
 #[allow(dead_code)] // its `main`
@@ -69,6 +72,33 @@ fn sizes(args: &[&str]) -> Lines {
 
 fn bounded(args: &[&str]) -> Lines {
     collected(|print| bounded::start(&bounded::Args::parse_from(arguments(args)), print))
+}
+
+#[test]
+fn buses_slow_steps_and_change_no_loss() {
+    if gsscale::gpu::list_adapters().iter().all(|adapter| adapter.refusal.is_some()) {
+        assert!(
+            std::env::var_os("CI").is_none(),
+            "there is no usable GPU adapter; mesa-vulkan-drivers has a software one"
+        );
+        println!("SKIPPED: there is no usable GPU adapter");
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 6, 64, 48, 600);
+    let args = [text(&scene), "--steps", "16", "--warm-up", "8", "--rounds", "1", "--shares", "2,20"];
+    let bus = |args: &[&str]| collected(|print| bus::start(&bus::Args::parse_from(arguments(args)), print));
+    let lines = bus(&args).unwrap();
+    let [slow, slower] = &lines[..] else { panic!("{lines:?}") };
+    for line in [slow, slower] {
+        assert_eq!((&line["same_losses"], number(line, "steps")), (&Value::Bool(true), 8.0), "{line}");
+        assert!(number(line, "download_seconds_median") > 0.0 && number(line, "ratio_hidden_none") >= 1.0, "{line}");
+        // A step cannot be faster than its uploads.
+        assert!(number(line, "seconds_per_step_median") > number(line, "upload_seconds_median"), "{line}");
+    }
+    assert!(number(slower, "upload_seconds_median") > 5.0 * number(slow, "upload_seconds_median"), "{slow} {slower}");
+    let error = bus(&[&args[..7], &["--shares", "0"]].concat()).unwrap_err().to_string();
+    assert!(error.contains("--shares") && error.contains("remedy"), "{error}");
 }
 
 #[test]
