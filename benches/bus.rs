@@ -143,7 +143,7 @@ fn run(args: &Args, out: &Path, rate: Option<f64>) -> InputResult<Vec<Step>> {
     train.arg(&args.scene).arg("--out").arg(out).args(RUN).args(["--device-mem", &args.device_mem, "--quiet"]);
     train.args(["--steps", &args.steps.to_string()]).args(&args.train).env_remove(BUS);
     if let Some(rate) = rate {
-        train.env(BUS, format!("{}/s,0us", rate.round()));
+        train.env(BUS, format!("{}B/s,0us", rate.round()));
     }
     let output = train.output().map_err(|e| InputError::io(&args.scene, "starting gsscale-train", &e))?;
     if !output.status.success() {

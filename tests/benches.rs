@@ -86,7 +86,7 @@ fn buses_slow_steps_and_change_no_loss() {
     }
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 6, 64, 48, 600);
-    let args = [text(&scene), "--steps", "16", "--warm-up", "8", "--rounds", "1", "--shares", "2,20"];
+    let args = [text(&scene), "--steps", "16", "--warm-up", "8", "--rounds", "1", "--shares", "0.2,2"];
     let bus = |args: &[&str]| collected(|print| bus::start(&bus::Args::parse_from(arguments(args)), print));
     let lines = bus(&args).unwrap();
     let [slow, slower] = &lines[..] else { panic!("{lines:?}") };
