@@ -89,7 +89,7 @@ mod tests {
         assert_eq!(rates(&TrainOverrides { scales_lr: Some(1e-3), ..long.clone() }), [1e-3, 3.0 * shn_lr]);
         let same = [scales_lr, shn_lr];
         assert_eq!(rates(&TrainOverrides { schedule: Some(Schedule::Classic), ..long.clone() }), same);
-        assert_eq!(rates(&TrainOverrides { strategy: None, ..long }), same);
+        assert_eq!(rates(&TrainOverrides { strategy: Some(StrategyName::Default), ..long }), same);
     }
 
     #[test]

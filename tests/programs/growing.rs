@@ -13,7 +13,7 @@ use tempfile::TempDir;
 /// Every kind of event happens several times: rounds (which also prune), opacity resets and raises of the SH degree.
 /// Small pages split often. Pruning by size would start with the first reset.
 const EVENTS: &str = "--page-rows 32 --refine-start 10 --refine-every 10 --reset-every 45 --sh-every 30 --prune-opa 0.05 \
-    --prune-scale3d 1000 --view-order groups:4 --test-every 8 --threads 2 --device cpu --schedule classic";
+    --prune-scale3d 1000 --view-order groups:4 --test-every 8 --threads 2 --device cpu --schedule classic --strategy default";
 
 fn words(text: &str) -> Vec<&str> {
     text.split_whitespace().collect()

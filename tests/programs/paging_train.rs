@@ -244,7 +244,7 @@ fn a_count_that_the_run_decides_pages_to_the_same_bits() {
         assert!(got == want, "{frames} frames");
         assert!(number(&summary, "pages_read") > 0, "{summary}");
     }
-    // A higher price allows fewer; and the last check cannot come after the last round.
+    // A higher price, and no trial, allow fewer; and the last check cannot come after the last round.
     let draft = [&base[..], &["--quality", "draft", "--refine-stop", "60"]].concat();
     let (_, summary) = run(folder.path(), &scene, &draft, &in_memory);
     let growth = summary["growth"].as_array().unwrap();
