@@ -10,7 +10,7 @@
 //! than there are, a round takes the surplus from the weighed rows in the same way.
 //!
 //! Where views come region by region, a round sees the scores of a few regions. Growth then spreads over whole epochs
-//! ([`LongAxisStrategy::share_of_room`]): otherwise the regions of the first rounds would take the room of all others.
+//! (`share_of_room`): otherwise the regions of the first rounds would take the room of all others.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the

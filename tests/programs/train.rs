@@ -5,6 +5,7 @@ use crate::support::scenes::{TextModel, city, eval, psnr, stderr, summary, text,
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
+use gsscale::densify::strategy::StrategyName;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
 use gsscale::train::inputs::prepare::{Prepared, prepare};
@@ -54,6 +55,7 @@ fn every_global_change_is_an_event_in_order() {
         refine_every: 10,
         refine_stop: 50,
         reset_every: 30,
+        strategy: StrategyName::Default,
         ..TrainConfig::default()
     };
     let Prepared { dataset, columns, sh_degree_start } = prepare(&scene, &config).unwrap();
