@@ -251,6 +251,29 @@ fn a_count_that_the_run_decides_pages_to_the_same_bits() {
     assert!(growth.len() == 3 && number(&growth[2], "allowed") < allowed, "{growth:?}");
 }
 
+/// A doubling on trial that fits noise is undone, and the same rows go for any number of frames and threads. Decisions depend on the
+/// last bit where values are near a limit, so the instruction path is named.
+#[test]
+fn a_doubling_that_is_undone_pages_to_the_same_bits() {
+    let folder = TempDir::new().unwrap();
+    let scene = folder.path().join("scene");
+    let size = CityOptions { seed: 3, views: 14, width: 48, height: 36, points: 2000, ..CityOptions::default() };
+    write_city(&scene, &CityOptions { supersample: 1, ..size }, &|_, _| {}).unwrap();
+    let flags = "--schedule run-length --strategy long-axis --steps 300 --page-rows 128 --view-order groups:4 --test-every 0 \
+                 --device cpu --simd baseline --log-every 1 --seed 1 --quiet";
+    let base: Vec<&str> = flags.split_whitespace().collect();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let allowed: Vec<u64> = whole["growth"].as_array().unwrap().iter().map(|check| number(check, "allowed")).collect();
+    assert_eq!(allowed, [4000, 8000, 16_000, 8000]);
+    let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+    let rows = |line: &str| number(&serde_json::from_str(line).unwrap(), "gaussians");
+    let most = metrics.lines().map(rows).max().unwrap();
+    assert!(most > 15_000 && (7_500..=8_000).contains(&number(&whole, "gaussians")), "{most}, then {whole}");
+    let (got, summary) = run(folder.path(), &scene, &base, &How { frames: 60, io: "auto", threads: "1", more: &[] });
+    assert!(number(&summary, "pages_read") > 0, "{summary}");
+    assert!(got == want && summary["growth"] == whole["growth"]);
+}
+
 /// 16-bit moments change training, but paging changes nothing further.
 #[test]
 fn moments_in_16_bits_page_to_the_same_bits() {

@@ -38,6 +38,16 @@ impl EvictPolicy {
             EvictPolicy::LeastRecentlyUsed => true,
         }
     }
+
+    /// The place of a page in the order.
+    pub fn key(self, candidate: Candidate) -> Key {
+        let age = u32::MAX - candidate.last_use;
+        let by = match self {
+            EvictPolicy::FarthestNextUse => [candidate.next_use, age],
+            EvictPolicy::LeastRecentlyUsed => [age, 0],
+        };
+        Key { by, page: Reverse(candidate.page) }
+    }
 }
 
 /// A page that could be evicted.
@@ -53,7 +63,7 @@ pub struct Candidate {
 
 /// Place of a page in the order: the greatest key is evicted first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Key {
+pub struct Key {
     /// Two numbers that the policy orders by.
     by: [u32; 2],
     page: Reverse<PageNo>,
@@ -109,10 +119,10 @@ impl EvictOrder {
         if self.uses.len() <= page.index() {
             self.uses.resize(page.index() + 1, None);
         }
-        let key = self.key(candidate);
+        let key = self.policy.key(candidate);
         match self.uses[page.index()].replace((next_use, last_use)) {
             // The heap has this key already.
-            Some((next_use, last_use)) if self.key(Candidate { page, next_use, last_use }) == key => return,
+            Some((next_use, last_use)) if self.policy.key(Candidate { page, next_use, last_use }) == key => return,
             Some(_) => {}
             None => self.len += 1,
         }
@@ -149,16 +159,7 @@ impl EvictOrder {
     fn is_current(&self, key: Key) -> bool {
         let page = key.page.0;
         self.uses[page.index()]
-            .is_some_and(|(next_use, last_use)| self.key(Candidate { page, next_use, last_use }) == key)
-    }
-
-    fn key(&self, candidate: Candidate) -> Key {
-        let age = u32::MAX - candidate.last_use;
-        let by = match self.policy {
-            EvictPolicy::FarthestNextUse => [candidate.next_use, age],
-            EvictPolicy::LeastRecentlyUsed => [age, 0],
-        };
-        Key { by, page: Reverse(candidate.page) }
+            .is_some_and(|(next_use, last_use)| self.policy.key(Candidate { page, next_use, last_use }) == key)
     }
 
     /// Drops outdated keys when they are the greater part of the heap.

@@ -12,6 +12,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthValues;
 use crate::render::Renderer;
 use crate::render::color_correct::ColorCorrect;
+use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
 use std::time::Instant;
 
@@ -60,7 +61,9 @@ impl Trainer {
         of_view: impl Fn(Now<'_>, &mut dyn Renderer, &Compared<'_>) -> Result<[f64; N], TrainError>,
         (dataset, targets): (&Dataset, &TargetCache),
     ) -> Result<[f64; N], TrainError> {
-        self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
+        // Those of views that were trained on may have moved.
+        let cameras: Vec<Camera> = views.iter().map(|&view| self.camera(dataset, view)).collect();
+        self.fit_widest(&cameras);
         let corrects = self.photos.iter().any(|parameter| parameter.corrects());
         let render = self.render_options();
         let mut values: Vec<[f64; N]> = Vec::with_capacity(views.len());
@@ -71,7 +74,7 @@ impl Trainer {
                 continue;
             }
             let compared = Compared {
-                camera: &dataset.views[view].camera,
+                camera: &cameras[i],
                 target: &target,
                 render: &render,
                 loss: &self.options.loss,

@@ -43,13 +43,11 @@ pub(super) type Now<'a> = (&'a mut PagedScene, u32, &'a mut WorkingSet);
 /// # Errors
 /// Pages could not be had, or the renderer failed.
 pub(super) fn psnr_of_view(
-    (scene, now, working): Now<'_>,
+    now: Now<'_>,
     renderer: &mut dyn Renderer,
     view: &Compared<'_>,
 ) -> Result<[f64; 1], TrainError> {
-    let pages = scene.pager.pages_of_view(view.camera);
-    let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(view.pages_most));
-    Ok([Draw { scene, now, working, renderer, view, batches: &batches }.picture(None)?])
+    drawn(now, renderer, view, |draw| Ok([draw.picture(None)?]))
 }
 
 /// PSNR of a view with all rows, and without the faintest quarter of the rows drawn, dB.
@@ -57,18 +55,29 @@ pub(super) fn psnr_of_view(
 /// # Errors
 /// Pages could not be had, or the renderer failed.
 pub(super) fn psnr_without_faint(
-    (scene, now, working): Now<'_>,
+    now: Now<'_>,
     renderer: &mut dyn Renderer,
     view: &Compared<'_>,
 ) -> Result<[f64; 2], TrainError> {
+    renderer.weigh_rows(true)?;
+    drawn(now, renderer, view, |draw| {
+        let whole = draw.picture(None)?;
+        let weights = draw.weights()?;
+        let without = draw.picture(Some(&are_kept(&weights)))?;
+        Ok([whole, without])
+    })
+}
+
+/// What `measure` finds of a view, whose pages are drawn in batches.
+fn drawn<T>(
+    (scene, now, working): Now<'_>,
+    renderer: &mut dyn Renderer,
+    view: &Compared<'_>,
+    measure: impl FnOnce(&mut Draw<'_, '_>) -> Result<T, TrainError>,
+) -> Result<T, TrainError> {
     let pages = scene.pager.pages_of_view(view.camera);
     let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(view.pages_most));
-    renderer.weigh_rows(true)?;
-    let mut draw = Draw { scene, now, working, renderer, view, batches: &batches };
-    let whole = draw.picture(None)?;
-    let weights = draw.weights()?;
-    let without = draw.picture(Some(&are_kept(&weights)))?;
-    Ok([whole, without])
+    measure(&mut Draw { scene, now, working, renderer, view, batches: &batches })
 }
 
 /// Whether each row stays: all but the faintest quarter of those that were drawn.

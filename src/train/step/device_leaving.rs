@@ -21,7 +21,7 @@ use super::pages::PagedScene;
 use crate::base::error::InputError;
 use crate::base::ids::PageNo;
 use crate::base::trace;
-use crate::paging::frames::evict::Candidate;
+use crate::paging::frames::evict::{Candidate, EvictPolicy};
 use crate::paging::frames::frame::FrameState;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Renderer;
@@ -88,7 +88,7 @@ impl DeviceTier {
     }
 
     /// The first `wanted` pages in slots by Belady's order, in use or not, without those of `kept` and those that are needed at `latest` or
-    /// before. Ties as in [`crate::paging::frames::evict::EvictOrder`].
+    /// before.
     fn in_order_of_eviction(
         &mut self,
         scene: &PagedScene,
@@ -104,7 +104,7 @@ impl DeviceTier {
             may_leave(*state, held.page) && held.next_use > latest && !kept.contains(&held.page)
         });
         let mut pages: Vec<Candidate> = candidates.map(|(_, held)| held).collect();
-        pages.sort_unstable_by_key(|held| (Reverse(held.next_use), held.last_use, held.page));
+        pages.sort_unstable_by_key(|held| Reverse(EvictPolicy::FarthestNextUse.key(*held)));
         pages.truncate(wanted);
         pages
     }
