@@ -11,10 +11,11 @@
 //! of a view would be the children of the most important ones, and the loss would say nothing about the count.
 //! `benches/RESULTS.md` has the measurements, also of what failed.
 //!
-//! A loss below the price does not tell a scene of few points or few steps a photo, where every doubling pays, from one where growth only
-//! fits noise. The latter shows training views much better than held-out ones. Where it does not, a doubling is tried (but with `--quality
-//! draft`). At each further check the scene doubles again, if that gap is still small or the held-out views gained. Otherwise the last
-//! doubling is undone: the rows of least weight go ([`super::long_axis`]). The last check begins no trial, since no check would judge it.
+//! A loss below the price can mean two things. In a scene of few points, or of few steps a photo, every doubling pays. In other scenes
+//! growth only fits noise. The second kind shows training views much better than held-out ones. A scene without that gap doubles on
+//! trial, unless `--quality draft` is set. Each further check doubles it again, if the gap is still small or the held-out views gained.
+//! Otherwise the check undoes the last doubling: the rows of least weight go ([`super::long_axis`]). The last check begins no trial,
+//! since no check would judge it.
 //!
 //! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`), which rows grow
 //! ([`super::long_axis`]).

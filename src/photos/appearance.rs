@@ -154,7 +154,7 @@ impl PhotoParameter for Appearance {
         self.look.correct(picture, photo.width as usize, Some(photo));
     }
 
-    fn back(&mut self, photo: &Target, v_rgb: &mut [f32]) {
+    fn picture_back(&mut self, photo: &Target, v_rgb: &mut [f32]) {
         self.look.back(&self.drawn, photo, v_rgb);
     }
 

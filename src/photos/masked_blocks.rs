@@ -96,11 +96,11 @@ impl PhotoParameter for MaskedBlocks {
         self.now = is_begun.then_some(Now { view: Some(at.view), are_kept, all_count });
     }
 
-    fn looks(&self) -> bool {
+    fn needs_picture(&self) -> bool {
         self.now.is_some_and(|now| !now.are_kept)
     }
 
-    fn compared<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+    fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
         let Some(Now { view, are_kept, all_count }) = self.now else { return photo };
         let states = view.map_or(&[][..], |view| self.state.of_view(view));
         self.found = picture.filter(|_| !are_kept).and_then(|picture| blocks::look(states, picture, photo));

@@ -1,7 +1,7 @@
 //! The seam: what a kind of parameters of photos can do in a run.
 //!
-//! A step calls [`PhotoParameter::begin_step`], then [`PhotoParameter::correct`] and [`PhotoParameter::compared`] between the
-//! picture and its loss, [`PhotoParameter::back`] and [`PhotoParameter::rows_out`] on the way of the gradient, and
+//! A step calls [`PhotoParameter::begin_step`], then [`PhotoParameter::correct`] and [`PhotoParameter::target`] between the
+//! picture and its loss, [`PhotoParameter::picture_back`] and [`PhotoParameter::row_gradients`] on the way of the gradient, and
 //! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on.
 //!
 //! Invariants: 1. values change in `start`, `end_step` and `restore` alone, so that a step can be repeated or rehearsed; 2. what
@@ -49,7 +49,7 @@ pub struct PhotoStep<'a> {
     pub events: &'a EventLog,
     /// Only the loss is measured: the view is not trained on.
     pub is_left_out: bool,
-    /// Nothing is kept: the step only has to take the memory and the time of a step that uses all of the kind.
+    /// The step is a rehearsal: it takes the memory and the time of a step that uses everything of the kind, and its results are dropped.
     pub is_rehearsal: bool,
 }
 
@@ -123,21 +123,21 @@ pub trait PhotoParameter {
     /// Corrects the picture `[3][height][width]` before it is compared with the photo.
     fn correct(&mut self, _picture: &mut [f32], _photo: &Target) {}
 
-    /// Whether this step looks at the corrected picture.
-    fn looks(&self) -> bool {
+    /// Whether [`PhotoParameter::target`] needs the corrected picture in this step.
+    fn needs_picture(&self) -> bool {
         false
     }
 
-    /// The photo to compare with, after a look at the corrected picture if it [`PhotoParameter::looks`] at one.
-    fn compared<'a>(&'a mut self, _picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+    /// The photo that the picture is compared with. `_picture` is the corrected picture, `[3][height][width]`, if a parameter needs it.
+    fn target<'a>(&'a mut self, _picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
         photo
     }
 
-    /// Turns the gradient with respect to the picture after [`PhotoParameter::correct`] into that before it.
-    fn back(&mut self, _photo: &Target, _v_rgb: &mut [f32]) {}
+    /// Turns the gradient with respect to the corrected picture into that with respect to the drawn one. Both are `[3][height][width]`.
+    fn picture_back(&mut self, _photo: &Target, _v_rgb: &mut [f32]) {}
 
     /// Takes the gradients of the rows of a batch, drawn with bands up to `sh_degree`. Not called with rows on a device.
-    fn rows_out(&mut self, _rows: &Columns, _gradients: &Columns, _camera: &Camera, _sh_degree: u8) {}
+    fn row_gradients(&mut self, _rows: &Columns, _gradients: &Columns, _camera: &Camera, _sh_degree: u8) {}
 
     /// Learns from a step. Returns warnings for the user.
     fn end_step(&mut self, _: &PhotoOutcome<'_>) -> Vec<String> {
@@ -152,7 +152,7 @@ pub trait PhotoParameter {
     /// Frees the buffers for a step.
     fn free_buffers(&mut self) {}
 
-    /// Bytes that the values take in the course of a run, with the copies of a commit, where the forecast counts them.
+    /// For the forecast: most bytes of the values during a run, with the copies that a commit makes.
     fn value_bytes(&self, _: &Dataset) -> u64 {
         0
     }

@@ -71,7 +71,7 @@ impl PhotoParameter for Poses {
         self.sum = (is_begun && !step.is_left_out && !step.is_rehearsal).then(MotionSum::default);
     }
 
-    fn rows_out(&mut self, rows: &Columns, gradients: &Columns, camera: &Camera, sh_degree: u8) {
+    fn row_gradients(&mut self, rows: &Columns, gradients: &Columns, camera: &Camera, sh_degree: u8) {
         if let Some(sum) = &mut self.sum {
             sum.add(rows, gradients, camera, sh_degree);
         }

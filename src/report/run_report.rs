@@ -246,8 +246,8 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
 }
 
 /// Of a run whose scene doubled on trial.
-const TRIALS: &str = " This loss did not pay, but the photos trained on were hardly better than those held out, so the scene doubled on \
-    trial, and doubled again at the next check as long as that held or the held-out photos gained. Otherwise the last doubling was undone.";
+const TRIALS: &str = " This loss did not pay. But the photos trained on were hardly better than those held out, so the scene doubled on \
+    trial. Each further check doubled it again if that was still so, or if the held-out photos had gained. Otherwise it undid the last doubling.";
 
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {

@@ -44,7 +44,7 @@ impl<'a> Comparison<'a> {
                 self.photos.iter_mut().for_each(|parameter| parameter.correct(picture, self.target));
             }
         }
-        let target = compared(self.photos, renderer, self.target)?;
+        let target = target_of(self.photos, renderer, self.target)?;
         renderer.loss(target, &self.loss)?;
         if self.is_left_out {
             return Ok(());
@@ -53,23 +53,23 @@ impl<'a> Comparison<'a> {
         // gradient back.
         if corrects {
             let v_rgb = &mut renderer.picture_gradient()?.v_rgb;
-            self.photos.iter_mut().rev().for_each(|parameter| parameter.back(self.target, v_rgb));
+            self.photos.iter_mut().rev().for_each(|parameter| parameter.picture_back(self.target, v_rgb));
         }
         renderer.picture_back()
     }
 }
 
-/// The photo to compare with, after a look at the picture where a parameter looks at it.
-fn compared<'p>(
+/// The photo that the picture is compared with. The picture is read back only if a parameter needs it.
+fn target_of<'p>(
     photos: &'p mut [Box<dyn PhotoParameter>],
     renderer: &mut dyn Renderer,
     target: &'p Target,
 ) -> Result<&'p Target, RenderError> {
-    let picture = match photos.iter().any(|parameter| parameter.looks()) {
+    let picture = match photos.iter().any(|parameter| parameter.needs_picture()) {
         true => Some(renderer.image()?.rgb.as_slice()),
         false => None,
     };
     // Otherwise the loss names the sizes that differ.
     let picture = picture.filter(|picture| picture.len() == 3 * target.pixels());
-    Ok(photos.iter_mut().fold(target, |target, parameter| parameter.compared(picture, target)))
+    Ok(photos.iter_mut().fold(target, |target, parameter| parameter.target(picture, target)))
 }

@@ -50,6 +50,6 @@ impl DeviceTier {
                 Some(Coming { page, next_use: step, payload })
             })
             .collect();
-        self.exchange(scene, renderer, (step.saturating_sub(1), leaves, true), &coming, of_view).map(|_| ())
+        self.load_evicting(scene, renderer, (step.saturating_sub(1), leaves, true), &coming, of_view).map(|_| ())
     }
 }

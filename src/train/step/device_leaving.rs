@@ -51,7 +51,7 @@ impl DeviceTier {
     /// Copies payloads up, in this order, as far as there are slots; pages leave for them, but none of `kept`, and none that is needed as soon
     /// as they are. `behind` is the step that was submitted last; `is_ahead` says that its work may still be under way. Returns how many went
     /// up. Does not wait.
-    pub(super) fn exchange(
+    pub(super) fn load_evicting(
         &mut self,
         scene: &PagedScene,
         renderer: &mut dyn Renderer,
@@ -63,7 +63,7 @@ impl DeviceTier {
         if wanted > 0 {
             let latest = coming.iter().map(|page| page.next_use).max().unwrap_or(0);
             let victims = self.in_order_of_eviction(scene, kept, latest, wanted);
-            self.leave(renderer, behind, leaves, &victims)?;
+            self.evict_behind(renderer, behind, leaves, &victims)?;
         }
         let (mut copies, mut pages) = (Vec::new(), Vec::new());
         for page in coming {
@@ -110,7 +110,7 @@ impl DeviceTier {
     }
 
     /// Empties the slots of these pages, behind the work submitted so far. Pages for whose copies back there is no memory stay.
-    fn leave(
+    fn evict_behind(
         &mut self,
         renderer: &mut dyn Renderer,
         behind: u32,

@@ -83,7 +83,7 @@ impl DeviceTier {
             missing.iter().map(|page| Coming { page: page.page, next_use: step, payload: payload(page) }).collect();
         let how = (step.saturating_sub(1), Leaves::Used, self.in_flight() > 0);
         let kept: Vec<PageNo> = pinned.iter().map(|page| page.page).collect();
-        let loaded = self.exchange(scene, renderer, how, &coming, &kept)?;
+        let loaded = self.load_evicting(scene, renderer, how, &coming, &kept)?;
         for page in missing.iter().take(loaded) {
             self.use_slot(page);
         }

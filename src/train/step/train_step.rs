@@ -257,7 +257,7 @@ impl Passes<'_, '_> {
         if self.backend.has_gradients() {
             let (WorkingSet { columns, gradients, .. }, degree) = (&*self.working, self.scene.rules.sh_degree());
             let parameters = self.comparison.photos.iter_mut();
-            parameters.for_each(|parameter| parameter.rows_out(columns, &gradients.columns, self.camera, degree));
+            parameters.for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.camera, degree));
         }
         drop(span);
         if is_first {
