@@ -5,8 +5,9 @@
 //! same round: its time over max(compute, upload) + download, where upload and download are the bytes that crossed the bus over its rate.
 //! 1 is a step whose uploads hide behind compute; a step that hides nothing takes (compute + upload + download) over the same.
 //!
-//! On a software driver the device computes inside the call that submits, on the thread that would copy. Such a driver can hide nothing,
-//! whatever the order of copies and submissions is: `ratio_hidden_none` says what that alone costs.
+//! A run with an emulated bus submits on a thread of its own ([`gsscale::gpu`]), so a software driver computes beside the host as well, and the
+//! run without a bus does not. So the ratio may be below 1: compute then includes host work that hides too. `ratio_hidden_none` is that of a
+//! step that hides nothing.
 
 pub mod support;
 

@@ -7,11 +7,12 @@
 
 use std::collections::VecDeque;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
 
 use super::buffers::Pool;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use super::mapping::{MapState, Mapping, SharedState};
+use super::submitter::Ticket;
 use rayon::prelude::*;
 
 /// Bytes of one staging buffer, at most: in the range where copies run fastest.
@@ -51,21 +52,17 @@ fn fill(raw: &wgpu::Buffer, at: u64, bytes: &[u8]) -> GpuResult<()> {
 /// Alignment of mapped ranges.
 const MAP_ALIGNMENT: u64 = wgpu::MAP_ALIGNMENT;
 
-const PENDING: u8 = 0;
-const MAPPED: u8 = 1;
-const FAILED: u8 = 2;
-
 #[derive(Debug)]
 struct Chunk {
     raw: wgpu::Buffer,
-    state: Arc<AtomicU8>,
+    state: SharedState,
     used: u64,
 }
 
 #[derive(Debug, Default)]
 struct Set {
     chunks: Vec<Chunk>,
-    submission: Option<wgpu::SubmissionIndex>,
+    ticket: Option<Ticket>,
 }
 
 /// The sets; the first one is being filled, and the next one is the longest submitted.
@@ -141,27 +138,18 @@ impl Belt {
         Ok(done)
     }
 
-    /// Unmaps the staged chunks before a submission, which makes them visible to the device.
-    pub(super) fn finish(&mut self) {
-        for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
-            chunk.state.store(PENDING, Ordering::Release);
-            chunk.raw.unmap();
-        }
-    }
-
-    /// Swaps the sets after a submission: this one waits for the device, the other one is next.
-    pub(super) fn submitted(&mut self, submission: &wgpu::SubmissionIndex) {
+    /// Hands the staged chunks over to the submission of `ticket`: the device may read them, and `mappings` brings them back when it has.
+    /// The other set is next.
+    pub(super) fn hand_over(&mut self, ticket: &Ticket, mappings: &mut Vec<Mapping>) {
         let mut any = false;
         for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
             any = true;
             chunk.used = 0;
-            let state = Arc::clone(&chunk.state);
-            chunk.raw.map_async(wgpu::MapMode::Write, .., move |result| {
-                state.store(if result.is_ok() { MAPPED } else { FAILED }, Ordering::Release);
-            });
+            chunk.raw.unmap();
+            mappings.push(Mapping::new(&chunk.raw, wgpu::MapMode::Write, self.chunk_bytes, &chunk.state));
         }
         if any {
-            self.sets[0].submission = Some(submission.clone());
+            self.sets[0].ticket = Some(ticket.clone());
             self.sets.rotate_left(1);
         }
     }
@@ -170,14 +158,15 @@ impl Belt {
 impl Set {
     /// Whether the device has not read the last content of this set, as far as is known.
     fn is_busy(&self) -> bool {
-        self.submission.is_some() && self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) == PENDING)
+        self.ticket.is_some() && self.chunks.iter().any(|c| c.state.get() == MapState::Pending)
     }
 
     /// Waits until the device has read the last content of this set.
     fn wait(&mut self, driver: &Driver) -> GpuResult<()> {
-        let Some(submission) = self.submission.take() else { return Ok(()) };
-        driver.wait("upload", Some(submission))?;
-        if self.chunks.iter().any(|c| c.state.load(Ordering::Acquire) != MAPPED) {
+        let Some(ticket) = self.ticket.take() else { return Ok(()) };
+        driver.wait_until("upload", &ticket, || self.chunks.iter().all(|c| c.state.get() != MapState::Pending))?;
+        if self.chunks.iter().any(|c| c.state.get() != MapState::Mapped) {
+            driver.wait("upload", None)?; // a lost device may fail the mapping before it reports the loss
             return Err(GpuError::validation("upload", "staging memory could not be mapped again"));
         }
         Ok(())
@@ -191,7 +180,7 @@ impl Set {
             None => {
                 let usage = wgpu::BufferUsages::MAP_WRITE | wgpu::BufferUsages::COPY_SRC;
                 match pool.keep("upload staging", chunk_bytes, usage) {
-                    Ok(raw) => self.chunks.push(Chunk { raw, state: Arc::new(AtomicU8::new(MAPPED)), used: 0 }),
+                    Ok(raw) => self.chunks.push(Chunk { raw, state: SharedState::new(MapState::Mapped), used: 0 }),
                     // A smaller set is submitted more often.
                     Err(error) if error.lacks_room() && !self.chunks.is_empty() => return Ok(None),
                     Err(error) => return Err(error),

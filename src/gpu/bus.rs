@@ -2,7 +2,7 @@
 //! what hides behind what can be seen on any device.
 //!
 //! The host makes these copies itself, to and from mapped staging memory. On a device with its own memory they cross the bus while the host
-//! copies. So the emulated bus makes the host wait.
+//! copies. So the emulated bus makes the host wait. The device computes meanwhile, on software drivers too (`submitter`).
 //!
 //! Invariants: 1. a copy takes no less than the latency plus its bytes over the rate; 2. nothing but time changes.
 

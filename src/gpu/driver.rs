@@ -7,6 +7,7 @@ use std::sync::Arc;
 use super::bus::EmulatedBus;
 use super::error::{GpuError, GpuResult};
 use super::faults::Faults;
+use super::submitter::{Submitter, Ticket};
 use crate::base::trace;
 use std::time::Instant;
 
@@ -14,8 +15,11 @@ use std::time::Instant;
 #[derive(Debug)]
 pub(super) struct Driver {
     pub(super) device: wgpu::Device,
-    pub(super) queue: wgpu::Queue,
     pub(super) faults: Arc<Faults>,
+    /// Submits to the queue: on a thread where a bus is emulated.
+    pub(super) submitter: Submitter,
+    /// Nanoseconds of a tick of the device's clock.
+    pub(super) timestamp_period: f32,
     /// How long copies between host and device take; `None`: as long as they take.
     bus: Option<EmulatedBus>,
 }
@@ -48,7 +52,8 @@ impl Driver {
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| reports.report(&error)));
         let losses = Arc::clone(&faults);
         device.set_device_lost_callback(move |_, message| losses.lost(message));
-        Ok(Driver { device, queue, faults, bus })
+        let submitter = Submitter::new(&device, &queue, bus.is_some())?;
+        Ok(Driver { device, faults, submitter, timestamp_period: queue.get_timestamp_period(), bus })
     }
 
     /// A new buffer; one with `MAP_WRITE` is mapped.
@@ -76,15 +81,41 @@ impl Driver {
     pub(super) fn check(&self) -> GpuResult<()> {
         if self.faults.is_reported() {
             // Without work the device reports its loss. An error of the wait itself says less than those.
+            self.submitter.drain();
             let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
         }
         self.faults.check()
     }
 
-    /// Waits until the device has finished `submission`; errors that no report explains name `stage`.
-    pub(super) fn wait(&self, stage: &str, submission: Option<wgpu::SubmissionIndex>) -> GpuResult<()> {
+    /// Waits until `is_done`, which the device reports once it has finished the submission of `ticket`.
+    ///
+    /// A submission that is under way on the thread that submits holds up a poll. So the device is polled only if the report has not come
+    /// with the submission.
+    pub(super) fn wait_until(&self, stage: &str, ticket: &Ticket, is_done: impl Fn() -> bool) -> GpuResult<()> {
+        let span = trace::span("wait").of("for", stage);
+        let is_submitted = ticket.index().is_some();
+        drop(span);
+        if !is_submitted {
+            self.faults.check()?;
+            return Err(GpuError::validation(stage, "its commands were not submitted"));
+        }
+        while !is_done() {
+            self.wait(stage, Some(ticket))?;
+        }
+        Ok(())
+    }
+
+    /// Waits until the device has finished `submission`, or all; errors that no report explains name `stage`.
+    pub(super) fn wait(&self, stage: &str, submission: Option<&Ticket>) -> GpuResult<()> {
         let _span = trace::span("wait").of("for", stage);
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index: submission, timeout: None });
+        let submission_index = match submission {
+            Some(ticket) => ticket.index(),
+            None => {
+                self.submitter.drain();
+                None
+            }
+        };
+        let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
         self.faults.check()?;
         waited.map(|_| ()).map_err(|e| GpuError::validation(stage, e))
     }

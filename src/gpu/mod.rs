@@ -25,8 +25,8 @@
 //! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
 //! adapter.
 //!
-//! Files import each other in one direction: `error` <- `bus`, `faults` <- `driver` (the wgpu device that the others share) <- `buffers`,
-//! `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
+//! Files import each other in one direction: `error` <- `bus`, `faults`, `mapping` <- `submitter` <- `driver` (the wgpu device that the others
+//! share) <- `buffers`, `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
 
 #[cfg(feature = "gpu")]
 mod adapter;
@@ -47,6 +47,8 @@ mod faults;
 mod injected;
 mod layout;
 #[cfg(feature = "gpu")]
+mod mapping;
+#[cfg(feature = "gpu")]
 mod profile;
 #[cfg(feature = "gpu")]
 mod readback;
@@ -56,6 +58,8 @@ mod record;
 mod shader;
 #[cfg(feature = "gpu")]
 mod sources;
+#[cfg(feature = "gpu")]
+mod submitter;
 mod traffic;
 #[cfg(feature = "gpu")]
 mod uniforms;

@@ -8,7 +8,9 @@ use std::sync::Arc;
 use super::buffers::BufferView;
 use super::driver::Driver;
 use super::error::GpuResult;
-use super::readback::{PendingMap, Readback, Staging};
+use super::mapping::Mapping;
+use super::readback::{Readback, Staging};
+use super::submitter::Ticket;
 
 /// Most passes of one recorder that are timed; further ones are not.
 const PASSES_MAX: u32 = 1024;
@@ -49,7 +51,7 @@ impl Profiler {
         Profiler {
             staging,
             queries,
-            seconds_per_tick: if on { f64::from(driver.queue.get_timestamp_period()) * 1e-9 } else { 0.0 },
+            seconds_per_tick: if on { f64::from(driver.timestamp_period) * 1e-9 } else { 0.0 },
             recorded: Vec::new(),
             under_way: Vec::new(),
             sums: Vec::new(),
@@ -84,7 +86,11 @@ impl Profiler {
     }
 
     /// Records the read-back of this submission's timestamps.
-    pub(super) fn resolve(&mut self, encoder: &mut wgpu::CommandEncoder) -> GpuResult<Option<PendingMap>> {
+    pub(super) fn resolve(
+        &mut self,
+        encoder: &mut wgpu::CommandEncoder,
+        ticket: &Ticket,
+    ) -> GpuResult<Option<Mapping>> {
         let Some((set, resolved)) = &self.queries else { return Ok(None) };
         if self.recorded.is_empty() {
             return Ok(None);
@@ -93,7 +99,7 @@ impl Profiler {
         let count = 2 * u32::try_from(stages.len()).unwrap_or(PASSES_MAX);
         encoder.resolve_query_set(set, 0..count, resolved, 0);
         let view = BufferView { raw: resolved.clone(), label: "stage times", offset: 0, size: u64::from(count) * 8 };
-        let (readback, pending) = self.staging.record(encoder, "stage times", &view)?;
+        let (readback, pending) = self.staging.record(encoder, "stage times", &view, ticket)?;
         self.under_way.push((readback, stages));
         Ok(Some(pending))
     }

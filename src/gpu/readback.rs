@@ -4,20 +4,17 @@
 //! Invariants: (1) a read-back returns the bytes as of its place in the recording; (2) reading before the recorder was
 //! submitted is an error, never an endless wait.
 
-use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use super::belt::COPY_PART;
 use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use super::mapping::{MapState, Mapping, SharedState};
+use super::submitter::Ticket;
 use crate::base::trace;
 use rayon::prelude::*;
-
-const RECORDED: u8 = 0;
-const MAPPING: u8 = 1;
-const MAPPED: u8 = 2;
-const FAILED: u8 = 3;
 
 /// The source of staging buffers, and the number of bytes read.
 #[derive(Debug)]
@@ -32,22 +29,23 @@ impl Staging {
         Arc::new(Staging { driver, pool, read: AtomicU64::new(0) })
     }
 
-    /// Records the copy of `view` for `stage`.
+    /// Records the copy of `view` for `stage`, in a recording that `ticket` submits.
     pub(super) fn record(
         self: &Arc<Self>,
         encoder: &mut wgpu::CommandEncoder,
         stage: &'static str,
         view: &BufferView,
-    ) -> GpuResult<(Readback, PendingMap)> {
+        ticket: &Ticket,
+    ) -> GpuResult<(Readback, Mapping)> {
         let size = view.size;
         let mut to = self.pool.take("read-back staging", size, Purpose::ReadBack)?;
         to.set_reusable(false); // until the host has read and unmapped it
-        let raw = to.raw().clone();
-        encoder.copy_buffer_to_buffer(&view.raw, view.offset, &raw, 0, size);
+        encoder.copy_buffer_to_buffer(&view.raw, view.offset, to.raw(), 0, size);
         self.read.fetch_add(size, Ordering::Relaxed);
-        let (state, submission) = (Arc::new(AtomicU8::new(RECORDED)), Arc::new(OnceLock::new()));
-        let pending = PendingMap { raw, size, state: Arc::clone(&state), submission: Arc::clone(&submission) };
-        Ok((Readback { buffer: to, stage, size, state, submission, staging: Arc::clone(self) }, pending))
+        let state = SharedState::new(MapState::Recorded);
+        let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, size, &state);
+        let ticket = ticket.clone();
+        Ok((Readback { buffer: to, stage, size, state, ticket, staging: Arc::clone(self) }, mapping))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
@@ -73,30 +71,9 @@ pub struct Readback {
     buffer: Buffer,
     stage: &'static str,
     size: u64,
-    state: Arc<AtomicU8>,
-    submission: Arc<OnceLock<wgpu::SubmissionIndex>>,
+    state: SharedState,
+    ticket: Ticket,
     staging: Arc<Staging>,
-}
-
-/// The part of a read-back that its recorder keeps until submission.
-#[derive(Debug)]
-pub(super) struct PendingMap {
-    raw: wgpu::Buffer,
-    size: u64,
-    state: Arc<AtomicU8>,
-    submission: Arc<OnceLock<wgpu::SubmissionIndex>>,
-}
-
-impl PendingMap {
-    /// Requests the mapping; called right after the submission.
-    pub(super) fn start(self, submission: &wgpu::SubmissionIndex) {
-        let _ = self.submission.set(submission.clone()); // starts once
-        self.state.store(MAPPING, Ordering::Release);
-        let state = Arc::clone(&self.state);
-        self.raw.map_async(wgpu::MapMode::Read, ..self.size, move |result| {
-            state.store(if result.is_ok() { MAPPED } else { FAILED }, Ordering::Release);
-        });
-    }
 }
 
 impl Readback {
@@ -129,18 +106,16 @@ impl Readback {
     }
 
     fn wait(&self) -> GpuResult<()> {
-        if self.state.load(Ordering::Acquire) == RECORDED {
+        if self.state.get() == MapState::Recorded {
             return Err(GpuError::validation(self.stage, "read before its commands were submitted"));
         }
         let driver = &self.staging.driver;
         driver.faults.set_stage(self.stage);
-        while self.state.load(Ordering::Acquire) == MAPPING {
-            // Waits for this read-back's own submission only: the device may work on later ones meanwhile.
-            driver.wait(self.stage, self.submission.get().cloned())?;
-        }
+        // Waits for this read-back's own submission only: the device may work on later ones meanwhile.
+        driver.wait_until(self.stage, &self.ticket, || self.state.get() != MapState::Pending)?;
         driver.faults.check()?;
-        match self.state.load(Ordering::Acquire) {
-            MAPPED => Ok(()),
+        match self.state.get() {
+            MapState::Mapped => Ok(()),
             _ => {
                 // A lost device may fail the mapping before it reports the loss.
                 driver.wait(self.stage, None)?;

@@ -13,8 +13,10 @@ use super::device::Gpu;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
 use super::injected::{FaultKind, fill_device};
-use super::readback::{PendingMap, Readback};
+use super::mapping::Mapping;
+use super::readback::Readback;
 use super::shader::{BindingKind, Pipeline};
+use super::submitter::{Job, Ticket, Waker};
 use super::uniforms::UNIFORM_CHUNK;
 use crate::base::trace;
 
@@ -34,7 +36,7 @@ pub fn groups_1d(count: u32, workgroup: u32) -> [u32; 3] {
 /// A submission that can be waited for.
 #[derive(Debug, Clone)]
 pub struct Submission {
-    index: wgpu::SubmissionIndex,
+    ticket: Ticket,
     name: &'static str,
 }
 
@@ -47,7 +49,9 @@ pub struct Recording {
     encoder: wgpu::CommandEncoder,
     pass: Option<(wgpu::ComputePass<'static>, &'static str)>,
     uniforms: Vec<Vec<u8>>,
-    readbacks: Vec<PendingMap>,
+    readbacks: Vec<Mapping>,
+    /// Of the submission that the commands will be part of.
+    ticket: Ticket,
     _open: Arc<()>,
 }
 
@@ -61,8 +65,15 @@ impl Gpu {
     /// Starts a recording; `name` appears in errors that belong to no stage.
     pub fn begin(&self, name: &'static str) -> Recorder<'_> {
         let encoder = self.driver.encoder(name);
-        let (uniforms, readbacks) = (Vec::new(), Vec::new());
-        let work = Recording { name, encoder, pass: None, uniforms, readbacks, _open: Arc::clone(&self.recordings) };
+        let work = Recording {
+            name,
+            encoder,
+            pass: None,
+            uniforms: Vec::new(),
+            readbacks: Vec::new(),
+            ticket: Ticket::default(),
+            _open: Arc::clone(&self.recordings),
+        };
         Recorder { gpu: self, work }
     }
 
@@ -93,7 +104,7 @@ impl Gpu {
     /// The device was lost or ran out of memory.
     pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
         self.driver.faults.set_stage(submission.name);
-        self.driver.wait(submission.name, Some(submission.index.clone()))
+        self.driver.wait(submission.name, Some(&submission.ticket))
     }
 }
 
@@ -205,7 +216,7 @@ impl Recorder<'_> {
         self.check_copy("read_back", view, view.size)?;
         self.work.pass = None;
         self.gpu.driver.faults.set_stage(stage);
-        let (readback, pending) = self.gpu.staging.record(&mut self.work.encoder, stage, view)?;
+        let (readback, pending) = self.gpu.staging.record(&mut self.work.encoder, stage, view, &self.work.ticket)?;
         self.work.readbacks.push(pending);
         Ok(readback)
     }
@@ -353,7 +364,7 @@ impl Recorder<'_> {
         let _span = trace::span("submit").of("what", self.work.name);
         self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
-        let stamps = profiler.resolve(&mut self.work.encoder)?;
+        let stamps = profiler.resolve(&mut self.work.encoder, &self.work.ticket)?;
         drop(profiler);
         self.work.readbacks.extend(stamps);
         gpu.driver.faults.set_stage(self.work.name);
@@ -361,22 +372,21 @@ impl Recorder<'_> {
         let encoder = std::mem::replace(&mut self.work.encoder, gpu.driver.encoder(self.work.name));
         let commands = encoder.finish();
         gpu.driver.check()?;
-        let written = lock(&gpu.uniforms).write(&mut self.work.uniforms);
-        gpu.uploaded.fetch_add(written, Ordering::Relaxed);
-        let mut belt = lock(&gpu.belt);
-        belt.finish();
-        let index = gpu.driver.queue.submit([commands]);
-        belt.submitted(&index);
-        drop(belt);
-        for pending in self.work.readbacks.drain(..) {
-            pending.start(&index);
-        }
-        // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped.
-        let polled = gpu.driver.device.poll(wgpu::PollType::Poll);
+        let uniforms = lock(&gpu.uniforms).take(&mut self.work.uniforms);
+        let written: usize = uniforms.iter().map(|(_, bytes)| bytes.len()).sum();
+        gpu.uploaded.fetch_add(written as u64, Ordering::Relaxed);
+        let ticket = std::mem::take(&mut self.work.ticket);
+        let mut mappings = std::mem::take(&mut self.work.readbacks);
+        lock(&gpu.belt).hand_over(&ticket, &mut mappings);
+        mappings.iter().for_each(Mapping::hand_over);
+        let submitted = gpu
+            .driver
+            .submitter
+            .submit(self.work.name, Job { uniforms, commands, mappings, waker: Waker::of(&ticket) });
         gpu.driver.check()?;
-        polled.map_err(|e| GpuError::validation(self.work.name, e))?;
+        submitted?;
         lock(&gpu.profiler).collect(4)?;
-        Ok(Submission { index, name: self.work.name })
+        Ok(Submission { ticket, name: self.work.name })
     }
 }
 

@@ -51,12 +51,11 @@ impl UniformRing {
         Ok(BufferView { raw, label: "uniforms", offset, size })
     }
 
-    /// Writes the packed uniforms to their buffers, before the next submission; returns the number of bytes.
-    pub(super) fn write(&mut self, packed: &mut Vec<Vec<u8>>) -> u64 {
-        let mut written = 0;
-        for (raw, bytes) in self.chunks.iter().zip(packed.drain(..)) {
-            self.driver.cross(bytes.len() as u64, || self.driver.queue.write_buffer(raw, 0, &bytes));
-            written += bytes.len() as u64;
+    /// The packed uniforms and their buffers, which are written right before the next submission.
+    pub(super) fn take(&mut self, packed: &mut Vec<Vec<u8>>) -> Vec<(wgpu::Buffer, Vec<u8>)> {
+        let written: Vec<_> = self.chunks.iter().cloned().zip(packed.drain(..)).collect();
+        for (_, bytes) in &written {
+            self.driver.cross(bytes.len() as u64, || {});
         }
         written
     }
