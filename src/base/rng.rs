@@ -24,6 +24,10 @@ pub enum Purpose {
     Test = 7,
     /// Disturbances of a scene; keys: kind of draw, photo or point.
     Disturb = 8,
+    /// Which rows get copies in a round; keys: uid, number of the round.
+    Relocation = 9,
+    /// Noise on means; keys: uid, step.
+    MeanNoise = 10,
 }
 
 /// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number

@@ -6,6 +6,7 @@ use super::choice::{Chosen, Device};
 use super::file::TrainConfig;
 use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::interval::CommitEvery;
+use crate::densify::strategy::StrategyName;
 use crate::optim::adam::EPS_MIN;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
@@ -57,8 +58,18 @@ impl TrainConfig {
             ("log-every", self.log_every > 0, "1 or more"),
         ])?;
         self.check_thresholds()?;
+        self.check_strategy()?;
         self.check_place()?;
         self.check_rates()
+    }
+
+    /// What a strategy needs.
+    fn check_strategy(&self) -> InputResult<()> {
+        if self.strategy == StrategyName::Mcmc && self.max_gaussians == 0 {
+            let problem = "it grows up to a cap, and there is none";
+            return Err(InputError::new("--strategy mcmc", problem, "give --max-gaussians N, such as 1000000"));
+        }
+        Ok(())
     }
 
     /// What an optimizer on a device does not do.
@@ -70,6 +81,7 @@ impl TrainConfig {
             (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
             (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
             (!self.refine_poses, "it leaves the gradients of poses on the device", "leave out --refine-poses"),
+            (self.strategy != StrategyName::Mcmc, "it adds no noise to means", "leave out --strategy mcmc"),
             (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
         ];
         match needs.iter().find(|(holds, ..)| !holds) {
@@ -169,5 +181,17 @@ mod tests {
         let bad = TrainConfig { max_alpha: 0.999_999_98, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--max-alpha")));
         assert!(TrainConfig::default().check().is_ok());
+    }
+
+    #[test]
+    fn relocation_needs_a_cap_and_the_host() {
+        let uncapped = TrainConfig { strategy: StrategyName::Mcmc, ..TrainConfig::default() };
+        let refusal = uncapped.check().err().map(|e| e.to_string()).unwrap_or_default();
+        assert!(refusal.contains("--strategy mcmc") && refusal.contains("give --max-gaussians"), "{refusal}");
+        let capped = TrainConfig { max_gaussians: 1000, ..uncapped };
+        assert!(capped.check().is_ok());
+        let on_device = TrainConfig { optimizer_on: Chosen(Some(OptimizerPlace::Device)), ..capped };
+        let refusal = on_device.check().err().map(|e| e.to_string()).unwrap_or_default();
+        assert!(refusal.contains("leave out --strategy mcmc, or --optimizer-on host"), "{refusal}");
     }
 }

@@ -144,7 +144,7 @@ choices! {
     "ssim-padding": SsimPadding { Valid = "valid", Same = "same" }
     "optimizer": Method { Deferred = "deferred", Dense = "dense", Sparse = "sparse" }
     "moments": Moments { F32 = "f32", Bf16 = "bf16" }
-    "strategy": StrategyName { Default = "default", LongAxis = "long-axis", None = "none" }
+    "strategy": StrategyName { Default = "default", LongAxis = "long-axis", Mcmc = "mcmc", None = "none" }
     "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
     "quality": Quality { Draft = "draft", Normal = "normal", Archive = "archive" }
     "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }

@@ -188,7 +188,9 @@ config_keys! {
     }
     "Densification" {
         /// long-axis (split along the longest axis; at --max-gaussians, or at the number that --quality decides, remove the
-        /// Gaussians that contribute least), default (that of gsplat: clone, split, prune, reset), or none
+        /// Gaussians that contribute least), default (that of gsplat: clone, split, prune, reset), mcmc (3DGS-MCMC, as gsplat's:
+        /// relocation of faint Gaussians, 5 % growth a round, noise on positions; needs --max-gaussians, not with --optimizer-on
+        /// device), or none
         strategy: StrategyName = StrategyName::LongAxis => Numbers;
         /// With --strategy long-axis, grow first the Gaussians with the largest screen-space gradient (gradient), with the
         /// largest squared error in the pixels that they cover (error), or with the largest geometric mean of both (mixed)
@@ -214,7 +216,7 @@ config_keys! {
         grow_grad2d: f64 = 2e-4 => Numbers;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
         grow_scale3d: f64 = 0.01 => Numbers;
-        /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets
+        /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets. With --strategy mcmc, relocate them
         prune_opa: f64 = 0.005 => Numbers;
         /// Remove Gaussians larger than this (times the scene scale), after the first --reset-every steps
         prune_scale3d: f64 = 0.1 => Numbers;

@@ -9,6 +9,7 @@ use crate::dataset::read::ReadOptions;
 use crate::densify::default::DefaultStrategy;
 use crate::densify::growth::GrowthRule;
 use crate::densify::long_axis::LongAxisStrategy;
+use crate::densify::mcmc::McmcStrategy;
 use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
 use crate::exchange::meta::ExportFrame;
 use crate::optim::adam::AdamConfig;
@@ -99,21 +100,12 @@ impl RunOptions {
                 ..RenderOptions::default()
             },
             loss: loss_options(config),
-            rates: Rates {
-                means: config.means_lr * f64::from(scene_scale),
-                means_final_factor: config.means_lr_final,
-                scales: config.scales_lr,
-                quats: config.quats_lr,
-                opacities: config.opacities_lr,
-                sh0: config.sh0_lr,
-                sh_n: config.shn_lr,
-                steps: schedule_steps(config),
-            },
+            rates: rates(config, scene_scale),
             adam: AdamConfig { eps: config.adam_eps, ..AdamConfig::default() },
             optimizer: config.optimizer,
             optimizer_on: config.optimizer_on.0.unwrap_or_default(),
             moments: config.moments,
-            strategy: strategy(config),
+            strategy: strategy(config, scene_scale),
             scene_scale,
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
@@ -149,12 +141,27 @@ fn photo_options(config: &TrainConfig, scene_scale: f32) -> PhotoOptions {
     }
 }
 
+/// The learning rates of a config.
+fn rates(config: &TrainConfig, scene_scale: f32) -> Rates {
+    Rates {
+        means: config.means_lr * f64::from(scene_scale),
+        means_final_factor: config.means_lr_final,
+        scales: config.scales_lr,
+        quats: config.quats_lr,
+        opacities: config.opacities_lr,
+        sh0: config.sh0_lr,
+        sh_n: config.shn_lr,
+        steps: schedule_steps(config),
+    }
+}
+
 /// The strategy of a config.
-fn strategy(config: &TrainConfig) -> Arc<dyn Strategy> {
+fn strategy(config: &TrainConfig, scene_scale: f32) -> Arc<dyn Strategy> {
     match config.strategy {
         StrategyName::None => Arc::new(NoStrategy),
         StrategyName::Default => Arc::new(default_strategy(config)),
         StrategyName::LongAxis => Arc::new(long_axis_strategy(config)),
+        StrategyName::Mcmc => Arc::new(mcmc_strategy(config, scene_scale)),
     }
 }
 
@@ -196,6 +203,19 @@ fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
         refine_every: config.refine_every,
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
         growth: growth_rule(config),
+    }
+}
+
+fn mcmc_strategy(config: &TrainConfig, scene_scale: f32) -> McmcStrategy {
+    McmcStrategy {
+        dead_opacity: config.prune_opa as f32,
+        refine_start: config.refine_start,
+        refine_stop: config.refine_stop,
+        refine_every: config.refine_every,
+        max_gaussians: config.max_gaussians,
+        seed: config.seed,
+        scene_scale: f64::from(scene_scale),
+        rates: rates(config, scene_scale),
     }
 }
 

@@ -239,6 +239,7 @@ mod tests {
                 numbers.iter().map(|&row| [row as f32 + draws.uniform() as f32, draws.uniform() as f32]).collect();
             let radii = vec![[1, 1]; rows];
             let drawn = DrawnRows {
+                step: view as u32,
                 rows: &numbers,
                 v_means2d: &v_means2d,
                 radii: &radii,

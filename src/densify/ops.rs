@@ -10,7 +10,7 @@
 //! their parents; 4. new rows are finite, because the log-scales of a parent are moved into the range of the run first.
 
 use super::strategy::{Fate, Round, RowFacts};
-use crate::base::math::{exp32, logit};
+use crate::base::math::{exp32, logit, sigmoid};
 use crate::base::rng::{Purpose, Stream, hash64};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::events::{LONG_AXIS_OFFSET, SPLIT_SIGMAS};
@@ -25,6 +25,10 @@ const LONG_AXIS_SHRINK: f64 = 0.5;
 const SHORT_AXES_SHRINK: f64 = 0.85;
 /// Opacity of the children of a long-axis split over that of their parent, after activation.
 const CHILD_OPACITY: f64 = 0.6;
+/// Rows that share a place.
+const SHARERS: u64 = 2;
+/// Least opacity of a row that shares a place.
+const SHARED_OPACITY_LEAST: f32 = 0.005;
 
 /// The effect of a round in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -63,7 +67,10 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
             log_scale: log_scales[row],
             opacity: opacities[row],
         });
-        if matches!(fate, Fate::Split { .. } | Fate::SplitLongAxis | Fate::Duplicate { pruned: false }) {
+        if matches!(
+            fate,
+            Fate::Split { .. } | Fate::SplitLongAxis | Fate::SharePlace | Fate::Duplicate { pruned: false }
+        ) {
             values.evaluate_row(rows, row, &mut block);
             values.log_scales().clamp_all(scales_of(&mut block));
         }
@@ -101,6 +108,12 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
                 for (child, block) in (0..).zip(long_axis_children(&block)) {
                     new_rows.push(child_uid(rows.uid[row], event, child), &block);
                 }
+            }
+            Fate::SharePlace => {
+                counts.split += 1;
+                removed.push(row as u32);
+                let shared = sharing_row(&block);
+                (0..SHARERS).for_each(|child| new_rows.push(child_uid(rows.uid[row], event, child), &shared));
             }
         }
     }
@@ -195,13 +208,42 @@ fn long_axis_children(parent: &RowBlock) -> [RowBlock; 2] {
     })
 }
 
+/// One of [`SHARERS`] equal rows that share the place of a row. Values other than opacity and scales are copied.
+fn sharing_row(parent: &RowBlock) -> RowBlock {
+    let mut row = *parent;
+    let (scales, opacity) = (first_lane(Column::Scales), first_lane(Column::Opacities));
+    let [shared, shrink] = shared_opacity_and_scale(f64::from(sigmoid(parent[opacity])), SHARERS as u32);
+    // gsplat's limits of the opacity; a logit must be finite.
+    row[opacity] = logit((shared as f32).clamp(SHARED_OPACITY_LEAST, 1.0 - f32::EPSILON));
+    for scale in &mut row[scales..scales + 3] {
+        *scale = (f64::from(*scale) + libm::log(shrink)) as f32;
+    }
+    row
+}
+
+/// Opacity of each of `n` equal rows that together let as much light through as one row of this opacity, and the factor on its
+/// standard deviations that keeps the integral of the picture (Kheradmand et al. 2024, equation 9). The factor is at most 1.
+fn shared_opacity_and_scale(opacity: f64, n: u32) -> [f64; 2] {
+    let shared = -libm::expm1(libm::log1p(-opacity) / f64::from(n));
+    let mut sum = 0.0;
+    for i in 1..=n {
+        let mut binomial = 1.0;
+        for k in 0..i {
+            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            sum += binomial * sign * libm::pow(shared, f64::from(k + 1)) / f64::from(k + 1).sqrt();
+            binomial *= f64::from(i - 1 - k) / f64::from(k + 1);
+        }
+    }
+    [shared, if sum > 0.0 { (opacity / sum).min(1.0) } else { 1.0 }]
+}
+
 /// Log-scale of a split's child, with the rounding of [`split_child`].
 pub(super) fn child_log_scale(parent: f32) -> f32 {
     (f64::from(parent) - libm::log(SPLIT_SHRINK)) as f32
 }
 
 /// Rotation matrix of a quaternion (w, x, y, z) of any length; a zero quaternion gives the identity.
-fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
+pub(super) fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     let length = q.iter().map(|x| x * x).sum::<f64>().sqrt();
     Rotation::from_quaternion(q.map(|c| c / length)).unwrap_or(Rotation::IDENTITY).matrix()
 }
@@ -273,6 +315,33 @@ mod tests {
         }
         let certain = long_axis_children(&[1000.0; BLOCK_LANES]);
         assert!((certain[0][3] - logit(0.6)).abs() < 1e-6, "one f32 rounding");
+    }
+
+    /// The light that a row lets through along a line through its middle, at a distance of t standard deviations.
+    #[test]
+    fn rows_that_share_a_place_look_like_the_row() {
+        for opacity in [0.01, 0.1, 0.5, 0.9, 0.999] {
+            for n in 1..=8 {
+                let [shared, shrink] = shared_opacity_and_scale(opacity, n);
+                // One f64 rounding of each of a few functions.
+                assert!(((1.0 - shared).powi(n as i32) - (1.0 - opacity)).abs() < 1e-13, "{opacity}, {n}");
+                // The integral of 1 - (1 - o' g(x / s))^n over x equals that of o g(x): the paper's condition.
+                let gaussian = |x: f64| (-0.5 * x * x).exp();
+                let (step, points) = (1e-3, -10_000..=10_000);
+                let together = |x: f64| 1.0 - (1.0 - shared * gaussian(x / shrink)).powi(n as i32);
+                let integral: f64 = points.clone().map(|i| together(f64::from(i) * step) * step).sum();
+                let whole = opacity * (2.0 * std::f64::consts::PI).sqrt();
+                // The cut at 10 sigma and the sum of 20,000 terms.
+                assert!((integral / whole - 1.0).abs() < 1e-9, "{opacity}, {n}: {integral} of {whole}");
+                assert!(shrink <= 1.0);
+            }
+        }
+        let mut parent = [0.0f32; BLOCK_LANES];
+        let opacity = first_lane(Column::Opacities);
+        for logit_opacity in [-1000.0, -5.0, 0.0, 9.0, 1000.0] {
+            parent[opacity] = logit_opacity;
+            assert!(sharing_row(&parent).iter().all(|x| x.is_finite()), "{logit_opacity}");
+        }
     }
 
     #[test]

@@ -17,6 +17,7 @@
 use super::growth::GrowthRule;
 use super::stats::{GradHistogram, accumulate};
 use crate::optim::bounds::SplitLimits;
+use crate::scene::columns::Columns;
 use crate::scene::events::EventKind;
 use crate::scene::rows::{Rows, RowsMut};
 use std::fmt;
@@ -28,6 +29,8 @@ pub enum StrategyName {
     Default,
     /// [`super::long_axis::LongAxisStrategy`].
     LongAxis,
+    /// [`super::mcmc::McmcStrategy`].
+    Mcmc,
     /// [`NoStrategy`].
     None,
 }
@@ -42,6 +45,8 @@ impl StrategyName {
 /// The rows of a step's working set, with their gradients and radii.
 #[derive(Debug, Clone, Copy)]
 pub struct DrawnRows<'a> {
+    /// 0-based step.
+    pub step: u32,
     /// Row numbers in the table of the view, ascending.
     pub rows: &'a [u32],
     /// Gradient of the loss with respect to each row's projected mean, pixel units.
@@ -53,6 +58,19 @@ pub struct DrawnRows<'a> {
     pub weights: &'a [[f32; 2]],
     /// Width and height of the picture, pixels.
     pub image_size: [u32; 2],
+}
+
+/// Rows of a view with their gradients, before the update.
+#[derive(Debug)]
+pub struct ViewGradients<'a> {
+    /// Values of the rows at the step.
+    pub columns: &'a Columns,
+    /// Gradients of the rows; one entry per row of `columns`, as is `radii`.
+    pub gradients: &'a mut Columns,
+    /// Radii of each row's footprint, pixels; a row with a zero radius was not drawn.
+    pub radii: &'a [[u32; 2]],
+    /// Rows of the whole view, of which these may be a batch.
+    pub rows_of_view: usize,
 }
 
 /// How many rows there are and may be.
@@ -94,6 +112,14 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
         accumulate(view, drawn.rows, drawn.v_means2d, drawn.radii, drawn.image_size, histogram)
     }
+
+    /// Adds gradients of the strategy's own to those of the loss. Not called where the optimizer runs on a device.
+    fn add_gradients(&self, _view: &mut ViewGradients<'_>) {}
+
+    /// Changes rows after the update of 0-based `step`, before bounds are taken: only rows of the list with the stamp `step + 1`,
+    /// which are those that the update rewrote. `listed` numbers them in the table that contains `view`. Calls come in parallel. Not
+    /// called where the optimizer runs on a device.
+    fn after_update(&self, _view: &mut RowsMut<'_>, _listed: &[u32], _step: u32) {}
 
     /// The rule by which the run decides how many rows it allows; `None` where it does not.
     fn growth(&self) -> Option<&GrowthRule> {
@@ -186,6 +212,8 @@ pub enum Fate {
     },
     /// Two children replace the row, side by side along its longest axis.
     SplitLongAxis,
+    /// Two rows replace the row, both at its place, which together look like it.
+    SharePlace,
 }
 
 /// A logged round.
@@ -231,6 +259,7 @@ pub fn effect_of(kind: &EventKind) -> Effect<'_> {
     match *kind {
         EventKind::Densify(ref thresholds) => Effect::Round(thresholds),
         EventKind::LongAxis(ref thresholds) => Effect::Round(thresholds),
+        EventKind::Relocate(ref thresholds) => Effect::Round(thresholds),
         EventKind::ResetOpacity { max_opacity } => Effect::ResetOpacity { max_opacity },
         EventKind::RaiseShDegree { degree } => Effect::RaiseShDegree { degree },
     }

@@ -44,6 +44,15 @@ pub struct LongAxisRound {
     pub prune_opacity: f32,
 }
 
+/// Thresholds of a round that removes dead rows and lets others share their place with a copy.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct RelocationRound {
+    /// Rows get a copy whose mean score lies in this bin or above; at least 1.
+    pub copy_from_bin: u32,
+    /// Rows of this opacity or less are removed.
+    pub dead_opacity: f32,
+}
+
 /// A kind of global change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum EventKind {
@@ -61,6 +70,8 @@ pub enum EventKind {
     Densify(RoundThresholds),
     /// A round of long-axis splits and removals.
     LongAxis(LongAxisRound),
+    /// A round of relocations.
+    Relocate(RelocationRound),
 }
 
 /// A global change and its step.

@@ -219,6 +219,32 @@ fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
     assert!(without != want, "the score changes nothing");
 }
 
+/// Rounds of relocation, noise and regularisers: for any memory and number of threads the same bits; the cap holds at every step,
+/// and faint rows make place for others.
+#[test]
+fn relocations_and_noise_page_to_the_same_bits_and_keep_the_cap() {
+    let folder = TempDir::new().unwrap();
+    let scene = scenes::wide_city(folder.path(), 8_000);
+    // Rows begin nearly dead, so that many die between two rounds and all have noise.
+    let rounds = ["--strategy", "mcmc", "--refine-start", "20", "--refine-every", "8", "--prune-opa", "0.03"];
+    let capped = ["--page-rows", "32", "--steps", "120", "--max-gaussians", "8100", "--log-every", "1"];
+    let base = [COMMON, &rounds, &capped, &["--init-opacity", "0.05", "--device", "cpu"]].concat();
+    let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
+    let most = number(&whole, "pages_pinned_max");
+    assert!(most < number(&whole, "pages") / 2, "a view sees too much");
+    for (frames, io, threads) in [(most, "auto", "1"), (most / 3, "", "2")] {
+        let (got, summary) = run(folder.path(), &scene, &base, &How { frames, io, threads, more: &[] });
+        assert!(got == want, "{frames} frames");
+        assert!(number(&summary, "pages_read") > 0, "{summary}");
+        let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
+        let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
+        assert!(rows.iter().all(|&rows| rows <= 8_100), "{rows:?}");
+        let falls = rows.windows(2).filter(|pair| pair[1] < pair[0]).count();
+        let rises = rows.windows(2).filter(|pair| pair[1] > pair[0]).count();
+        assert!(falls > 0 && rises > 0, "nothing died or nothing was copied: {rows:?}");
+    }
+}
+
 /// A count that the run decides: the same checks, the same decisions and the same bits for any number of frames and threads.
 #[test]
 fn a_count_that_the_run_decides_pages_to_the_same_bits() {

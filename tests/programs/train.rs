@@ -76,7 +76,7 @@ fn every_global_change_is_an_event_in_order() {
 
 fn letter(kind: EventKind) -> char {
     match kind {
-        EventKind::Densify(_) | EventKind::LongAxis(_) => 'd',
+        EventKind::Densify(_) | EventKind::LongAxis(_) | EventKind::Relocate(_) => 'd',
         EventKind::ResetOpacity { .. } => 'r',
         EventKind::RaiseShDegree { .. } => 's',
     }

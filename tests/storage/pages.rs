@@ -66,6 +66,7 @@ fn touch(
     }
     adam.step(state, &rows, &grads, step);
     let drawn = DrawnRows {
+        step: 0,
         rows: &rows,
         v_means2d: &v_means2d,
         radii: &radii,

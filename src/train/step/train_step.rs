@@ -16,10 +16,11 @@ use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
 use crate::base::trace;
+use crate::densify::strategy::ViewGradients;
 use crate::paging::batches::UseInStep;
 use crate::paging::error::PagingError;
 use crate::paging::pinned::PinnedPage;
-use crate::render::{LossValue, RenderOptions, RowBatches};
+use crate::render::{Gradients, LossValue, RenderOptions, RowBatches};
 use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
 use std::collections::VecDeque;
@@ -255,9 +256,13 @@ impl Passes<'_, '_> {
         let span = trace::span("rows out");
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
         if self.backend.has_gradients() {
-            let (WorkingSet { columns, gradients, .. }, degree) = (&*self.working, self.scene.rules.sh_degree());
+            let (WorkingSet { columns, gradients, .. }, degree) = (&mut *self.working, self.scene.rules.sh_degree());
             let parameters = self.comparison.photos.iter_mut();
             parameters.for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.camera, degree));
+            // After the gradients of poses, which follow from those of the loss alone.
+            let Gradients { columns: gradients, radii, .. } = gradients;
+            let mut view = ViewGradients { columns, gradients, radii, rows_of_view: self.outcome.rows };
+            self.scene.rules.strategy.add_gradients(&mut view);
         }
         drop(span);
         if is_first {

@@ -46,20 +46,24 @@ pub(super) fn update_pages(
     collects: bool,
 ) -> StepCounts {
     let at = scene.rules.adam.at(input.step);
+    let strategy = &scene.rules.strategy;
     let mut shares = shares(pages, input);
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
             let counts = at.step_rows(share.page.rows_mut(share.first_row), share.rows, share.values, share.grads);
             share.touched = counts.updated > 0;
+            if share.touched {
+                strategy.after_update(&mut share.page.rows_mut(share.first_row), share.rows, input.step);
+            }
             counts
         })
         .collect();
     if collects {
         let Gradients { means2d, radii, weights, .. } = input.gradients;
-        let strategy = &scene.rules.strategy;
         for share in &mut shares {
             let drawn = DrawnRows {
+                step: input.step,
                 rows: share.rows,
                 v_means2d: &means2d[share.listed.clone()],
                 radii: &radii[share.listed.clone()],

@@ -1,4 +1,4 @@
-//! A run that decides its count goes on with its decisions.
+//! A run that decides its count goes on with its decisions, and a run with relocations with its draws.
 
 use super::bench::{Bench, Place, SELDOM, ended, ply, signal, succeeded};
 use crate::support::scenes::summary;
@@ -31,4 +31,22 @@ fn a_run_that_decides_its_count_resumes_with_its_checks() {
     }
     // A cap that is given is another run.
     assert!(Bench::new().alone(&[DECIDES, &["--max-gaussians", "4000"]].concat()).ply != alone.ply);
+}
+
+const RELOCATES: &[&str] = &["--strategy", "mcmc", "--max-gaussians", "4000"];
+
+#[test]
+fn a_run_with_relocations_resumes_with_its_draws() {
+    let bench = Bench::new();
+    let alone = bench.alone(RELOCATES);
+    let out = bench.path("out");
+    for (place, lines) in [(Place::Memory, 9), (Place::Spill(alone.fewest / 2), 14)] {
+        let mut child = bench.begin(place, &[RELOCATES, &SELDOM[..]].concat());
+        bench.wait_for_lines(&mut child, lines);
+        signal(&mut child, "INT");
+        ended(child);
+        succeeded(bench.go_on(&[]));
+        assert!(ply(&out) == alone.ply, "{place:?}, {lines} lines: the resumed run gives another scene");
+        std::fs::remove_dir_all(&out).unwrap();
+    }
 }
