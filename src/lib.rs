@@ -71,7 +71,10 @@
 //! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
 //!    event kind in `scene/events.rs` if a round needs other values than today's. `densify/mod.rs` names the file.
 //! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
-//!    strategy from the keys.
+//!    strategy from the keys. `config/check.rs`: which keys it needs, and whether an optimizer on the device can do without it.
+//! 3. What acts on the rows of a view in every step: [`densify::strategy::Strategy::add_gradients`] and
+//!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
+//! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
 //! **A loss term**
 //! 1. A file in `render/`: the term as a function of picture and photo, and its gradient. Masked pixels do not count.

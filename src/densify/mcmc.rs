@@ -13,7 +13,7 @@
 //!   a dead row becomes room when its page has applied the removal, so another round gives it away.
 //! - Noise and regularisers act on rows that the view drew only. The means of the regularisers are over the rows of the view.
 //! - Lengths are in units of the scene scale, which gsplat has by making it about 1 on loading.
-//! - Both rows of a place start with zero moments and new uids; in gsplat only the chosen row loses its moments.
+//! - Both rows of a place start with zero moments and new uids.
 //!
 //! Not here: the values of the rows that share a place ([`super::ops`]).
 //!

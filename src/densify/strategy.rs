@@ -9,7 +9,8 @@
 //! 2. add a name to [`StrategyName`];
 //! 3. add the keys to `config/file.rs` and pass them to the struct in `config/limits.rs`;
 //! 4. if a round needs values beyond those of the events in `scene/events.rs`, add an event kind there, implement
-//!    [`Round`] for it and name it in [`effect_of`].
+//!    [`Round`] for it and name it in [`effect_of`];
+//! 5. if a row needs another [`Fate`], add it here and its values in [`super::ops`].
 //!
 //! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. an event gives a row
 //! the same fate whenever it is applied.
