@@ -9,7 +9,7 @@
 //!   with the greatest keys are such a draw (Efraimidis and Spirakis 2006). The histogram of keys gives the least key that
 //!   still fits, in whole bins. gsplat draws with replacement, so a row may get several copies in a round; here it gets one.
 //! - The opacity of the draw is the mean over the views that drew the row since the last round. Other rows get no copy.
-//! - A round gives away places for [`GROWTH`] of the rows drawn since the last round, as far as the cap has room. The place of
+//! - A round gives away places for 5 % of the rows drawn since the last round, as far as the cap has room. The place of
 //!   a dead row becomes room when its page has applied the removal, so another round gives it away.
 //! - Noise and regularisers act on rows that the view drew only. The means of the regularisers are over the rows of the view.
 //! - Lengths are in units of the scene scale, which gsplat has by making it about 1 on loading.

@@ -7,6 +7,7 @@ use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
+use gsscale::densify::mcmc::McmcStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
 use gsscale::densify::stats::{GradHistogram, accumulate};
@@ -17,7 +18,7 @@ use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RoundThresholds};
+use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RelocationRound, RoundThresholds};
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, read_page, write_page};
 use gsscale::scene::partition::{first_fill, partition};
 use gsscale::scene::rows::mean_grad2d;
@@ -65,8 +66,9 @@ fn touch(
         weights.push([(draws.uniform() * 9.0) as f32, draws.uniform() as f32]);
     }
     adam.step(state, &rows, &grads, step);
+    strategy.after_update(&mut state.view_mut(), &rows, step);
     let drawn = DrawnRows {
-        step: 0,
+        step,
         rows: &rows,
         v_means2d: &v_means2d,
         radii: &radii,
@@ -165,6 +167,20 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
         refine_every: 30,
         max_gaussians,
         growth: None,
+    }
+}
+
+/// Relocation and noise.
+fn mcmc(max_gaussians: u64) -> McmcStrategy {
+    McmcStrategy {
+        dead_opacity: 0.005,
+        refine_start: 20,
+        refine_stop: 240,
+        refine_every: 30,
+        max_gaussians,
+        seed: SEED,
+        scene_scale: 1.0,
+        rates: *adam(1.0).rates(),
     }
 }
 
@@ -332,6 +348,9 @@ fn events_that_pages_replay_late_give_the_rows_of_events_applied_at_once() {
     let cases = [(128, first_fill(128, true), 0), (128, 90, 30), (40, 40, 1000), (2500, 2500, 3), (7, 5, 10)];
     late_equals_at_once(&adam(1.0), &densify(3000), &cases);
     late_equals_at_once(&adam(1.0), &long_axis(2600), &cases);
+    // Growth is slower, so first pages are nearly full.
+    let fuller = [(128, 125, 0), (128, 120, 30), (40, 40, 1000), (2500, 2500, 3), (7, 6, 10)];
+    late_equals_at_once(&adam(1.0), &mcmc(2600), &fuller);
 }
 
 #[test]
@@ -480,6 +499,10 @@ fn random_log(key: u64, from: u32, limits: &SplitLimits) -> EventLog {
         let kind = match draws.below(4) {
             0 => EventKind::ResetOpacity { max_opacity: 0.01 },
             1 => EventKind::RaiseShDegree { degree: 1 + draws.below(2) as u8 },
+            _ if *limits == SplitLimits::NEVER => EventKind::Relocate(RelocationRound {
+                copy_from_bin: if draws.below(2) == 0 { 1 } else { 0x3900 },
+                dead_opacity: 0.005,
+            }),
             _ if is_long => EventKind::LongAxis(LongAxisRound {
                 split_from_bin: if draws.below(2) == 0 { 1 } else { 0x3900 },
                 remove_below_bin: 0,
@@ -515,6 +538,15 @@ fn bounds_hold_at_every_later_step_whatever_happens_meanwhile() {
 fn bounds_hold_with_splits_along_the_longest_axis() {
     let limits = long_axis(1).split_limits(1.0);
     assert_eq!(limits.reach, 0.75);
+    tightest_bounds(&adam(1000.0), &limits);
+    tightest_bounds(&adam(1.0).with_moments(Moments::Bf16), &limits);
+}
+
+/// Every row with statistics shares its place in half of the rounds; bounds leave no room for it.
+#[test]
+fn bounds_hold_with_rows_that_share_a_place() {
+    let limits = mcmc(1).split_limits(1.0);
+    assert_eq!(limits, SplitLimits::NEVER);
     tightest_bounds(&adam(1000.0), &limits);
     tightest_bounds(&adam(1.0).with_moments(Moments::Bf16), &limits);
 }
