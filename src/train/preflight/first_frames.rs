@@ -97,7 +97,9 @@ pub(super) fn frames_of_budget(
         return Ok(whole);
     }
     let rendering = memory.view - memory.working;
-    let beside = memory.fixed() - memory.working - memory.copies + (rendering - memory.view_pixels.min(rendering)) / 8;
+    // The margin for a larger view is left out where only the smallest batch remains: a run that grew into its budget resumes in it.
+    let spare = (rendering - memory.view_pixels.min(rendering)) / 8;
+    let beside = memory.fixed() - memory.working - memory.copies;
     let of_a_page = 2 * need.frame_bytes + page_working(config) + memory.copies.min(need.frame_bytes);
     let Some(left) = budget.checked_sub(beside).filter(|left| *left >= of_a_page) else {
         let problem = format!(
@@ -115,6 +117,7 @@ pub(super) fn frames_of_budget(
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };
+    let left = left.saturating_sub(spare).max(of_a_page);
     let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
     Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
 }
@@ -165,4 +168,44 @@ fn check_frames(frames: u64) -> InputResult<()> {
 /// Bytes of the working set for the rows of one full page.
 pub(super) fn page_working(config: &TrainConfig) -> u64 {
     u64::from(config.page_rows) * WorkingSet::row_bytes(config.sh_degree) as u64
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    /// A scene whose widest view takes 80 MiB of splats, in a run whose other parts take 100 MiB.
+    fn estimate() -> MemoryEstimate {
+        MemoryEstimate {
+            frames: 4096 * MIB,
+            staging: 10 * MIB,
+            view: 200 * MIB,
+            view_pixels: 20 * MIB,
+            working: 100 * MIB,
+            targets: 20 * MIB,
+            index: 10 * MIB,
+            copies: 0,
+            base: 40 * MIB,
+            device: None,
+        }
+    }
+
+    #[test]
+    fn a_budget_without_the_margin_gives_the_smallest_batch_and_one_below_it_is_refused() {
+        let config = TrainConfig { page_rows: 256, sh_degree: 3, ..TrainConfig::default() };
+        let need = LargestNeed { frame_bytes: MIB, pages: 2000 };
+        let of_a_page = 2 * need.frame_bytes + page_working(&config);
+        // All but the working set, which batches make smaller.
+        let least = 180 * MIB + of_a_page;
+        let frames = |bytes: u64| frames_of_budget(&config, &need, Some(bytes), &estimate());
+        assert_eq!(frames(least).unwrap(), FirstFrames { frames: 2, pages_most: 1 });
+        let refusal = frames(least - 1).err().unwrap().to_string();
+        assert!(refusal.contains("is not enough") && refusal.contains("give at least"), "{refusal}");
+        // An eighth of the splats stays free before frames take more.
+        assert_eq!(frames(least + 9 * MIB).unwrap(), frames(least).unwrap());
+        assert!(frames(least + 40 * MIB).unwrap().frames > 20);
+    }
 }
