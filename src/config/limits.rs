@@ -10,7 +10,7 @@ use crate::densify::default::DefaultStrategy;
 use crate::densify::growth::GrowthRule;
 use crate::densify::long_axis::LongAxisStrategy;
 use crate::densify::mcmc::McmcStrategy;
-use crate::densify::strategy::{NoStrategy, Strategy, StrategyName};
+use crate::densify::strategy::{NoStrategy, RoundSteps, Strategy, StrategyName};
 use crate::exchange::meta::ExportFrame;
 use crate::optim::adam::AdamConfig;
 use crate::optim::method::{Method, OptimizerPlace};
@@ -165,6 +165,10 @@ fn strategy(config: &TrainConfig, scene_scale: f32) -> Arc<dyn Strategy> {
     }
 }
 
+fn round_steps(config: &TrainConfig) -> RoundSteps {
+    RoundSteps { start: config.refine_start, stop: config.refine_stop, every: config.refine_every }
+}
+
 fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
     let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
     DefaultStrategy {
@@ -172,9 +176,7 @@ fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
         grow_scale3d: config.grow_scale3d as f32,
         prune_opa: config.prune_opa as f32,
         prune_scale3d: config.prune_scale3d as f32,
-        refine_start: config.refine_start,
-        refine_stop: config.refine_stop,
-        refine_every: config.refine_every,
+        rounds: round_steps(config),
         reset_every: never_if_zero(config.reset_every),
         schedule_steps: schedule_steps(config),
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
@@ -198,9 +200,7 @@ fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
         score: config.growth_score,
         recycle: config.recycle,
         prune_opa: config.prune_opa as f32,
-        refine_start: config.refine_start,
-        refine_stop: config.refine_stop,
-        refine_every: config.refine_every,
+        rounds: round_steps(config),
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
         growth: growth_rule(config),
     }
@@ -209,9 +209,7 @@ fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
 fn mcmc_strategy(config: &TrainConfig, scene_scale: f32) -> McmcStrategy {
     McmcStrategy {
         dead_opacity: config.prune_opa as f32,
-        refine_start: config.refine_start,
-        refine_stop: config.refine_stop,
-        refine_every: config.refine_every,
+        rounds: round_steps(config),
         max_gaussians: config.max_gaussians,
         seed: config.seed,
         scene_scale: f64::from(scene_scale),

@@ -6,7 +6,7 @@
 
 use super::ops::{child_log_scale, sigma};
 use super::stats::{GradHistogram, promised_growth};
-use super::strategy::{Extremes, Fate, Round, RowCount, RowFacts, Strategy};
+use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, RoundThresholds, SPLIT_SIGMAS};
@@ -23,12 +23,8 @@ pub struct DefaultStrategy {
     pub prune_opa: f32,
     /// A row is pruned if it is larger than this size, after step `reset_every`; in units of the scene scale.
     pub prune_scale3d: f32,
-    /// Rounds happen only after this step.
-    pub refine_start: u32,
-    /// Rounds, resets and statistics end before this step.
-    pub refine_stop: u32,
-    /// Steps between rounds.
-    pub refine_every: u32,
+    /// When rounds happen; resets end with them.
+    pub rounds: RoundSteps,
     /// Steps between opacity resets.
     pub reset_every: u32,
     /// Steps of the planned run: no reset comes shortly before its end.
@@ -48,9 +44,7 @@ impl Default for DefaultStrategy {
             grow_scale3d: 0.01,
             prune_opa: 0.005,
             prune_scale3d: 0.1,
-            refine_start: 500,
-            refine_stop: 15_000,
-            refine_every: 100,
+            rounds: RoundSteps { start: 500, stop: 15_000, every: 100 },
             reset_every: 3000,
             schedule_steps: u32::MAX,
             max_gaussians: u64::MAX,
@@ -59,17 +53,12 @@ impl Default for DefaultStrategy {
 }
 
 impl DefaultStrategy {
-    /// Whether a round follows this step.
-    pub fn is_round(&self, step: u32) -> bool {
-        step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
-    }
-
     /// Whether an opacity reset follows this step (after its round). Resets need pruning by opacity: with `prune_opa` 0
     /// the cap would be 0, which has no finite logit. They also need the steps after them in which opacities recover.
     pub fn is_reset(&self, step: u32) -> bool {
         let recovery = RECOVERY_STEPS.min(self.reset_every / 3);
         let is_late = step.saturating_add(1).saturating_add(recovery) > self.schedule_steps;
-        let is_due = step > 0 && step < self.refine_stop && step.is_multiple_of(self.reset_every);
+        let is_due = step > 0 && step < self.rounds.stop && step.is_multiple_of(self.reset_every);
         self.prune_opa > 0.0 && is_due && !is_late
     }
 
@@ -89,22 +78,14 @@ impl DefaultStrategy {
 }
 
 impl Strategy for DefaultStrategy {
-    fn grows(&self) -> bool {
-        true
-    }
-
-    fn collects(&self, step: u32) -> bool {
-        step < self.refine_stop
-    }
-
-    fn reads_histogram(&self, step: u32) -> bool {
-        self.is_round(step)
+    fn rounds(&self) -> Option<&RoundSteps> {
+        Some(&self.rounds)
     }
 
     /// A round, then a reset.
     fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
         let mut events = Vec::new();
-        if self.is_round(step) {
+        if self.rounds.is_round(step) {
             events.push(EventKind::Densify(self.thresholds(step, scene_scale, count.rows, histogram)));
         }
         if self.is_reset(step) {
@@ -163,7 +144,7 @@ mod tests {
     #[test]
     fn the_schedule_is_that_of_the_default_strategy() {
         let config = DefaultStrategy::default();
-        let rounds: Vec<u32> = (0..20_000).filter(|&s| config.is_round(s)).collect();
+        let rounds: Vec<u32> = (0..20_000).filter(|&s| config.rounds.is_round(s)).collect();
         assert_eq!((rounds[0], rounds[1], rounds[rounds.len() - 1]), (600, 700, 14_900));
         let resets: Vec<u32> = (0..20_000).filter(|&s| config.is_reset(s)).collect();
         assert_eq!(resets, [3000, 6000, 9000, 12_000]);
@@ -181,8 +162,8 @@ mod tests {
         }
         let often = DefaultStrategy { reset_every: 45, schedule_steps: 100, ..config };
         assert_eq!((0..100).filter(|&s| often.is_reset(s)).collect::<Vec<_>>(), [45]);
-        let never = DefaultStrategy { refine_every: 0, reset_every: 0, ..config };
-        assert!((0..20_000).all(|s| !never.is_round(s) && !never.is_reset(s)));
+        let never = DefaultStrategy { rounds: RoundSteps { every: 0, ..config.rounds }, reset_every: 0, ..config };
+        assert!((0..20_000).all(|s| !never.rounds.is_round(s) && !never.is_reset(s)));
         let unpruned = DefaultStrategy { prune_opa: 0.0, ..DefaultStrategy::default() };
         assert!((0..20_000).all(|s| !unpruned.is_reset(s)));
         assert_eq!(never.thresholds(9000, 1.0, 10, &GradHistogram::default()).prune_scale, f32::INFINITY);

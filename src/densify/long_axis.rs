@@ -20,8 +20,10 @@
 //! statistics; 3. nothing is drawn at random.
 
 use super::growth::GrowthRule;
-use super::stats::{GradHistogram, WEIGHED_VIEWS, accumulate_scores, grad_norm, rows_from_bin, score_bin, weight_bin};
-use super::strategy::{DrawnRows, Extremes, Fate, Round, RowCount, RowFacts, Strategy};
+use super::stats::{
+    GradHistogram, WEIGHED_VIEWS, accumulate_scores, grad_norm, reaches_bin, rows_from_bin, weight_bin,
+};
+use super::strategy::{DrawnRows, Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, LONG_AXIS_OFFSET, LongAxisRound};
@@ -51,12 +53,8 @@ pub struct LongAxisStrategy {
     pub recycle: f64,
     /// A row is removed if its opacity is below this value.
     pub prune_opa: f32,
-    /// Rounds happen only after this step.
-    pub refine_start: u32,
-    /// Rounds and statistics end before this step.
-    pub refine_stop: u32,
-    /// Steps between rounds.
-    pub refine_every: u32,
+    /// When rounds happen.
+    pub rounds: RoundSteps,
     /// Most rows of the scene.
     pub max_gaussians: u64,
     /// How the run decides the cap; `None` for a run whose cap is given.
@@ -64,28 +62,23 @@ pub struct LongAxisStrategy {
 }
 
 impl LongAxisStrategy {
-    /// Whether a round follows this step.
-    pub fn is_round(&self, step: u32) -> bool {
-        step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
-    }
-
     /// Share of the room under the cap that the round after this step may take, if an epoch of `epoch` steps visits one region after
     /// the other (0: any stretch of views shows all regions).
     ///
-    /// Growth begins with the first whole epoch after `refine_start`. The rounds of an epoch take equal parts of the room at
-    /// its beginning, and the last one takes what is left. Where no whole epoch fits before `refine_stop`, all rounds share.
+    /// Growth begins with the first whole epoch after `RoundSteps::start`. The rounds of an epoch take equal parts of the room at
+    /// its beginning, and the last one takes what is left. Where no whole epoch fits before `RoundSteps::stop`, all rounds share.
     fn share_of_room(&self, step: u32, epoch: u32) -> f64 {
-        if epoch <= self.refine_every {
+        if epoch <= self.rounds.every {
             return 1.0;
         }
-        let [step, epoch, start, stop] = [step, epoch, self.refine_start, self.refine_stop].map(u64::from);
+        let [step, epoch, start, stop] = [step, epoch, self.rounds.start, self.rounds.stop].map(u64::from);
         let first = start.next_multiple_of(epoch);
         let end = match first + epoch <= stop {
             true if step <= first => return 0.0,
             true => (first + (step - first).next_multiple_of(epoch)).min(stop - 1),
             false => stop - 1,
         };
-        let every = u64::from(self.refine_every);
+        let every = u64::from(self.rounds.every);
         1.0 / (end / every + 1 - step / every).max(1) as f64
     }
 
@@ -94,7 +87,7 @@ impl LongAxisStrategy {
         let RowCount { rows, allowed, regional_epoch } = count;
         let cap = self.max_gaussians.min(allowed);
         let is_full = rows as f64 >= FULL_FROM * cap as f64;
-        let is_last = step.saturating_add(self.refine_every) >= self.refine_stop;
+        let is_last = step.saturating_add(self.rounds.every) >= self.rounds.stop;
         let surplus = rows.saturating_sub(allowed) as f64 / rows.max(1) as f64;
         let recycled = if is_full && !is_last { self.recycle } else { 0.0 };
         let removed = (surplus.max(recycled) * histogram.weighed_rows() as f64) as u64;
@@ -121,16 +114,8 @@ impl LongAxisStrategy {
 }
 
 impl Strategy for LongAxisStrategy {
-    fn grows(&self) -> bool {
-        true
-    }
-
-    fn collects(&self, step: u32) -> bool {
-        step < self.refine_stop
-    }
-
-    fn reads_histogram(&self, step: u32) -> bool {
-        self.is_round(step)
+    fn rounds(&self) -> Option<&RoundSteps> {
+        Some(&self.rounds)
     }
 
     fn needs_weights(&self) -> bool {
@@ -147,16 +132,20 @@ impl Strategy for LongAxisStrategy {
     }
 
     fn growth_check(&self, step: u32) -> Option<usize> {
-        let before = step.checked_sub(self.refine_every).filter(|before| self.is_round(*before));
-        self.growth.filter(|_| self.is_round(step))?.due(before, step)
+        let before = step.checked_sub(self.rounds.every).filter(|before| self.rounds.is_round(*before));
+        self.growth.filter(|_| self.rounds.is_round(step))?.due(before, step)
     }
 
     fn may_check_growth(&self, step: u32) -> bool {
-        self.growth.is_some_and(|rule| step < self.refine_stop && rule.is_open(step, self.refine_every))
+        self.growth.is_some_and(|rule| step < self.rounds.stop && rule.is_open(step, self.rounds.every))
     }
 
     fn events_after(&self, step: u32, _: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
-        if self.is_round(step) { vec![EventKind::LongAxis(self.round(step, count, histogram))] } else { Vec::new() }
+        if self.rounds.is_round(step) {
+            vec![EventKind::LongAxis(self.round(step, count, histogram))]
+        } else {
+            Vec::new()
+        }
     }
 
     /// A row grows only from bin 1 on, so only with a score above 0.
@@ -171,7 +160,7 @@ impl LongAxisRound {
     }
 
     fn splits(&self, grad2d: f32, count: u32) -> bool {
-        count > 0 && score_bin(grad2d, count) >= self.split_from_bin
+        reaches_bin(grad2d, count, self.split_from_bin)
     }
 }
 
@@ -219,9 +208,7 @@ mod tests {
             score,
             recycle: 0.02,
             prune_opa: 0.005,
-            refine_start: 500,
-            refine_stop: 2400,
-            refine_every: 100,
+            rounds: RoundSteps { start: 500, stop: 2400, every: 100 },
             max_gaussians,
             growth: None,
         }
@@ -341,7 +328,7 @@ mod tests {
                 rows += taken;
                 taken
             };
-            (0..4000).filter(|&step| strategy.is_round(step)).map(take).collect::<Vec<f64>>()
+            (0..4000).filter(|&step| strategy.rounds.is_round(step)).map(take).collect::<Vec<f64>>()
         };
         let are_near = |got: &[f64], want: f64| got.iter().all(|got| (got - want).abs() < 1e-9);
         // Rounds follow steps 600, 700, .. 2300. A shuffle, and an epoch within a round, take all room at once.
@@ -360,7 +347,7 @@ mod tests {
     #[test]
     fn rounds_come_between_start_and_stop() {
         let strategy = strategy(GrowthScore::Mixed, 1000);
-        let rounds: Vec<u32> = (0..4000).filter(|&step| strategy.is_round(step)).collect();
+        let rounds: Vec<u32> = (0..4000).filter(|&step| strategy.rounds.is_round(step)).collect();
         assert_eq!((rounds[0], rounds[1], rounds[rounds.len() - 1]), (600, 700, 2300));
         assert!(strategy.collects(2399) && !strategy.collects(2400));
     }

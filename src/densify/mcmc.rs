@@ -1,8 +1,8 @@
 //! The strategy `mcmc`: 3DGS-MCMC (Kheradmand et al. 2024, arXiv 2404.09591) after gsplat's `MCMCStrategy`, for scenes in pages.
 //!
-//! A round removes dead rows, those of opacity [`McmcStrategy::dead_opacity`] or less, and puts copies beside rows drawn with a
-//! probability that grows with their opacity. Each update adds noise to the means of the rows that it rewrote, and each view
-//! adds the gradients of two regularisers to the rows that it drew.
+//! A round removes dead rows, which are those of opacity [`McmcStrategy::dead_opacity`] or less. It draws other rows with a
+//! probability that grows with their opacity, and two rows replace each of them at its place ([`Fate::SplitInPlace`]). Each update
+//! adds noise to the means of the rows that it rewrote. Each view adds the gradients of two regularisers to the rows that it drew.
 //!
 //! Where it differs from gsplat, which reads all rows in every step:
 //! - The draw is one without replacement. A row gets the key opacity / E, with E from the exponential distribution: the rows
@@ -15,15 +15,15 @@
 //! - Lengths are in units of the scene scale, which gsplat has by making it about 1 on loading.
 //! - Both rows of a place start with zero moments and new uids.
 //!
-//! Not here: the values of the rows that share a place ([`super::ops`]).
+//! Not here: the values of the two rows of a place ([`super::ops`]).
 //!
 //! Invariants: 1. a round never leaves more rows than the cap, unless there were more before; 2. keys and noise are functions
 //! of (seed, round or step, uid) and the row; 3. an update ends with the noise, so bounds of pages, which are taken
-//! afterwards, contain it; 4. sharing a place moves no mean and enlarges no row, so no bounds need room for a round.
+//! afterwards, contain it; 4. a split in place moves no mean and enlarges no row, so no bounds need room for a round.
 
 use super::ops::rotation;
-use super::stats::{GradHistogram, accumulate_scores, rows_from_bin, score_bin};
-use super::strategy::{DrawnRows, Extremes, Fate, Round, RowCount, RowFacts, Strategy, ViewGradients};
+use super::stats::{GradHistogram, accumulate_scores, reaches_bin, rows_from_bin};
+use super::strategy::{DrawnRows, Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy, ViewGradients};
 use crate::base::math::sigmoid;
 use crate::base::rng::{Purpose, Stream};
 use crate::optim::bounds::SplitLimits;
@@ -52,12 +52,8 @@ const DRAW_LEAST: f64 = 1e-20;
 pub struct McmcStrategy {
     /// Rows of this opacity or less are dead.
     pub dead_opacity: f32,
-    /// Rounds happen only after this step.
-    pub refine_start: u32,
-    /// Rounds and statistics end before this step.
-    pub refine_stop: u32,
-    /// Steps between rounds.
-    pub refine_every: u32,
+    /// When rounds happen.
+    pub rounds: RoundSteps,
     /// Most rows of the scene.
     pub max_gaussians: u64,
     /// Seed of keys and noise.
@@ -69,11 +65,6 @@ pub struct McmcStrategy {
 }
 
 impl McmcStrategy {
-    /// Whether a round follows this step.
-    pub fn is_round(&self, step: u32) -> bool {
-        step > self.refine_start && step < self.refine_stop && step.is_multiple_of(self.refine_every)
-    }
-
     /// The round that follows a step with this number of rows.
     pub fn round(&self, count: RowCount, histogram: &GradHistogram) -> RelocationRound {
         let room = self.max_gaussians.min(count.allowed).saturating_sub(count.rows);
@@ -87,7 +78,7 @@ impl McmcStrategy {
             return 0.0;
         }
         // A round follows the last step of its interval.
-        let round = u64::from(step.div_ceil(self.refine_every));
+        let round = u64::from(step.div_ceil(self.rounds.every));
         let uniform = Stream::new(self.seed, Purpose::Relocation, uid, round).uniform();
         (f64::from(opacity) / (-libm::log1p(-uniform)).max(DRAW_LEAST)) as f32
     }
@@ -113,16 +104,8 @@ impl McmcStrategy {
 }
 
 impl Strategy for McmcStrategy {
-    fn grows(&self) -> bool {
-        true
-    }
-
-    fn collects(&self, step: u32) -> bool {
-        step < self.refine_stop
-    }
-
-    fn reads_histogram(&self, step: u32) -> bool {
-        self.is_round(step)
+    fn rounds(&self) -> Option<&RoundSteps> {
+        Some(&self.rounds)
     }
 
     /// The score of a row is its key, so the mean score is the mean opacity over the draw of the row.
@@ -167,10 +150,10 @@ impl Strategy for McmcStrategy {
     }
 
     fn events_after(&self, step: u32, _: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
-        if self.is_round(step) { vec![EventKind::Relocate(self.round(count, histogram))] } else { Vec::new() }
+        if self.rounds.is_round(step) { vec![EventKind::Relocate(self.round(count, histogram))] } else { Vec::new() }
     }
 
-    /// Rows that share a place lie within the row whose place it was.
+    /// Children of a split in place lie within their parent.
     fn split_limits(&self, _: f32) -> SplitLimits {
         SplitLimits::NEVER
     }
@@ -178,7 +161,7 @@ impl Strategy for McmcStrategy {
 
 impl RelocationRound {
     fn copies(&self, grad2d: f32, count: u32) -> bool {
-        count > 0 && score_bin(grad2d, count) >= self.copy_from_bin
+        reaches_bin(grad2d, count, self.copy_from_bin)
     }
 }
 
@@ -188,7 +171,7 @@ impl Round for RelocationRound {
         if sigmoid(row.opacity) <= self.dead_opacity {
             Fate::Prune
         } else if self.copies(row.grad2d, row.count) {
-            Fate::SharePlace
+            Fate::SplitInPlace
         } else {
             Fate::Keep
         }
@@ -222,9 +205,7 @@ mod tests {
     fn strategy(max_gaussians: u64, seed: u64) -> McmcStrategy {
         McmcStrategy {
             dead_opacity: 0.005,
-            refine_start: 500,
-            refine_stop: 2400,
-            refine_every: 100,
+            rounds: RoundSteps { start: 500, stop: 2400, every: 100 },
             max_gaussians,
             seed,
             scene_scale: 2.0,
@@ -264,7 +245,7 @@ mod tests {
             let strategy = strategy(u64::MAX, seed);
             let (state, histogram) = drawn(&strategy, ROWS, 700);
             let round = strategy.round(RowCount::unlimited(ROWS as u64), &histogram);
-            let chosen: Vec<usize> = (0..ROWS).filter(|&row| fate(&round, &state, row) == Fate::SharePlace).collect();
+            let chosen: Vec<usize> = (0..ROWS).filter(|&row| fate(&round, &state, row) == Fate::SplitInPlace).collect();
             // A bin is under 1 % wide, and keys spread over several doublings: a bin holds some ten of the 1,000.
             assert!((970..=1000).contains(&chosen.len()), "{}", chosen.len());
             assert_eq!(round.promised(0, &histogram), chosen.len() as u64);

@@ -25,10 +25,10 @@ const LONG_AXIS_SHRINK: f64 = 0.5;
 const SHORT_AXES_SHRINK: f64 = 0.85;
 /// Opacity of the children of a long-axis split over that of their parent, after activation.
 const CHILD_OPACITY: f64 = 0.6;
-/// Rows that share a place.
-const SHARERS: u64 = 2;
-/// Least opacity of a row that shares a place.
-const SHARED_OPACITY_LEAST: f32 = 0.005;
+/// Children of a split in place ([`Fate::SplitInPlace`]).
+const IN_PLACE_CHILDREN: u64 = 2;
+/// Least opacity of such a child.
+const IN_PLACE_OPACITY_LEAST: f32 = 0.005;
 
 /// The effect of a round in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -69,7 +69,7 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
         });
         if matches!(
             fate,
-            Fate::Split { .. } | Fate::SplitLongAxis | Fate::SharePlace | Fate::Duplicate { pruned: false }
+            Fate::Split { .. } | Fate::SplitLongAxis | Fate::SplitInPlace | Fate::Duplicate { pruned: false }
         ) {
             values.evaluate_row(rows, row, &mut block);
             values.log_scales().clamp_all(scales_of(&mut block));
@@ -109,11 +109,11 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
                     new_rows.push(child_uid(rows.uid[row], event, child), &block);
                 }
             }
-            Fate::SharePlace => {
+            Fate::SplitInPlace => {
                 counts.split += 1;
                 removed.push(row as u32);
-                let shared = sharing_row(&block);
-                (0..SHARERS).for_each(|child| new_rows.push(child_uid(rows.uid[row], event, child), &shared));
+                let shared = in_place_child(&block);
+                (0..IN_PLACE_CHILDREN).for_each(|child| new_rows.push(child_uid(rows.uid[row], event, child), &shared));
             }
         }
     }
@@ -208,13 +208,13 @@ fn long_axis_children(parent: &RowBlock) -> [RowBlock; 2] {
     })
 }
 
-/// One of [`SHARERS`] equal rows that share the place of a row. Values other than opacity and scales are copied.
-fn sharing_row(parent: &RowBlock) -> RowBlock {
+/// A child of a split in place; all [`IN_PLACE_CHILDREN`] are equal. Values other than opacity and scales are those of the parent.
+fn in_place_child(parent: &RowBlock) -> RowBlock {
     let mut row = *parent;
     let (scales, opacity) = (first_lane(Column::Scales), first_lane(Column::Opacities));
-    let [shared, shrink] = shared_opacity_and_scale(f64::from(sigmoid(parent[opacity])), SHARERS as u32);
+    let [shared, shrink] = relocation_values(f64::from(sigmoid(parent[opacity])), IN_PLACE_CHILDREN as u32);
     // gsplat's limits of the opacity; a logit must be finite.
-    row[opacity] = logit((shared as f32).clamp(SHARED_OPACITY_LEAST, 1.0 - f32::EPSILON));
+    row[opacity] = logit((shared as f32).clamp(IN_PLACE_OPACITY_LEAST, 1.0 - f32::EPSILON));
     for scale in &mut row[scales..scales + 3] {
         *scale = (f64::from(*scale) + libm::log(shrink)) as f32;
     }
@@ -223,7 +223,7 @@ fn sharing_row(parent: &RowBlock) -> RowBlock {
 
 /// Opacity of each of `n` equal rows that together let as much light through as one row of this opacity, and the factor on its
 /// standard deviations that keeps the integral of the picture (Kheradmand et al. 2024, equation 9). The factor is at most 1.
-fn shared_opacity_and_scale(opacity: f64, n: u32) -> [f64; 2] {
+fn relocation_values(opacity: f64, n: u32) -> [f64; 2] {
     let shared = -libm::expm1(libm::log1p(-opacity) / f64::from(n));
     let mut sum = 0.0;
     for i in 1..=n {
@@ -319,10 +319,10 @@ mod tests {
 
     /// The light that a row lets through along a line through its middle, at a distance of t standard deviations.
     #[test]
-    fn rows_that_share_a_place_look_like_the_row() {
+    fn children_of_a_split_in_place_look_like_their_parent() {
         for opacity in [0.01, 0.1, 0.5, 0.9, 0.999] {
             for n in 1..=8 {
-                let [shared, shrink] = shared_opacity_and_scale(opacity, n);
+                let [shared, shrink] = relocation_values(opacity, n);
                 // One f64 rounding of each of a few functions.
                 assert!(((1.0 - shared).powi(n as i32) - (1.0 - opacity)).abs() < 1e-13, "{opacity}, {n}");
                 // The integral of 1 - (1 - o' g(x / s))^n over x equals that of o g(x): the paper's condition.
@@ -340,7 +340,7 @@ mod tests {
         let opacity = first_lane(Column::Opacities);
         for logit_opacity in [-1000.0, -5.0, 0.0, 9.0, 1000.0] {
             parent[opacity] = logit_opacity;
-            assert!(sharing_row(&parent).iter().all(|x| x.is_finite()), "{logit_opacity}");
+            assert!(in_place_child(&parent).iter().all(|x| x.is_finite()), "{logit_opacity}");
         }
     }
 

@@ -173,8 +173,14 @@ pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
 
 /// The rows of a view that [`GradHistogram::rows_from_bin`] counted, if their statistics are unchanged since the round.
 pub fn rows_from_bin(rows: &Rows<'_>, bin: u32) -> u64 {
-    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && score_bin(grad2d, count) >= bin;
+    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| reaches_bin(grad2d, count, bin);
     rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
+}
+
+/// Whether a view drew a row with these statistics, and its mean score lies in this bin or above.
+#[inline(always)]
+pub fn reaches_bin(grad2d: f32, count: u32, bin: u32) -> bool {
+    count > 0 && score_bin(grad2d, count) >= bin
 }
 
 /// Bin of the mean score of a row with these statistics.

@@ -43,6 +43,24 @@ impl StrategyName {
     }
 }
 
+/// When the rounds of a strategy happen; steps are 0-based.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoundSteps {
+    /// Rounds happen only after this step.
+    pub start: u32,
+    /// Rounds and statistics end before this step.
+    pub stop: u32,
+    /// Steps between rounds.
+    pub every: u32,
+}
+
+impl RoundSteps {
+    /// Whether a round follows this step.
+    pub fn is_round(&self, step: u32) -> bool {
+        step > self.start && step < self.stop && step.is_multiple_of(self.every)
+    }
+}
+
 /// The rows of a step's working set, with their gradients and radii.
 #[derive(Debug, Clone, Copy)]
 pub struct DrawnRows<'a> {
@@ -94,14 +112,23 @@ impl RowCount {
 
 /// A densification strategy: when rounds happen, and which statistics steps collect.
 pub trait Strategy: fmt::Debug + Send + Sync {
+    /// When rounds happen; `None` for a strategy without rounds.
+    fn rounds(&self) -> Option<&RoundSteps>;
+
     /// Whether the number of Gaussians may grow.
-    fn grows(&self) -> bool;
+    fn grows(&self) -> bool {
+        self.rounds().is_some()
+    }
 
     /// Whether this step collects statistics.
-    fn collects(&self, step: u32) -> bool;
+    fn collects(&self, step: u32) -> bool {
+        self.rounds().is_some_and(|rounds| step < rounds.stop)
+    }
 
     /// Whether [`Strategy::events_after`] reads the histogram after this step.
-    fn reads_histogram(&self, step: u32) -> bool;
+    fn reads_histogram(&self, step: u32) -> bool {
+        self.rounds().is_some_and(|rounds| rounds.is_round(step))
+    }
 
     /// Whether [`Strategy::collect`] reads [`DrawnRows::weights`], which the renderer collects on demand only.
     fn needs_weights(&self) -> bool {
@@ -151,16 +178,8 @@ pub trait Strategy: fmt::Debug + Send + Sync {
 pub struct NoStrategy;
 
 impl Strategy for NoStrategy {
-    fn grows(&self) -> bool {
-        false
-    }
-
-    fn collects(&self, _: u32) -> bool {
-        false
-    }
-
-    fn reads_histogram(&self, _: u32) -> bool {
-        false
+    fn rounds(&self) -> Option<&RoundSteps> {
+        None
     }
 
     fn events_after(&self, _: u32, _: f32, _: RowCount, _: &GradHistogram) -> Vec<EventKind> {
@@ -214,7 +233,7 @@ pub enum Fate {
     /// Two children replace the row, side by side along its longest axis.
     SplitLongAxis,
     /// Two rows replace the row, both at its place, which together look like it.
-    SharePlace,
+    SplitInPlace,
 }
 
 /// A logged round.
@@ -222,19 +241,20 @@ pub trait Round: Sync {
     /// The fate of a row.
     fn fate(&self, row: &RowFacts) -> Fate;
 
-    /// Whether the round may edit rows because of their statistics. May be false only if all fates are the same with all
-    /// statistics set to 0.
+    /// Whether statistics decide the fate of a row here. Where they do not, the fate of every row must be the one that it would have
+    /// with statistics of 0. Then the caller may skip the statistics.
     fn may_edit(&self, rows: &Rows<'_>) -> bool;
 
     /// Whether all rows without statistics whose values lie within these bounds survive the round unchanged. A page that
     /// missed many rounds then computes its bounds once instead of deciding every row in every round.
     fn keeps_all(&self, extremes: &Extremes) -> bool;
 
-    /// At the time the round is logged: at most this many rows will grow. The scene has at most `rows` rows, and the
-    /// histogram holds their statistics.
+    /// The most rows that the round adds, from the histogram alone, when the round is logged: pages apply the round later, and the cap
+    /// must hold until they have. The scene has at most `rows` rows. So whether a row grows must follow from the bin of its score.
     fn promised(&self, rows: u64, histogram: &GradHistogram) -> u64;
 
-    /// The part of [`Round::promised`] that lies in `rows`, of a page that has not applied the round yet.
+    /// The part of [`Round::promised`] for a page with these rows that has not applied the round yet. The sum over all pages is at most
+    /// [`Round::promised`].
     fn promised_rows(&self, rows: &Rows<'_>) -> u64;
 }
 

@@ -140,7 +140,7 @@ impl Belt {
 
     /// Hands the staged chunks over to the submission of `ticket`: the device may read them, and `mappings` brings them back when it has.
     /// The other set is next.
-    pub(super) fn hand_over(&mut self, ticket: &Ticket, mappings: &mut Vec<Mapping>) {
+    pub(super) fn submit_staged(&mut self, ticket: &Ticket, mappings: &mut Vec<Mapping>) {
         let mut any = false;
         for chunk in self.sets[0].chunks.iter_mut().filter(|c| c.used > 0) {
             any = true;

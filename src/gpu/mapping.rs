@@ -11,7 +11,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 pub(super) enum MapState {
     /// Commands that use it are being recorded.
     Recorded,
-    /// Those commands are handed over; the mapping follows them.
+    /// Those commands are submitted, or about to be; the mapping follows them.
     Pending,
     /// The host may use it.
     Mapped,
@@ -53,8 +53,8 @@ impl Mapping {
         Mapping { raw: raw.clone(), mode, size, state: state.clone() }
     }
 
-    /// Notes that the commands are handed over.
-    pub(super) fn hand_over(&self) {
+    /// Notes that the commands are submitted, or about to be.
+    pub(super) fn set_pending(&self) {
         self.state.set(MapState::Pending);
     }
 

@@ -377,8 +377,8 @@ impl Recorder<'_> {
         gpu.uploaded.fetch_add(written as u64, Ordering::Relaxed);
         let ticket = std::mem::take(&mut self.work.ticket);
         let mut mappings = std::mem::take(&mut self.work.readbacks);
-        lock(&gpu.belt).hand_over(&ticket, &mut mappings);
-        mappings.iter().for_each(Mapping::hand_over);
+        lock(&gpu.belt).submit_staged(&ticket, &mut mappings);
+        mappings.iter().for_each(Mapping::set_pending);
         let submitted = gpu
             .driver
             .submitter

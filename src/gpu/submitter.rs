@@ -120,7 +120,7 @@ impl Submitter {
 
     /// Waits until every recording has been submitted.
     pub(super) fn drain(&self) {
-        let last = lock(&self.last).take();
+        let last = lock(&self.last).clone();
         if let Some(ticket) = last {
             ticket.index();
         }

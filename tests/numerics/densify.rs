@@ -7,7 +7,7 @@ use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::stats::{GradHistogram, accumulate};
-use gsscale::densify::strategy::{RowCount, Strategy};
+use gsscale::densify::strategy::{RoundSteps, RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
@@ -148,10 +148,8 @@ fn row_is_drawn(uid: u64, step: u32) -> bool {
 fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
     let (adam, start, parts, steps) = (adam(), scene(1200, 1), 6, 260u32);
     let config = DefaultStrategy {
-        refine_start: 20,
-        refine_every: 30,
+        rounds: RoundSteps { start: 20, stop: 240, every: 30 },
         reset_every: 70,
-        refine_stop: 240,
         grow_grad2d: 3e-4,
         max_gaussians: 1330,
         ..DefaultStrategy::default()

@@ -28,6 +28,7 @@ mod gpu_trace;
 mod gpu_train;
 mod growing;
 mod growth;
+mod mcmc;
 mod memory;
 mod optimizers;
 mod outgrown;

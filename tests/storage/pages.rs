@@ -11,7 +11,7 @@ use gsscale::densify::mcmc::McmcStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
 use gsscale::densify::stats::{GradHistogram, accumulate};
-use gsscale::densify::strategy::{DrawnRows, Effect, Extremes, RowCount, Strategy, effect_of};
+use gsscale::densify::strategy::{DrawnRows, Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
 use gsscale::optim::deferred::DeferredAdam;
@@ -144,16 +144,10 @@ impl<'a> OnTime<'a> {
     }
 }
 
+const ROUNDS: RoundSteps = RoundSteps { start: 20, stop: 240, every: 30 };
+
 fn densify(max_gaussians: u64) -> DefaultStrategy {
-    DefaultStrategy {
-        refine_start: 20,
-        refine_every: 30,
-        reset_every: 70,
-        refine_stop: 240,
-        grow_grad2d: 2e-4,
-        max_gaussians,
-        ..DefaultStrategy::default()
-    }
+    DefaultStrategy { rounds: ROUNDS, reset_every: 70, grow_grad2d: 2e-4, max_gaussians, ..DefaultStrategy::default() }
 }
 
 /// Splits along the longest axis, and recycling of a tenth of the weighed rows.
@@ -162,9 +156,7 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
         score: GrowthScore::Mixed,
         recycle: 0.1,
         prune_opa: 0.005,
-        refine_start: 20,
-        refine_stop: 240,
-        refine_every: 30,
+        rounds: ROUNDS,
         max_gaussians,
         growth: None,
     }
@@ -174,9 +166,7 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
 fn mcmc(max_gaussians: u64) -> McmcStrategy {
     McmcStrategy {
         dead_opacity: 0.005,
-        refine_start: 20,
-        refine_stop: 240,
-        refine_every: 30,
+        rounds: ROUNDS,
         max_gaussians,
         seed: SEED,
         scene_scale: 1.0,
@@ -542,9 +532,9 @@ fn bounds_hold_with_splits_along_the_longest_axis() {
     tightest_bounds(&adam(1.0).with_moments(Moments::Bf16), &limits);
 }
 
-/// Every row with statistics shares its place in half of the rounds; bounds leave no room for it.
+/// Every row with statistics is split in place in half of the rounds; bounds leave no room for it.
 #[test]
-fn bounds_hold_with_rows_that_share_a_place() {
+fn bounds_hold_with_splits_in_place() {
     let limits = mcmc(1).split_limits(1.0);
     assert_eq!(limits, SplitLimits::NEVER);
     tightest_bounds(&adam(1000.0), &limits);
