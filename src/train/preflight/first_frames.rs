@@ -117,7 +117,7 @@ pub(super) fn frames_of_budget(
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };
-    let left = left.saturating_sub(spare).max(of_a_page);
+    let left = left.saturating_sub(spare);
     let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
     Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
 }
