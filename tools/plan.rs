@@ -57,8 +57,6 @@ same for least-recently-used eviction. Waiting assumes that the drive does one t
 The first lines are those of the dry run: memory, drive and time with the Gaussians that the run will reach. The table compares
 orders and frames with the Gaussians of the start, without import, evaluation, commits and decoding of photos.";
 
-/// Read and write rates of a common NVMe drive, bytes per second.
-const COMMON_DRIVE: [f64; 2] = [3e9, 2e9];
 /// Epochs to simulate; later ones count as the mean of those after the first.
 const EPOCHS: u32 = 4;
 
@@ -233,10 +231,10 @@ fn load(args: &Args) -> InputResult<Scene> {
         ));
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
-    let [read_rate, write_rate] = drive_rates(args, &config)?;
+    let drive_rate = drive_rates(args, &config)?;
     // If frames are given, the memory limit is not needed.
     let is_asked = args.compare_frames.is_empty() && config.frames == 0 && config.host_mem.0 > 0;
-    let forecast = forecast_of(args, &path, &config, is_asked)?;
+    let forecast = forecast_of(args, &path, (&config, drive_rate), is_asked)?;
     let known = forecast.as_ref().ok().filter(|_| is_asked).and_then(|forecast| forecast.tiers.frames);
     let look_for = LookFor {
         frames_within: (is_asked && known.is_none()).then_some(config.host_mem.0),
@@ -258,8 +256,8 @@ fn load(args: &Args) -> InputResult<Scene> {
         payload_most: grown(capacity_bytes(config.page_rows as usize, config.sh_degree)),
         frame_bytes: grown(frame_bytes),
         drive: DriveModel {
-            read_rate,
-            write_rate,
+            read_rate: drive_rate.read,
+            write_rate: drive_rate.write,
             step_seconds: match (args.step_seconds, &look.step) {
                 (Some(named), _) => named,
                 (None, Some(timed)) => timed.seconds * args.growth.powf(STEP_GROWTH),
@@ -281,7 +279,7 @@ fn load(args: &Args) -> InputResult<Scene> {
 fn forecast_of(
     args: &Args,
     scene: &Path,
-    config: &TrainConfig,
+    (config, drive_rate): (&TrainConfig, DriveRate),
     is_asked: bool,
 ) -> InputResult<Result<Forecast, String>> {
     if !args.compare_frames.is_empty() || config.frames > 0 || args.lists.is_some() {
@@ -291,7 +289,7 @@ fn forecast_of(
     if is_asked && config.residence().spill_dir().is_none() {
         config.spill_dir = std::env::temp_dir().join("gsscale-pages").to_string_lossy().into_owned();
     }
-    match forecast(scene, &config) {
+    match forecast(scene, &config, drive_rate) {
         Ok(Some(forecast)) => Ok(Ok(forecast)),
         Ok(None) => Ok(Err(String::from("its first pages take more than half of --host-mem"))),
         Err(error) if is_asked => Err(not_planned(error)),
@@ -306,14 +304,14 @@ fn folder_for(config: &TrainConfig) -> PathBuf {
 }
 
 /// Read and write rates: from the flags, measured on the drive of the spill directory, or those of a common drive.
-fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<[f64; 2]> {
+fn drive_rates(args: &Args, config: &TrainConfig) -> InputResult<DriveRate> {
     let named = [args.drive_read, args.drive_write].map(|rate| rate.map(|rate| rate.0 as f64));
-    let measured = match named {
-        [Some(_), Some(_)] => COMMON_DRIVE,
-        _ if config.residence().spill_dir().is_none() => COMMON_DRIVE,
-        _ => DriveRate::measure(&folder_for(config)).map(|rate| [rate.read, rate.write])?,
+    let DriveRate { read, write } = match named {
+        [Some(_), Some(_)] => DriveRate::COMMON,
+        _ if config.residence().spill_dir().is_none() => DriveRate::COMMON,
+        _ => DriveRate::measure(&folder_for(config))?,
     };
-    Ok([0, 1].map(|way| named[way].unwrap_or(measured[way])))
+    Ok(DriveRate { read: named[0].unwrap_or(read), write: named[1].unwrap_or(write) })
 }
 
 fn not_planned(error: TrainError) -> InputError {

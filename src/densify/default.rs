@@ -82,6 +82,10 @@ impl Strategy for DefaultStrategy {
         Some(&self.rounds)
     }
 
+    fn edits_all_after(&self, step: u32) -> bool {
+        self.is_reset(step)
+    }
+
     /// A round, then a reset.
     fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
         let mut events = Vec::new();

@@ -168,6 +168,12 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// statistics; the caller clears it after a round.
     fn events_after(&self, step: u32, scene_scale: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind>;
 
+    /// Whether the events that follow this step edit every page, whatever the statistics say. A device keeps no payload for steps behind
+    /// it; a wrong answer costs copies and changes no result.
+    fn edits_all_after(&self, _step: u32) -> bool {
+        false
+    }
+
     /// Limits for the bounds of pages: a round splits only rows within these limits, and children lie within their reach. Bounds and
     /// the cull of a device rely on it, so a limit that is too narrow loses rows from pictures without an error.
     fn split_limits(&self, scene_scale: f32) -> SplitLimits;

@@ -187,8 +187,9 @@ impl Pager {
     pub fn refresh_plan(&mut self, step: u32) {
         if self.config.plan_bytes > 0 && self.frames.frames_max() == usize::MAX {
             self.look_ahead.refresh(step, self.index.metas());
-            self.apply_changed_uses();
         }
+        self.look_ahead.refresh_near(step, self.index.metas());
+        self.apply_changed_uses();
     }
 
     /// Sets when pages move.

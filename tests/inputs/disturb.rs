@@ -68,7 +68,8 @@ fn held_out_photos_stay_clean_and_training_photos_change_by_seed() {
         Disturbance::Jpeg { quality: 20 },
         Disturbance::Boxes { count: 20, are_masked: false },
         Disturbance::Blurred { one_in: 2 },
-        Disturbance::Swapped { share: 0.2 },
+        Disturbance::Swapped { share: 0.2, are_removed: false },
+        Disturbance::Swapped { share: 0.2, are_removed: true },
     ];
     let pixels = |dataset: &Dataset, split| -> Vec<Vec<u8>> {
         of(dataset, split).into_iter().map(|view| decode(&view.photo).unwrap().rgb).collect()
@@ -107,7 +108,7 @@ fn photos_points_and_poses_go_as_told() {
 fn swapped_views_are_the_wrong_ones() {
     let folder = TempDir::new().unwrap();
     let dataset = city(folder.path());
-    let disturbance = Disturbance::Swapped { share: 0.2 };
+    let disturbance = Disturbance::Swapped { share: 0.2, are_removed: false };
     let swapped = disturbed(folder.path(), &dataset, &disturbance, 1);
     let wrong = plan(&dataset, &disturbance, 1).unwrap().wrong;
     let (before, after) = (of(&dataset, Split::Train), of(&swapped, Split::Train));
@@ -118,4 +119,12 @@ fn swapped_views_are_the_wrong_ones() {
         .map(|(_, b)| b.name.clone())
         .collect();
     assert_eq!((changed.len(), &changed), (6, &wrong));
+    // As if a user had found them: the same photos without these.
+    let found = Disturbance::Swapped { share: 0.2, are_removed: true };
+    let names = |scene: &Dataset| -> Vec<String> {
+        of(scene, Split::Train).into_iter().map(|view| view.name.clone()).filter(|name| !wrong.contains(name)).collect()
+    };
+    let removed = disturbed(folder.path(), &dataset, &found, 1);
+    assert_eq!((names(&removed), of(&removed, Split::Train).len()), (names(&swapped), 21 - 6));
+    assert!(plan(&dataset, &found, 1).unwrap().wrong.is_empty());
 }

@@ -9,7 +9,7 @@ use gsscale::train::inputs::prepare::prepare;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
-const SWAPPED: Disturbance = Disturbance::Swapped { share: 0.1 };
+const SWAPPED: Disturbance = Disturbance::Swapped { share: 0.1, are_removed: false };
 
 /// A disturbed scene.
 struct Disturbed {

@@ -308,6 +308,37 @@ fn a_run_is_set_beside_the_published_one() {
     }
 }
 
+#[test]
+fn the_defaults_of_gsscale_are_set_beside_both() {
+    let folder = TempDir::new().unwrap();
+    let data = lookalike(folder.path(), Layout::ColmapMerged);
+    let out = folder.path().join("out");
+    let common = ["run", "rubble", "--data", text(&data), "--out", text(&out), "--with-defaults"];
+    let output = bench(&[&common[..], &["--steps", "30", "--data-factor", "1", "--device", "cpu"]].concat());
+    let said = stderr(&output);
+    assert!(output.status.success(), "{said}");
+    let line: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let psnr = |line: &Value, of: &str| line[of]["test"]["psnr"].as_f64().unwrap();
+    assert!(psnr(&line, "with_defaults") != psnr(&line, "ours"), "two different rules");
+    assert_eq!(line["with_defaults"]["ssim_variant"], "reflect");
+    assert_eq!(line["difference"]["psnr"], psnr(&line, "ours") - 26.62);
+    // The settings: those of the paper in one folder, the defaults in the other; the photos are the same.
+    let [of_paper, of_defaults] =
+        [&out, &out.join("defaults")].map(|out| TrainConfig::read(&out.join("config.toml")).unwrap());
+    assert_eq!((of_paper.strategy, of_defaults.strategy), (StrategyName::Default, StrategyName::LongAxis));
+    assert_eq!((of_paper.test_every, of_defaults.test_every), (83, 83));
+    assert_eq!((of_paper.steps, of_defaults.steps), (30, 30));
+    for words in ["ours, defaults", "with the defaults of gsscale: "] {
+        assert!(said.contains(words), "{words}: {said}");
+    }
+    assert!(fs::read_to_string(out.join("published.html")).unwrap().contains("ours, defaults"));
+    let again = bench(&[&common[..], &["--no-train", "--quiet"]].concat());
+    assert!(again.status.success(), "{}", stderr(&again));
+    let again: Value = serde_json::from_slice(&again.stdout).unwrap();
+    // The PLY holds unit quaternions.
+    assert!((psnr(&again, "with_defaults") - psnr(&line, "with_defaults")).abs() < 0.01);
+}
+
 fn files_of(folder: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
     let mut stack = vec![folder.to_path_buf()];

@@ -31,11 +31,15 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-bench run rubble --data /data/rubble-pixsfm --dry-run        is the folder complete? what would it take?
   gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --lpips lpips_alex.safetensors
+  gsscale-bench run rubble --data /data/rubble-pixsfm --with-defaults --steps 30000      are the published settings the better ones?
   gsscale-bench run building --data /data/building-pixsfm --tier S3 --spill-dir /nvme/pages --host-mem 12GiB
   gsscale-train --resume runs/rubble && gsscale-bench run rubble --data /data/rubble-pixsfm --out runs/rubble --no-train
 
 Runs: rubble, building, residence, sciart, lfls, sziit, sztu, aerial. Standard output gets the figures as a line of
 JSON; OUT/published.json and OUT/published.html keep them.";
+
+/// Folder, inside the output folder, of the run with the defaults of gsscale.
+const DEFAULTS_FOLDER: &str = "defaults";
 
 /// Trains a published run and prints our figures beside the published ones.
 #[derive(Parser)]
@@ -58,10 +62,13 @@ pub struct Args {
     /// Input range of the LPIPS network: signed (-1..1) or unit (0..1)
     #[arg(long, default_value = "signed", value_name = "RANGE")]
     lpips_range: InputRange,
+    /// Also train with gsscale's own defaults, on the same photos; results go to the folder `defaults` in the output folder
+    #[arg(long, conflicts_with = "dry_run")]
+    with_defaults: bool,
     /// Check the folder, print the setup and the memory of the run, then stop
     #[arg(long)]
     dry_run: bool,
-    /// Evaluate the result in the output folder instead of training
+    /// Evaluate the results in the output folder instead of training
     #[arg(long, conflicts_with_all = ["dry_run", "overwrite", "tier"])]
     no_train: bool,
     /// Replace the results of an earlier run in the output folder
@@ -116,7 +123,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     if !args.quiet {
         describe(args, &setting, &config);
     }
-    let trained = if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, &setting, &config)? };
+    let trained = if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, (&setting, &setting.out), &config)? };
     let summary = match trained {
         Ok(summary) => summary,
         Err(code) => return Ok(code),
@@ -124,8 +131,15 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     if !summary.finished {
         setting.caveats.push(format!("the run stopped after {} steps", summary.steps));
     }
-    let ours = measure(args, &setting, &config, summary)?;
-    report(args, &setting, &config, &ours, print)?;
+    let ours = measure(args, &setting.out, &config, summary)?;
+    let with_defaults = match args.with_defaults {
+        true => match run_with_defaults(args, &setting)? {
+            Ok(ours) => Some(ours),
+            Err(code) => return Ok(code),
+        },
+        false => None,
+    };
+    report(args, &setting, &config, (&ours, with_defaults.as_ref()), print)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -200,11 +214,15 @@ fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
     }
 }
 
-/// Trains to the end. A dry run and a stopped run return only an exit code.
-fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<Summary, ExitCode>, TrainError> {
+/// Trains to the end, into `out`. A dry run and a stopped run return only an exit code.
+fn train(
+    args: &Args,
+    (setting, out): (&Setting, &Path),
+    config: &TrainConfig,
+) -> Result<Result<Summary, ExitCode>, TrainError> {
     let outcome = run(&RunRequest {
         scene: args.data.clone(),
-        out: setting.out.clone(),
+        out: out.to_path_buf(),
         config: config.clone(),
         dry_run: args.dry_run,
         existing: if args.overwrite { Existing::Overwrite } else { Existing::Refuse },
@@ -214,9 +232,35 @@ fn train(args: &Args, setting: &Setting, config: &TrainConfig) -> Result<Result<
     if outcome.exit_code == 0 {
         return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));
     }
-    let (name, data, out) = (args.run.display(), args.data.display(), setting.out.display());
-    eprintln!("stopped; for the table: gsscale-bench run {name} --data {data} --out {out} --no-train");
+    let (name, data, all) = (args.run.display(), args.data.display(), setting.out.display());
+    let resume = format!("gsscale-train --resume {}", out.display());
+    let more = if args.with_defaults { " --with-defaults" } else { "" };
+    eprintln!("stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train");
     Ok(Err(ExitCode::from(outcome.exit_code as u8)))
+}
+
+/// The run with the defaults of gsscale: photos, held-out photos, first points and the variant of SSIM are those of the published run.
+fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, ExitCode>, TrainError> {
+    let out = setting.out.join(DEFAULTS_FOLDER);
+    if args.no_train {
+        let config = TrainConfig::read(&out.join(CONFIG_FILE))?;
+        return Ok(Ok(measure(args, &out, &config, read_summary(&out)?)?));
+    }
+    let (published, mut keys) = (&setting.published, args.keys.clone());
+    keys.data_factor.get_or_insert(published.data_factor);
+    keys.test_every.get_or_insert(published.test_every);
+    keys.test_after.get_or_insert(published.test_after);
+    keys.init_ply.get_or_insert_with(|| published.init_ply.clone());
+    keys.ssim_variant.get_or_insert(published.ssim_variant);
+    let config = TrainConfig::of_new_run(None, &keys)?;
+    config.check()?;
+    if !args.quiet {
+        eprintln!("run     the same photos with the defaults of gsscale, into {}", out.display());
+    }
+    Ok(match train(args, (setting, &out), &config)? {
+        Ok(summary) => Ok(measure(args, &out, &config, summary)?),
+        Err(code) => Err(code),
+    })
 }
 
 fn read_summary(out: &Path) -> InputResult<Summary> {
@@ -228,11 +272,11 @@ fn read_summary(out: &Path) -> InputResult<Summary> {
 }
 
 /// Our figures, from the run's summary or, for LPIPS and --no-train, from an evaluation of the PLY.
-fn measure(args: &Args, setting: &Setting, config: &TrainConfig, summary: Summary) -> Result<Ours, TrainError> {
+fn measure(args: &Args, out: &Path, config: &TrainConfig, summary: Summary) -> Result<Ours, TrainError> {
     let mut ours = Ours::new(summary, config);
     if args.lpips.is_some() || args.no_train {
         let extras = EvalExtras { pictures: None, lpips: args.lpips.as_deref().map(|file| (file, args.lpips_range)) };
-        let report = evaluate_ply(&Trainer::ply_path(&setting.out), &args.data, config, &extras)?;
+        let report = evaluate_ply(&Trainer::ply_path(out), &args.data, config, &extras)?;
         (ours.test, ours.lpips_variant) = (report.test, report.lpips_variant);
     }
     Ok(ours)
@@ -242,7 +286,7 @@ fn report(
     args: &Args,
     setting: &Setting,
     config: &TrainConfig,
-    ours: &Ours,
+    (ours, with_defaults): (&Ours, Option<&Ours>),
     print: &mut dyn FnMut(&Value),
 ) -> InputResult<()> {
     let comparison = Comparison {
@@ -253,6 +297,7 @@ fn report(
         out: &setting.out,
         caveats: &setting.caveats,
         ours,
+        with_defaults,
     };
     let json = comparison.json();
     write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;

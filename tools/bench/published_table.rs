@@ -44,10 +44,40 @@ impl Ours {
     }
 }
 
+impl Ours {
+    fn costs(&self) -> String {
+        let Summary { gaussians, steps, train_seconds, host_bytes_peak, .. } = self.summary;
+        format!(
+            "{gaussians} Gaussians after {steps} steps, {train_seconds:.1} s of training; peak host memory {}; Gaussians \
+             with their moments {}",
+            format_bytes(host_bytes_peak),
+            format_bytes(self.state_bytes)
+        )
+    }
+
+    fn json(&self) -> Value {
+        let summary = &self.summary;
+        json!({
+            "test": self.test,
+            "ssim_variant": self.ssim_variant,
+            "lpips_variant": self.lpips_variant,
+            "gaussians": summary.gaussians,
+            "steps": summary.steps,
+            "train_seconds": summary.train_seconds,
+            "host_bytes_peak": summary.host_bytes_peak,
+            "state_bytes": self.state_bytes,
+            "bytes_read": summary.tiers.stats.bytes_read,
+            "bytes_written": summary.tiers.stats.bytes_written,
+        })
+    }
+}
+
 /// A row of the table.
 struct Row {
     measure: String,
     ours: Option<f64>,
+    /// Figure of the run with the defaults of gsscale.
+    with_defaults: Option<f64>,
     published: Option<f64>,
     /// Figure of the unchanged trainer.
     original: Option<f64>,
@@ -60,10 +90,14 @@ impl Row {
         Some(self.ours? - self.published?).filter(|_| self.is_same_measure)
     }
 
-    fn cells(&self) -> [String; 5] {
+    /// The cells, in the order of [`Comparison::head`].
+    fn cells(&self, has_defaults: bool) -> Vec<String> {
         let number = |x: Option<f64>| x.map_or("-".to_string(), |x| format!("{x:.*}", self.digits));
         let difference = self.difference().map_or("-".to_string(), |x| format!("{x:+.*}", self.digits));
-        [self.measure.clone(), number(self.ours), number(self.published), number(self.original), difference]
+        let mut cells = vec![self.measure.clone(), number(self.ours)];
+        cells.extend(has_defaults.then(|| number(self.with_defaults)));
+        cells.extend([number(self.published), number(self.original), difference]);
+        cells
     }
 }
 
@@ -83,17 +117,27 @@ pub struct Comparison<'a> {
     pub caveats: &'a [String],
     /// Our figures.
     pub ours: &'a Ours,
+    /// Our figures with the defaults of gsscale, if such a run was asked for.
+    pub with_defaults: Option<&'a Ours>,
 }
 
-const HEAD: [&str; 5] = ["held-out photos, mean", "ours", "GS-Scale", "unchanged gsplat", "ours - GS-Scale"];
-
 impl Comparison<'_> {
+    /// Names of the columns.
+    fn head(&self) -> Vec<&'static str> {
+        let mut head = vec!["held-out photos, mean", "ours"];
+        head.extend(self.with_defaults.map(|_| "ours, defaults"));
+        head.extend(["GS-Scale", "unchanged gsplat", "ours - GS-Scale"]);
+        head
+    }
+
     fn rows(&self) -> Vec<Row> {
         let (test, expected) = (self.ours.test, self.run.facts.expected.as_ref());
         let lpips_variant = self.ours.lpips_variant.as_deref();
-        let row = |measure, digits, ours, theirs: Option<[f64; 2]>, is_same_measure| {
+        let of_defaults = self.with_defaults.and_then(|run| run.test);
+        let row = |measure, digits, of: &dyn Fn(&TestMetrics) -> Option<f64>, theirs: Option<[f64; 2]>, is_same_measure| {
+            let [ours, with_defaults] = [test, of_defaults].map(|test| test.as_ref().and_then(of));
             let (published, original) = (theirs.map(|t| t[0]), theirs.map(|t| t[1]));
-            Row { measure, ours, published, original, is_same_measure, digits }
+            Row { measure, ours, with_defaults, published, original, is_same_measure, digits }
         };
         let psnr = expected.map(|e| [e.psnr, e.original_psnr]);
         let ssim = expected.map(|e| [e.ssim, e.original_ssim]);
@@ -102,28 +146,21 @@ impl Comparison<'_> {
         let is_same_lpips = expected.is_some_and(|e| Some(e.lpips_variant.as_str()) == lpips_variant);
         let (ssim_name, lpips_name) = (self.ours.ssim_variant, lpips_variant.unwrap_or("alex, signed"));
         let mut rows = vec![
-            row("PSNR, dB".into(), 2, test.map(|t| t.psnr), psnr, true),
-            row(format!("SSIM ({ssim_name})"), 3, test.map(|t| t.ssim), ssim, is_same_ssim),
-            row(format!("LPIPS ({lpips_name})"), 3, test.and_then(|t| t.lpips), lpips, is_same_lpips),
+            row("PSNR, dB".into(), 2, &|t| Some(t.psnr), psnr, true),
+            row(format!("SSIM ({ssim_name})"), 3, &|t| Some(t.ssim), ssim, is_same_ssim),
+            row(format!("LPIPS ({lpips_name})"), 3, &|t| t.lpips, lpips, is_same_lpips),
         ];
         if let Some(corrected) = test.and_then(|t| t.color_corrected) {
             let name = format!("colour-corrected PSNR ({}), dB", corrected.method.name());
-            rows.push(row(name, 2, Some(corrected.cc_psnr), None, false));
+            rows.push(row(name, 2, &|t| Some(t.color_corrected?.cc_psnr), None, false));
         }
         rows
     }
 
     /// Further facts, one line each.
     fn facts(&self) -> Vec<String> {
-        let summary = &self.ours.summary;
-        let mut facts = vec![format!(
-            "{} Gaussians after {} steps, {:.1} s of training; peak host memory {}; Gaussians with their moments {}",
-            summary.gaussians,
-            summary.steps,
-            summary.train_seconds,
-            format_bytes(summary.host_bytes_peak),
-            format_bytes(self.ours.state_bytes)
-        )];
+        let mut facts = vec![self.ours.costs()];
+        facts.extend(self.with_defaults.map(|run| format!("with the defaults of gsscale: {}", run.costs())));
         if let Some(memory) = &self.run.facts.memory {
             let here = memory.saving.map_or(String::new(), |s| format!("{s} on this scene; "));
             let ([least, most], mean) = (memory.saving_range, memory.saving_mean);
@@ -141,7 +178,6 @@ impl Comparison<'_> {
 
     /// The comparison as JSON.
     pub fn json(&self) -> Value {
-        let summary = &self.ours.summary;
         let rows = self.rows();
         let difference = |i: usize| rows[i].difference();
         json!({
@@ -153,18 +189,8 @@ impl Comparison<'_> {
             "out": self.out,
             "comparable": self.caveats.is_empty() && self.run.facts.expected.is_some(),
             "not_the_published_run": self.caveats,
-            "ours": {
-                "test": self.ours.test,
-                "ssim_variant": self.ours.ssim_variant,
-                "lpips_variant": self.ours.lpips_variant,
-                "gaussians": summary.gaussians,
-                "steps": summary.steps,
-                "train_seconds": summary.train_seconds,
-                "host_bytes_peak": summary.host_bytes_peak,
-                "state_bytes": self.ours.state_bytes,
-                "bytes_read": summary.tiers.stats.bytes_read,
-                "bytes_written": summary.tiers.stats.bytes_written,
-            },
+            "ours": self.ours.json(),
+            "with_defaults": self.with_defaults.map(Ours::json),
             "published": self.run.facts.expected,
             "published_memory": self.run.facts.memory,
             "difference": { "psnr": difference(0), "ssim": difference(1), "lpips": difference(2) },
@@ -174,16 +200,16 @@ impl Comparison<'_> {
 
     /// The table for a terminal.
     pub fn text(&self) -> String {
-        let rows: Vec<[String; 5]> = self.rows().iter().map(Row::cells).collect();
-        let head = HEAD.map(str::to_string);
-        let all = || std::iter::once(&head).chain(&rows);
-        let widths: [usize; 5] = std::array::from_fn(|c| all().map(|r| r[c].chars().count()).max().unwrap_or(0));
-        let line = |r: &[String; 5]| {
-            let [w0, w1, w2, w3, w4] = widths;
-            format!("{:<w0$}  {:>w1$}  {:>w2$}  {:>w3$}  {:>w4$}", r[0], r[1], r[2], r[3], r[4])
+        let mut table = vec![self.head().into_iter().map(str::to_string).collect::<Vec<_>>()];
+        table.extend(self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())));
+        let width = |column: usize| table.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+        let widths: Vec<usize> = (0..table[0].len()).map(width).collect();
+        let line = |row: &Vec<String>| {
+            let numbers = row.iter().zip(&widths).skip(1).map(|(cell, &width)| format!("  {cell:>width$}"));
+            format!("{:<width$}{}", row[0], numbers.collect::<String>(), width = widths[0])
         };
         let mut lines = vec![format!("{}, tier {}", self.run.facts.title, self.tier.unwrap_or("none"))];
-        lines.extend(all().map(line));
+        lines.extend(table.iter().map(line));
         lines.extend(self.facts());
         lines.extend(self.caveats.iter().map(|c| format!("not the published run: {c}")));
         lines.push(format!("report: {}", self.out.join("published.html").display()));
@@ -195,17 +221,17 @@ impl Comparison<'_> {
         let tier = self.tier.unwrap_or("none");
         let title = format!("gsscale: {} beside the published figures", self.run.facts.title);
         let mut page = Page::new(&title, &format!("{}, tier {tier}", self.data.display()));
-        let number = |row: &Row, i: usize| Cell::Number(row.cells()[i].clone());
-        page.table(
-            &self.rows(),
-            &[
-                (HEAD[0], &|row| Cell::text(&row.measure)),
-                (HEAD[1], &|row| number(row, 1)),
-                (HEAD[2], &|row| number(row, 2)),
-                (HEAD[3], &|row| number(row, 3)),
-                (HEAD[4], &|row| number(row, 4)),
-            ],
-        );
+        let rows: Vec<Vec<String>> =
+            self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())).collect();
+        let cell = |column: usize| -> Box<dyn Fn(&Vec<String>) -> Cell> {
+            match column {
+                0 => Box::new(|row| Cell::text(&row[0])),
+                _ => Box::new(move |row| Cell::Number(row[column].clone())),
+            }
+        };
+        let cells: Vec<_> = (0..self.head().len()).map(cell).collect();
+        let columns: Vec<_> = self.head().into_iter().zip(cells.iter().map(AsRef::as_ref)).collect();
+        page.table(&rows, &columns);
         self.facts().iter().for_each(|fact| page.paragraph(fact));
         if !self.caveats.is_empty() {
             page.heading("Not the published run");

@@ -31,9 +31,10 @@ Examples:
   gsscale-bench stability scans/village --out stability/village --only swapped10,boxes --remedies none,own
 
 Disturbances: exposure05 and exposure1 (photos brighter or darker by up to half a stop, a stop), white-balance, swapped5
-and swapped10 (photos that have changed places, percent), poses005 and poses05 (noise on the places of cameras, percent of
-the scene), jpeg20 (quality), boxes (20 grey boxes a photo), boxes-masked (with masks, as by hand), third (of the photos),
-points10 (a tenth of the points), points-random, blurred10 (percent). Held-out photos stay clean.
+and swapped10 (photos that have changed places, percent), swapped10-removed (without these photos, as by hand), poses005 and
+poses05 (noise on the places of cameras, percent of the scene), jpeg20 (quality), boxes (20 grey boxes a photo), boxes-masked
+(with masks, as by hand), third (of the photos), points10 (a tenth of the points), points-random, blurred10 (percent).
+Held-out photos stay clean.
 Remedies: none; own, what is meant for the disturbance; all together.
 
 Each run is a process of its own and adds a line to stability.jsonl in --out; the page is stability.html, and the end is a
@@ -48,13 +49,14 @@ const REMEDIES: [&str; 3] = [NO_REMEDY, "own", "all"];
 type Change = fn(&mut TrainConfig);
 
 /// Name of a disturbance, the disturbance, and its own remedy.
-const DISTURBANCES: [(&str, Disturbance, Option<Change>); 15] = [
+const DISTURBANCES: [(&str, Disturbance, Option<Change>); 16] = [
     (CLEAN, Disturbance::Nothing, None),
     ("exposure05", Disturbance::Exposure { stops: 0.5 }, Some(correct_exposure)),
     ("exposure1", Disturbance::Exposure { stops: 1.0 }, Some(correct_exposure)),
     ("white-balance", Disturbance::WhiteBalance { stops: 0.3 }, Some(correct_colors)),
-    ("swapped5", Disturbance::Swapped { share: 0.05 }, Some(leave_out_views)),
-    ("swapped10", Disturbance::Swapped { share: 0.1 }, Some(leave_out_views)),
+    ("swapped5", Disturbance::Swapped { share: 0.05, are_removed: false }, Some(leave_out_views)),
+    ("swapped10", Disturbance::Swapped { share: 0.1, are_removed: false }, Some(leave_out_views)),
+    ("swapped10-removed", Disturbance::Swapped { share: 0.1, are_removed: true }, None),
     ("poses005", Disturbance::PoseNoise { share: 0.0005 }, Some(refine_poses)),
     ("poses05", Disturbance::PoseNoise { share: 0.005 }, Some(refine_poses)),
     ("jpeg20", Disturbance::Jpeg { quality: 20 }, None),

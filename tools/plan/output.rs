@@ -36,7 +36,7 @@ pub fn json_of_forecast(forecast: &Forecast) -> Value {
         "memory_bytes": forecast.memory_at_end().total(), "memory_bytes_at_start": forecast.memory[0].total(),
         "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_most": forecast.drive_bytes_most,
         "ply_bytes": forecast.ply_bytes, "bytes_written": forecast.bytes_written,
-        "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds,
+        "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds, "drive_seconds": forecast.drive_seconds,
     })
 }
 

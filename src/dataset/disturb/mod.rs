@@ -44,6 +44,8 @@ pub enum Disturbance {
     Swapped {
         /// Of the training photos.
         share: f64,
+        /// Whether these photos are missing instead, as if a user had found them.
+        are_removed: bool,
     },
     /// Normal noise on the places of cameras, along each axis.
     PoseNoise {
@@ -187,7 +189,7 @@ fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
 fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
     let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
     let shown = match disturbance {
-        Disturbance::Swapped { share } => poses::swapped(dataset, &views, *share, seed),
+        Disturbance::Swapped { share, .. } => poses::swapped(dataset, &views, *share, seed),
         _ => (0..views.len()).collect(),
     };
     let noise = match disturbance {
@@ -196,6 +198,7 @@ fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -
     };
     let is_kept = |number: usize| match disturbance {
         Disturbance::FewPhotos { one_in } => is_chosen(seed, number, *one_in),
+        Disturbance::Swapped { are_removed: true, .. } => shown[number] == number,
         _ => true,
     };
     let of_number = |number: usize| TrainView {

@@ -30,6 +30,9 @@ pub struct DriveRate {
 }
 
 impl DriveRate {
+    /// A common NVMe drive.
+    pub const COMMON: DriveRate = DriveRate { read: 3e9, write: 2e9 };
+
     /// Measures the drive of `folder`. Leaves no file behind.
     ///
     /// # Errors

@@ -85,6 +85,21 @@ pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
     }
 }
 
+/// Whether two folders lie on one drive; true if the system does not report it.
+pub fn is_same_drive(a: &Path, b: &Path) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::MetadataExt;
+        let device = |folder: &Path| std::fs::metadata(folder).map(|m| m.dev()).ok();
+        device(a).zip(device(b)).is_none_or(|(a, b)| a == b)
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = (a, b);
+        true
+    }
+}
+
 #[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {

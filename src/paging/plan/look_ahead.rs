@@ -19,6 +19,8 @@ use crate::scene::page_meta::PageMeta;
 /// epochs ago, and their rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a
 /// large one 2 %.
 const REFRESHED: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
+/// Bounds of pages that [`LookAhead::refresh_near`] tests for a step: some .3 ms.
+const NEAR_BOUNDS: usize = 50_000;
 
 /// A page that a coming step will have to read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -58,6 +60,14 @@ impl LookAhead {
     /// Makes the page lists anew that the next [`LookAhead::play`] depends on most.
     pub fn refresh(&mut self, step: u32, index: &[PageMeta]) {
         REFRESHED.into_iter().for_each(|far| self.views.refresh(step.saturating_add(far), index));
+    }
+
+    /// Makes the page lists of the coming steps anew, as many as [`NEAR_BOUNDS`] allows: all of a small scene. For a tier above that
+    /// holds few of the pages, so that an inexact next use evicts the wrong one.
+    pub fn refresh_near(&mut self, step: u32, index: &[PageMeta]) {
+        let steps = (NEAR_BOUNDS / index.len().max(1)) as u32;
+        let planned = self.views.planned_to().saturating_sub(step);
+        (1..=steps.min(planned)).for_each(|far| self.views.refresh(step + far, index));
     }
 
     /// Plays the steps after `step`, whose pages are pinned, with the pages that `frames` holds. [`LookAhead::take_admits`]

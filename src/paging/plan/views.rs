@@ -38,6 +38,11 @@ impl ViewPlan {
         self.plan.steps().contains(&step).then(|| self.plan.pages(step))
     }
 
+    /// The step after the last planned one.
+    pub fn planned_to(&self) -> u32 {
+        self.plan.steps().end
+    }
+
     /// The first planned step that needs the page, or [`NEVER`].
     pub fn next_use(&self, page: PageNo) -> u32 {
         self.plan.next_use(page, 0).unwrap_or(NEVER)

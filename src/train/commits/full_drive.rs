@@ -8,13 +8,13 @@
 
 use super::checkpoint::Checkpoint;
 use crate::base::units::format_bytes;
-use crate::page::folder::file_system::free_bytes;
+use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::map::commit::Commits;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Interval between checks of the drive.
@@ -163,20 +163,5 @@ impl Checkpoint {
     /// Most bytes by which one commit can grow the page map: at most it doubles.
     fn map_growth(&self) -> u64 {
         std::fs::metadata(self.folder.join(crate::page::map::commit::MAP_NAME)).map_or(0, |map| map.len())
-    }
-}
-
-/// Whether two folders lie on one drive; true if the system does not report it.
-fn is_same_drive(a: &Path, b: &Path) -> bool {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::MetadataExt;
-        let device = |folder: &Path| std::fs::metadata(folder).map(|m| m.dev()).ok();
-        device(a).zip(device(b)).is_none_or(|(a, b)| a == b)
-    }
-    #[cfg(not(unix))]
-    {
-        let _ = (a, b);
-        true
     }
 }

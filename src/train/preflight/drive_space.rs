@@ -1,4 +1,4 @@
-//! The drive of the pages: whether it holds them, and how much a run writes to it.
+//! The drive of the pages: whether it holds them, how much a run writes to it, and how long a run waits for it.
 //!
 //! Not here: a drive that is full during a run ([`crate::train::commits::full_drive`]).
 //!
@@ -8,9 +8,10 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
+use crate::page::folder::drive_rate::DriveRate;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
-use crate::paging::simulation::replay::{ReplayOptions, replay};
+use crate::paging::simulation::replay::{DriveModel, Replay, ReplayOptions, replay};
 use crate::scene::partition::first_fill;
 use crate::schedule::visibility::ViewPages;
 use crate::train::inputs::places::drive_of;
@@ -18,7 +19,7 @@ use crate::train::memory::largest_view::train_cameras;
 use crate::train::memory::staging::PLAN_BYTES;
 use crate::train::state::trainer::Trainer;
 
-/// Epochs that are simulated to estimate the bytes a run writes.
+/// Epochs that are simulated to estimate the traffic of a run.
 const PLAYED_EPOCHS: u32 = 3;
 /// Versions of a page on the drive: one per commit kept (two), and one being written.
 pub(super) const VERSIONS: u64 = 3;
@@ -84,41 +85,68 @@ pub(super) fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2]
     Ok(())
 }
 
-/// Bytes that a run writes to the drive, without commits.
+/// What a run does with its drive, without commits.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(crate) struct StepWrites {
-    /// The import.
+pub(crate) struct DriveUse {
+    /// Bytes that the import writes.
     pub import: f64,
     /// A step with the Gaussians of now, and with those of the end.
-    pub of_step: [f64; 2],
+    pub of_step: [StepUse; 2],
 }
 
-/// The bytes that a step writes in a run with `frames` frames (possibly more than pages) whose number of pages grows by
-/// the factor `growth`. Simulates a few epochs with the current pages. At the end the same number of frames holds a
+/// What a step does with its drive, mean.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(crate) struct StepUse {
+    /// Bytes written.
+    pub written: f64,
+    /// Seconds that the step waits for the drive.
+    pub waits: f64,
+}
+
+/// Scene, frames and times of a run whose traffic is simulated.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct SimulatedRun {
+    /// Frames, possibly more than pages.
+    pub frames: usize,
+    /// Gaussians at the end over those of now.
+    pub growth: f64,
+    /// Seconds of a step that waits for nothing, with the Gaussians of now and with those of the end.
+    pub step_seconds: [f64; 2],
+    /// The drive.
+    pub drive: DriveRate,
+}
+
+/// What the steps of a run do with its drive. Simulates a few epochs with the current pages. At the end the same number of frames holds a
 /// smaller share of the pages, and a view needs more pages.
-pub(crate) fn step_writes(
-    config: &TrainConfig,
-    dataset: &Dataset,
-    trainer: &Trainer,
-    frames: usize,
-    growth: f64,
-) -> StepWrites {
+pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, run: &SimulatedRun) -> DriveUse {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
     let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
     let views = ViewPages::new(index, &cameras);
-    let of_step = |frames: usize| {
-        let options =
-            ReplayOptions { frames, policy: config.evict, reads_ahead: false, steps, plan_bytes: PLAN_BYTES as u64 };
-        let played = replay(&views, &page_bytes, trainer.view_order(), &options);
-        let written: u64 = played.map_or(0, |p| p.steps.iter().map(|s| s.bytes_written).sum());
-        written as f64 / f64::from(steps.max(1))
+    let play = |frames: usize, reads_ahead: bool| -> Replay {
+        let options = ReplayOptions { frames, policy: config.evict, reads_ahead, steps, plan_bytes: PLAN_BYTES as u64 };
+        replay(&views, &page_bytes, trainer.view_order(), &options).unwrap_or_default()
+    };
+    // With more Gaussians a page stands for several: a drive that is slower by as much takes as long.
+    let of_step = |frames: usize, growth: f64, step_seconds: f64| {
+        let (_, written) = play(frames, false).totals();
+        let (read_rate, write_rate) = (run.drive.read / growth, run.drive.write / growth);
+        let played = play(frames, true);
+        let steady = played.steady();
+        let waits = played.stall(steady.clone(), &DriveModel { read_rate, write_rate, step_seconds }).seconds;
+        StepUse { written: growth * written as f64 / f64::from(steps.max(1)), waits: waits / steady.len().max(1) as f64 }
     };
     // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
-    let then = ((frames as f64 / growth.max(1.0)) as usize).max(views.most().min(frames)).min(index.len());
-    let frames = frames.min(index.len()).max(1);
+    let growth = run.growth.max(1.0);
+    let then = ((run.frames as f64 / growth) as usize).max(views.most().min(run.frames)).min(index.len());
+    let frames = run.frames.min(index.len()).max(1);
     let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
-    let now = of_step(frames);
-    StepWrites { import, of_step: [now, if then < frames { of_step(then) } else { now } * growth.max(1.0)] }
+    let [step_seconds, step_seconds_then] = run.step_seconds;
+    let now = of_step(frames, 1.0, step_seconds);
+    let at_end = match then < frames || growth > 1.0 {
+        true => of_step(then.min(frames), growth, step_seconds_then),
+        false => now,
+    };
+    DriveUse { import, of_step: [now, at_end] }
 }

@@ -7,7 +7,7 @@
 //!
 //! Invariants: 1. the run does not depend on its forecast; 2. bytes of memory and drive depend on no clock.
 
-use super::drive_space::{StepWrites, VERSIONS};
+use super::drive_space::{DriveUse, StepUse, VERSIONS};
 use super::first_frames::{LargestNeed, obey};
 use super::plan::TierPlan;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
@@ -40,7 +40,7 @@ pub const STEP_GROWTH: f64 = 0.54;
 /// Gaussians: 150,000 of them at 790x594 take a step of 48 ms on two cores, 422,000 at 395x297 one of some 120 ms on one.
 const ROW_SECONDS: f64 = 0.4e-6;
 /// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache.
-const STEP_OVER_RENDERING: f64 = 1.35;
+pub(crate) const STEP_OVER_RENDERING: f64 = 1.35;
 /// Most pages of a grown scene, over the pages that its Gaussians would take at the fill of the first pages: .96 in sheffield_cross_395 and
 /// .99 in seneca (`gsscale-ckpt ls` after `--max-resolution 200 --steps 40 --keep-checkpoint`).
 const MORE_PAGES: f64 = 1.1;
@@ -130,6 +130,8 @@ pub struct Forecast {
     pub commit_bytes_most: f64,
     /// Seconds of all steps.
     pub seconds: f64,
+    /// Seconds among them in which steps wait for the drive.
+    pub drive_seconds: f64,
 }
 
 /// What was measured before the first step.
@@ -145,8 +147,8 @@ pub(crate) struct Measured {
     pub view_seconds: f64,
     /// Largest share of the Gaussians that a view draws.
     pub visible_share: f64,
-    /// Bytes that steps write.
-    pub writes: StepWrites,
+    /// What steps do with the drive.
+    pub drive: DriveUse,
 }
 
 impl Forecast {
@@ -158,14 +160,16 @@ impl Forecast {
         measured: &Measured,
         host_mem: Option<u64>,
     ) -> Forecast {
-        let Measured { rows, reach: (last, reach), steps_done, view_seconds, visible_share, writes } = *measured;
+        let Measured { rows, reach: (last, reach), steps_done, view_seconds, visible_share, drive } = *measured;
         let growth = last as f64 / rows.max(1) as f64;
         let steps = config.steps.saturating_sub(steps_done);
         let step_seconds = view_seconds * STEP_OVER_RENDERING;
         let more = ROW_SECONDS * visible_share * (last - rows) as f64 / rayon::current_num_threads() as f64;
         let by_rows = step_seconds + more * (mean_over_steps(config, steps_done, 2.0, 1.0) - 1.0);
         let by_power = step_seconds * mean_over_steps(config, steps_done, growth, STEP_GROWTH);
-        let seconds = f64::from(steps) * by_power.min(by_rows);
+        let waits_and_writes = drive.mean_of_steps(config, steps_done, growth);
+        let drive_seconds = f64::from(steps) * waits_and_writes.waits;
+        let seconds = f64::from(steps) * by_power.min(by_rows) + drive_seconds;
         let is_in_memory = config.residence() == Residence::Memory;
         let drive_bytes = (tiers.pages[0] as f64 * growth).ceil() as u64 * tiers.frame_bytes;
         let drive_bytes_most = store_bytes_most(config, tiers.pages[0] as f64 * growth);
@@ -184,13 +188,10 @@ impl Forecast {
             bytes_written: 0.0,
             commit_bytes_most: commit_bytes(config, state_bytes, seconds),
             seconds,
+            drive_seconds,
         };
         if !is_in_memory {
-            let ramp = mean_over_steps(config, steps_done, growth, 1.0);
-            // From the writes of a step now to those with the Gaussians of the end, as their number grows.
-            let share = if growth > 1.0 { (ramp - 1.0) / (growth - 1.0) } else { 0.0 };
-            let of_step = writes.of_step[0] + share * (writes.of_step[1] - writes.of_step[0]);
-            forecast.bytes_written = writes.import + of_step * f64::from(steps);
+            forecast.bytes_written = drive.import + waits_and_writes.written * f64::from(steps);
             if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
                 forecast.limit_memory(config, budget);
             }
@@ -220,6 +221,17 @@ impl Forecast {
     /// Memory at the number of Gaussians that will be reached.
     pub fn memory_at_end(&self) -> &MemoryEstimate {
         &self.memory[2]
+    }
+}
+
+impl DriveUse {
+    /// The mean over the steps to do: from a step of now to one with the Gaussians of the end, as their number grows.
+    fn mean_of_steps(&self, config: &TrainConfig, steps_done: u32, growth: f64) -> StepUse {
+        let ramp = mean_over_steps(config, steps_done, growth, 1.0);
+        let share = if growth > 1.0 { (ramp - 1.0) / (growth - 1.0) } else { 0.0 };
+        let [now, at_end] = self.of_step;
+        let mean = |now: f64, at_end: f64| now + share * (at_end - now);
+        StepUse { written: mean(now.written, at_end.written), waits: mean(now.waits, at_end.waits) }
     }
 }
 

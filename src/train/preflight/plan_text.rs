@@ -14,6 +14,8 @@ use crate::train::start::tiers::Tiers;
 
 /// Rated endurance of a common drive of 500 GB, bytes written.
 const ENDURANCE_BYTES: f64 = 300e12;
+/// Share of the time that steps wait for the drive from which the plan names it.
+const WAITS_WORTH_A_WORD: f64 = 0.1;
 
 /// Columns of a terminal.
 const COLUMNS: usize = 80;
@@ -81,11 +83,20 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
     text.push_str(&part("program and tables", memory.base + memory.copies));
     text.push_str(&drive(forecast, tiers, &at));
     text.push_str(&format!(
-        "time    about {} for {} steps{at}, without evaluation\n",
+        "time    about {} for {} steps{at}, without evaluation{}\n",
         format_seconds(forecast.seconds),
-        format_grouped(forecast.steps.into())
+        format_grouped(forecast.steps.into()),
+        waits(forecast)
     ));
     text
+}
+
+/// The part of the time that is spent on the drive, if it is worth a word.
+fn waits(forecast: &Forecast) -> String {
+    match forecast.drive_seconds > WAITS_WORTH_A_WORD * forecast.seconds {
+        true => format!(", {} of it waiting for a common drive", format_seconds(forecast.drive_seconds)),
+        false => String::new(),
+    }
 }
 
 /// Wraps the lines of a text at 80 columns, and indents the rest of each. Lines break only behind a comma, a semicolon or a colon, or

@@ -9,19 +9,30 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
 use crate::config::residence::Residence;
-use crate::page::folder::file_system::free_bytes;
+use crate::exchange::format::ExportFormat;
+use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::train::inputs::places::drive_of;
 use std::path::Path;
 
-/// Refuses a drive that cannot hold a PLY of the first Gaussians. Warns if the drive may not hold the results of the end: the PLY and, for
-/// a run in memory, its checkpoint. A drive that does not report its free space passes.
+/// Bytes of the files for viewers, over those of the PLY: .05 for SPZ, .1 for the levels of SOG.
+const EXPORT_SHARE: u64 = 8;
+
+/// Refuses a drive that cannot hold a PLY of the first Gaussians, unless the run is resumed. Warns if the drive may not hold the results of
+/// the end: the PLY, the files for viewers and, where they lie on the same drive, the pages of the store or the checkpoint beyond the
+/// `stored` bytes of now. A drive that does not report its free space passes.
 ///
 /// # Errors
 /// The drive has too little free space.
-pub(crate) fn check_drive_of_results(config: &TrainConfig, out: &Path, forecast: &Forecast) -> InputResult<()> {
-    let Some(free) = free_bytes(&drive_of(out)).ok().flatten() else { return Ok(()) };
+pub(crate) fn check_drive_of_results(
+    config: &TrainConfig,
+    out: &Path,
+    forecast: &Forecast,
+    (stored, is_resumed): (u64, bool),
+) -> InputResult<()> {
+    let drive = drive_of(out);
+    let Some(free) = free_bytes(&drive).ok().flatten() else { return Ok(()) };
     let [now, last] = forecast.gaussians.map(|rows| ply_bytes(config, rows));
-    if free < now {
+    if free < now && !is_resumed {
         let problem = format!(
             "the drive has {} free, but the PLY of the first Gaussians alone takes {}",
             format_bytes(free),
@@ -29,12 +40,20 @@ pub(crate) fn check_drive_of_results(config: &TrainConfig, out: &Path, forecast:
         );
         return Err(InputError::new(out, problem, "free space on it, or choose another --out"));
     }
-    let checkpoint = if config.residence() == Residence::Memory { forecast.drive_bytes_most } else { 0 };
-    if free < last.saturating_add(checkpoint) {
+    let results = last + if config.export == ExportFormat::Ply { 0 } else { last / EXPORT_SHARE };
+    let (pages, beside) = match config.residence() {
+        Residence::Memory => (forecast.drive_bytes_most, " and the checkpoint"),
+        Residence::SpillDir(folder) if is_same_drive(&drive, &drive_of(folder)) => {
+            (forecast.drive_bytes_most, " and the pages, which lie on the same drive,")
+        }
+        _ => (0, ""),
+    };
+    let needed = results.saturating_add(pages.saturating_sub(stored));
+    if free < needed {
         eprintln!(
-            "warning: the results may take {} in {}, whose drive has {} free: free space, choose another --out, or lower \
-             --max-gaussians",
-            format_bytes(last.saturating_add(checkpoint)),
+            "warning: the results{beside} may take {} more in {}, whose drive has {} free: free space, choose another --out, or \
+             lower --max-gaussians",
+            format_bytes(needed),
             out.display(),
             format_bytes(free)
         );

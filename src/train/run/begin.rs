@@ -18,6 +18,7 @@ use crate::config::residence::Residence;
 use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
+use crate::page::folder::drive_rate::DriveRate;
 use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
@@ -28,8 +29,8 @@ use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::estimate::list_bytes;
 use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
 use crate::train::preflight::device_memory;
-use crate::train::preflight::drive_space::{StepWrites, check_first_drive, step_writes};
-use crate::train::preflight::forecast::{Forecast, Measured, Reach, reach};
+use crate::train::preflight::drive_space::{DriveUse, SimulatedRun, check_first_drive, drive_use};
+use crate::train::preflight::forecast::{Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, reach};
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
@@ -172,11 +173,11 @@ pub(crate) fn begin(
     Ok((renderer, options, driver))
 }
 
-/// The forecast of a run, as its dry run makes it: nothing is written. `None` if a dry run cannot hold the scene.
+/// The forecast of a run on a drive of this rate, as its dry run makes it: nothing is written. `None` if a dry run cannot hold the scene.
 ///
 /// # Errors
 /// Those of a dry run.
-pub fn forecast(scene: &Path, config: &TrainConfig) -> Result<Option<Forecast>, TrainError> {
+pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Result<Option<Forecast>, TrainError> {
     let (scene, config) = (scene.to_path_buf(), config.clone());
     let request = RunRequest {
         scene,
@@ -193,7 +194,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig) -> Result<Option<Forecast>, 
         return Ok(None);
     }
     let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
-    plan(&request.config, &dataset, &tiers, &mut trainer, (host_mem, driver)).map(Some)
+    plan(&request.config, &dataset, &tiers, &mut trainer, (host_mem, driver), drive_rate).map(Some)
 }
 
 /// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
@@ -203,6 +204,7 @@ fn plan(
     tiers: &Tiers,
     trainer: &mut Trainer,
     (host_mem, driver): (Option<u64>, u64),
+    drive_rate: DriveRate,
 ) -> Result<Forecast, TrainError> {
     trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
     let largest = plan::allow_largest_view(config, dataset, trainer, host_mem);
@@ -220,9 +222,12 @@ fn plan(
     device_memory::check(config, &memory)?;
     let plan = plan::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;
     let growth = last as f64 / rows.max(1) as f64;
-    let writes = match plan.frames {
-        Some(frames) => step_writes(config, dataset, trainer, frames as usize, growth),
-        None => StepWrites::default(),
+    let step_seconds = times.seconds * STEP_OVER_RENDERING;
+    let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
+    let simulated = |frames| SimulatedRun { frames, growth, step_seconds, drive: drive_rate };
+    let drive = match plan.frames {
+        Some(frames) => drive_use(config, dataset, trainer, &simulated(frames as usize)),
+        None => DriveUse::default(),
     };
     let measured = Measured {
         rows,
@@ -230,7 +235,7 @@ fn plan(
         steps_done,
         view_seconds: times.seconds,
         visible_share: times.visible_share,
-        writes,
+        drive,
     };
     Ok(Forecast::new(config, memory, plan, &measured, host_mem))
 }
@@ -245,7 +250,7 @@ pub(super) fn plan_and_train(
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     trainer.start_photos(dataset).iter().for_each(|warning| eprintln!("warning: {warning}"));
-    let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver))?;
+    let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver), DriveRate::COMMON)?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
         let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
@@ -257,9 +262,9 @@ pub(super) fn plan_and_train(
             false => eprintln!("{plan}"),
         }
     }
-    if begun.past.is_none() {
-        check_drive_of_results(config, &request.out, &forecast)?;
-    }
+    let slots = trainer.scene.pager.slot_space().map_or(0, |slots| slots.total);
+    let stored = slots * forecast.tiers.frame_bytes;
+    check_drive_of_results(config, &request.out, &forecast, (stored, begun.past.is_some()))?;
     if request.dry_run {
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }

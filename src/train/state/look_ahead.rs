@@ -20,6 +20,7 @@ impl Trainer {
         let pages = self.scene.pager.index().len();
         let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.slots() < pages);
         let has_plan = !self.is_in_memory() || is_on_device_in_part;
+        self.expect_edits();
         // The step in flight has begun already.
         let first = usize::from(self.is_ahead());
         if !has_plan || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
@@ -34,6 +35,16 @@ impl Trainer {
             self.coming_views(count).iter().skip(first).map(|&view| self.camera(dataset, view)).collect();
         let cameras: Vec<&Camera> = cameras.iter().collect();
         self.scene.pager.look_ahead(self.state.step + first as u32, &cameras);
+    }
+
+    /// Tells the device which coming step is the next after which events edit every page: an opacity reset, or a raise of the SH degree.
+    fn expect_edits(&mut self) {
+        let options = &self.options;
+        let raises = |step: u32| options.sh_degree_at(step + 1) > options.sh_degree_at(step);
+        if let Some(tier) = &mut self.device {
+            let edits_all = |step| options.strategy.edits_all_after(step) || raises(step);
+            tier.expect_edits(self.state.step, options.steps, edits_all);
+        }
     }
 
     /// Indices in `dataset.views` of the views of the coming steps, at most `count`.

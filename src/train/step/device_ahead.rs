@@ -35,7 +35,7 @@ fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
 
 impl DeviceTier {
     /// Copies payloads of 0-based `step`, the next one, which needs the pages `of_view`, into slots. The device may still be at work on this
-    /// step.
+    /// step. Nothing goes up if events between the two steps edit every page.
     pub(super) fn load_ahead(
         &mut self,
         scene: &PagedScene,
@@ -43,6 +43,9 @@ impl DeviceTier {
         (step, of_view): (u32, &[PageNo]),
         leaves: Leaves,
     ) -> Result<(), TrainError> {
+        if !self.serves(step) {
+            return Ok(());
+        }
         let missing = of_view.iter().copied().filter(|page| self.slots.state(*page).is_none());
         let coming: Vec<Coming<'_>> = missing
             .filter_map(|page| {

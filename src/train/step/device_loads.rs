@@ -181,12 +181,14 @@ impl DeviceTier {
         }
     }
 
-    /// Takes over from the plan when the pages in slots are needed next. Slots of pages that events are to edit are needed by no step.
+    /// Takes over from the plan when the pages in slots are needed next. No step needs the slot of a page that
+    /// events edit first.
     pub(super) fn plan_uses(&mut self, scene: &PagedScene) {
         let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
         for page in pages {
-            let next_use = if are_edits_due(scene, page) { NEVER } else { scene.pager.next_use(page) };
-            self.slots.set_next_use(page, next_use);
+            let next_use = scene.pager.next_use(page);
+            let is_kept = self.serves(next_use) && !are_edits_due(scene, page);
+            self.slots.set_next_use(page, if is_kept { next_use } else { NEVER });
         }
     }
 }

@@ -22,7 +22,7 @@ use crate::optim::bounds::SplitLimits;
 use crate::optim::one_step::OneStep;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
-use crate::paging::frames::evict::EvictPolicy;
+use crate::paging::frames::evict::{EvictPolicy, NEVER};
 use crate::paging::frames::table::FrameTable;
 use crate::paging::pinned::PinnedPage;
 use crate::paging::plan::bound::FewestReads;
@@ -94,6 +94,8 @@ pub struct DeviceTier {
     pub(super) flights: Flights,
     /// Loads that no order of eviction avoids.
     pub(super) fewest: FewestReads,
+    /// The next 0-based step whose events edit every page, [`NEVER`] if there is none; `None` until it is known.
+    edits_after: Option<u32>,
 }
 
 /// The device of a renderer.
@@ -149,6 +151,7 @@ impl DeviceTier {
             traffic: SlotTraffic::default(),
             flights,
             fewest: FewestReads::default(),
+            edits_after: None,
         };
         tier.fit(scene, renderer)?;
         Ok(tier)
@@ -183,6 +186,19 @@ impl DeviceTier {
     /// What was copied so far.
     pub fn traffic(&self) -> SlotTraffic {
         SlotTraffic { slots: self.slots() as u64, bytes_loaded_fewest: self.fewest.bytes(), ..self.traffic }
+    }
+
+    /// Looks for the next step from `now` on that satisfies `edits_all`: its events edit every page, so that no payload in a slot serves
+    /// the steps behind it.
+    pub(crate) fn expect_edits(&mut self, now: u32, steps: u32, edits_all: impl Fn(u32) -> bool) {
+        if self.edits_after.is_none_or(|after| after < now) {
+            self.edits_after = Some((now..steps).find(|step| edits_all(*step)).unwrap_or(NEVER));
+        }
+    }
+
+    /// Whether the payloads of now serve 0-based `step`, unless events edit their page alone.
+    pub(super) fn serves(&self, step: u32) -> bool {
+        self.edits_after.is_none_or(|after| step <= after)
     }
 
     /// Makes slots for all pages of the scene, as far as the share of the device memory goes.
