@@ -1,5 +1,5 @@
 //! The config of a new run. Flags override the config file, which overrides the defaults. The length of the run sets some
-//! of the keys that neither gives ([`super::schedule`]).
+//! of the keys that neither gives ([`super::schedule`]), and `poor-points` some more.
 //!
 //! Invariants: 1. a given key is never changed; 2. the result is written to the config of the run as if every key had
 //! been given, so a resumed run keeps its values whatever its new length.
@@ -7,8 +7,16 @@
 use super::file::{TrainConfig, TrainOverrides};
 use super::schedule::{Lengths, Schedule};
 use crate::base::error::InputResult;
+use crate::densify::long_axis::GrowthScore;
 use std::collections::BTreeSet;
 use std::path::Path;
+
+/// With `poor-points`: the factor of the learning rate of positions. Points that lie at a wrong place have a long way to go.
+const POOR_MEANS_LR: f64 = 20.0 / 3.0;
+/// With `poor-points`: the factor of first sizes, so that few points cover the scene.
+const POOR_INIT_SCALE: f64 = 2.0;
+/// With `poor-points`: the share of Gaussians that a round at the cap moves to a better place.
+const POOR_RECYCLE: f64 = 0.05;
 
 impl TrainConfig {
     /// The config of a new run, not checked yet.
@@ -23,7 +31,27 @@ impl TrainConfig {
         given.extend(keys.given().into_iter().map(str::to_string));
         keys.clone().apply(&mut config);
         config.follow_length(&given);
+        if config.poor_points {
+            config.suit_poor_points(|field| !given.contains(field));
+        }
         Ok(config)
+    }
+
+    /// Sets the fields of `poor-points` that are open. The values were chosen by the PSNR of held-out photos of two scenes with a tenth
+    /// of their points and with random ones, see "Few or random points" in `benches/RESULTS.md`.
+    pub fn suit_poor_points(&mut self, is_open: impl Fn(&str) -> bool) {
+        if is_open("means_lr") {
+            self.means_lr *= POOR_MEANS_LR;
+        }
+        if is_open("init_scale") {
+            self.init_scale = POOR_INIT_SCALE;
+        }
+        if is_open("recycle") {
+            self.recycle = POOR_RECYCLE;
+        }
+        if is_open("growth_score") {
+            self.growth_score = GrowthScore::Mixed;
+        }
     }
 
     /// Sets the keys of the schedule that are not in `given` (names of fields) by `--schedule` and `--steps`.
@@ -90,6 +118,17 @@ mod tests {
         let same = [scales_lr, shn_lr];
         assert_eq!(rates(&TrainOverrides { schedule: Some(Schedule::Classic), ..long.clone() }), same);
         assert_eq!(rates(&TrainOverrides { strategy: Some(StrategyName::Default), ..long }), same);
+    }
+
+    #[test]
+    fn poor_points_set_what_is_not_given() {
+        let poor = TrainOverrides { steps: Some(3000), poor_points: Some(true), ..TrainOverrides::default() };
+        let config = of_flags(&poor);
+        assert!((config.means_lr - 3.2e-3).abs() < 1e-9, "{}", config.means_lr);
+        assert_eq!((config.init_scale, config.recycle, config.growth_score), (2.0, 0.05, GrowthScore::Mixed));
+        let given = TrainOverrides { means_lr: Some(1e-4), recycle: Some(0.0), ..poor };
+        let config = of_flags(&given);
+        assert_eq!((config.means_lr, config.init_scale, config.recycle), (1e-4, 2.0, 0.0));
     }
 
     #[test]

@@ -12,7 +12,6 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::load_options;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
 use gsscale::dataset::loader::Dataset;
-use gsscale::densify::long_axis::GrowthScore;
 use gsscale::densify::strategy::StrategyName;
 use gsscale::render::color_correct::ColorCorrect;
 use gsscale::report::record::RunRecord;
@@ -63,8 +62,8 @@ const DISTURBANCES: [(&str, Disturbance, Option<Change>); 16] = [
     ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, Some(mask_blocks)),
     ("boxes-masked", Disturbance::Boxes { count: 20, are_masked: true }, None),
     ("third", Disturbance::FewPhotos { one_in: 3 }, None),
-    ("points10", Disturbance::FewPoints { one_in: 10 }, Some(grow_from_few)),
-    ("points-random", Disturbance::RandomPoints, Some(grow_from_few)),
+    ("points10", Disturbance::FewPoints { one_in: 10 }, Some(suit_few_points)),
+    ("points-random", Disturbance::RandomPoints, Some(suit_few_points)),
     ("blurred10", Disturbance::Blurred { one_in: 10 }, Some(leave_out_views)),
 ];
 
@@ -88,10 +87,9 @@ fn mask_blocks(config: &mut TrainConfig) {
     config.robust_pixels = true;
 }
 
-/// Growth where the error is large, and positions that move ten times as fast.
-fn grow_from_few(config: &mut TrainConfig) {
-    (config.strategy, config.growth_score) = (StrategyName::LongAxis, GrowthScore::Mixed);
-    config.means_lr = 1.6e-3;
+fn suit_few_points(config: &mut TrainConfig) {
+    config.strategy = StrategyName::LongAxis;
+    config.suit_poor_points(|_| true);
 }
 
 fn all_remedies(config: &mut TrainConfig) {

@@ -107,8 +107,9 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, config: &TrainConfig) ->
         ));
     }
     dataset.warnings.push(format!(
-        "the dataset has no points: starting from {} random points in the views' frusta",
-        config.init_points
+        "the dataset has no points: starting from {} random points in the views' frusta{}",
+        config.init_points,
+        if config.poor_points { "" } else { "; --poor-points --init-scale 1 suits them" }
     ));
     let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let count = config.init_points as usize;
