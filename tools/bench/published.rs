@@ -17,6 +17,7 @@ use gsscale::render::lpips::InputRange;
 use gsscale::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::report::Summary;
+use gsscale::train::memory::estimate::reset_host_bytes_peak;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::out_folder::Existing;
 use gsscale::train::run::request::RunRequest;
@@ -257,6 +258,7 @@ fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, Exit
     if !args.quiet {
         eprintln!("run     the same photos with the defaults of gsscale, into {}", out.display());
     }
+    reset_host_bytes_peak();
     Ok(match train(args, (setting, &out), &config)? {
         Ok(summary) => Ok(measure(args, &out, &config, summary)?),
         Err(code) => Err(code),

@@ -101,6 +101,9 @@ impl Row {
     }
 }
 
+/// Makes the cell of a column from a row.
+type MakeCell = Box<dyn Fn(&Vec<String>) -> Cell>;
+
 /// The input of the report.
 pub struct Comparison<'a> {
     /// The published run.
@@ -223,7 +226,7 @@ impl Comparison<'_> {
         let mut page = Page::new(&title, &format!("{}, tier {tier}", self.data.display()));
         let rows: Vec<Vec<String>> =
             self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())).collect();
-        let cell = |column: usize| -> Box<dyn Fn(&Vec<String>) -> Cell> {
+        let cell = |column: usize| -> MakeCell {
             match column {
                 0 => Box::new(|row| Cell::text(&row[0])),
                 _ => Box::new(move |row| Cell::Number(row[column].clone())),
