@@ -1,7 +1,7 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
 // camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
-// `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score and the lowest opacity of a page, from
-// which the host decides whether a round edits rows. Where the host does not wait for the numbers of rows, `place` finds where
+// `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score, the lowest opacity and the
+// least mean weight of a page, from which the host decides whether a round edits rows. Where the host does not wait for the numbers of rows, `place` finds where
 // the list of each page begins, and `pad` fills the room behind the last row. The twin of tests/numerics/twins/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
@@ -340,21 +340,29 @@ fn survey(place: Place) {
     let page = pages[p];
     var lowest = 3.4e38;
     var mean = 0.0;
+    var weight = 3.4e38;
     for (var row = place.lane; row < page.rows; row += 256u) {
         lowest = min(lowest, hull(page, OPACITIES, row, 0u, u.rate).x);
+        let word = slab[count_at(page) + row];
+        if is_weighed(word) {
+            weight = min(weight, mean_weight(word));
+        }
         let score = mean_score(page, row);
         mean = max(mean, select(score, max(score, SMALLEST_MEAN), score > 0.0));
     }
     parts[0][place.lane] = lowest;
     parts[1][place.lane] = mean;
+    parts[2][place.lane] = weight;
     for (var half = 128u; half > 0u; half = half / 2u) {
         workgroupBarrier();
         if place.lane < half {
             parts[0][place.lane] = min(parts[0][place.lane], parts[0][place.lane + half]);
             parts[1][place.lane] = max(parts[1][place.lane], parts[1][place.lane + half]);
+            parts[2][place.lane] = min(parts[2][place.lane], parts[2][place.lane + half]);
         }
     }
     if place.lane == 0u {
+        surveys[p].least_weight = bitcast<u32>(parts[2][0]);
         surveys[p].lowest_opacity = bitcast<u32>(parts[0][0]);
         surveys[p].largest_mean = bitcast<u32>(parts[1][0]);
     }

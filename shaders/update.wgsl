@@ -31,7 +31,8 @@ struct UpdateUniforms {
     half_size: vec2<f32>,
     /// 1: this step collects statistics.
     collects: u32,
-    pad: u32,
+    /// 1: blending weights are among them, and a row has two footprints.
+    weighs: u32,
 }
 
 @group(0) @binding(0) var<uniform> u: UpdateUniforms;
@@ -45,11 +46,12 @@ struct UpdateUniforms {
 @group(0) @binding(6) var<storage, read> grads: array<u32>;
 /// `[listed row]`: the largest magnitude of a gradient so far, bits of a float.
 @group(0) @binding(7) var<storage, read_write> largest: array<u32>;
-/// Gradient of the projected mean, radii.
+/// Gradient of the projected mean, radii; where rows are weighed, each is followed by the weight and three words of no use here.
 @group(0) @binding(8) var<storage, read> footprints: array<vec4<f32>>;
 /// `[page]`: the words of a PageResult.
 @group(0) @binding(9) var<storage, read_write> results: array<atomic<u32>>;
-/// Change of the number of rows by bin of the mean growth score, modulo 2^32.
+/// Change of the number of rows by bin of the mean growth score and, behind these where rows are weighed, of the mean blending weight;
+/// modulo 2^32.
 @group(0) @binding(10) var<storage, read_write> bins: array<atomic<u32>>;
 /// One word: 0 while the gate is open.
 @group(0) @binding(11) var<storage, read> gate: array<u32>;
@@ -62,6 +64,11 @@ const UPDATED: u32 = 0u;
 const SKIPPED: u32 = 1u;
 const DRAWN: u32 = 2u;
 const COLLECTED: u32 = 3u;
+/// Bins of scores; those of weights follow.
+const BINS: u32 = 32768u;
+/// Least and greatest weight, as in src/scene/sightings.rs.
+const WEIGHT_LEAST: f32 = 1e-30;
+const WEIGHT_MOST: f32 = 1e30;
 
 /// Without signs, floats are ordered as integers, with those that are not finite after all others.
 fn is_usable(bits: u32) -> bool {
@@ -133,8 +140,27 @@ fn bin(sum: f32, count: u32) -> u32 {
     return bitcast<u32>(quotient(sum, max(count & VIEWS_MOST, 1u))) >> 16u;
 }
 
-/// Adds a growth score to the statistics of a row, unless it is not finite or the row counts no more views.
-fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>) {
+/// The word of sightings after one more view, weighed or not, as in src/scene/sightings.rs. A weight that is NaN counts as the least.
+fn with_view(word: u32, weight: f32) -> u32 {
+    if u.weighs == 0u {
+        return word + 1u;
+    }
+    let bits = bitcast<u32>(weight);
+    let limited = clamp(weight, WEIGHT_LEAST, WEIGHT_MOST);
+    let added = select(limited, select(WEIGHT_LEAST, WEIGHT_MOST, bits == 0x7f800000u), !is_finite(weight));
+    let sum = min(weight_sum(word) + added, WEIGHT_MOST);
+    return (((bitcast<u32>(sum) + (1u << (DROPPED_BITS - 1u))) >> DROPPED_BITS) << VIEWS_BITS) | ((word & VIEWS_MOST) + 1u);
+}
+
+/// Changes the number of rows in the bin of a mean weight, if enough views have weighed the row.
+fn count_weight(word: u32, change: u32) {
+    if is_weighed(word) {
+        atomicAdd(&bins[BINS + (bitcast<u32>(mean_weight(word)) >> 16u)], change);
+    }
+}
+
+/// Adds a growth score and a weight to the statistics of a row, unless the score is not finite or the row counts no more views.
+fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>, weight: f32) {
     let scaled = footprint.xy * u.half_size;
     let score = sqrt(scaled.x * scaled.x + scaled.y * scaled.y);
     let sum_at = grad2d_at(page) + row;
@@ -149,9 +175,14 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>) {
     if count > 0u {
         atomicSub(&bins[bin(sum, count)], 1u);
     }
+    let word = with_view(count, weight);
     slab[sum_at] = bitcast<u32>(added);
-    slab[views_at] = count + 1u;
-    atomicAdd(&bins[bin(added, count + 1u)], 1u);
+    slab[views_at] = word;
+    atomicAdd(&bins[bin(added, word)], 1u);
+    if u.weighs != 0u {
+        count_weight(count, 0xffffffffu);
+        count_weight(word, 1u);
+    }
     atomicAdd(&results[RESULT_WORDS * p + COLLECTED], 1u);
 }
 
@@ -176,11 +207,12 @@ fn finish(place: Place) {
     } else if largest[i] != 0u {
         atomicAdd(&results[RESULT_WORDS * listed.x + SKIPPED], 1u);
     }
-    let footprint = footprints[i];
+    let of_row = select(1u, 2u, u.weighs != 0u);
+    let footprint = footprints[of_row * i];
     if footprint.z > 0.0 && footprint.w > 0.0 {
         atomicAdd(&results[RESULT_WORDS * listed.x + DRAWN], 1u);
         if u.collects != 0u {
-            collect(page, listed.x, listed.y, footprint);
+            collect(page, listed.x, listed.y, footprint, footprints[of_row * i + of_row - 1u].x);
         }
     }
 }

@@ -41,7 +41,9 @@ struct PageSurvey {
     largest_mean: u32,
     /// Lower bound of the opacities, before activation, for all later steps without an update; bits of a float.
     lowest_opacity: u32,
-    pad: vec2<u32>,
+    /// Least mean blending weight of the rows that are judged by it, bits of a float; a number above 1e30 without such rows.
+    least_weight: u32,
+    pad: u32,
 }
 
 /// Number of the page of an entry without a row, behind the listed rows.

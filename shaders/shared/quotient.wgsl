@@ -1,8 +1,12 @@
 // A division whose result is that of the CPU, to the bit: devices may divide with an error of 2.5 units in the last
-// place, and the histogram of growth scores counts rows of both. The twin of `mean_grad2d` in src/scene/rows.rs.
+// place, and the histogram counts rows of both. The twin of `mean_grad2d` in src/scene/rows.rs and of src/scene/sightings.rs.
 
-/// Low bits of a word of sightings: the number of views (src/scene/sightings.rs).
+/// Low bits of a word of sightings: the number of views (src/scene/sightings.rs). The rest is the sum of weights, without its low bits.
+const VIEWS_BITS: u32 = 12u;
 const VIEWS_MOST: u32 = 4095u;
+const DROPPED_BITS: u32 = 11u;
+/// A row is judged by its weight from this many views on, as in src/densify/stats.rs.
+const WEIGHED_VIEWS: u32 = 3u;
 
 /// `sum / count`, rounded to nearest, for a sum of 0 or between 1e-30 and the largest number, and a count from 1 to 4095.
 fn quotient(sum: f32, count: u32) -> f32 {
@@ -28,4 +32,19 @@ fn quotient(sum: f32, count: u32) -> f32 {
         }
     }
     return bitcast<f32>(q);
+}
+
+/// Sum of the weights in a word of sightings.
+fn weight_sum(word: u32) -> f32 {
+    return bitcast<f32>((word >> VIEWS_BITS) << DROPPED_BITS);
+}
+
+/// Whether a row is judged by its weight.
+fn is_weighed(word: u32) -> bool {
+    return (word & VIEWS_MOST) >= WEIGHED_VIEWS && (word >> VIEWS_BITS) != 0u;
+}
+
+/// Mean weight of a view, of a row that is weighed.
+fn mean_weight(word: u32) -> f32 {
+    return quotient(weight_sum(word), word & VIEWS_MOST);
 }

@@ -122,6 +122,10 @@ impl Strategy for LongAxisStrategy {
         self.score != GrowthScore::Gradient || self.recycle > 0.0 || self.growth.is_some()
     }
 
+    fn collects_on_device(&self) -> bool {
+        self.score == GrowthScore::Gradient
+    }
+
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
         let half = drawn.image_size.map(|n| n as f32 * 0.5);
         accumulate_scores(view, drawn.rows, drawn.radii, histogram, |listed| self.of_row(drawn, half, listed))

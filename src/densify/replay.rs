@@ -19,7 +19,7 @@ use crate::scene::events::{Event, EventLog};
 use crate::scene::page_layout::read_page;
 use crate::scene::page_split::{SplitTooDeep, split_page};
 use crate::scene::rows::{Rows, RowsMut, RowsNow};
-use crate::scene::sightings::VIEWS_MOST;
+use crate::scene::sightings::{VIEWS_MOST, of_mean_weight};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
@@ -61,11 +61,13 @@ pub struct Replay {
     pub reset_rows: usize,
 }
 
-/// Bounds on the rows of a page whose payload lies on a device. No row has a blending weight.
+/// Bounds on the rows of a page whose payload lies on a device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PageFacts {
     /// At least the mean growth score of every row.
     pub largest_mean: f32,
+    /// At most the mean blending weight of every row that rounds judge by it; infinite without such rows.
+    pub least_weight: f32,
     /// Bounds of the rows, for any later step until a step touches the page.
     pub extremes: Extremes,
     /// SH degree with which the page is stored.
@@ -110,14 +112,17 @@ impl<'a> PendingEvents<'a> {
     /// Whether the events from number `applied` on do no more to a page than to clear its statistics, as far as `page` tells; false
     /// where that is not sure. A round is among them, and none of them moves a count of rows.
     pub fn only_clears(&self, applied: usize, page: &PageFacts) -> bool {
-        let (mut largest_mean, mut rounds) = (page.largest_mean, 0);
+        let (mut largest_mean, mut least_weight, mut rounds) = (page.largest_mean, page.least_weight, 0);
         let keeps = self.events[applied..].iter().all(|event| match effect_of(&event.kind) {
             Effect::RaiseShDegree { degree } => degree <= page.sh_degree,
             Effect::ResetOpacity { .. } => false,
             Effect::Round(round) => {
                 rounds += 1;
-                // One row with the largest score, one that was drawn as often as can be counted; rounds judge rows one by one.
-                let (grad2d, count) = ([std::mem::take(&mut largest_mean), 0.0], [1, VIEWS_MOST]);
+                // One row with the largest score, one that was drawn as often as can be counted, one with the least weight; rounds
+                // judge rows one by one. The first round clears the statistics.
+                let weight = std::mem::replace(&mut least_weight, f32::INFINITY);
+                let weighed = if weight.is_finite() { of_mean_weight(weight) } else { 1 };
+                let (grad2d, count) = ([std::mem::take(&mut largest_mean), 0.0, 0.0], [1, VIEWS_MOST, weighed]);
                 let rows = Rows { grad2d: &grad2d, count: &count, ..Rows::default() };
                 round.promised_rows(&rows) == 0 && !round.may_edit(&rows) && round.keeps_all(&page.extremes)
             }

@@ -83,9 +83,10 @@ impl GradHistogram {
         }
     }
 
-    /// Adds what a device counted: `changes[bin]`, a signed number in a u32, is the change of the rows of that bin of mean scores.
+    /// Adds what a device counted: `changes[bin]`, a signed number in a u32, is the change of the rows of that bin of mean scores; bins of
+    /// mean weights follow where the device weighs rows.
     pub fn add_changes(&mut self, changes: &[u32]) {
-        for (rows, change) in self.bins[..BINS].iter_mut().zip(changes) {
+        for (rows, change) in self.bins.iter_mut().zip(changes) {
             let counted = i64::from(*rows) + i64::from(*change as i32);
             self.uncounted += u64::try_from(-counted).unwrap_or(0);
             *rows = u32::try_from(counted).unwrap_or(0);

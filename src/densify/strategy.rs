@@ -135,6 +135,12 @@ pub trait Strategy: fmt::Debug + Send + Sync {
         false
     }
 
+    /// Whether a device that updates the pages can collect the statistics: the norm of the gradient as the score and, where
+    /// [`Strategy::needs_weights`] says so, the blending weight.
+    fn collects_on_device(&self) -> bool {
+        !self.needs_weights()
+    }
+
     /// Adds the gradients of a step to the statistics of the rows and updates the histogram, which counts every row
     /// that has statistics. Returns the number of rows that changed.
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {

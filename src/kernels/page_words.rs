@@ -54,8 +54,10 @@ crate::wgsl_struct! {
         pub largest_mean: u32,
         /// Lower bound of the opacities, before activation, for all later steps without an update; bits.
         pub lowest_opacity: u32,
+        /// Least mean blending weight of the rows that are judged by it, bits; a number above 1e30 without such rows.
+        pub least_weight: u32,
         /// Unused.
-        pub pad: [u32; 2],
+        pub pad: u32,
     }
 }
 

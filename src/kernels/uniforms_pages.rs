@@ -85,8 +85,8 @@ crate::wgsl_struct! {
         pub half_size: [f32; 2],
         /// 1 if this step collects statistics.
         pub collects: u32,
-        /// Unused.
-        pub pad: u32,
+        /// 1 if blending weights are among them, and a row has two footprints.
+        pub weighs: u32,
     }
 }
 
@@ -132,7 +132,7 @@ impl GatherUniforms {
 
 impl UpdateUniforms {
     /// Uniforms of a step; slab, rows and column are set for each dispatch.
-    pub fn new(camera: &Camera, step: &StepNumbers, collects: bool) -> UpdateUniforms {
+    pub fn new(camera: &Camera, step: &StepNumbers, collects: bool, weighs: bool) -> UpdateUniforms {
         UpdateUniforms {
             slab: 0,
             row_count: 0,
@@ -144,7 +144,7 @@ impl UpdateUniforms {
             inv_root_correction: step.inv_root_correction,
             half_size: [camera.width, camera.height].map(|n| n as f32 * 0.5),
             collects: u32::from(collects),
-            pad: 0,
+            weighs: u32::from(weighs),
         }
     }
 

@@ -68,7 +68,7 @@ impl GpuRenderer {
 
     /// Memory of the update of `rows` rows: gradients, and the largest of each row.
     pub(super) fn update_room(&self, rows: u32, sh_degree: u8) -> GpuResult<(RowGradients, Buffer)> {
-        let grads = RowGradients::new(&self.gpu, rows, sh_degree, false)?;
+        let grads = RowGradients::new(&self.gpu, rows, sh_degree, self.weighs)?;
         Ok((grads, self.gpu.buffer("largest gradients", 4 * u64::from(rows))?))
     }
 
@@ -99,11 +99,11 @@ impl GpuRenderer {
         (grads, largest): &(RowGradients, Buffer),
         (results, collects): (&Buffer, bool),
     ) -> GpuResult<()> {
-        let out = RowsOut { gpu: &self.gpu, stages: &self.rows, view: &view.of, weighs: false };
+        let out = RowsOut { gpu: &self.gpu, stages: &self.rows, view: &view.of, weighs: self.weighs };
         let splats = [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, at as u64));
         out.record(recorder, values, splats, grads)?;
         let RowGradients { columns: grads, footprints } = grads;
-        let buffers = UpdateBuffers { values, grads, footprints, largest, results, collects };
+        let buffers = UpdateBuffers { values, grads, footprints, largest, results, collects, weighs: self.weighs };
         source.pages().update(&self.gpu, recorder, source, part, &buffers)
     }
 

@@ -1,5 +1,5 @@
 //! Records the stages on pages on a device: gather and update. Owns the slots, the optimizer's tables and the bins of
-//! growth scores.
+//! growth scores and weights.
 //!
 //! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. Columns
 //! are gathered and updated one by one: an invocation for each float, and few bindings.
@@ -26,7 +26,7 @@ use std::sync::Arc;
 
 /// Invocations per workgroup.
 pub(super) const WORKGROUP: u32 = 256;
-/// Bins of mean growth scores: the upper halves of floats that are not negative.
+/// Bins of mean growth scores, and as many of mean weights: the upper halves of floats that are not negative.
 const BINS: u64 = 1 << 15;
 /// Bytes of a listed row: number of the page, number of the row.
 const LISTED_BYTES: u64 = 8;
@@ -152,7 +152,7 @@ impl DevicePages {
         };
         let mut recorder = gpu.begin("pages");
         let tables = recorder.buffer_with("optimizer tables", DeferredTables::new(&rules.numbers).words())?;
-        let bins = recorder.buffer_zeroed("bins", 4 * BINS)?;
+        let bins = recorder.buffer_zeroed("bins", 4 * BINS * if rules.weighs { 2 } else { 1 })?;
         let gate = recorder.buffer_zeroed("gate", 4)?;
         gpu.submit(recorder)?;
         Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins, gate })
@@ -279,7 +279,7 @@ impl DevicePages {
     ) -> GpuResult<()> {
         let PageRows { view, batch, table, .. } = *source;
         let UpdateBuffers { values, grads, .. } = *buffers;
-        let uniforms = UpdateUniforms::new(&view.camera, &view.step, buffers.collects);
+        let uniforms = UpdateUniforms::new(&view.camera, &view.step, buffers.collects, buffers.weighs);
         recorder.clear(&buffers.largest.view())?;
         for window in windows(gpu, values.rows, WIDEST) {
             let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
@@ -302,7 +302,7 @@ impl DevicePages {
                     recorder.dispatch("update", &self.stages.step, &views, groups)?;
                 }
                 let [pages, slab, _, rows] = of_slab;
-                let footprints = window.of(buffers.footprints, footprint_bytes(false));
+                let footprints = window.of(buffers.footprints, footprint_bytes(buffers.weighs));
                 let own = [largest.clone(), footprints, buffers.results.view(), self.bins.view(), self.gate.view()];
                 let views: Vec<BufferView> =
                     [recorder.uniform(&uniforms)?, pages, slab, rows].into_iter().chain(own).collect();
@@ -422,6 +422,8 @@ pub struct UpdateBuffers<'a> {
     pub results: &'a Buffer,
     /// Whether statistics are collected.
     pub collects: bool,
+    /// Whether blending weights are among them; the run's rules allow it.
+    pub weighs: bool,
 }
 
 /// The listed rows of a batch, as a source of columns.

@@ -36,6 +36,8 @@ pub struct PageRules {
     pub numbers: RunNumbers,
     /// Limits within which rows may split.
     pub splits: SplitNumbers,
+    /// Whether steps may weigh rows ([`Renderer::weigh_rows`]).
+    pub weighs: bool,
 }
 
 /// The first part of a recorded step, up to its picture.

@@ -14,9 +14,10 @@
 const VIEWS_BITS: u32 = 12;
 /// The most views that a row counts between two rounds.
 pub const VIEWS_MOST: u32 = (1 << VIEWS_BITS) - 1;
-/// Least and greatest weight of a view, so that the sum of a weighed row is neither zero nor infinite.
+/// Least weight of a view, so that the sum of a weighed row is not zero.
 const WEIGHT_LEAST: f32 = 1e-30;
-const WEIGHT_MOST: f32 = 1e30;
+/// Greatest weight of a view and greatest sum, so that sums stay finite.
+pub const WEIGHT_MOST: f32 = 1e30;
 /// Bits of an f32 that the sum of weights drops.
 const DROPPED_BITS: u32 = 11;
 
@@ -37,6 +38,14 @@ pub fn weight(word: u32) -> f32 {
 pub fn mean_weight(word: u32) -> Option<f32> {
     let sum = weight(word);
     (sum > 0.0).then(|| sum / views(word).max(1) as f32)
+}
+
+/// A word of many views with a mean weight of at most `mean`, and hardly less.
+pub fn of_mean_weight(mean: f32) -> u32 {
+    // A power of two, so that the mean is the sum but for its low bits.
+    const VIEWS: u32 = 1 << (VIEWS_BITS - 1);
+    let sum = (mean * VIEWS as f32).clamp(WEIGHT_LEAST, WEIGHT_MOST);
+    ((sum.to_bits() >> DROPPED_BITS) << VIEWS_BITS) | VIEWS
 }
 
 /// Whether a row with this word takes no more statistics.
@@ -84,6 +93,17 @@ mod tests {
                 assert!((mean * f64::from(n) / exact - 1.0).abs() < 0.02, "{size} after {n} views: {mean}");
             }
         }
+    }
+
+    #[test]
+    fn a_word_of_a_mean_has_that_mean() {
+        let mut draws = Stream::new(32, Purpose::Test, 0, 0);
+        for _ in 0..10_000 {
+            let mean = libm::exp(draws.range(-60.0, 50.0)) as f32;
+            let got = mean_weight(of_mean_weight(mean)).unwrap_or(f32::NAN);
+            assert!(got <= mean && got >= mean * (1.0 - 1.0 / 2048.0), "{mean}: {got}");
+        }
+        assert!(mean_weight(of_mean_weight(0.0)).is_some() && mean_weight(of_mean_weight(f32::INFINITY)).is_some());
     }
 
     #[test]

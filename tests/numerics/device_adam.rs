@@ -132,7 +132,7 @@ fn the_form_of_devices_follows_dense_adam() {
             let rows: Vec<[u32; 2]> = with_gradient.iter().map(|row| [0, *row as u32]).collect();
             let numbers_now = adam.at(now).numbers();
             let gathers = GatherUniforms::new(&camera(), &numbers, now, &SPLITS, 1);
-            let of_step = UpdateUniforms::new(&camera(), &numbers_now, false);
+            let of_step = UpdateUniforms::new(&camera(), &numbers_now, false, false);
             let mut largest = vec![0; rows.len()];
             let mut parts = Vec::new();
             for (column, of_column) in columns().zip(of_columns) {
@@ -190,7 +190,7 @@ struct OnDevice {
 impl OnDevice {
     fn new(gpu: Gpu, dense: &Dense, words: &[u64], layout: PageLayout, steps: u32) -> OnDevice {
         let numbers = dense.adam.numbers(steps).unwrap();
-        let rules = PageRules { payload_bytes: layout.bytes(), numbers, splits: SPLITS };
+        let rules = PageRules { payload_bytes: layout.bytes(), numbers, splits: SPLITS, weighs: false };
         let mut pages = DevicePages::new(&gpu, &rules).unwrap();
         pages.slots.add(&gpu, 1).unwrap();
         let slot = SlotPage { slot: DeviceSlot(0), layout };
@@ -217,7 +217,8 @@ impl OnDevice {
             recorder.upload(&buffer.view(), of_column).unwrap();
         }
         let results = recorder.buffer_zeroed("results", size_of::<PageResult>() as u64).unwrap();
-        let buffers = UpdateBuffers { values, grads, footprints, largest, results: &results, collects: false };
+        let buffers =
+            UpdateBuffers { values, grads, footprints, largest, results: &results, collects: false, weighs: false };
         pages.update(gpu, &mut recorder, &source, &(0..ROWS), &buffers).unwrap();
         gpu.submit(recorder).unwrap();
         is_checked.then(|| pages.results(gpu, &source, &results).unwrap()[0])

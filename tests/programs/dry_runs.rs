@@ -80,7 +80,11 @@ fn a_drive_without_room_for_the_result_is_refused_before_the_first_step() {
     refused(&[]);
     drive.resize(160 << 10);
     let close = short(&scene, &["--out", text(&out), "--dry-run"]);
-    assert!(close.status.success() && stderr(&close).contains("the results and the checkpoint may take"), "{}", stderr(&close));
+    assert!(
+        close.status.success() && stderr(&close).contains("the results and the checkpoint may take"),
+        "{}",
+        stderr(&close)
+    );
     drive.resize(16 << 20);
     let fits = short(&scene, &["--out", text(&out), "--dry-run"]);
     assert!(fits.status.success() && !stderr(&fits).contains("warning"), "{}", stderr(&fits));

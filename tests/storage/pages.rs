@@ -10,7 +10,7 @@ use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::mcmc::McmcStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
-use gsscale::densify::stats::{GradHistogram, accumulate};
+use gsscale::densify::stats::{GradHistogram, WEIGHED_VIEWS, accumulate};
 use gsscale::densify::strategy::{DrawnRows, Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::SplitLimits;
@@ -22,6 +22,7 @@ use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, Relocati
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, read_page, write_page};
 use gsscale::scene::partition::{first_fill, partition};
 use gsscale::scene::rows::mean_grad2d;
+use gsscale::scene::sightings::{mean_weight, views};
 use gsscale::scene::state::SceneState;
 use gsscale::train::step::catch_up::evaluate_all;
 use std::collections::{BTreeMap, HashMap};
@@ -229,8 +230,10 @@ fn facts_of(state: &SceneState, adam: &DeferredAdam) -> PageFacts {
     let rows = state.view();
     let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
     let sigma_max = adam.page_bounds(&rows, &SplitLimits::NEVER).sigma_max;
+    let weights = rows.count.iter().filter(|&&word| views(word) >= WEIGHED_VIEWS).filter_map(|&word| mean_weight(word));
     PageFacts {
         largest_mean: means.fold(0.0, f32::max),
+        least_weight: weights.fold(f32::INFINITY, f32::min),
         extremes: Extremes { lowest_opacity: adam.lowest_opacity(&rows), sigma_max },
         sh_degree: state.sh_degree(),
     }
@@ -242,7 +245,7 @@ impl InPages<'_> {
         let pending = PendingEvents::new(self.adam, SEED, self.page_rows, log);
         let before = page.state();
         let facts = facts_of(&before, self.adam);
-        let only_clears = !self.strategy.needs_weights() && pending.only_clears(page.applied, &facts);
+        let only_clears = self.strategy.collects_on_device() && pending.only_clears(page.applied, &facts);
         let mut rows = page.layout.rows_mut(bytemuck::cast_slice_mut(&mut page.payload), 0);
         let replay = pending.apply(id, page.applied, &mut rows).unwrap();
         page.applied = log.len();
@@ -393,7 +396,7 @@ fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, 
         assert!(pages.splits > 0 || page_rows == 2500, "{case}: no page was split");
         assert!(pages.unchanged > 0 || page_rows != 7, "{case}: no round left a page alone");
         println!("{case}: of {} pages it was known that nothing but statistics would change", pages.foretold);
-        assert!(pages.foretold > 0 || page_rows != 7 || by.needs_weights(), "{case}: no page was known to stay");
+        assert!(pages.foretold > 0 || page_rows != 7 || !by.collects_on_device(), "{case}: no page was known to stay");
     }
     whole.state
 }

@@ -124,7 +124,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     if !args.quiet {
         describe(args, &setting, &config);
     }
-    let trained = if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, (&setting, &setting.out), &config)? };
+    let trained =
+        if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, (&setting, &setting.out), &config)? };
     let summary = match trained {
         Ok(summary) => summary,
         Err(code) => return Ok(code),
@@ -236,7 +237,9 @@ fn train(
     let (name, data, all) = (args.run.display(), args.data.display(), setting.out.display());
     let resume = format!("gsscale-train --resume {}", out.display());
     let more = if args.with_defaults { " --with-defaults" } else { "" };
-    eprintln!("stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train");
+    eprintln!(
+        "stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train"
+    );
     Ok(Err(ExitCode::from(outcome.exit_code as u8)))
 }
 

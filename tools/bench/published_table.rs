@@ -137,11 +137,12 @@ impl Comparison<'_> {
         let (test, expected) = (self.ours.test, self.run.facts.expected.as_ref());
         let lpips_variant = self.ours.lpips_variant.as_deref();
         let of_defaults = self.with_defaults.and_then(|run| run.test);
-        let row = |measure, digits, of: &dyn Fn(&TestMetrics) -> Option<f64>, theirs: Option<[f64; 2]>, is_same_measure| {
-            let [ours, with_defaults] = [test, of_defaults].map(|test| test.as_ref().and_then(of));
-            let (published, original) = (theirs.map(|t| t[0]), theirs.map(|t| t[1]));
-            Row { measure, ours, with_defaults, published, original, is_same_measure, digits }
-        };
+        let row =
+            |measure, digits, of: &dyn Fn(&TestMetrics) -> Option<f64>, theirs: Option<[f64; 2]>, is_same_measure| {
+                let [ours, with_defaults] = [test, of_defaults].map(|test| test.as_ref().and_then(of));
+                let (published, original) = (theirs.map(|t| t[0]), theirs.map(|t| t[1]));
+                Row { measure, ours, with_defaults, published, original, is_same_measure, digits }
+            };
         let psnr = expected.map(|e| [e.psnr, e.original_psnr]);
         let ssim = expected.map(|e| [e.ssim, e.original_ssim]);
         let lpips = expected.map(|e| [e.lpips, e.original_lpips]);
@@ -224,8 +225,7 @@ impl Comparison<'_> {
         let tier = self.tier.unwrap_or("none");
         let title = format!("gsscale: {} beside the published figures", self.run.facts.title);
         let mut page = Page::new(&title, &format!("{}, tier {tier}", self.data.display()));
-        let rows: Vec<Vec<String>> =
-            self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())).collect();
+        let rows: Vec<Vec<String>> = self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())).collect();
         let cell = |column: usize| -> MakeCell {
             match column {
                 0 => Box::new(|row| Cell::text(&row[0])),

@@ -135,7 +135,10 @@ pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Train
         let played = play(frames, true);
         let steady = played.steady();
         let waits = played.stall(steady.clone(), &DriveModel { read_rate, write_rate, step_seconds }).seconds;
-        StepUse { written: growth * written as f64 / f64::from(steps.max(1)), waits: waits / steady.len().max(1) as f64 }
+        StepUse {
+            written: growth * written as f64 / f64::from(steps.max(1)),
+            waits: waits / steady.len().max(1) as f64,
+        }
     };
     // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
     let growth = run.growth.max(1.0);

@@ -157,9 +157,9 @@ pub(crate) fn begin(
         let remedy = "give a GPU with --device, or use --optimizer-on host";
         return Err(InputError::new("--optimizer-on device", problem, remedy).into());
     }
-    if options.optimizer_on == OptimizerPlace::Device && options.strategy.needs_weights() {
-        let problem = "a device that updates the pages collects gradients, not the blending weights of Gaussians";
-        let remedy = "use --growth-score gradient with --recycle 0, or --optimizer-on host";
+    if options.optimizer_on == OptimizerPlace::Device && !options.strategy.collects_on_device() {
+        let problem = "a device that updates the pages collects gradients, not the errors of pixels";
+        let remedy = "use --growth-score gradient, or --optimizer-on host";
         return Err(InputError::new("--optimizer-on device", problem, remedy).into());
     }
     // Without a search for a device, a difference is the noise of the allocator.

@@ -59,7 +59,7 @@ impl Trainer {
 
     /// Whether pictures are compared with photos without correction or masks, so that no step needs its picture on the host.
     fn compares_plainly(&self) -> bool {
-        !self.photos.iter().any(|parameter| parameter.needs_host()) && !self.options.strategy.needs_weights()
+        !self.photos.iter().any(|parameter| parameter.needs_host())
     }
 
     /// Records the step `ahead` steps from now, whose photo is `target`. False if the step cannot be recorded now.

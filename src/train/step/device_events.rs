@@ -2,7 +2,7 @@
 //! no row of a page, and so does no more than to clear its statistics, is left to the device: the page stays where it is.
 //!
 //! ```text
-//! pages behind in events │ survey: largest score, lowest opacity, 16 bytes a page │ ── no row is edited ──> cleared on the device
+//! pages behind in events │ survey: largest score, lowest opacity, least weight: 16 bytes a page │ ── no row is edited ──> cleared on the device
 //!                                                                                 └─ a row may be ──────> drained, edited, loaded
 //! ```
 //!
@@ -26,13 +26,15 @@ use crate::paging::pinned::PinnedPage;
 use crate::render::pages::SlotPage;
 use crate::render::{RenderError, Renderer};
 use crate::scene::page_meta::PageMeta;
+use crate::scene::sightings::WEIGHT_MOST;
 use crate::train::error::TrainError;
 
 /// What a device found out about a page, with what the index of pages says.
 fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
-    let lowest_opacity = f32::from_bits(survey.lowest_opacity);
+    let [lowest_opacity, least_weight] = [survey.lowest_opacity, survey.least_weight].map(f32::from_bits);
     PageFacts {
         largest_mean: f32::from_bits(survey.largest_mean),
+        least_weight: if least_weight > WEIGHT_MOST { f32::INFINITY } else { least_weight },
         extremes: Extremes { lowest_opacity, sigma_max: page.bounds.sigma_max },
         sh_degree: page.sh_degree,
     }
@@ -40,7 +42,8 @@ fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
 
 /// What a page would be like that no round edits.
 fn best_facts(page: &PageMeta) -> PageFacts {
-    facts(page, &PageSurvey { largest_mean: 0, lowest_opacity: f32::INFINITY.to_bits(), pad: [0; 2] })
+    let [lowest_opacity, least_weight] = [f32::INFINITY.to_bits(); 2];
+    facts(page, &PageSurvey { largest_mean: 0, lowest_opacity, least_weight, pad: 0 })
 }
 
 /// `None` where memory is short.

@@ -177,7 +177,7 @@ impl DeviceTier {
         if !self.is_recordable(scene, &pages, step) {
             return Ok(false);
         }
-        renderer.weigh_rows(false)?;
+        renderer.weigh_rows(step.collects && scene.rules.strategy.needs_weights())?;
         scene.pager.begin_view(step.step, step.camera)?;
         self.begin_step(scene, renderer, step.step)?;
         self.pin_flight(scene, renderer, step.step, &pages)?;

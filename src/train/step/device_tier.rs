@@ -139,7 +139,12 @@ impl DeviceTier {
         let flights = Flights::new(OneStep::new(&numbers, scene.rules.splits()));
         let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;
-        device.hold_pages(&PageRules { payload_bytes, numbers, splits })?;
+        device.hold_pages(&PageRules {
+            payload_bytes,
+            numbers,
+            splits,
+            weighs: scene.rules.strategy.needs_weights(),
+        })?;
         let slots_most = slots_in(device.room(), device.slot_bytes()).clamp(1, u64::from(u32::MAX / 2));
         let mut tier = DeviceTier {
             slots: FrameTable::new(0, EvictPolicy::FarthestNextUse),

@@ -20,11 +20,13 @@
 use super::deferred::{FOR_EVER, TableWords};
 use super::page_words::{Table, Words};
 use gsscale::base::math::exp32;
+use gsscale::densify::stats::WEIGHED_VIEWS;
 use gsscale::kernels::page_words::{DevicePage, PageResult, PageSurvey};
 use gsscale::kernels::uniforms_pages::GatherUniforms;
 use gsscale::scene::columns::Column;
 use gsscale::scene::optimizer_numbers::SeriesSums;
 use gsscale::scene::rows::mean_grad2d;
+use gsscale::scene::sightings::{mean_weight, views};
 
 /// Slacks of bounds: see `gsscale::optim::bounds`. That of values is twice the CPU's, for devices that divide and take
 /// roots less exactly.
@@ -185,12 +187,17 @@ pub fn bounds(input: &GatherInput<'_>, results: &mut [PageResult]) {
 /// Finds what decides whether a round edits rows of the pages in the slab. The uniform names the column of the opacities.
 pub fn survey(input: &GatherInput<'_>, surveys: &mut [PageSurvey]) {
     for (page, survey) in input.pages.iter().zip(surveys).filter(|(page, _)| input.is_bound(page)) {
-        let (mut lowest, mut largest) = (3.4e38f32, 0.0f32);
+        let (mut lowest, mut largest, mut weight) = (3.4e38f32, 0.0f32, 3.4e38f32);
         for row in 0..page.rows as usize {
+            let word = input.slab[page.count_at(row)];
+            if views(word) >= WEIGHED_VIEWS {
+                weight = mean_weight(word).map_or(weight, |mean| mean.min(weight));
+            }
             lowest = lowest.min(input.hull(page, Column::Opacities, row, 0, input.uniforms.rate)[0]);
             let score = input.mean_score(page, row);
             largest = largest.max(if score > 0.0 { score.max(SMALLEST_MEAN) } else { score });
         }
         (survey.lowest_opacity, survey.largest_mean) = (lowest.to_bits(), largest.to_bits());
+        survey.least_weight = weight.to_bits();
     }
 }

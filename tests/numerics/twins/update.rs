@@ -17,6 +17,7 @@
 use super::deferred::{TableWords, flush};
 use super::page_words::{Table, Words};
 use gsscale::base::math::LARGEST_GRAD;
+use gsscale::densify::stats::weight_bin;
 use gsscale::kernels::page_words::{DevicePage, PageResult};
 use gsscale::kernels::uniforms_pages::UpdateUniforms;
 use gsscale::scene::columns::Column;
@@ -37,6 +38,9 @@ pub struct UpdateInput<'a> {
     /// `[listed row]`: the largest magnitude of a gradient, bits.
     pub largest: &'a [u32],
 }
+
+/// Bins of mean scores; those of mean weights follow.
+const BINS: usize = 1 << 15;
 
 fn is_usable(bits: u32) -> bool {
     bits != 0 && bits <= LARGEST_GRAD.to_bits()
@@ -82,7 +86,8 @@ pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [
 }
 
 /// Stamps the rows that [`step`] rewrote, counts, and collects statistics. `footprints` holds the gradient of the
-/// projected mean and the radii of each listed row, `bins` the change of the number of rows by bin of the mean score.
+/// projected mean and the radii of each listed row, each followed by its weight where rows are weighed; `bins` the change of the number
+/// of rows by bin of the mean score, then by bin of the mean weight.
 pub fn finish(
     input: &UpdateInput<'_>,
     footprints: &[[f32; 4]],
@@ -101,12 +106,14 @@ pub fn finish(
         } else {
             result.skipped += u32::from(input.largest[i] != 0);
         }
-        let footprint = footprints[i];
+        let of_row = if input.uniforms.weighs != 0 { 2 } else { 1 };
+        let footprint = footprints[of_row * i];
+        let weight = (of_row == 2).then(|| footprints[2 * i + 1][0]);
         if footprint[2] > 0.0 && footprint[3] > 0.0 {
             result.drawn += 1;
             if input.uniforms.collects != 0 {
                 let at = [page.grad2d_at(row as usize), page.count_at(row as usize)];
-                result.collected += u32::from(collect(footprint, input.uniforms.half_size, at, slab, bins));
+                result.collected += u32::from(collect((footprint, weight), input.uniforms.half_size, at, slab, bins));
             }
         }
     }
@@ -121,9 +128,9 @@ pub fn clear_statistics(pages: &[DevicePage], bound: u32, slab: &mut [u32]) {
     }
 }
 
-/// Adds a growth score to the statistics of a row; whether it did.
+/// Adds a growth score and a weight to the statistics of a row; whether it did.
 fn collect(
-    footprint: [f32; 4],
+    (footprint, weight): ([f32; 4], Option<f32>),
     half_size: [f32; 2],
     [sum_at, count_at]: [usize; 2],
     slab: &mut [u32],
@@ -140,9 +147,17 @@ fn collect(
         let bin = &mut bins[bin(sum, count)];
         *bin = bin.wrapping_sub(1);
     }
-    (slab[sum_at], slab[count_at]) = (added.to_bits(), with_view(count, None));
+    (slab[sum_at], slab[count_at]) = (added.to_bits(), with_view(count, weight));
     let bin = &mut bins[bin(added, slab[count_at])];
     *bin = bin.wrapping_add(1);
+    if weight.is_some() {
+        for (word, change) in [(count, u32::MAX), (slab[count_at], 1)] {
+            if let Some(of_weight) = weight_bin(word) {
+                let bin = &mut bins[BINS + of_weight as usize];
+                *bin = bin.wrapping_add(change);
+            }
+        }
+    }
     true
 }
 
