@@ -251,7 +251,7 @@ fn what_a_device_does_not_do_is_refused_with_a_remedy() {
     let mut cases = cases.to_vec();
     if has_device() {
         // Without a device the lack of one is said first.
-        cases.push((&weighs, "use --growth-score gradient with --recycle 0"));
+        cases.push((&weighs, "use --growth-score gradient, or --optimizer-on host"));
     }
     for (more, remedy) in cases {
         let args = [text(&scene), "--out", text(&out), "--steps", "3", "--optimizer-on", "device"];
