@@ -76,17 +76,14 @@
 //!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
-//! **A loss term**
-//! 1. A file in `render/`: the term as a function of picture and photo, and its gradient. Masked pixels do not count.
-//!    `render/mod.rs` names the file.
-//! 2. `train/step/comparison.rs`: the one place between picture and gradient, for training and for the rehearsal before the
-//!    first step. It works on the CPU and on devices through [`render::Renderer::picture_mut`] and
-//!    [`render::Renderer::picture_gradient`].
-//! 3. `kernels/image_loss.rs`: the weight of the term is a field of [`kernels::image_loss::LossOptions`], which reaches step and
-//!    rehearsal as [`train::step::comparison::Comparison::loss`]. The weight is a config key; `config/limits.rs` fills the field.
-//! 4. `train/step/train_step.rs`, `read_loss`: adds the term to the loss that is logged.
-//! 5. Where the time of the term matters: instead of 1 and 2 the stage itself, `kernels/image_loss.rs` and `image_loss.wgsl`
-//!    among the shaders.
+//! **A loss term** is a kind of [`photos`] without values of its own:
+//! 1. A file in `photos/`: a [`photos::parameter::PhotoParameter`] whose `adds_loss` and `needs_picture` are true. `target` gets the corrected picture
+//!    and the photo that the loss compares, keeps the term's value and gradient, and returns the photo; `loss` gives the value;
+//!    `picture_back` adds the gradient; `buffer_bytes` counts the memory. Masked pixels do not count.
+//! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
+//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `config/check.rs` for its range.
+//! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
+//!    shaders. Steps that a device records ahead know no other terms, so a kind that adds to the loss ends them.
 //!
 //! **A parameter of photos**
 //! 1. A file in `photos/`: the values, their change of a picture, a photo or a camera, their derivatives, and what they learn, as

@@ -10,7 +10,7 @@
 use crate::appearance::state::AppearanceState;
 use crate::densify::growth::{GrowthCheck, GrowthState};
 use crate::outliers::blocks::BlockOutliers;
-use crate::outliers::views::ViewOutliers;
+use crate::outliers::views::ViewState;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::photos::saved::{Encoded, SavedValues};
 use crate::poses::state::PoseState;
@@ -25,7 +25,7 @@ pub(super) const NEWEST: u32 = 7;
 #[cfg_attr(test, derive(serde::Serialize))]
 pub(super) struct OlderEnd<G> {
     pub appearance: AppearanceState,
-    pub outliers: ViewOutliers,
+    pub outliers: Vec<ViewState>,
     pub growth: G,
     pub blocks: BlockOutliers,
     pub first_exposures: u32,
@@ -119,7 +119,7 @@ impl From<OlderGrowth> for GrowthState {
 
 /// The encoded values that a state of this version lacks, in the order of the layout; `None` for a version that is not read.
 pub(super) fn missing_values(version: u32) -> Result<Option<Vec<u8>>, EncodingError> {
-    let (outliers, growth, blocks) = (ViewOutliers::default(), GrowthState::default(), BlockOutliers::default());
+    let (outliers, growth, blocks) = (Vec::<ViewState>::new(), GrowthState::default(), BlockOutliers::default());
     let before = match version {
         OLDEST => encoding::to_bytes(&(AppearanceState::default(), outliers, growth, blocks))?,
         5 => encoding::to_bytes(&(outliers, growth, blocks))?,
@@ -181,7 +181,7 @@ mod tests {
             let has = |since: u32| version >= since;
             let end = OlderEnd {
                 appearance: if has(5) { appearance } else { AppearanceState::default() },
-                outliers: if has(6) { outliers } else { ViewOutliers::default() },
+                outliers: if has(6) { outliers } else { Vec::new() },
                 growth: older_growth(&if has(6) { growth } else { GrowthState::default() }),
                 blocks: if has(7) { blocks } else { BlockOutliers::default() },
                 first_exposures: 0,

@@ -296,7 +296,7 @@ pub(super) mod tests {
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
     use crate::outliers::blocks::{BlockOutliers, look};
-    use crate::outliers::views::ViewOutliers;
+    use crate::outliers::views::ViewState;
     use crate::photos::saved::Encoded;
     use crate::poses::gradient::MotionGradient;
     use crate::poses::state::PoseState;
@@ -324,7 +324,7 @@ pub(super) mod tests {
     pub(in crate::checkpoint) fn end_of_8() -> OlderEnd<GrowthState> {
         OlderEnd {
             appearance: AppearanceState::new(&[0, 1, 0]),
-            outliers: ViewOutliers::new(3),
+            outliers: vec![ViewState::default(); 3],
             growth: GrowthState {
                 first: 7,
                 checks: vec![

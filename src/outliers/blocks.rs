@@ -34,8 +34,6 @@ const CONTRAST_LEAST: f64 = 0.03;
 /// Blocks are judged after a tenth of the run, at the latest after [`FIRST_LOOK_LATEST`] steps.
 const FIRST_LOOK_PART: u32 = 10;
 const FIRST_LOOK_LATEST: u32 = 500;
-/// Steps after an opacity reset in which pictures are too dark for a judgement.
-pub const STEPS_AFTER_RESET: u32 = 500;
 
 /// The first step that judges blocks, in a run of `steps` steps: pictures have the mean colours of the scene by then.
 pub fn first_look_at_blocks(steps: u32) -> u32 {

@@ -8,6 +8,10 @@
 //! median absolute deviation, gets a strike; any other view loses one. A view is an outlier from its second strike on, until it has lost
 //! all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
 //!
+//! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step does not
+//! train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures fall
+//! fast at first.
+//!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
 //! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
 
@@ -31,9 +35,13 @@ const STRIKES_MOST: u8 = 4;
 /// A measure is an outlier if three conditions hold: it exceeds the median by this many standard deviations (estimated from the median
 /// absolute deviation), the error is at least this many times the median error, and the picture leaves at least this share of the
 /// variance unexplained. A photo of another place leaves more than all of the variance, until the scene adapts to show the photo.
-const DEVIATIONS: f64 = 3.0;
-const RATIO_LEAST: f64 = 1.6;
-const UNEXPLAINED_LEAST: f64 = 0.3;
+const USUAL: Limits = Limits { deviations: 3.0, ratio: 1.6, unexplained: 0.5 };
+/// Epochs in which a clear contradiction counts at once; strikes decide from then on.
+pub const EPOCHS_AT_ONCE: u32 = 3;
+/// The last measures that a picture is compared with in these epochs, at most.
+const RECENT_MOST: usize = 16;
+/// A contradiction is clear if the same three conditions hold with these limits.
+const CLEAR: Limits = Limits { deviations: 4.0, ratio: 2.0, unexplained: 0.8 };
 
 /// The state of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -52,18 +60,22 @@ pub struct ViewState {
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ViewOutliers {
     views: Vec<ViewState>,
+    /// Measures of the last steps on views that are no outliers, fixed-point, the newest last; at most [`RECENT_MOST`].
+    recent: Vec<i32>,
 }
 
-/// Variance of the used pixels of a photo over its channels, of values in 0..1; `None` without used pixels. Of a large photo
-/// some [`SAMPLE`] pixels are looked at.
-fn variance(photo: &Target) -> Option<f64> {
+/// Used pixels of a photo, some [`SAMPLE`] of a large one.
+fn sample(photo: &Target) -> impl Iterator<Item = (usize, &[u8; 3])> {
     // Odd, so that it runs through the columns of a picture.
     let stride = (photo.pixels() / SAMPLE) | 1;
+    let pixels = photo.rgb.as_chunks::<3>().0.iter().enumerate().step_by(stride);
+    pixels.filter(|&(i, _)| photo.mask.as_ref().is_none_or(|mask| mask[i] != 0))
+}
+
+/// Variance of the sample of a photo over its channels, of values in 0..1; `None` without used pixels.
+fn variance(photo: &Target) -> Option<f64> {
     let (mut count, mut sums, mut squares) = (0u64, [0u64; 3], 0u64);
-    for (i, rgb) in photo.rgb.as_chunks::<3>().0.iter().enumerate().step_by(stride) {
-        if photo.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
-            continue;
-        }
+    for (_, rgb) in sample(photo) {
         count += 1;
         for (sum, &value) in sums.iter_mut().zip(rgb) {
             *sum += u64::from(value);
@@ -75,10 +87,59 @@ fn variance(photo: &Target) -> Option<f64> {
     (count > 0).then(|| ((squares as f64 - of_means) / (3.0 * n * 255.0 * 255.0)).max(VARIANCE_LEAST))
 }
 
+/// Mean squared error of a picture `[3][height][width]` over the sample of its photo; `None` without used pixels, or where it is not
+/// finite.
+fn squared_error(picture: &[f32], photo: &Target) -> Option<f64> {
+    let (mut count, mut sum, pixels) = (0u64, 0.0, photo.pixels());
+    for (i, rgb) in sample(photo) {
+        count += 1;
+        for (c, &value) in rgb.iter().enumerate() {
+            let difference = f64::from(picture[c * pixels + i]) - f64::from(value) / 255.0;
+            sum += difference * difference;
+        }
+    }
+    let mse = sum / (3.0 * count as f64);
+    mse.is_finite().then_some(mse)
+}
+
+/// The measure of a picture, fixed-point but not rounded.
+fn measure(mse: f64, variance: f64) -> f64 {
+    (libm::log(mse.max(1e-12) / variance) * PER_UNIT).clamp(-STORED_MOST, STORED_MOST)
+}
+
+/// Measures of the last steps as [`Limits::most`] takes them.
+fn recent(measures: &[i32]) -> Vec<f64> {
+    measures.iter().map(|&measure| f64::from(measure)).collect()
+}
+
+/// How far a measure may lie above the others, and how large it must be at least, to be an outlier.
+struct Limits {
+    deviations: f64,
+    ratio: f64,
+    unexplained: f64,
+}
+
+impl Limits {
+    /// The largest measure that is no outlier among `measures`; `None` if they are too few.
+    fn most(&self, mut measures: Vec<f64>) -> Option<f64> {
+        if measures.len() < VIEWS_LEAST {
+            return None;
+        }
+        let (middle, deviation) = median_and_deviation(&mut measures)?;
+        let far = (self.deviations * (deviation / MAD_OF_NORMAL)).max(PER_UNIT * libm::log(self.ratio));
+        Some((middle + far).max(PER_UNIT * libm::log(self.unexplained)))
+    }
+}
+
 impl ViewOutliers {
     /// The state of `views` views before the first measure.
     pub fn new(views: usize) -> ViewOutliers {
-        ViewOutliers { views: vec![ViewState::default(); views] }
+        ViewOutliers::of_views(vec![ViewState::default(); views])
+    }
+
+    /// The state of views whose last steps are unknown.
+    pub fn of_views(views: Vec<ViewState>) -> ViewOutliers {
+        ViewOutliers { views, recent: Vec::new() }
     }
 
     /// Whether both have the same number of views.
@@ -105,25 +166,39 @@ impl ViewOutliers {
     /// Notes the mean squared error of a view's picture.
     pub fn measure(&mut self, view: usize, mse: f64, photo: &Target) {
         let (Some(state), Some(variance)) = (self.views.get_mut(view), variance(photo)) else { return };
-        if mse.is_finite() {
-            let measure = libm::log(mse.max(1e-12) / variance) * PER_UNIT;
-            state.measure = measure.clamp(-STORED_MOST, STORED_MOST).round() as i32;
-            state.is_measured = true;
+        if !mse.is_finite() {
+            return;
         }
+        state.measure = measure(mse, variance).round() as i32;
+        state.is_measured = true;
+        if !state.is_named {
+            if CLEAR.most(recent(&self.recent)).is_some_and(|most| f64::from(state.measure) > most) {
+                state.strikes = state.strikes.max(1);
+            }
+            self.recent.drain(..(self.recent.len() + 1).saturating_sub(RECENT_MOST));
+            self.recent.push(state.measure);
+        }
+    }
+
+    /// Whether a picture `[3][height][width]` contradicts its photo so clearly, beside those of the last steps, that the first sightings
+    /// count. `false` after fewer than [`VIEWS_LEAST`] steps.
+    ///
+    /// # Panics
+    /// Picture and photo differ in size.
+    pub fn contradicts(&self, picture: &[f32], photo: &Target) -> bool {
+        let (Some(most), Some(variance)) = (CLEAR.most(recent(&self.recent)), variance(photo)) else { return false };
+        squared_error(picture, photo).is_some_and(|mse| measure(mse, variance) > most)
     }
 
     /// Judges the views measured since the last call, at the end of the epoch with this number, from 0. Returns those that
     /// have become outliers, ascending.
     pub fn end_epoch(&mut self, epoch: u32) -> Vec<usize> {
         let measured = self.views.iter().filter(|v| v.is_measured);
-        let mut measured: Vec<f64> = measured.map(|v| f64::from(v.measure)).collect();
+        let measured = measured.map(|v| f64::from(v.measure)).collect();
         let mut found = Vec::new();
-        let can_judge = measured.len() >= VIEWS_LEAST && epoch > 0;
-        if let (true, Some((middle, deviation))) = (can_judge, median_and_deviation(&mut measured)) {
-            let far = (DEVIATIONS * (deviation / MAD_OF_NORMAL)).max(PER_UNIT * libm::log(RATIO_LEAST));
-            let least = (middle + far).max(PER_UNIT * libm::log(UNEXPLAINED_LEAST));
+        if let (true, Some(most)) = (epoch > 0, USUAL.most(measured)) {
             for (number, view) in self.views.iter_mut().enumerate().filter(|(_, view)| view.is_measured) {
-                if view.judge(f64::from(view.measure) > least) {
+                if view.judge(f64::from(view.measure) > most) {
                     found.push(number);
                 }
             }
@@ -143,6 +218,9 @@ impl ViewOutliers {
                 && (view.is_named || view.strikes < STRIKES_NAMED)
                 && !(view.is_named && view.strikes == 0)
         };
+        if self.recent.len() > RECENT_MOST {
+            return Err("it remembers the errors of more steps than a run does");
+        }
         if self.views.iter().all(is_possible) { Ok(()) } else { Err("the error of a view is out of bounds") }
     }
 }
@@ -174,7 +252,7 @@ mod tests {
         for epoch in 0..epochs {
             for view in 0..12 {
                 let usual = 0.01 * (1.0 + 0.05 * view as f64);
-                outliers.measure(view, if view >= 10 { usual * wrong } else { usual }, &photo(60));
+                outliers.measure(view, if view >= 10 { usual * wrong } else { usual }, &photo(200));
             }
             found.extend(outliers.end_epoch(epoch));
         }
@@ -193,6 +271,22 @@ mod tests {
         after(3, 1.0, &mut outliers);
         assert_eq!(outliers.named().count(), 0);
         assert_eq!(after(9, 1.1, &mut outliers), [0; 0], "a tenth more is no contradiction");
+    }
+
+    #[test]
+    fn a_clear_contradiction_is_named_after_the_second_epoch() {
+        // 1.3 of the variance, where the others leave .065; six times that of the others is .39.
+        let mut outliers = ViewOutliers::new(12);
+        assert_eq!(after(1, 20.0, &mut outliers), [0; 0], "the first epoch does not count");
+        assert_eq!((outliers.views[10].strikes, outliers.check()), (1, Ok(())));
+        let mut outliers = ViewOutliers::new(12);
+        assert_eq!(after(2, 20.0, &mut outliers), [10, 11]);
+        assert_eq!(outliers.check(), Ok(()));
+        // A view that was far from the last steps alone loses the strike.
+        let mut outliers = ViewOutliers::new(12);
+        after(1, 20.0, &mut outliers);
+        assert_eq!(after(2, 1.0, &mut outliers), [0; 0]);
+        assert_eq!(outliers.views[10].strikes, 0);
     }
 
     #[test]
@@ -239,6 +333,52 @@ mod tests {
         outliers.measure(99, 1.0, &photo(60));
     }
 
+    /// A picture of the photo whose pixels are `share` of the contrast away from the photo: with 1, dark and bright have changed places.
+    fn picture(photo: &Target, contrast: f32, share: f32) -> Vec<f32> {
+        let value = |i: usize| f32::from(photo.rgb[i % photo.pixels() * 3]) / 255.0;
+        let away = |i: usize| if value(i) > 20.0 / 255.0 { -contrast } else { contrast } * share / 255.0;
+        (0..3 * photo.pixels()).map(|i| value(i) + away(i)).collect()
+    }
+
+    #[test]
+    fn a_clear_contradiction_shows_at_the_first_sighting() {
+        let photo = photo(60);
+        let (swapped, grey, near) =
+            (picture(&photo, 60.0, 1.0), picture(&photo, 60.0, 0.5), picture(&photo, 60.0, 0.3));
+        let usual = 0.2 * variance(&photo).unwrap();
+        let mut outliers = ViewOutliers::new(12);
+        (0..7).for_each(|view| outliers.measure(view, usual, &photo));
+        assert!(!outliers.contradicts(&swapped, &photo), "seven steps are too few");
+        outliers.measure(7, usual, &photo);
+        assert!(outliers.contradicts(&swapped, &photo), "four times the variance");
+        assert!(outliers.contradicts(&grey, &photo), "all of the variance");
+        assert!(!outliers.contradicts(&near, &photo), "a third of the variance");
+        assert_eq!(outliers.named().count(), 0, "a look names nobody");
+        // Where the last pictures are as bad, as in the first steps of a run, none contradicts.
+        (0..RECENT_MOST).for_each(|view| outliers.measure(view % 12, 4.0 * variance(&photo).unwrap(), &photo));
+        assert!(!outliers.contradicts(&swapped, &photo));
+        (0..RECENT_MOST).for_each(|view| outliers.measure(view % 12, usual, &photo));
+        assert_eq!((outliers.recent.len(), outliers.check()), (RECENT_MOST, Ok(())));
+        outliers.views[3] = ViewState { is_named: true, strikes: 2, ..ViewState::default() };
+        (0..RECENT_MOST).for_each(|_| outliers.measure(3, 4.0 * variance(&photo).unwrap(), &photo));
+        assert!(outliers.contradicts(&swapped, &photo), "outliers are no measure of others");
+        let masked = Target { mask: Some(vec![0; 32]), ..photo.clone() };
+        assert!(!outliers.contradicts(&swapped, &masked));
+    }
+
+    #[test]
+    fn errors_are_those_of_the_used_pixels() {
+        let photo = photo(60);
+        let picture = picture(&photo, 60.0, 0.5);
+        let share = |photo: &Target| squared_error(&picture, photo).unwrap() / (30.0f64 / 255.0).powi(2);
+        assert!((share(&photo) - 1.0).abs() < 1e-5, "f32 pictures");
+        let half = Target { mask: Some((0..32).map(|i| if i < 16 { 255 } else { 0 }).collect()), ..photo.clone() };
+        assert!((share(&half) - 1.0).abs() < 1e-5);
+        assert_eq!(squared_error(&picture, &Target { mask: Some(vec![0; 32]), ..photo.clone() }), None);
+        let broken = vec![f32::NAN; 96];
+        assert_eq!(squared_error(&broken, &photo), None);
+    }
+
     #[test]
     fn variance_is_that_of_the_used_pixels() {
         assert!((variance(&photo(60)).unwrap() - (30.0f64 / 255.0).powi(2)).abs() < 1e-12);
@@ -258,5 +398,8 @@ mod tests {
         refused(|view| view.strikes = STRIKES_MOST + 1);
         refused(|view| view.strikes = STRIKES_NAMED);
         refused(|view| view.is_named = true);
+        let mut outliers = ViewOutliers::new(2);
+        outliers.recent = vec![0; RECENT_MOST + 1];
+        assert!(outliers.check().is_err());
     }
 }

@@ -7,12 +7,11 @@ use super::PhotoOptions;
 use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
 use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
-use crate::outliers::blocks::{self, BlockOutliers, BlockState, STEPS_AFTER_RESET};
+use crate::outliers::blocks::{self, BlockOutliers, BlockState};
 use crate::outliers::blocks::{counts_masked_blocks, first_look_at_blocks};
 use crate::page::format::encoding::EncodingError;
 use crate::report::html::Page;
 use crate::scene::camera::Camera;
-use crate::scene::events::{Event, EventKind};
 use crate::scene::image::Target;
 use serde_json::Value;
 use std::path::Path;
@@ -89,9 +88,7 @@ impl PhotoParameter for MaskedBlocks {
             return;
         }
         let is_begun = !self.state.of_view(at.view).is_empty() || at.step >= first_look_at_blocks(self.steps);
-        let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
-        let reset = at.events.events().iter().rev().find(is_reset);
-        let are_kept = reset.is_some_and(|reset| at.step - reset.step <= STEPS_AFTER_RESET);
+        let are_kept = at.follows_reset();
         let all_count = counts_masked_blocks(at.step, self.steps, self.train_views);
         self.now = is_begun.then_some(Now { view: Some(at.view), are_kept, all_count });
     }

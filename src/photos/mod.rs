@@ -10,8 +10,9 @@
 //! (`config::check`).
 //!
 //! Invariants: 1. a step that was skipped teaches nothing but the error of its view; 2. what is known after a step is a function of
-//! steps and photos alone, and lies in the saved values, so a resumed run knows the same; 3. the order of the list changes no
-//! step: all corrections of a picture come before all looks at it.
+//! steps and photos alone, and lies in the saved values, so a resumed run knows the same; 3. all corrections of a picture come
+//! before all looks at it; 4. a kind that adds to the loss stands behind the kinds that correct, and behind masks, so that it
+//! compares what the loss compares, and its gradient is taken back through the corrections.
 
 mod appearance;
 mod masked_blocks;

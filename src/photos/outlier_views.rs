@@ -4,12 +4,13 @@
 //! Not here: the verdict.
 
 use super::PhotoOptions;
-use super::parameter::{Kind, PhotoOutcome, PhotoParameter};
+use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
 use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
-use crate::outliers::views::ViewOutliers;
+use crate::outliers::views::{EPOCHS_AT_ONCE, ViewOutliers, ViewState};
 use crate::page::format::encoding::EncodingError;
 use crate::report::html::{Cell, Page};
+use crate::scene::image::Target;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -21,11 +22,19 @@ pub(super) const KIND: Kind = Kind { name: "outliers", file: None, first, check,
 
 /// Names that a warning lists.
 const NAMES_LISTED: usize = 20;
+/// A view that is left out is measured once in this many epochs. In the others its turn goes to another view.
+const MEASURED_EVERY: usize = 4;
 
 struct OutlierViews {
     state: ViewOutliers,
     are_left_out: bool,
     train_views: u32,
+    /// The step looks at its picture.
+    looks: bool,
+    /// The step is a rehearsal, whose look judges nothing.
+    is_rehearsal: bool,
+    /// The picture contradicts its photo.
+    is_found: bool,
 }
 
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
@@ -33,11 +42,26 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
         state: ViewOutliers::new(dataset.views.len()),
         are_left_out: options.robust_views,
         train_views: dataset.train_views().len() as u32,
+        looks: false,
+        is_rehearsal: false,
+        is_found: false,
     }))
 }
 
+/// Saved values, also those of programs that did not keep the measures of the last steps.
+fn decoded(saved: &Encoded) -> Result<ViewOutliers, ValuesError> {
+    match saved.decoded(ViewOutliers::check) {
+        Err(ValuesError::Encoding(_)) => {
+            let outliers = ViewOutliers::of_views(saved.decoded(|_: &Vec<ViewState>| Ok(()))?);
+            outliers.check().map_err(ValuesError::Impossible)?;
+            Ok(outliers)
+        }
+        decoded => decoded,
+    }
+}
+
 fn check(saved: &Encoded) -> Result<(), ValuesError> {
-    saved.decoded(ViewOutliers::check).map(drop)
+    decoded(saved).map(drop)
 }
 
 impl PhotoParameter for OutlierViews {
@@ -50,15 +74,46 @@ impl PhotoParameter for OutlierViews {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, ViewOutliers::check, ViewOutliers::is_as_large_as)
+        let saved = decoded(saved)?;
+        if saved.is_as_large_as(&self.state) {
+            self.state = saved;
+        }
+        Ok(())
     }
 
     fn leaves_out(&self, view: usize) -> bool {
         self.are_left_out && self.state.is_named(view)
     }
 
+    /// Every [`MEASURED_EVERY`]th epoch such a view is compared with its photo, so that it can return.
+    fn gives_turn_away(&self, view: usize, step: u32) -> bool {
+        let epoch = step / self.train_views.max(1);
+        self.leaves_out(view) && !(epoch as usize + view).is_multiple_of(MEASURED_EVERY)
+    }
+
     fn needs_host(&self) -> bool {
         self.are_left_out
+    }
+
+    fn begin_step(&mut self, at: &PhotoStep<'_>) {
+        let is_early = at.step < EPOCHS_AT_ONCE * self.train_views && !at.follows_reset();
+        self.looks = self.are_left_out && !at.is_left_out && (is_early || at.is_rehearsal);
+        (self.is_rehearsal, self.is_found) = (at.is_rehearsal, false);
+    }
+
+    fn needs_picture(&self) -> bool {
+        self.looks
+    }
+
+    fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+        if self.looks && !self.is_rehearsal {
+            self.is_found = picture.is_some_and(|picture| self.state.contradicts(picture, photo));
+        }
+        photo
+    }
+
+    fn leaves_out_now(&self) -> bool {
+        self.is_found
     }
 
     /// Notes the error of the view, also of a step that was skipped, and after an epoch names the views that have become outliers.
@@ -130,4 +185,41 @@ fn section(page: &mut Page, _: &Path, summary: &Value) {
             ("", &|view| Cell::text(state(view))),
         ],
     );
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    fn outliers(named: &[usize]) -> OutlierViews {
+        let is_named = |view: usize| named.contains(&view);
+        // As a commit holds a view: measure, whether it is measured, strikes, whether it is an outlier.
+        let views: Vec<(i32, bool, u8, bool)> =
+            (0..10).map(|v| (5, false, 2 * u8::from(is_named(v)), is_named(v))).collect();
+        let state = decoded(&Encoded::of(&views).unwrap()).unwrap();
+        OutlierViews { state, are_left_out: true, train_views: 10, looks: false, is_rehearsal: false, is_found: false }
+    }
+
+    #[test]
+    fn values_without_the_last_steps_are_read_and_saved_with_them() {
+        let mut first = outliers(&[3]);
+        assert!(first.leaves_out(3) && !first.leaves_out(4));
+        let saved = first.save().unwrap();
+        assert_eq!(decoded(&saved).unwrap(), first.state);
+        first.restore(&Encoded::of(&vec![(0, false, 0u8, false); 10]).unwrap()).unwrap();
+        assert!(!first.leaves_out(3));
+        first.restore(&Encoded::of(&vec![(0, false, 2u8, true); 11]).unwrap()).unwrap();
+        assert!(!first.leaves_out(3), "of other photos");
+        assert!(check(&Encoded::of(&vec![(0, false, 9u8, false); 10]).unwrap()).is_err(), "nine strikes");
+        assert!(check(&Encoded::of(&7u8).unwrap()).is_err());
+    }
+
+    #[test]
+    fn a_view_that_is_left_out_keeps_one_turn_in_four() {
+        let outliers = outliers(&[3]);
+        let kept: Vec<u32> = (0..8).filter(|epoch| !outliers.gives_turn_away(3, 10 * epoch + 7)).collect();
+        assert_eq!(kept, [1, 5]);
+        assert!((0..80).all(|step| !outliers.gives_turn_away(4, step)));
+    }
 }

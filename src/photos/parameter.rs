@@ -16,7 +16,7 @@ use crate::page::format::encoding::EncodingError;
 use crate::report::run_report::Section;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
-use crate::scene::events::EventLog;
+use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use serde::Serialize;
 use serde_json::Value;
@@ -53,6 +53,18 @@ pub struct PhotoStep<'a> {
     pub is_rehearsal: bool,
 }
 
+/// Steps after an opacity reset in which pictures are too dark for a judgement.
+const STEPS_AFTER_RESET: u32 = 500;
+
+impl PhotoStep<'_> {
+    /// Whether an opacity reset is so near that the picture says nothing about its photo.
+    pub fn follows_reset(&self) -> bool {
+        let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
+        let reset = self.events.events().iter().rev().find(is_reset);
+        reset.is_some_and(|reset| self.step - reset.step <= STEPS_AFTER_RESET)
+    }
+}
+
 /// A step that was done.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoOutcome<'a> {
@@ -60,7 +72,7 @@ pub struct PhotoOutcome<'a> {
     pub view: usize,
     /// The step, from 0.
     pub step: u32,
-    /// The step has changed nothing.
+    /// The step has changed nothing: it was skipped, or its view was left out.
     pub is_skipped: bool,
     /// Mean squared error of the picture.
     pub mse: f64,
@@ -107,14 +119,25 @@ pub trait PhotoParameter {
         false
     }
 
+    /// Whether the turn of a view goes to another view at `step`.
+    fn gives_turn_away(&self, _view: usize, _step: u32) -> bool {
+        false
+    }
+
     /// Whether pictures are corrected.
     fn corrects(&self) -> bool {
         false
     }
 
+    /// Whether the kind adds a term to the loss: [`PhotoParameter::target`] compares picture and photo, [`PhotoParameter::loss`] gives the
+    /// value, and [`PhotoParameter::picture_back`] adds the gradient.
+    fn adds_loss(&self) -> bool {
+        false
+    }
+
     /// Whether the host acts between picture and gradient, so that a device cannot be given steps ahead.
     fn needs_host(&self) -> bool {
-        self.corrects()
+        self.corrects() || self.adds_loss()
     }
 
     /// Prepares for a step, and forgets what an earlier attempt has found.
@@ -133,7 +156,18 @@ pub trait PhotoParameter {
         photo
     }
 
-    /// Turns the gradient with respect to the corrected picture into that with respect to the drawn one. Both are `[3][height][width]`.
+    /// Whether the step must not train on the photo, as the picture has shown. After [`PhotoParameter::target`].
+    fn leaves_out_now(&self) -> bool {
+        false
+    }
+
+    /// What the kind adds to the loss of the step. After [`PhotoParameter::target`].
+    fn loss(&self) -> f64 {
+        0.0
+    }
+
+    /// Turns the gradient with respect to the corrected picture into that with respect to the drawn one, both `[3][height][width]`; a term of the
+    /// loss adds its own. The last kind of the list comes first.
     fn picture_back(&mut self, _photo: &Target, _v_rgb: &mut [f32]) {}
 
     /// Takes the gradients of the rows of a batch, drawn with bands up to `sh_degree`. Not called with rows on a device.

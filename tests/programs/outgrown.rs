@@ -195,7 +195,8 @@ fn frames_return_after_a_photo_that_shows_much_of_the_scene() {
     // The first step with the fewest frames is that of a photo from high above; few photos follow until all are ordinary.
     let (wide, least) = frames.iter().enumerate().min_by_key(|(_, frames)| **frames).unwrap();
     let again = frames[wide..].iter().max().unwrap();
-    assert!(2 * again >= 3 * least, "{least} frames at step {wide}, at most {again} after it: {frames:?}");
+    // How much of the budget is free for frames is measured in the process, so their number varies by some percent.
+    assert!(3 * again >= 4 * least, "{least} frames at step {wide}, at most {again} after it: {frames:?}");
     // The documented error is a tenth.
     let peak = done["host_bytes_peak"].as_f64().unwrap();
     assert!(peak <= 1.1 * BUDGET, "{:.1} MB at the peak, {frames:?}", peak / 1e6);

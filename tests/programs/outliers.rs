@@ -180,3 +180,26 @@ fn threads_and_frames_give_the_same_bytes_without_wrong_views() {
     assert!(ply(&one) == ply(&two), "one thread and two threads differ");
     assert!(ply(&one) == ply(&paged), "batches differ");
 }
+
+/// The host looks at the picture of a step whose pages a device holds, and ends the step there if the picture contradicts its photo.
+#[test]
+fn pages_on_a_device_give_the_same_bytes_without_wrong_views() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 24, 96, 64, 1500);
+    let swapped = disturbed(&scene, &folder.path().join("swapped"), &SWAPPED);
+    let [all, few] = ["all", "few"].map(|name| folder.path().join(name));
+    let flags =
+        ["--steps", "130", "--strategy", "none", "--robust-views", "--device", "gpu", "--optimizer-on", "device"];
+    for (out, slots) in [(&all, "64MiB"), (&few, "5MiB")] {
+        run(
+            &swapped,
+            out,
+            &[&flags[..], &["--page-rows", "32", "--view-order", "shuffle", "--device-mem", slots]].concat(),
+        );
+    }
+    assert!(!named(&all).is_empty(), "no view was left out, so the test shows nothing");
+    assert!(ply(&all) == ply(&few), "fewer slots give other bytes");
+}

@@ -11,6 +11,9 @@ const LOOK_AHEAD_EVERY: u32 = 8;
 const LOOK_AHEAD_LEAST: u32 = 64;
 const LOOK_AHEAD_MOST: u32 = 8192;
 
+/// The turns of a view that is left out go to this many views after it.
+const SUBSTITUTES: usize = 8;
+
 /// Memory for the plan of a run in memory whose device holds a part of the pages, bytes.
 const DEVICE_PLAN_BYTES: usize = 4 << 20;
 
@@ -23,7 +26,10 @@ impl Trainer {
         self.expect_edits();
         // The step in flight has begun already.
         let first = usize::from(self.is_ahead());
-        if !has_plan || !self.state.step.is_multiple_of(LOOK_AHEAD_EVERY) {
+        // Views are judged between epochs.
+        let is_due = self.state.step.is_multiple_of(LOOK_AHEAD_EVERY)
+            || self.state.step.is_multiple_of(self.train_views.len() as u32);
+        if !has_plan || !is_due {
             return;
         }
         if self.is_in_memory() {
@@ -51,7 +57,41 @@ impl Trainer {
     pub(super) fn coming_views(&self, count: u32) -> Vec<usize> {
         let (step, mut coming) = (self.state.step, Vec::new());
         self.order.upcoming(step, count.min(self.options.steps - step), &mut coming);
-        let view = |(at, &position)| self.train_views[self.held_out.trained_at(at, position)];
-        (step..).zip(&coming).map(view).collect()
+        (step..).zip(&coming).map(|(at, &position)| self.view_in_turn(at, position)).collect()
+    }
+
+    /// Index in `dataset.views` of the view of a step whose turn is at `position` of the training views. A view that is held out or left out
+    /// gives its turn to one of the next ones, in each epoch another.
+    pub(super) fn view_in_turn(&self, step: u32, position: usize) -> usize {
+        let views = self.train_views.len();
+        let at = |position: usize| self.train_views[self.held_out.trained_at(step, position)];
+        let gives_away = |position: usize| self.photos.iter().any(|photo| photo.gives_turn_away(at(position), step));
+        at(substitute((position, views), step as usize / views, gives_away))
+    }
+}
+
+/// The position of 0..views that trains in the turn of `position` in an epoch: `position`, unless it gives its turn away. Where all positions give
+/// their turns away, each keeps its own.
+fn substitute((position, views): (usize, usize), epoch: usize, gives_away: impl Fn(usize) -> bool) -> usize {
+    if !gives_away(position) {
+        return position;
+    }
+    let first = position + 1 + epoch % SUBSTITUTES;
+    (first..first + views).map(|at| at % views).find(|&at| !gives_away(at)).unwrap_or(position)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_turn_that_is_given_away_goes_to_the_next_ones_in_turn() {
+        let of = |position: usize, epoch: usize| substitute((position, 12), epoch, |at| at == 3 || at == 5);
+        assert!((0..20).all(|epoch| of(7, epoch) == 7));
+        let taken: Vec<usize> = (0..9).map(|epoch| of(3, epoch)).collect();
+        assert_eq!(taken, [4, 6, 6, 7, 8, 9, 10, 11, 4]);
+        assert_eq!(of(5, 7), 1, "beyond the last");
+        assert_eq!(substitute((3, 12), 2, |_| true), 3);
+        assert_eq!(substitute((0, 1), 2, |_| true), 0);
     }
 }

@@ -30,7 +30,7 @@ impl Trainer {
 
     /// Lets the parameters learn from the current step, which was taken or skipped.
     pub(super) fn end_step_of_photo(&mut self, view: usize, done: &StepOutcome, photo: &Target, dataset: &Dataset) {
-        let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some(), done.loss.mse);
+        let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some() || done.is_left_out, done.loss.mse);
         let outcome = PhotoOutcome { view, step, is_skipped, mse, photo, dataset };
         let warnings = self.photos.iter_mut().flat_map(|parameter| parameter.end_step(&outcome));
         warnings.for_each(|warning| eprintln!("warning: {warning}"));

@@ -239,7 +239,7 @@ impl Trainer {
     /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
         let position = self.order.view_at(self.state.step);
-        self.train_views[self.held_out.trained_at(self.state.step, position)]
+        self.view_in_turn(self.state.step, position)
     }
 
     /// Seconds spent in steps.

@@ -11,7 +11,7 @@
 //! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
 use super::batch::{AtStep, RowBackend, UpdateCounts};
-use super::comparison::Comparison;
+use super::comparison::{Comparison, added_loss};
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
@@ -218,9 +218,10 @@ impl Passes<'_, '_> {
         Ok(())
     }
 
-    /// Waits for the loss of the step. A second loss term is added to it here.
+    /// Waits for the loss of the step.
     fn read_loss(&mut self) -> Result<(), TrainError> {
         self.outcome.loss = self.backend.renderer().loss_value()?;
+        self.outcome.loss.loss += added_loss(self.comparison.photos);
         Ok(())
     }
 
