@@ -181,7 +181,7 @@ impl ViewOutliers {
     }
 
     /// Whether a picture `[3][height][width]` contradicts its photo so clearly, beside those of the last steps, that the first sightings
-    /// count. `false` after fewer than [`VIEWS_LEAST`] steps.
+    /// count. `false` after fewer than eight steps.
     ///
     /// # Panics
     /// Picture and photo differ in size.

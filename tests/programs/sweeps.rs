@@ -78,15 +78,23 @@ fn rungs_on_a_device_end_alike() {
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let args = ["--steps", "30", "--page-rows", "16", "--strategy", "none", "--share", "70", "--device-mem", "6MiB"];
-    let more = ["--rungs", "overlap,memory,pages,resident", "--device", "gpu", "--json"];
+    let more = ["--rungs", "overlap,memory,pages,ahead,split,resident", "--device", "gpu", "--json"];
     let rungs = lines(&[&["ladder", text(&scene), "--out", text(&out)][..], &args, &more].concat());
-    let [overlap, memory, pages, resident] = &rungs[..] else { panic!("{rungs:?}") };
-    assert!(overlap["ply"] == memory["ply"] && pages["ply"] == resident["ply"], "{rungs:?}");
+    let [overlap, memory, pages, ahead, split, resident] = &rungs[..] else { panic!("{rungs:?}") };
+    assert!(
+        overlap["ply"] == memory["ply"] && [ahead, split, resident].iter().all(|r| r["ply"] == pages["ply"]),
+        "{rungs:?}"
+    );
+    assert!(number(split, "device_bytes_peak") <= 3.0 * 1048576.0, "{split}");
     assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
     assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{rungs:?}");
     assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{rungs:?}");
-    let words = ["The results of overlap, memory are the same", "The results of pages, resident are the same"];
+    let words =
+        ["The results of overlap, memory are the same", "The results of pages, ahead, split, resident are the same"];
     check_page(&out.join("ladder.html"), &words, folder.path());
+    let of_none = [&["ladder", text(&scene), "--out", text(&out)][..], &args[..args.len() - 2], &["--rungs", "split"]];
+    let output = bench(&of_none.concat());
+    assert!(!output.status.success() && stderr(&output).contains("name --device-mem"), "{}", stderr(&output));
     let on_cpu = [&["ladder", text(&scene), "--out", text(&out)][..], &args, &["--rungs", "pages", "--device", "cpu"]];
     let output = bench(&on_cpu.concat());
     assert!(!output.status.success() && stderr(&output).contains("use --device auto or gpu"), "{}", stderr(&output));

@@ -73,7 +73,13 @@ impl Knobs<'_> {
     fn changed(&self, knob: &str, label: impl Into<String>, change: impl FnOnce(&mut TrainConfig)) -> Option<Planned> {
         let mut config = self.base.clone();
         change(&mut config);
-        (config != *self.base).then(|| Planned { knob: knob.into(), label: label.into(), config, scene: None })
+        (config != *self.base).then(|| Planned {
+            knob: knob.into(),
+            label: label.into(),
+            config,
+            scene: None,
+            environment: Vec::new(),
+        })
     }
 
     fn each<T, const N: usize>(&self, values: [T; N], setting: impl Fn(T) -> Option<Planned>) -> Vec<Planned> {

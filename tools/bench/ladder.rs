@@ -27,7 +27,7 @@ const EXAMPLES: &str = "\
 Examples:
   gsscale-bench ladder scans/village --out ladders/village --steps 3000 --strategy none --page-rows 128
   gsscale-bench ladder scans/city --out ladders/city --steps 300 --strategy none --share 25 --view-order groups:25
-  gsscale-bench ladder scans/city --out ladders/gpu --rungs overlap,memory,pages,resident --device gpu --device-mem 4GiB
+  gsscale-bench ladder scans/city --out ladders/gpu --rungs overlap,pages,ahead,split,resident --device gpu --device-mem 4GiB
 
 Rungs:
   naive      every step updates every Gaussian; pages are read on demand; the least recently used page is evicted
@@ -36,6 +36,8 @@ Rungs:
   overlap    reads and writes overlap with compute
   memory     all pages are in memory
   pages      as overlap, with the pages of --device-mem on the GPU, which updates them (--device gpu)
+  ahead      a step is submitted before the numbers of the last one are waited for (--device gpu)
+  split      as ahead with half of --device-mem: a view that does not fit is drawn in parts (--device gpu)
   resident   all pages are in memory and on the GPU (--device gpu)
 
 Without --rungs, the first five run.
@@ -66,12 +68,13 @@ struct Rung {
     what: &'static str,
     rounding: Rounding,
     change: fn(&mut TrainConfig),
+    environment: &'static [(&'static str, &'static str)],
 }
 
 /// The rungs that need no GPU.
 const HOST_RUNGS: [&str; 5] = ["naive", "deferred", "planned", "overlap", "memory"];
 
-const RUNGS: [Rung; 7] = [
+const RUNGS: [Rung; 9] = [
     Rung {
         name: "naive",
         what: "naive offloading: dense updates, pages on demand, LRU",
@@ -80,26 +83,53 @@ const RUNGS: [Rung; 7] = [
             c.optimizer = Method::Dense;
             (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed);
         },
+        environment: &[],
     },
     Rung {
         name: "deferred",
         what: "+ deferred Adam",
         rounding: Rounding::Host,
         change: |c| (c.transfers, c.evict) = (Transfers::Demand, EvictPolicy::LeastRecentlyUsed),
+        environment: &[],
     },
     Rung {
         name: "planned",
         what: "+ planned cache and prefetch",
         rounding: Rounding::Host,
         change: |c| c.transfers = Transfers::Ahead,
+        environment: &[],
     },
-    Rung { name: "overlap", what: "+ overlap with compute", rounding: Rounding::Host, change: |_| {} },
-    Rung { name: "memory", what: "all in memory", rounding: Rounding::Host, change: in_memory },
+    Rung {
+        name: "overlap",
+        what: "+ overlap with compute",
+        rounding: Rounding::Host,
+        change: |_| {},
+        environment: &[],
+    },
+    Rung { name: "memory", what: "all in memory", rounding: Rounding::Host, change: in_memory, environment: &[] },
     Rung {
         name: "pages",
         what: "+ pages on the device",
         rounding: Rounding::Device,
-        change: |c| c.optimizer_on = Chosen(Some(OptimizerPlace::Device)),
+        change: on_device,
+        environment: &[("GSSCALE_STEPS_IN_FLIGHT", "0")],
+    },
+    Rung {
+        name: "ahead",
+        what: "+ steps submitted ahead",
+        rounding: Rounding::Device,
+        change: on_device,
+        environment: &[],
+    },
+    Rung {
+        name: "split",
+        what: "+ half of the device memory, views in parts",
+        rounding: Rounding::Device,
+        change: |c| {
+            on_device(c);
+            c.device_mem = ByteSize(c.device_mem.0 / 2);
+        },
+        environment: &[],
     },
     Rung {
         name: "resident",
@@ -107,10 +137,16 @@ const RUNGS: [Rung; 7] = [
         rounding: Rounding::Device,
         change: |c| {
             in_memory(c);
-            (c.optimizer_on, c.device_mem) = (Chosen(Some(OptimizerPlace::Device)), ByteSize(0));
+            on_device(c);
+            c.device_mem = ByteSize(0);
         },
+        environment: &[],
     },
 ];
+
+fn on_device(config: &mut TrainConfig) {
+    config.optimizer_on = Chosen(Some(OptimizerPlace::Device));
+}
 
 fn in_memory(config: &mut TrainConfig) {
     (config.spill_dir, config.frames) = (String::new(), 0);
@@ -131,6 +167,10 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         let mut config = config.clone();
         (rung.change)(&mut config);
         config.check()?;
+    }
+    if config.device_mem.0 == 0 && chosen().any(|rung| rung.name == "split") {
+        let problem = "the rung split halves a budget that is not given";
+        return Err(InputError::new("--rungs", problem, "name --device-mem, or leave the rung out").into());
     }
     let (scene, page) = (&args.common.scene, args.common.out.join("ladder.html"));
     let facts = Facts::of(scene, &config)?;
@@ -157,7 +197,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let mut done = Vec::new();
     for rung in chosen() {
         let label = rung.name.into();
-        let mut planned = Planned { knob: "ladder".into(), label, config: config.clone(), scene: None };
+        let environment = rung.environment.to_vec();
+        let mut planned = Planned { knob: "ladder".into(), label, config: config.clone(), scene: None, environment };
         (rung.change)(&mut planned.config);
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;

@@ -29,11 +29,11 @@ Examples:
   gsscale-bench stability scans/village --out stability/village --steps 1500 --max-resolution 400 --seeds 1,2,3
   gsscale-bench stability scans/village --out stability/village --only swapped10,boxes --remedies none,own
 
-Disturbances: exposure05 and exposure1 (photos brighter or darker by up to half a stop, a stop), white-balance, swapped5
-and swapped10 (photos that have changed places, percent), swapped10-removed (without these photos, as by hand), poses005 and
-poses05 (noise on the places of cameras, percent of the scene), jpeg20 (quality), boxes (20 grey boxes a photo), boxes-masked
-(with masks, as by hand), third (of the photos), points10 (a tenth of the points), points-random, blurred10 (percent).
-Held-out photos stay clean.
+Disturbances: exposure05, exposure1 and exposure2 (photos brighter or darker by up to half a stop, a stop, two stops),
+white-balance, swapped5 and swapped10 (photos that have changed places, percent), swapped10-removed (without these photos, as
+by hand), poses005 and poses05 (noise on the places of cameras, percent of the scene), jpeg20 (quality), boxes (20 grey boxes
+a photo), boxes-masked (with masks, as by hand), third (of the photos), points10 (a tenth of the points), points-random,
+blurred10 (percent). Held-out photos stay clean.
 Remedies: none; own, what is meant for the disturbance; all together.
 
 Each run is a process of its own and adds a line to stability.jsonl in --out; the page is stability.html, and the end is a
@@ -48,10 +48,11 @@ const REMEDIES: [&str; 3] = [NO_REMEDY, "own", "all"];
 type Change = fn(&mut TrainConfig);
 
 /// Name of a disturbance, the disturbance, and its own remedy.
-const DISTURBANCES: [(&str, Disturbance, Option<Change>); 16] = [
+const DISTURBANCES: [(&str, Disturbance, Option<Change>); 17] = [
     (CLEAN, Disturbance::Nothing, None),
     ("exposure05", Disturbance::Exposure { stops: 0.5 }, Some(correct_exposure)),
     ("exposure1", Disturbance::Exposure { stops: 1.0 }, Some(correct_exposure)),
+    ("exposure2", Disturbance::Exposure { stops: 2.0 }, Some(correct_exposure)),
     ("white-balance", Disturbance::WhiteBalance { stops: 0.3 }, Some(correct_colors)),
     ("swapped5", Disturbance::Swapped { share: 0.05, are_removed: false }, Some(leave_out_views)),
     ("swapped10", Disturbance::Swapped { share: 0.1, are_removed: false }, Some(leave_out_views)),
@@ -219,7 +220,8 @@ fn plan_all(args: &Args, dataset: &Dataset, given: &TrainConfig) -> InputResult<
                     "own" => (*own)?(&mut config),
                     _ => all_remedies(&mut config),
                 }
-                Some(Planned { knob: (*name).into(), label: remedy.into(), config, scene: Some(scene.clone()) })
+                let scene = Some(scene.clone());
+                Some(Planned { knob: (*name).into(), label: remedy.into(), config, scene, environment: Vec::new() })
             });
             scenes.push(Disturbed { disturbance: *disturbance, seed, folder, runs: runs.collect() });
         }

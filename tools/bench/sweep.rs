@@ -114,6 +114,8 @@ pub struct Planned {
     pub config: TrainConfig,
     /// The scene of the run, if it is not the scene of the sweep.
     pub scene: Option<MadeScene>,
+    /// Environment variables of the run, by name. The runs of the sweep inherit all others.
+    pub environment: Vec<(&'static str, &'static str)>,
 }
 
 /// A scene made from that of the sweep.
@@ -151,7 +153,9 @@ impl Planned {
     pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
         let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
-        format!("{:016x}", xxh3_64(format!("{}\n{settings}{how}", surroundings.text).as_bytes()))
+        let environment: String = self.environment.iter().map(|(name, value)| format!("\n{name}={value}")).collect();
+        let all = format!("{}\n{settings}{how}{environment}", surroundings.text);
+        format!("{:016x}", xxh3_64(all.as_bytes()))
     }
 
     /// Name of the run's folder.
@@ -231,7 +235,7 @@ impl Sweep {
         let began = Instant::now();
         let scene = planned.scene.as_ref().map_or(&self.scene, |scene| &scene.folder);
         let arguments = [scene, Path::new("--out"), &part, Path::new("--config"), &file];
-        let output = self.spawn("gsscale-train", &arguments)?;
+        let output = self.spawn("gsscale-train", &arguments, &planned.environment)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
             // Before the folders are removed: an interrupted run keeps its checkpoint.
@@ -294,7 +298,7 @@ impl Sweep {
             write_config(&file, &self.base)?;
             let json = folder.join(EVALUATED_FILE);
             let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
-            let output = self.spawn("gsscale-eval", &arguments)?;
+            let output = self.spawn("gsscale-eval", &arguments, &[])?;
             if !output.status.success() {
                 refuse_interrupted(&output)?;
                 record.problem = Some(problem(&output));
@@ -308,11 +312,16 @@ impl Sweep {
 
     /// Runs a program from the folder of this program to its end. The program's standard input is the lock file, so the
     /// lock stays held while the program lives.
-    fn spawn(&self, program: &str, arguments: &[&Path]) -> InputResult<Output> {
+    fn spawn(&self, program: &str, arguments: &[&Path], environment: &[(&str, &str)]) -> InputResult<Output> {
         let path = beside(program)?;
         let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
         let mut command = Command::new(&path);
-        command.args(arguments).stdin(Stdio::from(held)).stdout(Stdio::null()).stderr(Stdio::piped());
+        command
+            .args(arguments)
+            .envs(environment.iter().copied())
+            .stdin(Stdio::from(held))
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped());
         if program == "gsscale-train" {
             command.arg("--quiet");
         }
