@@ -191,6 +191,8 @@ fn section(page: &mut Page, _: &Path, summary: &Value) {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::scene::camera::Camera;
+    use crate::scene::events::EventLog;
 
     fn outliers(named: &[usize]) -> OutlierViews {
         let is_named = |view: usize| named.contains(&view);
@@ -213,6 +215,30 @@ mod tests {
         assert!(!first.leaves_out(3), "of other photos");
         assert!(check(&Encoded::of(&vec![(0, false, 9u8, false); 10]).unwrap()).is_err(), "nine strikes");
         assert!(check(&Encoded::of(&7u8).unwrap()).is_err());
+    }
+
+    #[test]
+    fn a_step_leaves_a_clear_contradiction_out_in_the_first_epochs_alone() {
+        let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let (width, height, near_plane, far_plane) = (4, 4, 0.01, 100.0);
+        let camera = Camera { viewmat, fx: 20.0, fy: 20.0, cx: 2.0, cy: 2.0, width, height, near_plane, far_plane };
+        // Black and white in turn; a picture with both exchanged leaves four times the variance.
+        let photo =
+            Target { width, height, rgb: (0..48).map(|i| if i / 3 % 2 == 0 { 0 } else { 255 }).collect(), mask: None };
+        let exchanged: Vec<f32> = (0..48).map(|i| if i % 2 == 0 { 1.0 } else { 0.0 }).collect();
+        let mut outliers = outliers(&[]);
+        (0..10).for_each(|view| outliers.state.measure(view, 0.02, &photo));
+        let events = EventLog::default();
+        let mut leaves_out = |step: u32, is_rehearsal: bool, picture: &[f32]| {
+            let at = PhotoStep { view: 7, step, camera: &camera, events: &events, is_left_out: false, is_rehearsal };
+            outliers.begin_step(&at);
+            let picture = outliers.needs_picture().then_some(picture);
+            outliers.target(picture, &photo);
+            outliers.leaves_out_now()
+        };
+        assert!(leaves_out(29, false, &exchanged), "three epochs of ten views");
+        assert!(!leaves_out(30, false, &exchanged));
+        assert!(!leaves_out(29, true, &exchanged), "a rehearsal takes the whole step");
     }
 
     #[test]
