@@ -165,7 +165,8 @@ config_keys! {
         /// Initial size, times the distance to the three nearest neighbours
         init_scale: f64 = 1.0 => Numbers;
         /// For few or random first points: --growth-score mixed, --recycle 0.05, --init-scale 2 and 6.7 times the --means-lr of
-        /// --schedule, where they are not given. A resumed run keeps its values
+        /// --schedule, where they are not given. Photos that overlap little lose by it: compare with a run without. A resumed
+        /// run keeps its values
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] poor_points: bool = false => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers;
