@@ -83,7 +83,8 @@
 //! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
 //! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `config/check.rs` for its range.
 //! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
-//!    shaders. Steps that a device records ahead know no other terms, so a kind that adds to the loss ends them.
+//!    shaders. A run with such a kind records no steps ahead on a device: recorded steps compute the built-in
+//!    loss alone.
 //!
 //! **A parameter of photos**
 //! 1. A file in `photos/`: the values, their change of a picture, a photo or a camera, their derivatives, and what they learn, as

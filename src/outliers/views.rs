@@ -36,8 +36,8 @@ const STRIKES_MOST: u8 = 4;
 /// absolute deviation), the error is at least this many times the median error, and the picture leaves at least this share of the
 /// variance unexplained. A photo of another place leaves more than all of the variance, until the scene adapts to show the photo.
 const USUAL: Limits = Limits { deviations: 3.0, ratio: 1.6, unexplained: 0.5 };
-/// Epochs in which a clear contradiction counts at once; strikes decide from then on.
-pub const EPOCHS_AT_ONCE: u32 = 3;
+/// Epochs in which a step compares its picture with its photo before it trains; from then on only strikes decide.
+pub const FIRST_EPOCHS: u32 = 3;
 /// The last measures that a picture is compared with in these epochs, at most.
 const RECENT_MOST: usize = 16;
 /// A contradiction is clear if the same three conditions hold with these limits.
@@ -219,7 +219,7 @@ impl ViewOutliers {
                 && !(view.is_named && view.strikes == 0)
         };
         if self.recent.len() > RECENT_MOST {
-            return Err("it remembers the errors of more steps than a run does");
+            return Err("more recent errors of views are stored than a run keeps");
         }
         if self.views.iter().all(is_possible) { Ok(()) } else { Err("the error of a view is out of bounds") }
     }

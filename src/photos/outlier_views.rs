@@ -7,7 +7,7 @@ use super::PhotoOptions;
 use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
 use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
-use crate::outliers::views::{EPOCHS_AT_ONCE, ViewOutliers, ViewState};
+use crate::outliers::views::{FIRST_EPOCHS, ViewOutliers, ViewState};
 use crate::page::format::encoding::EncodingError;
 use crate::report::html::{Cell, Page};
 use crate::scene::image::Target;
@@ -34,7 +34,7 @@ struct OutlierViews {
     /// The step is a rehearsal, whose look judges nothing.
     is_rehearsal: bool,
     /// The picture contradicts its photo.
-    is_found: bool,
+    is_contradicted: bool,
 }
 
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
@@ -44,7 +44,7 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
         train_views: dataset.train_views().len() as u32,
         looks: false,
         is_rehearsal: false,
-        is_found: false,
+        is_contradicted: false,
     }))
 }
 
@@ -96,9 +96,9 @@ impl PhotoParameter for OutlierViews {
     }
 
     fn begin_step(&mut self, at: &PhotoStep<'_>) {
-        let is_early = at.step < EPOCHS_AT_ONCE * self.train_views && !at.follows_reset();
+        let is_early = at.step < FIRST_EPOCHS * self.train_views && !at.follows_reset();
         self.looks = self.are_left_out && !at.is_left_out && (is_early || at.is_rehearsal);
-        (self.is_rehearsal, self.is_found) = (at.is_rehearsal, false);
+        (self.is_rehearsal, self.is_contradicted) = (at.is_rehearsal, false);
     }
 
     fn needs_picture(&self) -> bool {
@@ -107,13 +107,13 @@ impl PhotoParameter for OutlierViews {
 
     fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
         if self.looks && !self.is_rehearsal {
-            self.is_found = picture.is_some_and(|picture| self.state.contradicts(picture, photo));
+            self.is_contradicted = picture.is_some_and(|picture| self.state.contradicts(picture, photo));
         }
         photo
     }
 
     fn leaves_out_now(&self) -> bool {
-        self.is_found
+        self.is_contradicted
     }
 
     /// Notes the error of the view, also of a step that was skipped, and after an epoch names the views that have become outliers.
@@ -200,7 +200,14 @@ mod tests {
         let views: Vec<(i32, bool, u8, bool)> =
             (0..10).map(|v| (5, false, 2 * u8::from(is_named(v)), is_named(v))).collect();
         let state = decoded(&Encoded::of(&views).unwrap()).unwrap();
-        OutlierViews { state, are_left_out: true, train_views: 10, looks: false, is_rehearsal: false, is_found: false }
+        OutlierViews {
+            state,
+            are_left_out: true,
+            train_views: 10,
+            looks: false,
+            is_rehearsal: false,
+            is_contradicted: false,
+        }
     }
 
     #[test]

@@ -84,7 +84,8 @@ pub struct PhotoOutcome<'a> {
 
 /// The parameters of one kind: their values for all photos, and their buffers for a step.
 pub trait PhotoParameter {
-    /// The name of the kind in commits. It stands for the layout of its values: another layout needs another name.
+    /// The name of the kind in commits. It stands for the layout of its values: another layout needs another name, unless the older one is
+    /// told apart and read too.
     fn name(&self) -> &'static str;
 
     /// The values as a commit holds them.
@@ -119,7 +120,7 @@ pub trait PhotoParameter {
         false
     }
 
-    /// Whether the turn of a view goes to another view at `step`.
+    /// Whether another view trains at `step` in the turn of this view.
     fn gives_turn_away(&self, _view: usize, _step: u32) -> bool {
         false
     }
@@ -219,4 +220,25 @@ pub fn views_by_name(dataset: &Dataset) -> Vec<usize> {
     let mut views = dataset.train_views();
     views.sort_by(|&a, &b| dataset.views[a].name.cmp(&dataset.views[b].name));
     views
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_say_nothing_for_500_steps_after_a_reset() {
+        let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        let (width, height, near_plane, far_plane) = (4, 4, 0.01, 100.0);
+        let camera = Camera { viewmat, fx: 20.0, fy: 20.0, cx: 2.0, cy: 2.0, width, height, near_plane, far_plane };
+        let mut events = EventLog::default();
+        let follows = |events: &EventLog, step: u32| {
+            PhotoStep { view: 0, step, camera: &camera, events, is_left_out: false, is_rehearsal: false }
+                .follows_reset()
+        };
+        assert!(!follows(&events, 100));
+        events.push(Event { step: 99, kind: EventKind::ResetOpacity { max_opacity: 0.01 } });
+        events.push(Event { step: 150, kind: EventKind::RaiseShDegree { degree: 1 } });
+        assert!(follows(&events, 151) && follows(&events, 599) && !follows(&events, 600));
+    }
 }

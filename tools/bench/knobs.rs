@@ -73,13 +73,7 @@ impl Knobs<'_> {
     fn changed(&self, knob: &str, label: impl Into<String>, change: impl FnOnce(&mut TrainConfig)) -> Option<Planned> {
         let mut config = self.base.clone();
         change(&mut config);
-        (config != *self.base).then(|| Planned {
-            knob: knob.into(),
-            label: label.into(),
-            config,
-            scene: None,
-            environment: Vec::new(),
-        })
+        (config != *self.base).then(|| Planned::new(knob, label, config))
     }
 
     fn each<T, const N: usize>(&self, values: [T; N], setting: impl Fn(T) -> Option<Planned>) -> Vec<Planned> {

@@ -74,6 +74,9 @@ struct Rung {
 /// The rungs that need no GPU.
 const HOST_RUNGS: [&str; 5] = ["naive", "deferred", "planned", "overlap", "memory"];
 
+/// Environment variable of the steps that a device has in flight.
+const IN_FLIGHT: &str = "GSSCALE_STEPS_IN_FLIGHT";
+
 const RUNGS: [Rung; 9] = [
     Rung {
         name: "naive",
@@ -112,14 +115,14 @@ const RUNGS: [Rung; 9] = [
         what: "+ pages on the device",
         rounding: Rounding::Device,
         change: on_device,
-        environment: &[("GSSCALE_STEPS_IN_FLIGHT", "0")],
+        environment: &[(IN_FLIGHT, "0")],
     },
     Rung {
         name: "ahead",
         what: "+ steps submitted ahead",
         rounding: Rounding::Device,
         change: on_device,
-        environment: &[],
+        environment: &[(IN_FLIGHT, "2")],
     },
     Rung {
         name: "split",
@@ -129,7 +132,7 @@ const RUNGS: [Rung; 9] = [
             on_device(c);
             c.device_mem = ByteSize(c.device_mem.0 / 2);
         },
-        environment: &[],
+        environment: &[(IN_FLIGHT, "2")],
     },
     Rung {
         name: "resident",
@@ -140,7 +143,7 @@ const RUNGS: [Rung; 9] = [
             on_device(c);
             c.device_mem = ByteSize(0);
         },
-        environment: &[],
+        environment: &[(IN_FLIGHT, "2")],
     },
 ];
 
@@ -196,9 +199,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let mut sweep = Sweep::open(&args.common, &config, RESULTS)?;
     let mut done = Vec::new();
     for rung in chosen() {
-        let label = rung.name.into();
-        let environment = rung.environment.to_vec();
-        let mut planned = Planned { knob: "ladder".into(), label, config: config.clone(), scene: None, environment };
+        let environment = rung.environment;
+        let mut planned = Planned { environment, ..Planned::new("ladder", rung.name, config.clone()) };
         (rung.change)(&mut planned.config);
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;

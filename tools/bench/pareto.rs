@@ -128,7 +128,7 @@ fn plan(args: &Args, mut config: TrainConfig) -> Result<(Planned, Vec<Planned>),
     }
     let knobs = Knobs { scene: &args.common.scene, base: &config, facts: &facts, share: args.share };
     let settings = knobs.settings(&args.knobs)?;
-    Ok((Planned { knob: "base".into(), label: "base".into(), config, scene: None, environment: Vec::new() }, settings))
+    Ok((Planned::new("base", "base", config), settings))
 }
 
 /// The base with all seeds, then the settings seed by seed.

@@ -221,7 +221,7 @@ fn plan_all(args: &Args, dataset: &Dataset, given: &TrainConfig) -> InputResult<
                     _ => all_remedies(&mut config),
                 }
                 let scene = Some(scene.clone());
-                Some(Planned { knob: (*name).into(), label: remedy.into(), config, scene, environment: Vec::new() })
+                Some(Planned { scene, ..Planned::new(name, remedy, config) })
             });
             scenes.push(Disturbed { disturbance: *disturbance, seed, folder, runs: runs.collect() });
         }

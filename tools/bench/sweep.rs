@@ -115,7 +115,7 @@ pub struct Planned {
     /// The scene of the run, if it is not the scene of the sweep.
     pub scene: Option<MadeScene>,
     /// Environment variables of the run, by name. The runs of the sweep inherit all others.
-    pub environment: Vec<(&'static str, &'static str)>,
+    pub environment: &'static [(&'static str, &'static str)],
 }
 
 /// A scene made from that of the sweep.
@@ -149,6 +149,11 @@ pub fn use_drive(config: &mut TrainConfig, frames: u64) {
 }
 
 impl Planned {
+    /// A run on the scene of the sweep, in its environment.
+    pub fn new(knob: &str, label: impl Into<String>, config: TrainConfig) -> Planned {
+        Planned { knob: knob.into(), label: label.into(), config, scene: None, environment: &[] }
+    }
+
     /// Digest of all settings, the seed, the scene, and the surroundings.
     pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
@@ -235,7 +240,7 @@ impl Sweep {
         let began = Instant::now();
         let scene = planned.scene.as_ref().map_or(&self.scene, |scene| &scene.folder);
         let arguments = [scene, Path::new("--out"), &part, Path::new("--config"), &file];
-        let output = self.spawn("gsscale-train", &arguments, &planned.environment)?;
+        let output = self.spawn("gsscale-train", &arguments, planned.environment)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
             // Before the folders are removed: an interrupted run keeps its checkpoint.

@@ -10,7 +10,7 @@
 //! with what was found.
 
 use crate::photos::parameter::PhotoParameter;
-use crate::render::{LossOptions, RenderError, Renderer};
+use crate::render::{LossOptions, LossValue, RenderError, Renderer};
 use crate::scene::image::Target;
 
 /// What the picture of a view is compared with.
@@ -21,7 +21,7 @@ pub struct Comparison<'a> {
     pub loss: LossOptions,
     /// What acts on the picture or learns from the step; each has begun the step.
     pub photos: &'a mut [Box<dyn PhotoParameter>],
-    /// Only the loss is measured: the view is not trained on. A look at the picture may decide so too.
+    /// Only the loss is measured: the view is not trained on. A parameter that has seen the picture may set this too.
     pub is_left_out: bool,
 }
 
@@ -56,11 +56,16 @@ impl<'a> Comparison<'a> {
         }
         renderer.picture_back()
     }
-}
 
-/// The terms that parameters add to the loss.
-pub(super) fn added_loss(photos: &[Box<dyn PhotoParameter>]) -> f64 {
-    photos.iter().map(|parameter| parameter.loss()).sum()
+    /// Waits for the loss of the step, and adds the terms of the parameters.
+    ///
+    /// # Errors
+    /// No loss was computed, or the renderer failed.
+    pub(super) fn loss_value(&self, renderer: &mut dyn Renderer) -> Result<LossValue, RenderError> {
+        let value = renderer.loss_value()?;
+        let added: f64 = self.photos.iter().map(|parameter| parameter.loss()).sum();
+        Ok(LossValue { loss: value.loss + added, ..value })
+    }
 }
 
 /// The photo that the picture is compared with. The picture is read back only if a parameter needs it.
@@ -91,49 +96,18 @@ mod tests {
     use std::cell::RefCell;
     use std::rc::Rc;
 
-    /// Leaves a view out if its picture is black where the photo is white.
+    /// Adds the sum of the picture to the loss, and leaves the view out if the picture is black where the photo is white.
     #[derive(Default)]
-    struct LeavesBlackOut {
-        is_found: bool,
-    }
-
-    impl PhotoParameter for LeavesBlackOut {
-        fn name(&self) -> &'static str {
-            "black"
-        }
-
-        fn save(&self) -> Result<Encoded, EncodingError> {
-            Encoded::of(&())
-        }
-
-        fn restore(&mut self, _: &Encoded) -> Result<(), ValuesError> {
-            Ok(())
-        }
-
-        fn needs_picture(&self) -> bool {
-            true
-        }
-
-        fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
-            self.is_found =
-                picture.unwrap().iter().all(|value| *value == 0.0) && photo.rgb.iter().all(|byte| *byte == 255);
-            photo
-        }
-
-        fn leaves_out_now(&self) -> bool {
-            self.is_found
-        }
-    }
-
-    /// Adds the sum of the picture to the loss.
-    #[derive(Default)]
-    struct AddsBrightness {
+    struct Probe {
         sum: f64,
+        is_black_on_white: bool,
+        /// The gradient as it came.
+        v_rgb: Rc<RefCell<Vec<f32>>>,
     }
 
-    impl PhotoParameter for AddsBrightness {
+    impl PhotoParameter for Probe {
         fn name(&self) -> &'static str {
-            "brightness"
+            "probe"
         }
 
         fn save(&self) -> Result<Encoded, EncodingError> {
@@ -154,7 +128,12 @@ mod tests {
 
         fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
             self.sum = picture.unwrap().iter().map(|value| f64::from(*value)).sum();
+            self.is_black_on_white = self.sum == 0.0 && photo.rgb.iter().all(|byte| *byte == 255);
             photo
+        }
+
+        fn leaves_out_now(&self) -> bool {
+            self.is_black_on_white
         }
 
         fn loss(&self) -> f64 {
@@ -162,6 +141,7 @@ mod tests {
         }
 
         fn picture_back(&mut self, _: &Target, v_rgb: &mut [f32]) {
+            *self.v_rgb.borrow_mut() = v_rgb.to_vec();
             v_rgb.iter_mut().for_each(|v| *v += 1.0);
         }
     }
@@ -185,55 +165,30 @@ mod tests {
     fn a_look_at_the_picture_leaves_the_view_out() {
         for (byte, is_left_out) in [(0, false), (255, true)] {
             let (photo, mut renderer) = (photo(byte), drawn(0.0));
-            let mut photos: [Box<dyn PhotoParameter>; 1] = [Box::<LeavesBlackOut>::default()];
+            let mut photos: [Box<dyn PhotoParameter>; 1] = [Box::<Probe>::default()];
             let mut comparison = Comparison { photos: &mut photos, ..Comparison::new(&photo, LossOptions::default()) };
             comparison.loss_and_back(&mut renderer).unwrap();
             assert_eq!(comparison.is_left_out, is_left_out, "a photo of {byte}");
             // The loss of a view that is left out is known too.
-            assert!((renderer.loss_value().unwrap().mse - f64::from(byte) / 255.0).abs() < 1e-6);
-        }
-    }
-
-    /// Keeps the gradient that the kinds behind it have left.
-    struct Listens(Rc<RefCell<Vec<f32>>>);
-
-    impl PhotoParameter for Listens {
-        fn name(&self) -> &'static str {
-            "listens"
-        }
-
-        fn save(&self) -> Result<Encoded, EncodingError> {
-            Encoded::of(&())
-        }
-
-        fn restore(&mut self, _: &Encoded) -> Result<(), ValuesError> {
-            Ok(())
-        }
-
-        fn adds_loss(&self) -> bool {
-            true
-        }
-
-        fn picture_back(&mut self, _: &Target, v_rgb: &mut [f32]) {
-            *self.0.borrow_mut() = v_rgb.to_vec();
+            assert!((comparison.loss_value(&mut renderer).unwrap().mse - f64::from(byte) / 255.0).abs() < 1e-6);
         }
     }
 
     #[test]
     fn a_term_of_the_loss_adds_its_gradient_and_its_value() {
-        let heard = Rc::new(RefCell::new(Vec::new()));
-        let mut photos: Vec<Box<dyn PhotoParameter>> =
-            vec![Box::new(Listens(heard.clone())), Box::<AddsBrightness>::default()];
-        let gradient = |photos: &mut [Box<dyn PhotoParameter>]| {
-            let (photo, mut renderer) = (photo(51), drawn(0.25));
-            let mut comparison = Comparison { photos, ..Comparison::new(&photo, LossOptions::default()) };
-            comparison.loss_and_back(&mut renderer).unwrap();
-            heard.take()
-        };
-        let (with, plain) = (gradient(&mut photos), gradient(&mut photos[..1]));
-        assert_eq!(plain.len(), 3 * 256);
-        assert!(plain.iter().zip(&with).all(|(plain, with)| plain + 1.0 == *with));
-        assert_eq!((added_loss(&photos), added_loss(&photos[..1])), (3.0 * 256.0 * 0.25, 0.0));
-        assert!(photos[1].needs_host(), "steps that a device records ahead would lack the term");
+        let probes = [Probe::default(), Probe::default()];
+        let [first, second] = [&probes[0], &probes[1]].map(|probe| probe.v_rgb.clone());
+        let mut photos = probes.map(|probe| Box::new(probe) as Box<dyn PhotoParameter>);
+        assert!(photos[0].needs_host(), "steps that a device records ahead would lack the term");
+        let (photo, mut renderer) = (photo(51), drawn(0.25));
+        let mut comparison = Comparison { photos: &mut photos, ..Comparison::new(&photo, LossOptions::default()) };
+        comparison.loss_and_back(&mut renderer).unwrap();
+        // The last kind comes first: it sees the gradient of the loss, the first kind that and the term of the last one.
+        let (first, second) = (first.take(), second.take());
+        assert_eq!(second.len(), 3 * 256);
+        assert!(first.iter().zip(&second).all(|(first, second)| *first == second + 1.0));
+        let (plain, all) = (renderer.loss_value().unwrap(), comparison.loss_value(&mut renderer).unwrap());
+        assert_eq!(all.loss, plain.loss + 2.0 * 3.0 * 256.0 * 0.25);
+        assert_eq!(all.mse, plain.mse, "the error of the picture has no terms");
     }
 }

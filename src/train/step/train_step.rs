@@ -11,7 +11,7 @@
 //! [`TrainError::Torn`]: the pages in memory belong to no step then.
 
 use super::batch::{AtStep, RowBackend, UpdateCounts};
-use super::comparison::{Comparison, added_loss};
+use super::comparison::Comparison;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
@@ -220,8 +220,7 @@ impl Passes<'_, '_> {
 
     /// Waits for the loss of the step.
     fn read_loss(&mut self) -> Result<(), TrainError> {
-        self.outcome.loss = self.backend.renderer().loss_value()?;
-        self.outcome.loss.loss += added_loss(self.comparison.photos);
+        self.outcome.loss = self.comparison.loss_value(self.backend.renderer())?;
         Ok(())
     }
 
