@@ -90,14 +90,14 @@ fn direct_sum(m: f32, v: f32, stamp: u32, end: u32, of_means: bool) -> f32 {
     let terms = min(end - stamp, tables[DIRECT_TERMS]);
     let bias = tables[BIAS];
     let bias_last = tables[BIAS_LENGTH] - 1u;
-    let factors = tables[MEANS_FACTOR];
-    let factor_last = tables[MEANS_FACTOR_LENGTH] - 1u;
+    let factors = tables[RATE_FACTORS] + select(1u, 0u, of_means);
+    let factors_last = tables[RATE_FACTORS_LENGTH] - 1u;
     var sum = 0.0;
     for (var left = terms; left > 0u; left--) {
         let t = stamp + left;
         let at = bias + 2u * min(t, bias_last);
         let power = tables[DECAY_POWERS] + 2u * left;
-        let rate = select(1.0, number(factors + min(t - 1u, factor_last)), of_means);
+        let rate = number(factors + 2u * min(t - 1u, factors_last));
         sum += rate * number(at) * number(power) * m / (root * number(power + 1u) * number(at + 1u) + number(EPS));
     }
     return sum;

@@ -11,7 +11,7 @@ use crate::optim::adam::EPS_MIN;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 
-/// Most steps of a run: the optimizer keeps 88 bytes for each.
+/// Most steps of a run: the optimizer keeps [`crate::optim::drift::STEP_BYTES`] for each.
 const STEPS_MAX: u32 = 10_000_000;
 /// Most random points to start from.
 const INIT_POINTS_MAX: u32 = 100_000_000;
@@ -129,8 +129,10 @@ impl TrainConfig {
                 return refuse(key, "a number from 0 to 1e6");
             }
         }
-        if !(self.means_lr_final > 0.0 && self.means_lr_final <= 1.0) {
-            return refuse("means-lr-final", "a number above 0 and up to 1");
+        for (key, fraction) in [("means-lr-final", self.means_lr_final), ("others-lr-final", self.others_lr_final)] {
+            if !(fraction > 0.0 && fraction <= 1.0) {
+                return refuse(key, "a number above 0 and up to 1");
+            }
         }
         self.check_adam_eps()
     }

@@ -111,12 +111,13 @@ config_keys! {
     "Training" {
         /// Total number of steps; --resume can raise it (see --keep-checkpoint)
         [value_parser = parse_count32] steps: u32 = 30_000 => Length;
-        /// Steps over which the learning rate of positions decays; it is constant afterwards. 0 = --steps. A resumed
-        /// run keeps its first value
+        /// Steps over which learning rates decay; they are constant afterwards. 0 = --steps, and with --strategy long-axis and
+        /// --schedule run-length at most 200 for each training photo. A resumed run keeps its first value
         [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
         /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
-        /// also of --scales-lr and --shn-lr, where they are not given: run-length (by --steps; the classic values from
-        /// 30,000 steps on) or classic (their defaults below). A resumed run keeps its values
+        /// also of --scales-lr, --quats-lr, --shn-lr and --others-lr-final, where they are not given: run-length (by --steps;
+        /// the classic values from 30,000 steps on, except that others-lr-final is 0.1) or classic (their defaults below). A
+        /// resumed run keeps its values
         schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
         seed: u64 = 42 => Numbers;
@@ -149,6 +150,9 @@ config_keys! {
         sh0_lr: f64 = 2.5e-3 => Numbers;
         /// Learning rate of the higher SH bands
         shn_lr: f64 = 2.5e-3 / 20.0 => Numbers;
+        /// Learning rates of everything but positions at the last step, as a fraction: they fall over the last tenth of the
+        /// run. 1 = they are constant
+        others_lr_final: f64 = 1.0 => Numbers before "1.0";
         /// Adam's epsilon, 1e-16 to 1: below 1e-16 it is lost in the f32 rounding of second moments
         adam_eps: f64 = 1e-15 => Numbers;
         /// Which Gaussians Adam updates: deferred (all; those without a gradient when next visible), dense (all at

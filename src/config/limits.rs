@@ -146,6 +146,7 @@ fn rates(config: &TrainConfig, scene_scale: f32) -> Rates {
     Rates {
         means: config.means_lr * f64::from(scene_scale),
         means_final_factor: config.means_lr_final,
+        others_final_factor: config.others_lr_final,
         scales: config.scales_lr,
         quats: config.quats_lr,
         opacities: config.opacities_lr,

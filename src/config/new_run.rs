@@ -1,15 +1,38 @@
 //! The config of a new run. Flags override the config file, which overrides the defaults. The length of the run sets some
 //! of the keys that neither gives ([`super::schedule`]), and `poor-points` some more.
 //!
-//! Invariants: 1. a given key is never changed; 2. the result is written to the config of the run as if every key had
+//! Invariants: 1. a given key is never changed, unless it has the value that the length of the run gives; 2. the result is written to the config of the run as if every key had
 //! been given, so a resumed run keeps its values whatever its new length.
 
 use super::file::{TrainConfig, TrainOverrides};
 use super::schedule::{Lengths, Schedule};
 use crate::base::error::InputResult;
 use crate::densify::long_axis::GrowthScore;
+use crate::densify::strategy::StrategyName;
 use std::collections::BTreeSet;
 use std::path::Path;
+
+/// A key of the schedule: its field, its place in a config, and its value in lengths.
+type LengthKey<T> = (&'static str, fn(&mut TrainConfig) -> &mut T, fn(&Lengths) -> T);
+
+/// The keys of the schedule that count steps.
+const STEP_KEYS: [LengthKey<u32>; 4] = [
+    ("sh_every", |config| &mut config.sh_every, |lengths| lengths.sh_every),
+    ("refine_start", |config| &mut config.refine_start, |lengths| lengths.refine_start),
+    ("refine_every", |config| &mut config.refine_every, |lengths| lengths.refine_every),
+    ("refine_stop", |config| &mut config.refine_stop, |lengths| lengths.refine_stop),
+];
+/// The keys of the schedule that are rates.
+const RATE_KEYS: [LengthKey<f64>; 5] = [
+    ("means_lr", |config| &mut config.means_lr, |lengths| lengths.means_lr),
+    ("scales_lr", |config| &mut config.scales_lr, |lengths| lengths.scales_lr),
+    ("quats_lr", |config| &mut config.quats_lr, |lengths| lengths.quats_lr),
+    ("shn_lr", |config| &mut config.shn_lr, |lengths| lengths.shn_lr),
+    ("others_lr_final", |config| &mut config.others_lr_final, |lengths| lengths.others_lr_final),
+];
+/// Most steps of a schedule for each training photo. Held-out photos of a small scene are best after some 200 steps a photo
+/// (`benches/RESULTS.md`, "Long runs on a small scene").
+const PHOTO_STEPS_MOST: u64 = 200;
 
 /// With `poor-points`: the factor of the learning rate of positions. Points that lie at a wrong place have a long way to go.
 const POOR_MEANS_LR: f64 = 20.0 / 3.0;
@@ -60,35 +83,47 @@ impl TrainConfig {
             Schedule::RunLength => Lengths::of_run(self.steps, self.strategy),
             Schedule::Classic => Lengths::CLASSIC,
         };
-        let is_open = |field: &str| !given.contains(field);
-        if is_open("sh_every") {
-            self.sh_every = lengths.sh_every;
+        self.set_lengths(&lengths, |field| !given.contains(field));
+    }
+
+    /// Ends the schedule of a run with the strategy `long-axis` after [`PHOTO_STEPS_MOST`] steps for each of its training photos,
+    /// unless `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos.
+    /// Keys that have the values of the run's length get those of the schedule's. Returns the steps of the schedule if it ends
+    /// before the run.
+    pub fn suit_photos(&mut self, photos: usize) -> Option<u32> {
+        let steps = (photos as u64).saturating_mul(PHOTO_STEPS_MOST).max(1);
+        let follows_length = self.schedule == Schedule::RunLength && self.strategy == StrategyName::LongAxis;
+        if !follows_length || self.schedule_steps != 0 || steps >= u64::from(self.steps) {
+            return None;
         }
-        if is_open("refine_start") {
-            self.refine_start = lengths.refine_start;
+        let followers = self.keys_with(&Lengths::of_run(self.steps, self.strategy));
+        self.schedule_steps = steps as u32;
+        self.set_lengths(&Lengths::of_run(self.schedule_steps, self.strategy), |field| followers.contains(field));
+        Some(self.schedule_steps)
+    }
+
+    /// Sets the keys of the schedule whose fields are open.
+    fn set_lengths(&mut self, lengths: &Lengths, is_open: impl Fn(&str) -> bool) {
+        for (_, place, value) in STEP_KEYS.iter().filter(|(field, ..)| is_open(field)) {
+            *place(self) = value(lengths);
         }
-        if is_open("refine_every") {
-            self.refine_every = lengths.refine_every;
+        for (_, place, value) in RATE_KEYS.iter().filter(|(field, ..)| is_open(field)) {
+            *place(self) = value(lengths);
         }
-        if is_open("refine_stop") {
-            self.refine_stop = lengths.refine_stop;
-        }
-        if is_open("means_lr") {
-            self.means_lr = lengths.means_lr;
-        }
-        if is_open("scales_lr") {
-            self.scales_lr = lengths.scales_lr;
-        }
-        if is_open("shn_lr") {
-            self.shn_lr = lengths.shn_lr;
-        }
+    }
+
+    /// The fields of the keys that have these values.
+    fn keys_with(&mut self, lengths: &Lengths) -> BTreeSet<&'static str> {
+        let steps = STEP_KEYS.iter().filter(|(_, place, value)| *place(self) == value(lengths)).map(|key| key.0);
+        let mut fields: BTreeSet<_> = steps.collect();
+        fields.extend(RATE_KEYS.iter().filter(|(_, place, value)| *place(self) == value(lengths)).map(|key| key.0));
+        fields
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::densify::strategy::StrategyName;
 
     fn of_flags(keys: &TrainOverrides) -> TrainConfig {
         TrainConfig::of_new_run(None, keys).unwrap_or_default()
@@ -101,23 +136,50 @@ mod tests {
         assert_eq!(of_flags(&classic), want);
         let short = TrainOverrides { steps: Some(3000), ..classic };
         assert_eq!(of_flags(&short), TrainConfig { steps: 3000, ..want });
-        assert_eq!(of_flags(&TrainOverrides::default()), TrainConfig::default(), "30,000 steps are the default");
+        let settled = TrainConfig { others_lr_final: 0.1, ..TrainConfig::default() };
+        assert_eq!(of_flags(&TrainOverrides::default()), settled, "30,000 steps are the default");
     }
 
     #[test]
-    fn the_strategy_long_axis_has_faster_rates_in_short_runs() {
+    fn the_strategy_long_axis_has_faster_rates_in_short_runs_that_settle() {
         let long =
             TrainOverrides { steps: Some(3000), strategy: Some(StrategyName::LongAxis), ..TrainOverrides::default() };
         let rates = |keys: &TrainOverrides| {
-            let TrainConfig { scales_lr, shn_lr, .. } = of_flags(keys);
-            [scales_lr, shn_lr]
+            let TrainConfig { scales_lr, quats_lr, shn_lr, others_lr_final, .. } = of_flags(keys);
+            [scales_lr, quats_lr, shn_lr, others_lr_final]
         };
-        let TrainConfig { scales_lr, shn_lr, .. } = TrainConfig::default();
-        assert_eq!(rates(&long), [3.0 * scales_lr, 3.0 * shn_lr]);
-        assert_eq!(rates(&TrainOverrides { scales_lr: Some(1e-3), ..long.clone() }), [1e-3, 3.0 * shn_lr]);
-        let same = [scales_lr, shn_lr];
+        let TrainConfig { scales_lr, quats_lr, shn_lr, others_lr_final, .. } = TrainConfig::default();
+        assert_eq!(rates(&long), [3.0 * scales_lr, 3.0 * quats_lr, 3.0 * shn_lr, 0.1]);
+        let given = TrainOverrides { scales_lr: Some(1e-3), others_lr_final: Some(0.5), ..long.clone() };
+        assert_eq!(rates(&given), [1e-3, 3.0 * quats_lr, 3.0 * shn_lr, 0.5]);
+        let same = [scales_lr, quats_lr, shn_lr, others_lr_final];
         assert_eq!(rates(&TrainOverrides { schedule: Some(Schedule::Classic), ..long.clone() }), same);
         assert_eq!(rates(&TrainOverrides { strategy: Some(StrategyName::Default), ..long }), same);
+    }
+
+    #[test]
+    fn few_photos_end_the_schedule_before_the_run() {
+        let keys = TrainOverrides { means_lr: Some(1e-4), refine_every: Some(50), ..TrainOverrides::default() };
+        let (before, mut config) = (of_flags(&keys), of_flags(&keys));
+        assert_eq!(
+            (config.suit_photos(150), config.suit_photos(usize::MAX)),
+            (None, None),
+            "200 steps a photo or fewer"
+        );
+        assert_eq!(config, before);
+        assert_eq!(config.suit_photos(28), Some(5600));
+        let short = Lengths::of_run(5600, StrategyName::LongAxis);
+        assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 5600, short.refine_stop));
+        assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
+        assert!(config.suit_photos(5).is_none() && config.check().is_ok(), "its schedule is given now");
+        for keys in [
+            TrainOverrides { schedule_steps: Some(30_000), ..keys.clone() },
+            TrainOverrides { schedule: Some(Schedule::Classic), ..keys.clone() },
+            TrainOverrides { strategy: Some(StrategyName::Default), ..keys },
+        ] {
+            let mut config = of_flags(&keys);
+            assert_eq!((config.suit_photos(28), config == of_flags(&keys)), (None, true));
+        }
     }
 
     #[test]

@@ -24,7 +24,7 @@ impl DeferredTables {
         };
         put(0, numbers.limits.len(), numbers.limits.as_flattened());
         put(2, numbers.bias.len(), numbers.bias.as_flattened());
-        put(4, numbers.means_factor.len(), &numbers.means_factor);
+        put(4, numbers.rate_factors.len(), numbers.rate_factors.as_flattened());
         put(6, numbers.decay_powers.len().saturating_sub(1), numbers.decay_powers.as_flattened());
         put(8, numbers.decays.len(), numbers.decays.as_flattened());
         let [one_minus_beta1, one_minus_beta2] = numbers.one_minus_betas;

@@ -28,16 +28,19 @@ const BIAS_STEPS: u32 = 40_000;
 /// The series is used if sqrt(v) exceeds this many eps; the omitted terms are e^3 < 1.6e-8 of the movement.
 const SERIES_FLOOR: f32 = 400.0;
 
-/// Series sums of one gap at unit base rate: T1, T2, T3, 0 for the schedule of the means, then the same for the
-/// constant one.
+/// Series sums of one gap at unit base rate: T1, T2, T3, 0 for the schedule of the means, then the same for that of the
+/// other columns.
 pub(crate) type Drift = [f32; 8];
 
-/// Tables of a run: 88 bytes per step (at least 40,000 steps), plus 0.6 MB.
+/// Bytes of the tables for each step of a run.
+pub const STEP_BYTES: u64 = 96;
+
+/// Tables of a run: [`STEP_BYTES`] per step (at least 40,000 steps), plus 0.6 MB.
 #[derive(Debug, Clone)]
 pub struct DriftTables {
     rates: Rates,
     config: AdamConfig,
-    /// `[s]`: T1, T2, T3 for the means' schedule and for the constant one.
+    /// `[s]`: T1, T2, T3 for the means' schedule and for that of the others.
     series: Vec<[f64; 6]>,
     /// `series` rounded: the movement over infinite gaps.
     limits: Vec<Drift>,
@@ -47,8 +50,8 @@ pub struct DriftTables {
     bias: Vec<[f64; 2]>,
     /// `[j]`: beta1^j, sqrt(beta2^j).
     decay_powers: Vec<[f64; 2]>,
-    /// `[step]`, 0-based: factor on the rate of the means.
-    means_factor: Vec<f64>,
+    /// `[step]`, 0-based: factors on the rate of the means and on the other rates.
+    rate_factors: Vec<[f64; 2]>,
     /// Whether values stay in place without a gradient.
     is_still: bool,
 }
@@ -65,15 +68,15 @@ impl DriftTables {
             config.beta1
         );
         let horizon = rates.steps.max(BIAS_STEPS) as usize;
-        let means_factor: Vec<f64> = (0..=rates.steps).map(|step| rates.means_factor(step)).collect();
+        let rate_factors: Vec<[f64; 2]> = (0..=rates.steps).map(|step| rates.factors(step)).collect();
         let bias = bias_table(config);
         let mut series = vec![[0.0; 6]; horizon + 1];
         // Row s needs the factors of 1-based step s + 1. Beyond the horizon they are constant: a geometric series.
         let term = |s: usize| {
             let [inv_bias1, inv_root] = bias[(s + 1).min(bias.len() - 1)];
-            let means = means_factor[s.min(means_factor.len() - 1)];
+            let factors = rate_factors[s.min(rate_factors.len() - 1)];
             let corrected = |p: usize| inv_bias1 / libm::pow(inv_root, p as f64 + 1.0);
-            std::array::from_fn::<f64, 6, _>(|i| if i < 3 { means * corrected(i) } else { corrected(i - 3) })
+            std::array::from_fn::<f64, 6, _>(|i| factors[i / 3] * corrected(i % 3))
         };
         let last = term(horizon);
         series[horizon] = std::array::from_fn(|i| last[i] * ratios[i % 3] / (1.0 - ratios[i % 3]));
@@ -87,7 +90,7 @@ impl DriftTables {
             decay_powers: powers([config.beta1, root], DIRECT_TERMS + 1),
             series,
             bias,
-            means_factor,
+            rate_factors,
             rates,
             config,
             is_still: false,
@@ -124,7 +127,7 @@ impl DriftTables {
             + self.limits.len() * 32
             + self.ratio_powers.len() * 24
             + (self.bias.len() + self.decay_powers.len()) * 16
-            + self.means_factor.len() * 8
+            + self.rate_factors.len() * 16
     }
 
     /// Series sums for the gap from a state of `stamp` steps to one of `now` steps.
@@ -136,7 +139,7 @@ impl DriftTables {
         rounded(self.sums(stamp, now))
     }
 
-    /// [`DriftTables::drift`] before rounding: T1, T2, T3 for the means' schedule and for the constant one.
+    /// [`DriftTables::drift`] before rounding: T1, T2, T3 for the means' schedule and for that of the others.
     fn sums(&self, stamp: u32, now: u32) -> [f64; 6] {
         let gap = now.saturating_sub(stamp) as usize;
         let from = (stamp as usize).min(self.series.len() - 1);
@@ -147,7 +150,7 @@ impl DriftTables {
     }
 
     /// Movement of a value from a state of `stamp` steps with moments `m` and `v` to one of `now` steps, at unit base
-    /// rate, on the schedule of the means or the constant one. Computes in f64 what `drifted` and `direct_sum` compute
+    /// rate, on the schedule of the means or that of the others. Computes in f64 what `drifted` and `direct_sum` compute
     /// in f32: the oracle of the formula, unused in training.
     pub fn movement(&self, [m, v]: [f64; 2], stamp: u32, now: u32, of_means: bool) -> f64 {
         let root = v.sqrt();
@@ -173,9 +176,9 @@ impl DriftTables {
         &self.bias[..(steps as usize).saturating_add(DIRECT_TERMS + 1).min(self.bias.len())]
     }
 
-    /// `[step]`, 0-based: factors on the rate of the means; the last holds from there on.
-    pub(super) fn means_factors(&self) -> &[f64] {
-        &self.means_factor
+    /// `[step]`, 0-based: factors on the rate of the means and on the others; the last pair holds from there on.
+    pub(super) fn rate_factors(&self) -> &[[f64; 2]] {
+        &self.rate_factors
     }
 
     /// `[j]`: beta1^j, sqrt(beta2^j), for the terms of the direct sum.
@@ -205,7 +208,8 @@ impl DriftTables {
         for j in 1..=terms {
             let t = (stamp as usize).saturating_add(j);
             let [inv_bias1, inv_root] = self.bias[t.min(self.bias.len() - 1)];
-            let rate = if of_means { self.means_factor[(t - 1).min(self.means_factor.len() - 1)] } else { 1.0 };
+            let [means, others] = self.rate_factors[(t - 1).min(self.rate_factors.len() - 1)];
+            let rate = if of_means { means } else { others };
             let [decay1, decay2] = self.decay_powers[j];
             sums[j % LANES] += rate * inv_bias1 * decay1 * m / (root * decay2 * inv_root + eps);
         }
@@ -295,7 +299,8 @@ mod tests {
         let mut moved = 0.0;
         for t in stamp + 1..=now {
             let (j, tf) = (f64::from(t - stamp), f64::from(t));
-            let rate = if of_means { tables.rates.means_factor(t - 1) } else { 1.0 };
+            let [means, others] = tables.rates.factors(t - 1);
+            let rate = if of_means { means } else { others };
             let root = (v * beta2.powf(j)).sqrt() / (1.0 - beta2.powf(tf)).sqrt();
             moved += rate * m * beta1.powf(j) / ((1.0 - beta1.powf(tf)) * (root + eps));
         }
@@ -304,8 +309,9 @@ mod tests {
 
     #[test]
     fn series_and_direct_sum_agree_with_the_definition() {
-        for eps in [1e-15, 1e-8] {
-            let tables = DriftTables::new(Rates::new(1.0, 5000), AdamConfig { eps, ..AdamConfig::default() });
+        for (eps, others_final_factor) in [(1e-15, 1.0), (1e-8, 1.0), (1e-15, 0.1), (1e-8, 0.01)] {
+            let rates = Rates { others_final_factor, ..Rates::new(1.0, 5000) };
+            let tables = DriftTables::new(rates, AdamConfig { eps, ..AdamConfig::default() });
             let floor = EpsFloor::new(eps);
             for stamp in [0, 1, 7, 300, 4990, 5000, 60_000] {
                 for gap in [0, 1, 2, 15, 199, 200, 201, 399, 400, 401, 3000] {

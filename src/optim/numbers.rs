@@ -26,7 +26,7 @@ impl DeferredAdam {
         Some(RunNumbers {
             limits: (0..=steps).map(|stamp| *tables.limit(stamp)).collect(),
             bias: tables.bias_until(steps).iter().map(|pair| pair.map(|x| x as f32)).collect(),
-            means_factor: tables.means_factors().iter().map(|&x| x as f32).collect(),
+            rate_factors: tables.rate_factors().iter().map(|pair| pair.map(|x| x as f32)).collect(),
             decay_powers: tables.decay_powers().iter().map(|pair| pair.map(|x| x as f32)).collect(),
             decays: decays.map(|decay| [decay.first, decay.kept, decay.lost]).collect(),
             eps: floor.eps,

@@ -1,10 +1,18 @@
 //! Learning rates: a pure function of column and step.
 //!
 //! Invariants: 1. steps are 0-based; 2. the rate of the means falls exponentially from `means` at step 0 to `means *
-//! means_final_factor` at step `steps` and stays there; the others are constant; 3. a rate depends on nothing else, so
-//! a resumed run has the same rates.
+//! means_final_factor` at step `steps` and stays there; 3. the other rates are constant over the first nine tenths of
+//! `steps`, fall exponentially to `others_final_factor` times their base over the last tenth, and stay there; 4. a rate
+//! depends on nothing else, so a resumed run has the same rates.
+//!
+//! Why the others fall at the end: under Adam a value whose gradients have changing signs keeps moving by its rate, so a
+//! constant rate leaves noise of that size in every value. A fall over more than the last tenth costs more movement than
+//! the noise is worth (`benches/RESULTS.md`, "Rates that settle").
 
 use crate::scene::columns::Column;
+
+/// Share of the steps after which the rates of all columns but the means fall.
+const SETTLES_FROM: f64 = 0.9;
 
 /// Rates of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -23,7 +31,9 @@ pub struct Rates {
     pub sh_n: f64,
     /// Fraction of the means' rate that remains at the end of the schedule.
     pub means_final_factor: f64,
-    /// Steps over which the rate of the means falls.
+    /// Fraction of the other rates that remains at the end of the schedule; 1 = they are constant.
+    pub others_final_factor: f64,
+    /// Steps of the schedule.
     pub steps: u32,
 }
 
@@ -38,6 +48,7 @@ impl Rates {
             sh0: 2.5e-3,
             sh_n: 2.5e-3 / 20.0,
             means_final_factor: 0.01,
+            others_final_factor: 1.0,
             steps,
         }
     }
@@ -62,11 +73,30 @@ impl Rates {
         libm::pow(self.means_final_factor, f64::from(step) / f64::from(self.steps))
     }
 
+    /// Factor on the other rates at a step: 1 up to [`SETTLES_FROM`] of the steps, from there on `others_final_factor` to the
+    /// power of the share of the rest that has passed.
+    pub fn others_factor(&self, step: u32) -> f64 {
+        let settles_from = SETTLES_FROM * f64::from(self.steps);
+        if step >= self.steps {
+            return self.others_final_factor;
+        }
+        if f64::from(step) <= settles_from {
+            return 1.0;
+        }
+        let passed = (f64::from(step) - settles_from) / (f64::from(self.steps) - settles_from);
+        libm::pow(self.others_final_factor, passed)
+    }
+
+    /// Factors at a step: on the rate of the means, and on the others.
+    pub fn factors(&self, step: u32) -> [f64; 2] {
+        [self.means_factor(step), self.others_factor(step)]
+    }
+
     /// Rate of a column at a step.
     pub fn at(&self, column: Column, step: u32) -> f64 {
         match column {
             Column::Means => self.means * self.means_factor(step),
-            _ => self.base(column),
+            _ => self.base(column) * self.others_factor(step),
         }
     }
 }
@@ -76,7 +106,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn only_the_means_decay() {
+    fn the_other_rates_fall_over_the_last_tenth() {
+        let rates = Rates { others_final_factor: 0.1, ..Rates::new(2.0, 1000) };
+        let of_steps = |column| [0, 900, 950, 1000, 5000].map(|step| rates.at(column, step) / rates.base(column));
+        for column in Column::ALL.into_iter().filter(|&c| c != Column::Means) {
+            for (got, want) in of_steps(column).into_iter().zip([1.0, 1.0, 0.1f64.sqrt(), 0.1, 0.1]) {
+                // A few roundings of pow.
+                assert!((got / want - 1.0).abs() < 1e-12, "{column:?}: {got}");
+            }
+        }
+        assert_eq!(rates.at(Column::Means, 950), Rates::new(2.0, 1000).at(Column::Means, 950));
+        assert_eq!(Rates { steps: 0, ..rates }.at(Column::Sh0, 0), 0.1 * rates.sh0);
+    }
+
+    #[test]
+    fn only_the_means_decay_without_a_factor_of_the_others() {
         let rates = Rates::new(2.0, 1000);
         assert_eq!(rates.at(Column::Means, 0), 3.2e-4);
         // Half way in the exponent: a tenth. The slack allows for a few roundings of pow.

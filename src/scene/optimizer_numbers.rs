@@ -5,7 +5,8 @@
 
 use super::columns::Column;
 
-/// Series sums of one gap at unit base rate: three for the schedule of the means, 0, then the same for the constant one.
+/// Series sums of one gap at unit base rate: three for the schedule of the means, 0, then the same for that
+/// of the other columns.
 pub type SeriesSums = [f32; 8];
 
 /// Numbers of a run.
@@ -15,8 +16,8 @@ pub struct RunNumbers {
     pub limits: Vec<SeriesSums>,
     /// `[t]`, t from 1: 1 / (1 - beta1^t), 1 / sqrt(1 - beta2^t); beyond the end as the last.
     pub bias: Vec<[f32; 2]>,
-    /// `[step]`, 0-based: factor on the rate of the means; beyond the end as the last.
-    pub means_factor: Vec<f32>,
+    /// `[step]`, 0-based: factors on the rate of the means and on the other rates; beyond the end as the last.
+    pub rate_factors: Vec<[f32; 2]>,
     /// `[j]`: beta1^j, sqrt(beta2^j). Its length less one is the number of terms of the direct sum.
     pub decay_powers: Vec<[f32; 2]>,
     /// `[k]`: decay of the moments over k steps: factor of the first, factor of the second, share that the second loses.

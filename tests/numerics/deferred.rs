@@ -61,8 +61,8 @@ fn touched_rows(rows: usize, step: u32) -> Vec<u32> {
 #[test]
 fn values_follow_dense_adam_in_f64() {
     let rows = 10;
-    for decay in [1.0, 0.01] {
-        let rates = Rates { means_final_factor: decay, ..Rates::new(3.0, STEPS) };
+    for (means_final_factor, others_final_factor) in [(1.0, 1.0), (0.01, 0.1)] {
+        let rates = Rates { means_final_factor, others_final_factor, ..Rates::new(3.0, STEPS) };
         let adam = DeferredAdam::new(rates, AdamConfig::default(), SimdPath::best());
         let start = random_columns(rows, 0, 1.0, 1);
         let mut state = SceneState::from_columns(start.clone());

@@ -61,7 +61,8 @@ struct Dense {
 impl Dense {
     /// Before the first of `steps` steps, and the rows as a page has them.
     fn new(eps: f64, steps: u32) -> (Dense, Vec<u64>, PageLayout) {
-        let (rates, config) = (Rates::new(1.0, steps), AdamConfig { eps, ..AdamConfig::default() });
+        let rates = Rates { others_final_factor: 0.1, ..Rates::new(1.0, steps) };
+        let config = AdamConfig { eps, ..AdamConfig::default() };
         let adam = DeferredAdam::new(rates, config, SimdPath::best());
         let mut state = SceneState::from_columns(Columns::zeros(ROWS, 0));
         let mut draws = Stream::new(9, Purpose::Test, 0, 0);

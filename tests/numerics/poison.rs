@@ -285,6 +285,7 @@ fn rows_do_not_move_into_the_past_nor_without_end() {
     let rates = Rates {
         means: 1e-2,
         means_final_factor: 0.01,
+        others_final_factor: 0.1,
         scales: 5e-3,
         quats: 1e-3,
         opacities: 5e-2,

@@ -54,6 +54,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     check_folders(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
+    let request = &suit_photos(request, &start);
+    let config = &request.config;
     let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         check_first_drive(config, start.rows)?;
@@ -69,6 +71,18 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let run = RunId::draw();
     let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
     plan_and_train(request, &dataset, tiers, trainer, begun)
+}
+
+/// The request, with a schedule that suits the number of training photos.
+fn suit_photos(request: &RunRequest, start: &Start) -> RunRequest {
+    let mut request = request.clone();
+    let photos = start.dataset.train_views().len();
+    if let Some(steps) = request.config.suit_photos(photos).filter(|_| !request.quiet) {
+        crate::say!(
+            "photos  {photos} to train on: the rates fall until step {steps}, and stay low (see --schedule-steps)"
+        );
+    }
+    request
 }
 
 /// Refuses folders in which the run may not begin, before anything else is read. Changes nothing, so dry runs refuse what runs refuse.
@@ -190,6 +204,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     };
     let host_mem = host_budget(&request.config);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
+    let request = suit_photos(&request, &start);
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }

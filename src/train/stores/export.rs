@@ -16,6 +16,7 @@ use crate::densify::stats::GradHistogram;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::LEVELS_MAX;
+use crate::optim::drift::STEP_BYTES;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
@@ -158,8 +159,7 @@ pub(super) fn scene_at(
 ) -> Result<PagedScene, TrainError> {
     let pages = store.pages_at(generation)?;
     let frame = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
-    // 88 bytes of tables for each step of the schedule.
-    let tables = 88 * u64::from(options.rates.steps);
+    let tables = STEP_BYTES * u64::from(options.rates.steps);
     let fixed = FIXED_BYTES + others + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
     let frames = (host_mem / share).saturating_sub(fixed) / (frame * COPIES);
     if frames == 0 {

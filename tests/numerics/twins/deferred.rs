@@ -58,7 +58,8 @@ impl TableWords<'_> {
             let t = stamp as usize + left;
             let [inv_bias1, inv_root] = self.entry(2, t);
             let [decay1, decay2] = [0, 1].map(|k| self.float(decay_powers + 2 * left + k));
-            let [rate] = if of_means { self.entry(4, t - 1) } else { [1.0] };
+            let [means, others] = self.entry(4, t - 1);
+            let rate = if of_means { means } else { others };
             sum += rate * inv_bias1 * decay1 * m / (root * decay2 * inv_root + self.eps());
         }
         sum
