@@ -76,12 +76,16 @@
 //!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
-//! **A loss term** is a kind of [`photos`] without values of its own:
+//! **A loss term** is a kind of [`photos`] that learns nothing, also where the term does not look at the photo:
 //! 1. A file in `photos/`: a [`photos::parameter::PhotoParameter`] whose `adds_loss` and `needs_picture` are true. `target` gets the corrected picture
-//!    and the photo that the loss compares, keeps the term's value and gradient, and returns the photo; `loss` gives the value;
-//!    `picture_back` adds the gradient; `buffer_bytes` counts the memory. Masked pixels do not count.
+//!    and the photo that the loss compares, computes value and gradient, keeps both, and returns the photo. `loss` gives the value,
+//!    `picture_back` adds the gradient, `begin_step` forgets both, because a step may show no picture. `buffer_bytes` counts the memory,
+//!    `free_buffers` frees it. Masked pixels do not count, nor does a term of several pixels with one of them. Sums have a fixed order,
+//!    for the same bits on any number of threads. `save` gives `Encoded::of(&())`. The test of `train/step/comparison.rs` has
+//!    a small example. `first` returns `None` where the weight is 0, so that nothing changes.
 //! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `config/check.rs` for its range.
+//! 3. The key, as above: `config/file.rs` (with `before "0.0"` behind its class, so that runs of older programs resume), `photo_options`
+//!    in `config/limits.rs`, `config/check.rs` for its range. `CHANGELOG.md` names it.
 //! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
 //!    shaders. A run with such a kind records no steps ahead on a device: recorded steps compute the built-in
 //!    loss alone.

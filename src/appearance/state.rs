@@ -148,9 +148,28 @@ impl AppearanceState {
 
     /// Moves the values of a view's photo and camera towards what a step has found.
     pub fn learn(&mut self, mode: AppearanceMode, (view, group): (usize, usize), found: &Found) {
+        let Some(image) = self.images.get(view) else { return };
+        self.move_image(mode, view, found, gain(image.sightings, IMAGE_GAIN_LEAST));
+        if let (Some(falloff), Some(camera)) = (&found.falloff, self.cameras.get_mut(group)) {
+            let weight = gain(camera.sightings, CAMERA_GAIN_LEAST);
+            for (values, found) in camera.falloff.iter_mut().zip(falloff) {
+                let next = std::array::from_fn(|k| values[k] + weight * (found[k] - values[k]));
+                *values = bounded_channel(next).unwrap_or(*values);
+            }
+            camera.sightings = camera.sightings.saturating_add(1);
+        }
+    }
+
+    /// Gives a photo what a step has found for it, whatever it had before. For photos that are left out: the next look must not judge
+    /// them by a value from a rougher scene. The camera learns nothing from them.
+    pub fn follow(&mut self, mode: AppearanceMode, view: usize, found: &Found) {
+        self.move_image(mode, view, found, 1.0);
+    }
+
+    /// Moves the values of a photo by this share of the way to what was found.
+    fn move_image(&mut self, mode: AppearanceMode, view: usize, found: &Found, weight: f64) {
         let (acting, mean) = (self.acting(view, mode.image_values()), self.mean());
         let Some(image) = self.images.get_mut(view) else { return };
-        let weight = gain(image.sightings, IMAGE_GAIN_LEAST);
         let is_new = image.sightings == 0;
         for k in 0..mode.image_values() {
             let next = acting[k] + weight * (found.image[k] - acting[k]);
@@ -160,14 +179,6 @@ impl AppearanceState {
         }
         image.sightings = image.sightings.saturating_add(1);
         self.seen += u32::from(is_new);
-        if let (Some(falloff), Some(camera)) = (&found.falloff, self.cameras.get_mut(group)) {
-            let weight = gain(camera.sightings, CAMERA_GAIN_LEAST);
-            for (values, found) in camera.falloff.iter_mut().zip(falloff) {
-                let next = std::array::from_fn(|k| values[k] + weight * (found[k] - values[k]));
-                *values = bounded_channel(next).unwrap_or(*values);
-            }
-            camera.sightings = camera.sightings.saturating_add(1);
-        }
     }
 
     /// Checks values from a file.
@@ -234,6 +245,20 @@ mod tests {
         let before = state.clone();
         state.begin_with([(0, -2.0)]);
         assert_eq!(state, before);
+    }
+
+    #[test]
+    fn a_photo_that_is_left_out_has_what_was_found_last_and_teaches_its_camera_nothing() {
+        let mode = AppearanceMode::Full;
+        let mut state = AppearanceState::new(&[0, 0]);
+        state.learn(mode, (0, 0), &found(0.0));
+        for exposure in [-2.0, -2.0, 0.5] {
+            state.follow(mode, 1, &Found { falloff: Some([[0.1; CHANNEL_VALUES]; 3]), ..found(exposure) });
+        }
+        // What is found counts from the mean before: -2, then -1 - 2, then -1.5 + .5. An average of the three would lie at -1.9.
+        let far = state.acting(1, 1)[0] - state.acting(0, 1)[0];
+        assert_eq!((state.check(), state.cameras[0].sightings, state.images[1].sightings), (Ok(()), 0, 3));
+        assert!((far - -1.0).abs() < 1e-6, "{far}");
     }
 
     #[test]

@@ -112,7 +112,7 @@ config_keys! {
         /// Total number of steps; --resume can raise it (see --keep-checkpoint)
         [value_parser = parse_count32] steps: u32 = 30_000 => Length;
         /// Steps over which learning rates decay; they are constant afterwards. 0 = --steps, and with --strategy long-axis and
-        /// --schedule run-length at most 200 for each training photo. A resumed run keeps its first value
+        /// --schedule run-length at most 150 for each training photo. A resumed run keeps its first value
         [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
         /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
         /// also of --scales-lr, --quats-lr, --shn-lr and --others-lr-final, where they are not given: run-length (by --steps;

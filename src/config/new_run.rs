@@ -30,9 +30,11 @@ const RATE_KEYS: [LengthKey<f64>; 5] = [
     ("shn_lr", |config| &mut config.shn_lr, |lengths| lengths.shn_lr),
     ("others_lr_final", |config| &mut config.others_lr_final, |lengths| lengths.others_lr_final),
 ];
-/// Most steps of a schedule for each training photo. Held-out photos of a small scene are best after some 200 steps a photo
+/// Most steps of a schedule for each training photo. Held-out photos of a small scene are best after 100 to 200 steps a photo
 /// (`benches/RESULTS.md`, "Long runs on a small scene").
-const PHOTO_STEPS_MOST: u64 = 200;
+const PHOTO_STEPS_MOST: u64 = 150;
+/// The value of `others-lr-final` where a schedule ends before the run: the steps behind it shall hardly move anything.
+const STILL: f64 = 0.01;
 
 /// With `poor-points`: the factor of the learning rate of positions. Points that lie at a wrong place have a long way to go.
 const POOR_MEANS_LR: f64 = 20.0 / 3.0;
@@ -98,7 +100,8 @@ impl TrainConfig {
         }
         let followers = self.keys_with(&Lengths::of_run(self.steps, self.strategy));
         self.schedule_steps = steps as u32;
-        self.set_lengths(&Lengths::of_run(self.schedule_steps, self.strategy), |field| followers.contains(field));
+        let of_schedule = Lengths { others_lr_final: STILL, ..Lengths::of_run(self.schedule_steps, self.strategy) };
+        self.set_lengths(&of_schedule, |field| followers.contains(field));
         Some(self.schedule_steps)
     }
 
@@ -162,15 +165,16 @@ mod tests {
         let keys = TrainOverrides { means_lr: Some(1e-4), refine_every: Some(50), ..TrainOverrides::default() };
         let (before, mut config) = (of_flags(&keys), of_flags(&keys));
         assert_eq!(
-            (config.suit_photos(150), config.suit_photos(usize::MAX)),
+            (config.suit_photos(200), config.suit_photos(usize::MAX)),
             (None, None),
-            "200 steps a photo or fewer"
+            "150 steps a photo or fewer"
         );
         assert_eq!(config, before);
-        assert_eq!(config.suit_photos(28), Some(5600));
-        let short = Lengths::of_run(5600, StrategyName::LongAxis);
-        assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 5600, short.refine_stop));
+        assert_eq!(config.suit_photos(28), Some(4200));
+        let short = Lengths::of_run(4200, StrategyName::LongAxis);
+        assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
+        assert_eq!(config.others_lr_final, 0.01);
         assert!(config.suit_photos(5).is_none() && config.check().is_ok(), "its schedule is given now");
         for keys in [
             TrainOverrides { schedule_steps: Some(30_000), ..keys.clone() },

@@ -41,7 +41,6 @@ struct Appearance {
     first_exposures: u32,
     /// The correction of the step, and whether the step only measures its loss.
     look: Look,
-    is_left_out: bool,
     /// The picture of the step as it was drawn, `[3][height][width]`.
     drawn: Vec<f32>,
     /// The values that fit the photo best under the last picture.
@@ -57,7 +56,6 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
             camera_groups,
             first_exposures: 0,
             look: Look::default(),
-            is_left_out: false,
             drawn: Vec::new(),
             found: None,
         })
@@ -142,15 +140,13 @@ impl PhotoParameter for Appearance {
     fn begin_step(&mut self, step: &PhotoStep<'_>) {
         let of_view = (step.view, self.camera_groups.get(step.view).copied().unwrap_or_default());
         self.look = self.state.look(self.mode, of_view, step.camera);
-        (self.is_left_out, self.found) = (step.is_left_out, None);
+        self.found = None;
     }
 
     fn correct(&mut self, picture: &mut [f32], photo: &Target) {
         self.drawn.clear();
         self.drawn.extend_from_slice(picture);
-        if !self.is_left_out {
-            self.found = find(&Pair { drawn: &self.drawn, photo }, &self.look, self.mode);
-        }
+        self.found = find(&Pair { drawn: &self.drawn, photo }, &self.look, self.mode);
         self.look.correct(picture, photo.width as usize, Some(photo));
     }
 
@@ -158,10 +154,14 @@ impl PhotoParameter for Appearance {
         self.look.back(&self.drawn, photo, v_rgb);
     }
 
+    /// A photo that is left out is fitted too: a wrong exposure, from a first look at a rough scene, must not keep a right photo out.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        let group = self.camera_groups.get(outcome.view);
-        if let (Some(found), false, Some(&group)) = (self.found.take(), outcome.is_skipped, group) {
-            self.state.learn(self.mode, (outcome.view, group), &found);
+        let found = self.found.take().filter(|_| !outcome.is_skipped);
+        if let (Some(found), Some(&group)) = (found, self.camera_groups.get(outcome.view)) {
+            match outcome.is_left_out {
+                true => self.state.follow(self.mode, outcome.view, &found),
+                false => self.state.learn(self.mode, (outcome.view, group), &found),
+            }
         }
         Vec::new()
     }

@@ -109,7 +109,7 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        if let (Some(found), false) = (self.found.take(), outcome.is_skipped) {
+        if let (Some(found), true) = (self.found.take(), outcome.has_trained()) {
             self.state.learn(outcome.view, found);
         }
         Vec::new()

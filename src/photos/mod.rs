@@ -46,7 +46,7 @@ pub struct PhotoOptions {
     pub scene_scale: f32,
 }
 
-/// All kinds, in the order of their sections in the report.
+/// All kinds, in the order in which they correct a picture, and of their sections in the report. Gradients pass them in the opposite order.
 pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outlier_views::KIND, masked_blocks::KIND];
 
 /// The parameters of a run.

@@ -72,14 +72,23 @@ pub struct PhotoOutcome<'a> {
     pub view: usize,
     /// The step, from 0.
     pub step: u32,
-    /// The step has changed nothing: it was skipped, or its view was left out.
+    /// The step was skipped: its picture may not be sound.
     pub is_skipped: bool,
+    /// The view was left out: its picture was compared with the photo, and nothing else was done with it.
+    pub is_left_out: bool,
     /// Mean squared error of the picture.
     pub mse: f64,
     /// The photo.
     pub photo: &'a Target,
     /// The dataset, for names.
     pub dataset: &'a Dataset,
+}
+
+impl PhotoOutcome<'_> {
+    /// Whether the step has changed the scene.
+    pub fn has_trained(&self) -> bool {
+        !self.is_skipped && !self.is_left_out
+    }
 }
 
 /// The parameters of one kind: their values for all photos, and their buffers for a step.

@@ -78,7 +78,7 @@ impl PhotoParameter for Poses {
     }
 
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        if let (Some(sum), false) = (self.sum.take(), outcome.is_skipped) {
+        if let (Some(sum), true) = (self.sum.take(), outcome.has_trained()) {
             let rate = rate_at(outcome.step, self.steps, self.train_views);
             self.state.learn(outcome.view, &sum.gradient(), self.scene_scale, rate);
         }

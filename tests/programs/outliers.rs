@@ -203,3 +203,23 @@ fn pages_on_a_device_give_the_same_bytes_without_wrong_views() {
     assert!(!named(&all).is_empty(), "no view was left out, so the test shows nothing");
     assert!(ply(&all) == ply(&few), "fewer slots give other bytes");
 }
+
+/// The first exposures are fitted to a rough scene. They keep no right photo out, because photos that are left out are fitted too.
+#[test]
+fn exposures_of_the_first_looks_leave_no_right_view_out() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 32, 160, 112, 3000);
+    let steps = ["--steps", "600", "--schedule", "run-length", "--max-gaussians", "8000", "--device", "cpu"];
+    for disturbance in [Disturbance::Nothing, SWAPPED] {
+        let of = disturbed(&scene, &folder.path().join("scene"), &disturbance);
+        let out = folder.path().join("out");
+        run(&of, &out, &[&steps[..], &["--robust-views", "--appearance", "exposure", "--overwrite"]].concat());
+        assert_eq!(sorted(named(&out)), sorted(of.wrong), "{}", disturbance.name());
+        std::fs::remove_dir_all(of.scene).unwrap();
+    }
+}
+
+fn sorted(mut names: Vec<String>) -> Vec<String> {
+    names.sort();
+    names
+}

@@ -1,7 +1,7 @@
 //! Whole runs through the real binaries: the same bits for any number of threads, the same quality far from the origin,
 //! the same metrics from the PLY alone, and an early stop that loses nothing.
 
-use crate::support::scenes::{TextModel, city, eval, psnr, stderr, summary, text, train};
+use crate::support::scenes::{TextModel, city, eval, psnr, stderr, summary, text, told, train};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
@@ -41,6 +41,27 @@ fn one_and_two_threads_give_the_same_bytes() {
     assert!(files[1] == files[2], "two runs of the same command differ");
     let gaussians = summary(&folder.path().join("run0"))["gaussians"].as_u64().unwrap();
     assert_ne!(gaussians, 1500, "no densification round changed anything, so the test shows little");
+}
+
+/// With few photos the schedule ends before the run, and a resumed run keeps it.
+#[test]
+fn the_schedule_of_few_photos_ends_before_the_run() {
+    let folder = TempDir::new().unwrap();
+    let (scene, out) = (city(folder.path(), 4, 48, 32, 200), folder.path().join("run"));
+    let flags = ["--out", text(&out), "--device", "cpu", "--test-every", "0", "--keep-checkpoint"];
+    let said = told(&train(&[&[text(&scene), "--steps", "700"], &flags[..]].concat()));
+    assert!(said.contains("4 to train on") && said.contains("until step 600"), "{said}");
+    let key = |name: &str| {
+        let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+        config.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(" = ").map(str::to_string)).unwrap()
+    };
+    // A fifth of the schedule's 600 steps is without rounds, not of the run's 700.
+    let wanted =
+        |steps: &str| assert_eq!([key("steps"), key("schedule-steps"), key("refine-stop")], [steps, "600", "480"]);
+    wanted("700");
+    let resumed = train(&["--resume", text(&out), "--steps", "750", "--quiet"]);
+    assert!(resumed.status.success(), "{}", stderr(&resumed));
+    wanted("750");
 }
 
 #[test]

@@ -30,8 +30,9 @@ impl Trainer {
 
     /// Lets the parameters learn from the current step, which was taken or skipped.
     pub(super) fn end_step_of_photo(&mut self, view: usize, done: &StepOutcome, photo: &Target, dataset: &Dataset) {
-        let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some() || done.is_left_out, done.loss.mse);
-        let outcome = PhotoOutcome { view, step, is_skipped, mse, photo, dataset };
+        let StepOutcome { is_left_out, ref loss, .. } = *done;
+        let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some(), loss.mse);
+        let outcome = PhotoOutcome { view, step, is_skipped, is_left_out, mse, photo, dataset };
         let warnings = self.photos.iter_mut().flat_map(|parameter| parameter.end_step(&outcome));
         warnings.for_each(|warning| eprintln!("warning: {warning}"));
     }
