@@ -214,7 +214,7 @@ fn exposures_of_the_first_looks_leave_no_right_view_out() {
         let of = disturbed(&scene, &folder.path().join("scene"), &disturbance);
         let out = folder.path().join("out");
         run(&of, &out, &[&steps[..], &["--robust-views", "--appearance", "exposure", "--overwrite"]].concat());
-        assert_eq!(sorted(named(&out)), sorted(of.wrong), "{}", disturbance.name());
+        assert_eq!(sorted(named(&out)), sorted(of.wrong), "{disturbance:?}");
         std::fs::remove_dir_all(of.scene).unwrap();
     }
 }
