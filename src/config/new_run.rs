@@ -88,7 +88,7 @@ impl TrainConfig {
         self.set_lengths(&lengths, |field| !given.contains(field));
     }
 
-    /// Ends the schedule of a run with the strategy `long-axis` after [`PHOTO_STEPS_MOST`] steps for each of its training photos,
+    /// Ends the schedule of a run with the strategy `long-axis` after 150 steps for each of its training photos,
     /// unless `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos.
     /// Keys that have the values of the run's length get those of the schedule's. Returns the steps of the schedule if it ends
     /// before the run.

@@ -73,7 +73,7 @@ impl Rates {
         libm::pow(self.means_final_factor, f64::from(step) / f64::from(self.steps))
     }
 
-    /// Factor on the other rates at a step: 1 up to [`SETTLES_FROM`] of the steps, from there on `others_final_factor` to the
+    /// Factor on the other rates at a step: 1 over nine tenths of the steps, from there on `others_final_factor` to the
     /// power of the share of the rest that has passed.
     pub fn others_factor(&self, step: u32) -> f64 {
         let settles_from = SETTLES_FROM * f64::from(self.steps);
