@@ -49,6 +49,7 @@ fn the_schedule_of_few_photos_ends_before_the_run() {
     let folder = TempDir::new().unwrap();
     let (scene, out) = (city(folder.path(), 4, 48, 32, 200), folder.path().join("run"));
     let flags = ["--out", text(&out), "--device", "cpu", "--test-every", "0", "--keep-checkpoint"];
+    let flags = [&flags[..], &["--schedule", "run-length", "--strategy", "long-axis"]].concat();
     let said = told(&train(&[&[text(&scene), "--steps", "700"], &flags[..]].concat()));
     assert!(said.contains("4 to train on") && said.contains("until step 600"), "{said}");
     let key = |name: &str| {
