@@ -160,9 +160,9 @@ impl AppearanceState {
         }
     }
 
-    /// Gives a photo what a step has found for it, whatever it had before. For photos that are left out: the next look must not judge
-    /// them by a value from a rougher scene. The camera learns nothing from them.
-    pub fn follow(&mut self, mode: AppearanceMode, view: usize, found: &Found) {
+    /// Gives a photo the values that a step has found, in place of those it had. For photos that are left out: the next look must
+    /// not judge them by values from a rougher scene. The camera learns nothing.
+    pub fn replace(&mut self, mode: AppearanceMode, view: usize, found: &Found) {
         self.move_image(mode, view, found, 1.0);
     }
 
@@ -253,7 +253,7 @@ mod tests {
         let mut state = AppearanceState::new(&[0, 0]);
         state.learn(mode, (0, 0), &found(0.0));
         for exposure in [-2.0, -2.0, 0.5] {
-            state.follow(mode, 1, &Found { falloff: Some([[0.1; CHANNEL_VALUES]; 3]), ..found(exposure) });
+            state.replace(mode, 1, &Found { falloff: Some([[0.1; CHANNEL_VALUES]; 3]), ..found(exposure) });
         }
         // What is found counts from the mean before: -2, then -1 - 2, then -1.5 + .5. An average of the three would lie at -1.9.
         let far = state.acting(1, 1)[0] - state.acting(0, 1)[0];

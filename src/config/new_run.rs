@@ -1,8 +1,9 @@
 //! The config of a new run. Flags override the config file, which overrides the defaults. The length of the run sets some
 //! of the keys that neither gives ([`super::schedule`]), and `poor-points` some more.
 //!
-//! Invariants: 1. a given key is never changed, unless it has the value that the length of the run gives; 2. the result is written to the config of the run as if every key had
-//! been given, so a resumed run keeps its values whatever its new length.
+//! Invariants: 1. a given key is never changed, unless photos are few and it has the value that the length of the run gives; 2. the
+//! result is written to the config of the run as if every key had been given, so a resumed run keeps its values whatever its new
+//! length.
 
 use super::file::{TrainConfig, TrainOverrides};
 use super::schedule::{Lengths, Schedule};
@@ -88,21 +89,41 @@ impl TrainConfig {
         self.set_lengths(&lengths, |field| !given.contains(field));
     }
 
-    /// Ends the schedule of a run with the strategy `long-axis` after 150 steps for each of its training photos,
-    /// unless `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos.
-    /// Keys that have the values of the run's length get those of the schedule's. Returns the steps of the schedule if it ends
-    /// before the run.
+    /// Ends the schedule of a run with the strategy `long-axis` after 150 steps for each of its training photos, unless
+    /// `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos. A key
+    /// that has its value by the length of the run gets the one by the length of the schedule. Returns the steps of the schedule
+    /// if it ends before the run.
     pub fn suit_photos(&mut self, photos: usize) -> Option<u32> {
         let steps = (photos as u64).saturating_mul(PHOTO_STEPS_MOST).max(1);
         let follows_length = self.schedule == Schedule::RunLength && self.strategy == StrategyName::LongAxis;
         if !follows_length || self.schedule_steps != 0 || steps >= u64::from(self.steps) {
             return None;
         }
-        let followers = self.keys_with(&Lengths::of_run(self.steps, self.strategy));
         self.schedule_steps = steps as u32;
-        let of_schedule = Lengths { others_lr_final: STILL, ..Lengths::of_run(self.schedule_steps, self.strategy) };
-        self.set_lengths(&of_schedule, |field| followers.contains(field));
+        let mut of_run = self.of_length(self.steps);
+        let mut of_schedule = TrainConfig { others_lr_final: STILL, ..self.of_length(self.schedule_steps) };
+        self.exchange(&STEP_KEYS, &mut of_run, &mut of_schedule);
+        self.exchange(&RATE_KEYS, &mut of_run, &mut of_schedule);
         Some(self.schedule_steps)
+    }
+
+    /// Gives the keys that have their values as in `old` those of `new`.
+    fn exchange<T: PartialEq + Copy>(&mut self, keys: &[LengthKey<T>], old: &mut TrainConfig, new: &mut TrainConfig) {
+        for (_, place, _) in keys {
+            if *place(self) == *place(old) {
+                *place(self) = *place(new);
+            }
+        }
+    }
+
+    /// A config of this strategy and this many steps in which no key of the schedule is given.
+    fn of_length(&self, steps: u32) -> TrainConfig {
+        let mut config = TrainConfig { steps, ..self.clone() };
+        config.follow_length(&BTreeSet::new());
+        if config.poor_points {
+            config.suit_poor_points(|_| true);
+        }
+        config
     }
 
     /// Sets the keys of the schedule whose fields are open.
@@ -113,14 +134,6 @@ impl TrainConfig {
         for (_, place, value) in RATE_KEYS.iter().filter(|(field, ..)| is_open(field)) {
             *place(self) = value(lengths);
         }
-    }
-
-    /// The fields of the keys that have these values.
-    fn keys_with(&mut self, lengths: &Lengths) -> BTreeSet<&'static str> {
-        let steps = STEP_KEYS.iter().filter(|(_, place, value)| *place(self) == value(lengths)).map(|key| key.0);
-        let mut fields: BTreeSet<_> = steps.collect();
-        fields.extend(RATE_KEYS.iter().filter(|(_, place, value)| *place(self) == value(lengths)).map(|key| key.0));
-        fields
     }
 }
 
@@ -175,6 +188,11 @@ mod tests {
         assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
         assert_eq!(config.others_lr_final, 0.01);
+        // Few photos and poor points: both factors of the rate of positions hold.
+        let poor = TrainOverrides { poor_points: Some(true), ..TrainOverrides::default() };
+        let mut of_both = of_flags(&poor);
+        assert_eq!(of_both.suit_photos(28), Some(4200));
+        assert!((of_both.means_lr / (short.means_lr * POOR_MEANS_LR) - 1.0).abs() < 1e-12, "{}", of_both.means_lr);
         assert!(config.suit_photos(5).is_none() && config.check().is_ok(), "its schedule is given now");
         for keys in [
             TrainOverrides { schedule_steps: Some(30_000), ..keys.clone() },

@@ -38,11 +38,11 @@ pub enum Quality {
 }
 
 impl Quality {
-    /// The loss from which growth pays in a run of up to [`UNIT_MOST`] steps, as a multiple of that in [`CHECKS`]. A scene with twice the Gaussians loses
-    /// about half as much.
+    /// The loss from which growth pays in a run of up to [`UNIT_MOST`] steps, as a multiple of that in [`CHECKS`]. A scene with
+    /// twice the Gaussians loses about half as much.
     ///
     /// Normal is chosen for at most 12 % of the Gaussians that gsplat's rule makes without a cap, with at least its PSNR, and draft
-    /// for 8 %. With normal, scenes stop where the next doubling brings about .6 dB, or less (`benches/RESULTS.md`).
+    /// for 8 %. With normal, scenes stop where the next doubling brings about .7 dB, or less (`benches/RESULTS.md`).
     fn price(self) -> f64 {
         match self {
             Quality::Draft => 6.0,
@@ -59,7 +59,7 @@ const CHECKS: [[f64; 2]; 4] = [[1.0 / 3.0, 0.07], [0.4, 0.16], [1.4 / 3.0, 0.24]
 /// length.
 const UNIT_MOST: u32 = 3000;
 /// Most by which the price of a run longer than [`UNIT_MOST`] falls. A run of twice the steps trains more Gaussians, and its rates are
-/// lower, so that the scene loses less at a check: sheffield_cross .34 dB in a run of 7,000 steps, .51 dB in one of 3,000.
+/// lower, so that the scene loses less at a check: sheffield_cross .34 dB in a run of 7,000 steps, about .5 dB in one of 3,000.
 const LONGER_MOST: f64 = 2.5;
 /// Most doublings of one stage, which is the number of rounds between two checks.
 const DOUBLINGS_MOST: f64 = 2.0;

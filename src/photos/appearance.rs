@@ -39,7 +39,7 @@ struct Appearance {
     state: AppearanceState,
     /// Photos whose exposure started from EXIF data.
     first_exposures: u32,
-    /// The correction of the step, and whether the step only measures its loss.
+    /// The correction of the step.
     look: Look,
     /// The picture of the step as it was drawn, `[3][height][width]`.
     drawn: Vec<f32>,
@@ -154,12 +154,12 @@ impl PhotoParameter for Appearance {
         self.look.back(&self.drawn, photo, v_rgb);
     }
 
-    /// A photo that is left out is fitted too: a wrong exposure, from a first look at a rough scene, must not keep a right photo out.
+    /// A photo that is left out is fitted too, or the exposure of a first look, at a rough scene, would keep a right photo out.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
         let found = self.found.take().filter(|_| !outcome.is_skipped);
         if let (Some(found), Some(&group)) = (found, self.camera_groups.get(outcome.view)) {
             match outcome.is_left_out {
-                true => self.state.follow(self.mode, outcome.view, &found),
+                true => self.state.replace(self.mode, outcome.view, &found),
                 false => self.state.learn(self.mode, (outcome.view, group), &found),
             }
         }

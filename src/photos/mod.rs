@@ -46,7 +46,8 @@ pub struct PhotoOptions {
     pub scene_scale: f32,
 }
 
-/// All kinds, in the order in which they correct a picture, and of their sections in the report. Gradients pass them in the opposite order.
+/// All kinds, in the order in which they correct a picture; gradients pass them in the opposite order. The sections of the report have
+/// this order too.
 pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outlier_views::KIND, masked_blocks::KIND];
 
 /// The parameters of a run.
