@@ -202,6 +202,8 @@ fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
         recycle: config.recycle,
         prune_opa: config.prune_opa as f32,
         rounds: round_steps(config),
+        checks: round_steps(config),
+        shares_room: false,
         max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
         growth: growth_rule(config),
     }

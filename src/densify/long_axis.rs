@@ -9,8 +9,10 @@
 //! when the removals have been applied, so the cap holds at every step. There are no opacity resets. Where the run allows fewer rows
 //! than there are, a round takes the surplus from the weighed rows in the same way.
 //!
-//! Where views come region by region, a round sees the scores of a few regions. Growth then spreads over whole epochs
-//! (`share_of_room`): otherwise the regions of the first rounds would take the room of all others.
+//! Where views come region by region and an epoch is longer than `refine_every`, a round sees the statistics of a few regions. So
+//! rounds then come at the ends of epochs ([`Strategy::for_regions`]): its thresholds hold for all regions, as those of a shuffle do,
+//! and it recycles what the rounds of a shuffled epoch would. Runs in which two such rounds do not fit keep their rounds, which share the
+//! room.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
@@ -29,9 +31,12 @@ use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, LONG_AXIS_OFFSET, LongAxisRound};
 use crate::scene::rows::{Rows, RowsMut};
 use crate::scene::sightings::views;
+use std::sync::Arc;
 
 /// Rows are recycled once this share of the cap is reached.
 const FULL_FROM: f64 = 0.9;
+/// The largest share of the weighed rows that a round recycles: places are free until the next round, which may be an epoch away.
+const RECYCLED_MOST: f64 = 0.25;
 
 /// The value of `--growth-score`: which rows grow first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,6 +60,10 @@ pub struct LongAxisStrategy {
     pub prune_opa: f32,
     /// When rounds happen.
     pub rounds: RoundSteps,
+    /// When the checks of [`LongAxisStrategy::growth`] may happen: with the rounds of a shuffle.
+    pub checks: RoundSteps,
+    /// Each round sees some regions only, so that all rounds share the room.
+    pub shares_room: bool,
     /// Most rows of the scene.
     pub max_gaussians: u64,
     /// How the run decides the cap; `None` for a run whose cap is given.
@@ -62,36 +71,25 @@ pub struct LongAxisStrategy {
 }
 
 impl LongAxisStrategy {
-    /// Share of the room under the cap that the round after this step may take, if an epoch of `epoch` steps visits one region after
-    /// the other (0: any stretch of views shows all regions).
-    ///
-    /// Growth begins with the first whole epoch after `RoundSteps::start`. The rounds of an epoch take equal parts of the room at
-    /// its beginning, and the last one takes what is left. Where no whole epoch fits before `RoundSteps::stop`, all rounds share.
-    fn share_of_room(&self, step: u32, epoch: u32) -> f64 {
-        if epoch <= self.rounds.every {
+    /// Share of the room under the cap that the round after this step may take.
+    fn share_of_room(&self, step: u32) -> f64 {
+        if !self.shares_room {
             return 1.0;
         }
-        let [step, epoch, start, stop] = [step, epoch, self.rounds.start, self.rounds.stop].map(u64::from);
-        let first = start.next_multiple_of(epoch);
-        let end = match first + epoch <= stop {
-            true if step <= first => return 0.0,
-            true => (first + (step - first).next_multiple_of(epoch)).min(stop - 1),
-            false => stop - 1,
-        };
-        let every = u64::from(self.rounds.every);
-        1.0 / (end / every + 1 - step / every).max(1) as f64
+        let RoundSteps { stop, every, .. } = self.rounds;
+        1.0 / f64::from(((stop - 1) / every + 1 - step / every).max(1))
     }
 
     /// The round after this step. The last round removes nothing by weight, since no round would give the places away.
     pub fn round(&self, step: u32, count: RowCount, histogram: &GradHistogram) -> LongAxisRound {
-        let RowCount { rows, allowed, regional_epoch } = count;
+        let RowCount { rows, allowed } = count;
         let cap = self.max_gaussians.min(allowed);
         let is_full = rows as f64 >= FULL_FROM * cap as f64;
         let is_last = step.saturating_add(self.rounds.every) >= self.rounds.stop;
         let surplus = rows.saturating_sub(allowed) as f64 / rows.max(1) as f64;
         let recycled = if is_full && !is_last { self.recycle } else { 0.0 };
         let removed = (surplus.max(recycled) * histogram.weighed_rows() as f64) as u64;
-        let room = self.share_of_room(step, regional_epoch) * cap.saturating_sub(rows) as f64;
+        let room = self.share_of_room(step) * cap.saturating_sub(rows) as f64;
         LongAxisRound {
             split_from_bin: histogram.split_bin(room.round() as u64),
             remove_below_bin: if removed > 0 { histogram.remove_bin(removed) } else { 0 },
@@ -118,6 +116,19 @@ impl Strategy for LongAxisStrategy {
         Some(&self.rounds)
     }
 
+    fn for_regions(&self, epoch: u32) -> Option<Arc<dyn Strategy>> {
+        if epoch <= self.rounds.every {
+            return None;
+        }
+        let at_ends = RoundSteps { every: epoch, ..self.rounds };
+        let first = u64::from(at_ends.start / epoch + 1) * u64::from(epoch);
+        if first + u64::from(epoch) >= u64::from(at_ends.stop) {
+            return Some(Arc::new(LongAxisStrategy { shares_room: true, ..*self }));
+        }
+        let recycle = (self.recycle * f64::from(epoch) / f64::from(self.rounds.every)).min(RECYCLED_MOST);
+        Some(Arc::new(LongAxisStrategy { rounds: at_ends, recycle, ..*self }))
+    }
+
     fn needs_weights(&self) -> bool {
         self.score != GrowthScore::Gradient || self.recycle > 0.0 || self.growth.is_some()
     }
@@ -136,12 +147,12 @@ impl Strategy for LongAxisStrategy {
     }
 
     fn growth_check(&self, step: u32) -> Option<usize> {
-        let before = step.checked_sub(self.rounds.every).filter(|before| self.rounds.is_round(*before));
-        self.growth.filter(|_| self.rounds.is_round(step))?.due(before, step)
+        let before = step.checked_sub(self.checks.every).filter(|before| self.checks.is_round(*before));
+        self.growth.filter(|_| self.checks.is_round(step))?.due(before, step)
     }
 
     fn may_check_growth(&self, step: u32) -> bool {
-        self.growth.is_some_and(|rule| step < self.rounds.stop && rule.is_open(step, self.rounds.every))
+        self.growth.is_some_and(|rule| step < self.checks.stop && rule.is_open(step, self.checks.every))
     }
 
     fn events_after(&self, step: u32, _: f32, count: RowCount, histogram: &GradHistogram) -> Vec<EventKind> {
@@ -204,6 +215,7 @@ mod tests {
     use super::*;
     use crate::base::math::logit;
     use crate::base::rng::{Purpose, Stream};
+    use crate::densify::growth::Quality;
     use crate::scene::columns::Columns;
     use crate::scene::state::SceneState;
 
@@ -213,6 +225,8 @@ mod tests {
             recycle: 0.02,
             prune_opa: 0.005,
             rounds: RoundSteps { start: 500, stop: 2400, every: 100 },
+            checks: RoundSteps { start: 500, stop: 2400, every: 100 },
+            shares_room: false,
             max_gaussians,
             growth: None,
         }
@@ -322,30 +336,59 @@ mod tests {
         assert!(keeps(logit(0.006)) && !keeps(logit(0.004)));
     }
 
+    /// The steps of the rounds.
+    fn rounds(strategy: &dyn Strategy) -> Vec<u32> {
+        (0..4000).filter(|&step| strategy.reads_histogram(step)).collect()
+    }
+
     #[test]
-    fn growth_spreads_over_epochs_that_visit_one_region_after_the_other() {
-        let strategy = strategy(GrowthScore::Gradient, 2000);
-        let grown = |epoch: u32| {
-            let mut rows = 1000.0;
-            let take = |step: u32| {
-                let taken = strategy.share_of_room(step, epoch) * (2000.0 - rows);
-                rows += taken;
-                taken
-            };
-            (0..4000).filter(|&step| strategy.rounds.is_round(step)).map(take).collect::<Vec<f64>>()
+    fn rounds_come_at_the_ends_of_epochs_that_visit_one_region_after_the_other() {
+        let rule = GrowthRule::new(Quality::Normal, 3000);
+        let by_steps = LongAxisStrategy { growth: Some(rule), ..strategy(GrowthScore::Gradient, 2000) };
+        // A shuffle, and an epoch within a round.
+        assert!(by_steps.for_regions(0).is_none() && by_steps.for_regions(100).is_none());
+        let by_epochs = by_steps.for_regions(150).unwrap();
+        assert_eq!(rounds(&*by_epochs), (4..16).map(|epoch| 150 * epoch).collect::<Vec<u32>>());
+        assert_eq!(rounds(&*by_steps.for_regions(799).unwrap()), [799, 1598, 2397]);
+        // The checks of growth come as before.
+        let checks = |strategy: &dyn Strategy| {
+            (0..4000).filter_map(|step| strategy.growth_check(step).map(|n| (step, n))).collect::<Vec<_>>()
         };
-        let are_near = |got: &[f64], want: f64| got.iter().all(|got| (got - want).abs() < 1e-9);
-        // Rounds follow steps 600, 700, .. 2300. A shuffle, and an epoch within a round, take all room at once.
-        assert!(are_near(&[grown(0)[0], grown(100)[0]], 1000.0));
-        // An epoch of 800 steps begins at step 800: eight rounds, 900 to 1600, take an eighth each.
-        let eight = grown(800);
-        assert!(
-            are_near(&eight[..3], 0.0) && are_near(&eight[3..11], 125.0) && are_near(&eight[11..], 0.0),
-            "{eight:?}"
-        );
-        // No whole epoch of 1300 steps fits: all 18 rounds share.
-        assert!(are_near(&grown(1300), 1000.0 / 18.0));
-        assert!(are_near(&grown(50_000), 1000.0 / 18.0));
+        assert_eq!(checks(&*by_epochs), [(1000, 0), (1200, 1), (1400, 2), (1600, 3)]);
+        assert_eq!(checks(&by_steps), checks(&*by_epochs));
+        // Two rounds do not fit: the rounds stay.
+        for epoch in [1300, 2400, 50_000, u32::MAX] {
+            assert_eq!(rounds(&*by_steps.for_regions(epoch).unwrap()), rounds(&by_steps), "{epoch}");
+        }
+    }
+
+    #[test]
+    fn a_round_at_the_end_of_an_epoch_recycles_as_much_as_those_of_a_shuffle() {
+        let by_steps = strategy(GrowthScore::Error, 1000);
+        let (state, histogram) = drawn(&by_steps, 1000, 4);
+        let removed = |recycle: f64| {
+            let strategy = LongAxisStrategy { recycle, ..by_steps }.for_regions(300).unwrap();
+            let events = strategy.events_after(600, 1.0, RowCount::unlimited(1000), &histogram);
+            let [EventKind::LongAxis(round)] = events[..] else { panic!("no round") };
+            (0..1000).filter(|&row| round.fate(&facts(&state, row)) == Fate::Prune).count()
+        };
+        // Bins hold up to ten rows here. Three rounds of a shuffle take 2 % each; a quarter goes at most.
+        assert!((50..=60).contains(&removed(0.02)), "{}", removed(0.02));
+        assert!((240..=250).contains(&removed(0.2)), "{}", removed(0.2));
+    }
+
+    #[test]
+    fn rounds_that_see_some_regions_share_the_room() {
+        let strategy = LongAxisStrategy { shares_room: true, ..strategy(GrowthScore::Gradient, 2000) };
+        let mut rows = 1000.0;
+        let take = |step: u32| {
+            let taken = strategy.share_of_room(step) * (2000.0 - rows);
+            rows += taken;
+            taken
+        };
+        let grown: Vec<f64> = rounds(&strategy).into_iter().map(take).collect();
+        assert!(grown.iter().all(|taken| (taken - 1000.0 / 18.0).abs() < 1e-9), "{grown:?}");
+        assert_eq!(LongAxisStrategy { shares_room: false, ..strategy }.share_of_room(600), 1.0);
     }
 
     #[test]

@@ -22,6 +22,7 @@ use crate::scene::columns::Columns;
 use crate::scene::events::EventKind;
 use crate::scene::rows::{Rows, RowsMut};
 use std::fmt;
+use std::sync::Arc;
 
 /// The value of `--strategy`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -99,14 +100,12 @@ pub struct RowCount {
     pub rows: u64,
     /// The most rows that the run allows at this step. If the strategy has a cap of its own, the smaller of the two applies.
     pub allowed: u64,
-    /// Steps of an epoch whose views come region by region; 0 if any stretch of views shows all regions.
-    pub regional_epoch: u32,
 }
 
 impl RowCount {
     /// Rows without a limit.
     pub fn unlimited(rows: u64) -> RowCount {
-        RowCount { rows, allowed: u64::MAX, regional_epoch: 0 }
+        RowCount { rows, allowed: u64::MAX }
     }
 }
 
@@ -114,6 +113,12 @@ impl RowCount {
 pub trait Strategy: fmt::Debug + Send + Sync {
     /// When rounds happen; `None` for a strategy without rounds.
     fn rounds(&self) -> Option<&RoundSteps>;
+
+    /// The strategy of a run whose views come region by region, in epochs of `epoch` steps (0: any stretch of views shows all regions);
+    /// `None` if this one suits it.
+    fn for_regions(&self, _epoch: u32) -> Option<Arc<dyn Strategy>> {
+        None
+    }
 
     /// Whether the number of Gaussians may grow.
     fn grows(&self) -> bool {

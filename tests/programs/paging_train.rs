@@ -194,8 +194,8 @@ fn a_cap_on_the_gaussians_holds_at_every_step_and_pages_to_the_same_bits() {
 fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
     let folder = TempDir::new().unwrap();
     let scene = scenes::wide_city(folder.path(), 8_000);
-    // A round after every eighth step: most pages are unseen in between, and some rows are weighed often enough.
-    let rounds = ["--refine-start", "20", "--refine-every", "8", "--strategy", "long-axis", "--recycle", "0.2"];
+    // Views come in groups, so rounds come after whole epochs of 28 steps and recycle 28 / 8 times as much.
+    let rounds = ["--refine-start", "20", "--refine-every", "8", "--strategy", "long-axis", "--recycle", "0.01"];
     let mixed = ["--growth-score", "mixed"];
     let capped =
         ["--page-rows", "32", "--steps", "120", "--max-gaussians", "8800", "--log-every", "1", "--device", "cpu"];

@@ -158,6 +158,8 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
         recycle: 0.1,
         prune_opa: 0.005,
         rounds: ROUNDS,
+        checks: ROUNDS,
+        shares_room: false,
         max_gaussians,
         growth: None,
     }

@@ -139,9 +139,12 @@ impl Trainer {
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
+        let order = view_order(options.view_order, options.seed, dataset);
+        let strategy = options.strategy.for_regions(order.regional_epoch());
+        let options = RunOptions { strategy: strategy.unwrap_or_else(|| options.strategy.clone()), ..options };
         Trainer {
             scene,
-            order: view_order(options.view_order, options.seed, dataset),
+            order,
             held_out: HeldOut::new(&options.strategy, train_views.len()),
             train_views,
             photos: first_parameters(&options.photos, dataset),
@@ -380,8 +383,7 @@ impl Trainer {
         }
         self.check_growth(step, dataset, targets)?;
         let scale = self.options.scene_scale;
-        let regional_epoch = self.order.regional_epoch();
-        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed(), regional_epoch };
+        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed() };
         let kinds = self.options.strategy.events_after(step, scale, count, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);
