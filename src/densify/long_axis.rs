@@ -211,6 +211,7 @@ impl Round for LongAxisRound {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::math::logit;
