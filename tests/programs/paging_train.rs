@@ -285,7 +285,7 @@ fn a_doubling_that_is_undone_pages_to_the_same_bits() {
     let scene = folder.path().join("scene");
     let size = CityOptions { seed: 3, views: 14, width: 48, height: 36, points: 2000, ..CityOptions::default() };
     write_city(&scene, &CityOptions { supersample: 1, ..size }, &|_, _| {}).unwrap();
-    let flags = "--schedule run-length --strategy long-axis --steps 300 --page-rows 128 --view-order groups:4 --test-every 0 \
+    let flags = "--schedule run-length --strategy long-axis --steps 300 --page-rows 128 --view-order shuffle --test-every 0 \
                  --device cpu --simd baseline --log-every 1 --seed 1 --quiet";
     let base: Vec<&str> = flags.split_whitespace().collect();
     let (want, whole) = run(folder.path(), &scene, &base, &How { frames: 0, io: "", threads: "2", more: &[] });
