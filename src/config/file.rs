@@ -215,8 +215,8 @@ config_keys! {
         refine_start: u32 = 500 => Numbers;
         /// Step at which densification rounds and opacity resets end
         refine_stop: u32 = 15_000 => Numbers;
-        /// Steps between densification rounds. With --strategy long-axis and --view-order groups:N, rounds come after whole
-        /// passes over the photos if a pass is longer
+        /// Steps between densification rounds. With --strategy long-axis and --view-order groups:N or tour, a round comes after
+        /// each pass over the photos if a pass has more steps
         refine_every: u32 = 100 => Numbers;
         /// Steps between opacity resets (to twice --prune-opa); 0 = never. No reset comes in the last steps of the planned run
         /// (a third of this number, at most 1,000), because opacities need steps to recover

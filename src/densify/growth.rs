@@ -179,13 +179,13 @@ impl GrowthRule {
         GrowthRule { quality, price, unit: steps.clamp(1, UNIT_MOST) }
     }
 
-    /// The number of the check at the begin of a round after `step`: the last check that fell due since the round before,
-    /// whose step is `round_before`.
-    pub fn due(&self, round_before: Option<u32>, step: u32) -> Option<usize> {
+    /// The number of the check after `step`: the last one that fell due since the step before at which a check was possible,
+    /// `before`.
+    pub fn due(&self, before: Option<u32>, step: u32) -> Option<usize> {
         let is_past = |step: u32, share: f64| f64::from(step) >= share * f64::from(self.unit);
         (0..CHECKS.len()).rfind(|&number| {
             let [share, _] = CHECKS[number];
-            is_past(step, share) && !round_before.is_some_and(|before| is_past(before, share))
+            is_past(step, share) && !before.is_some_and(|before| is_past(before, share))
         })
     }
 

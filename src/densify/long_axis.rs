@@ -9,10 +9,10 @@
 //! when the removals have been applied, so the cap holds at every step. There are no opacity resets. Where the run allows fewer rows
 //! than there are, a round takes the surplus from the weighed rows in the same way.
 //!
-//! Where views come region by region and an epoch is longer than `refine_every`, a round sees the statistics of a few regions. So
-//! rounds then come at the ends of epochs ([`Strategy::for_regions`]): its thresholds hold for all regions, as those of a shuffle do,
-//! and it recycles what the rounds of a shuffled epoch would. Runs in which two such rounds do not fit keep their rounds, which share the
-//! room.
+//! Views may come region by region, in epochs longer than `refine_every`. A round within such an epoch would have the statistics of
+//! a few regions. So rounds come at the ends of epochs ([`Strategy::for_regions`]): the thresholds of a round then hold for all
+//! regions, as in a shuffle, and a round recycles as much as all rounds of a shuffled epoch. A run in which two such rounds do not
+//! fit keeps its rounds, and these rounds share the room.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
@@ -60,9 +60,9 @@ pub struct LongAxisStrategy {
     pub prune_opa: f32,
     /// When rounds happen.
     pub rounds: RoundSteps,
-    /// When the checks of [`LongAxisStrategy::growth`] may happen: with the rounds of a shuffle.
+    /// When the checks of [`LongAxisStrategy::growth`] may happen. Checks come by steps, also where rounds come by epochs.
     pub checks: RoundSteps,
-    /// Each round sees some regions only, so that all rounds share the room.
+    /// Whether all rounds share the room under the cap, because each of them has the statistics of some regions only.
     pub shares_room: bool,
     /// Most rows of the scene.
     pub max_gaussians: u64,

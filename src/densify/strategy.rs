@@ -114,8 +114,8 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// When rounds happen; `None` for a strategy without rounds.
     fn rounds(&self) -> Option<&RoundSteps>;
 
-    /// The strategy of a run whose views come region by region, in epochs of `epoch` steps (0: any stretch of views shows all regions);
-    /// `None` if this one suits it.
+    /// The strategy of a run whose views come region by region, in epochs of `epoch` steps; 0 if any stretch of views shows all regions.
+    /// `None` if the strategy needs no change.
     fn for_regions(&self, _epoch: u32) -> Option<Arc<dyn Strategy>> {
         None
     }

@@ -212,6 +212,8 @@ fn long_axis_rounds_page_to_the_same_bits_and_keep_the_cap() {
         let metrics = std::fs::read_to_string(folder.path().join("out/metrics.jsonl")).unwrap();
         let rows: Vec<u64> = metrics.lines().map(|l| number(&serde_json::from_str(l).unwrap(), "gaussians")).collect();
         assert!(rows.iter().all(|&rows| rows <= 8_800), "{rows:?}");
+        // Step 28, counted from 0, ends the first epoch after --refine-start. By steps, the first round would follow step 24.
+        assert!(rows[..=28].iter().all(|&rows| rows == 8_000), "a round within an epoch: {rows:?}");
         assert!(rows.windows(2).any(|pair| pair[1] < pair[0]), "nothing was recycled: {rows:?}");
         assert!(rows.iter().max() > Some(&8_600), "the cap is not reached: {rows:?}");
     }
