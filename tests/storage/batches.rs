@@ -179,6 +179,25 @@ fn a_full_drive_never_tears_a_step() {
     assert!(failures > 1, "{failures}");
 }
 
+/// Checks of growth, evaluation and export come between steps. Each reads pages although no dirty page can be written, and leaves
+/// the failure to the next step, which waits for space.
+#[test]
+fn every_row_can_be_read_while_the_drive_is_full() {
+    let want = trained_in_memory();
+    let faults = Faults::new();
+    let mut scene = scene(Some(&faults));
+    (0..STEPS).for_each(|s| assert!(step(&mut scene, s).unwrap().skipped.is_none()));
+    faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
+    for _ in 0..2 {
+        assert!(rows(&mut scene) == want);
+        assert!(scene.pager.frames() <= FRAMES + 1, "{} frames", scene.pager.frames());
+    }
+    let error = step(&mut scene, STEPS).unwrap_err();
+    assert!(error.is_out_of_space() && !matches!(error, TrainError::Torn { .. }), "{error}");
+    faults.clear();
+    assert!(rows(&mut scene) == want);
+}
+
 /// A walk of other batches than the pager's own, with uses that are told to it: what comes back is evicted last.
 #[test]
 fn pages_that_return_stay_longer_than_pages_that_are_done() {

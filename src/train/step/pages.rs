@@ -388,12 +388,30 @@ impl PagedScene {
         self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
+    /// Pins the first pages of a list, `batch` at most, and returns the list of the others. Where dirty pages cannot be written,
+    /// as on a full drive, too few frames may be left: `batch` is halved until the pages fit.
+    fn acquire_first<'a>(
+        &mut self,
+        pages: &'a [PageNo],
+        batch: &mut usize,
+    ) -> Result<(Vec<PinnedPage>, &'a [PageNo]), PagingError> {
+        loop {
+            let (first, later) = pages.split_at(pages.len().min(*batch));
+            match self.pager.acquire_pages(first) {
+                Err(PagingError::WorkingSet { .. }) if first.len() > 1 => *batch = first.len() / 2,
+                pinned => return Ok((pinned?, later)),
+            }
+        }
+    }
+
     /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies.
     pub(crate) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
         // The copies of a batch take as much memory as its frames.
-        let batch = PAGES_PER_BATCH.min(self.pager.frames_max() / 2).max(1);
-        for pages in pages.chunks(batch) {
-            let pinned = self.pager.acquire_pages(pages)?;
+        let mut batch = PAGES_PER_BATCH.min(self.pager.frames_max() / 2).max(1);
+        let mut rest = pages;
+        while !rest.is_empty() {
+            let (pinned, later) = self.acquire_first(rest, &mut batch)?;
+            rest = later;
             let rules = &self.rules;
             let pending = rules.pending();
             let copies: Vec<Option<SceneState>> = pinned

@@ -55,7 +55,7 @@ pub fn rehearse(
     for batch in &batches {
         scene.gather_pages(batch, camera, now, working)?;
         renderer.rows_in(&working.columns)?;
-        rows += working.row_from_working.len();
+        rows += working.columns.rows();
     }
     renderer.picture()?;
     comparison.loss_and_back(renderer)?;
