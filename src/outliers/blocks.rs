@@ -8,12 +8,14 @@
 //!
 //! At each visit of a view, a block is masked if its score lies far above the median of the view, by the median absolute
 //! deviation. A block half as far above is masked if it touches a masked block or was masked before. Masked blocks are still
-//! measured: such a block is unmasked when the scene, trained on the other photos, shows it.
+//! measured: such a block is unmasked when the scene, trained on the other photos, shows it. Pixels beside masked blocks that belong to
+//! the same object do not count either ([`super::rims`]).
 //!
 //! Invariants: 1. running means are fixed-point numbers, and a mask follows from them, the photo and the mask before; 2. at most
 //! a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its size.
 
 use super::residuals::{BlockGrid, NO_PIXELS, PER_UNIT, contrasts, residuals};
+use super::rims::mask_rims;
 use super::{MAD_OF_NORMAL, median_and_deviation};
 use crate::scene::image::Target;
 use serde::{Deserialize, Serialize};
@@ -129,8 +131,9 @@ pub fn look(before: &[BlockState], picture: &[f32], photo: &Target) -> Option<Ve
     Some(states)
 }
 
-/// Writes the photo without its masked blocks into `masked`, whose memory is used again.
-pub fn mask(states: &[BlockState], photo: &Target, masked: &mut Target) {
+/// Writes the photo without its masked blocks into `masked`, whose memory is used again. With the `picture` that the masks come
+/// from, the rims of the masked blocks ([`super::rims`]) are left out too.
+pub fn mask(states: &[BlockState], picture: Option<&[f32]>, photo: &Target, masked: &mut Target) {
     let grid = BlockGrid::of(photo.width, photo.height);
     (masked.width, masked.height) = (photo.width, photo.height);
     masked.rgb.clone_from(&photo.rgb);
@@ -148,6 +151,10 @@ pub fn mask(states: &[BlockState], photo: &Target, masked: &mut Target) {
     for (block, _) in states.iter().enumerate().filter(|(_, state)| state.is_masked()) {
         let (columns, rows) = grid.pixels(block);
         rows.for_each(|y| mask[y * photo.width as usize..][columns.clone()].fill(0));
+    }
+    if let Some(picture) = picture {
+        let is_masked: Vec<bool> = states.iter().map(|state| state.is_masked()).collect();
+        mask_rims(&is_masked, picture, photo, mask);
     }
 }
 
@@ -234,7 +241,7 @@ mod tests {
 
     fn masked_pixels(states: &[BlockState], photo: &Target) -> Vec<usize> {
         let mut masked = Target::default();
-        mask(states, photo, &mut masked);
+        mask(states, None, photo, &mut masked);
         assert_eq!(masked.rgb, photo.rgb);
         (0..photo.pixels()).filter(|&i| masked.mask.as_ref().unwrap()[i] == 0).collect()
     }
@@ -248,6 +255,21 @@ mod tests {
         let states = look(&[], &picture, &photo).unwrap();
         let inside: Vec<usize> = (16..28).flat_map(|y| (20..32).map(move |x| y * WIDTH + x)).collect();
         assert_eq!(masked_pixels(&states, &photo), inside);
+    }
+
+    #[test]
+    fn an_object_across_blocks_is_masked_with_its_rim() {
+        let (photo, picture) = scene(Some((21, 18)));
+        let states = look(&[], &picture, &photo).unwrap();
+        let object: Vec<usize> = (18..30).flat_map(|y| (21..33).map(move |x| y * WIDTH + x)).collect();
+        let blocks = masked_pixels(&states, &photo);
+        assert!(!blocks.is_empty() && object.iter().any(|pixel| !blocks.contains(pixel)), "blocks alone leave a rim");
+        let mut masked = Target::default();
+        mask(&states, Some(&picture), &photo, &mut masked);
+        let mask = masked.mask.unwrap();
+        let (out, kept): (Vec<usize>, Vec<usize>) = (0..photo.pixels()).partition(|&pixel| mask[pixel] == 0);
+        assert!(object.iter().all(|pixel| out.contains(pixel)));
+        assert!(kept.iter().all(|pixel| !object.contains(pixel)) && out.len() <= object.len() + blocks.len());
     }
 
     #[test]
@@ -271,7 +293,7 @@ mod tests {
         photo.mask = Some(of_user.clone());
         let states = look(&[], &picture, &photo).unwrap();
         let mut masked = Target::default();
-        mask(&states, &photo, &mut masked);
+        mask(&states, None, &photo, &mut masked);
         assert_eq!(masked.mask.unwrap(), of_user);
         photo.mask = Some(vec![0; photo.pixels()]);
         assert_eq!(look(&[], &picture, &photo), None);

@@ -1,6 +1,7 @@
 //! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
-//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks.
+//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks, with their
+//! [`rims`].
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
 //! Invariants: 1. every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
@@ -11,6 +12,7 @@
 
 pub mod blocks;
 pub mod residuals;
+pub mod rims;
 pub mod views;
 
 /// Median absolute deviation of a normal distribution, in standard deviations.

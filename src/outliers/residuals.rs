@@ -49,8 +49,25 @@ impl BlockGrid {
         (x..(x + self.side).min(self.width), y..(y + self.side).min(self.height))
     }
 
+    /// Numbers of the pixels of a block, row by row.
+    pub(super) fn pixel_numbers(&self, block: usize) -> impl Iterator<Item = usize> {
+        let (columns, rows) = self.pixels(block);
+        let width = self.width;
+        rows.flat_map(move |y| columns.clone().map(move |x| y * width + x))
+    }
+
+    /// Side of a block, pixels.
+    pub(super) fn side(&self) -> usize {
+        self.side
+    }
+
+    /// The blocks of a line of blocks.
+    pub(super) fn line(&self, line: usize) -> Range<usize> {
+        line * self.columns()..((line + 1) * self.columns()).min(self.blocks())
+    }
+
     /// The blocks around a block, and the block.
-    fn around(&self, block: usize) -> impl Iterator<Item = usize> {
+    pub(super) fn around(&self, block: usize) -> impl Iterator<Item = usize> {
         let (columns, lines) = (self.columns(), self.height.div_ceil(self.side));
         let (x, y) = (block % columns, block / columns);
         let lines = y.saturating_sub(1)..(y + 2).min(lines);
@@ -69,9 +86,8 @@ impl BlockGrid {
 
     /// Sum of brightness (R + G + B, 0..765) and of its square over the used pixels of a block, and their number.
     fn brightness(&self, block: usize, photo: &Target) -> [u64; 3] {
-        let (columns, rows) = self.pixels(block);
         let mut sums = [0; 3];
-        for i in rows.flat_map(|y| columns.clone().map(move |x| y * self.width + x)) {
+        for i in self.pixel_numbers(block) {
             if photo.mask.as_ref().is_none_or(|mask| mask[i] != 0) {
                 let value: u64 = photo.rgb[3 * i..3 * i + 3].iter().map(|&byte| u64::from(byte)).sum();
                 [sums[0], sums[1], sums[2]] = [sums[0] + value, sums[1] + value * value, sums[2] + 1];
@@ -83,9 +99,8 @@ impl BlockGrid {
     /// The residual of a block: mean colour of the picture less that of the photo, absolute, mean over channels, fixed-point.
     /// `None` if a used pixel is NaN.
     fn residual(&self, block: usize, picture: &[f32], photo: &Target) -> Option<u16> {
-        let (columns, rows) = self.pixels(block);
         let (mut sums, mut count) = ([0f32; 3], 0u32);
-        for i in rows.flat_map(|y| columns.clone().map(move |x| y * self.width + x)) {
+        for i in self.pixel_numbers(block) {
             if photo.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
                 continue;
             }

@@ -104,7 +104,10 @@ impl PhotoParameter for MaskedBlocks {
         if all_count {
             return photo;
         }
-        blocks::mask(self.found.as_deref().unwrap_or(states), photo, &mut self.masked);
+        match &self.found {
+            Some(found) => blocks::mask(found, picture, photo, &mut self.masked),
+            None => blocks::mask(states, None, photo, &mut self.masked),
+        }
         &self.masked
     }
 

@@ -95,9 +95,9 @@ fn masking_what_stands_on_one_photo_only_wins_back_part_of_what_masks_by_hand_wi
     let [clean, clean_robust, boxes, robust, by_hand] = [&a, &b, &c, &d, &e].map(|out| psnr(out));
     println!("clean {clean:.2} dB, masking {clean_robust:.2} dB, {:.1} % of it", 100.0 * masked(&b));
     println!("boxes {boxes:.2} dB, masking {robust:.2} dB, {:.1} %, by hand {by_hand:.2} dB", 100.0 * masked(&d));
-    // Less than half of it, and it costs where nothing has moved (benches/RESULTS.md): this holds what there is.
-    assert!(robust > boxes + 0.1 && by_hand > robust);
-    assert!(clean_robust > clean - 0.6 && masked(&b) < 0.5 * masked(&d));
+    // It won 40 % of it, and cost .6 dB where nothing has moved (benches/RESULTS.md): this holds what there is.
+    assert!(robust > boxes + 0.3 * (by_hand - boxes) && by_hand > robust);
+    assert!(clean_robust > clean - 0.8 && masked(&b) < 0.5 * masked(&d));
     assert!(summary(&a)["masked_share"].is_null());
     let report = |out: &Path| std::fs::read_to_string(out.join("report.html")).unwrap();
     assert!(report(&d).contains("Parts of photos that contradict") && !report(&a).contains("Parts of photos"));
