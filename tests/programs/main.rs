@@ -38,6 +38,7 @@ mod plan_tool;
 mod poses;
 mod published;
 mod real_scenes;
+mod regions;
 mod report;
 #[cfg(unix)]
 mod resume;
