@@ -1,12 +1,14 @@
 //! Rims of transient objects: pixels beside masked blocks that belong to the same object.
 //!
-//! Blocks at the border of an object show it in part, so their mean colours may differ too little for a mask. Yet they teach the scene
-//! the border: where objects are a dozen pixels wide, masks of all blocks that lie within an object win half of what exact masks
-//! win, and masks of all blocks of which half does win five sixths (`benches/RESULTS.md`). So a pixel of a block beside a masked block
-//! is left out if the mean colour of the masked block explains the pixel far better than the picture does.
+//! The blocks at the border of an object show the object in part. Their mean colours may differ too little for a mask, yet such blocks
+//! teach the scene the border. Where objects are a dozen pixels wide, a mask of the blocks that lie wholly in an object wins half of
+//! what exact masks win, and a mask of the blocks that lie at least half in an object wins five sixths (`benches/RESULTS.md`). So a
+//! pixel of a block beside a masked block is left out if the mean colour of the masked block explains the pixel far better than the
+//! picture does.
 //!
-//! Invariants: 1. a rim is at most one block wide; 2. pixels that the picture shows right are never part of a rim, so rims of blocks that
-//! were masked by mistake stay small; 3. nothing is remembered: a rim follows from the masked blocks, the picture and the photo.
+//! Invariants: 1. a rim is at most one block wide; 2. pixels that the picture shows right are never part of a rim, so the rim of a block
+//! that was masked by mistake ends when the picture shows the place; 3. nothing is remembered: a rim follows from the masked blocks, the
+//! picture and the photo, so a step whose picture is not looked at has no rims.
 
 use super::residuals::BlockGrid;
 use crate::scene::image::Target;
@@ -110,7 +112,7 @@ mod tests {
         assert_eq!(masked(&blocks, &picture, &photo), want);
         // The same with noise of three grey levels in the photo, which is a fortieth of the residual.
         let mut noisy = photo.clone();
-        noisy.rgb.iter_mut().enumerate().for_each(|(i, value)| *value += [0, 3, 1][i % 3]);
+        noisy.rgb.iter_mut().enumerate().for_each(|(i, value)| *value += [0, 3, 1][i / 3 % 3]);
         assert_eq!(masked(&blocks, &picture, &noisy), want);
     }
 

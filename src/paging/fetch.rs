@@ -48,6 +48,9 @@ impl Pager {
             return Err(error);
         }
         let pinned: Vec<PinnedPage> = pinned.collect();
+        if !asker.is_step() {
+            self.counters.stats.other_pages_needed += pinned.len() as u64;
+        }
         self.count_pinned();
         Ok(pinned)
     }
@@ -67,16 +70,13 @@ impl Pager {
             self.counters.stats.misses += misses as u64;
             self.counters.stats.hits += (pages.len() - misses) as u64;
             self.counters.stats.absent += to_read.len() as u64;
-        } else {
-            let bytes = |page: &PageNo| self.index.slot(*page).map_or(0, |slot| slot.transfer_bytes() as u64);
-            self.counters.stats.other_pages_needed += pages.len() as u64;
-            self.counters.stats.other_bytes_read += to_read.iter().map(bytes).sum::<u64>();
         }
         loop {
             self.write_needed(fetch)?;
             while let Some(&page) = to_read.front().filter(|page| self.mover.may_decode(self.index.slot(**page))) {
                 if self.begin_read(page, false) {
                     to_read.pop_front();
+                    self.count_read(page, fetch.asker);
                 } else if !self.make_room(to_read.len(), fetch.asker)? {
                     break;
                 }
@@ -94,6 +94,14 @@ impl Pager {
             self.counters.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
             self.judge(fetch, failures)?;
+        }
+    }
+
+    /// Counts the bytes of a read that has begun for an asker that is no step.
+    fn count_read(&mut self, page: PageNo, asker: Asker) {
+        if !asker.is_step() {
+            let bytes = self.index.slot(page).map_or(0, |slot| slot.transfer_bytes() as u64);
+            self.counters.stats.other_bytes_read += bytes;
         }
     }
 

@@ -106,6 +106,7 @@ impl PhotoParameter for MaskedBlocks {
         }
         match &self.found {
             Some(found) => blocks::mask(found, picture, photo, &mut self.masked),
+            // Without a look at the picture there are no rims.
             None => blocks::mask(states, None, photo, &mut self.masked),
         }
         &self.masked
@@ -145,8 +146,8 @@ fn section(page: &mut Page, _: &Path, summary: &Value) {
     let Some(share) = summary[FIGURE].as_f64() else { return };
     page.heading("Parts of photos that contradict the scene");
     page.paragraph(&format!(
-        "At the end, {:.1} % of the area of the training photos did not count (--robust-pixels), because it differs from the \
-         pictures as cars, people or shadows that moved do. Much more than such things take suggests wrong poses or changing \
+        "At the end, blocks of {:.1} % of the area of the training photos did not count (--robust-pixels), because they differ \
+         from the pictures as cars, people or shadows that moved do; rims of objects come on top. Much more than such things take suggests wrong poses or changing \
          exposures.",
         100.0 * share
     ));

@@ -56,8 +56,8 @@ fn city_with_one_detailed_quarter(folder: &Path) -> (PathBuf, Quarters) {
     (scene, quarters)
 }
 
-/// Within 10 %, after 15 epochs in which the count grows to 2.5 times the points. Two shuffles of different seeds differ by as much as
-/// 7 %. Rounds by steps, each with the statistics of six groups, gave 22 % more in the detailed quarter and 22 % less in another.
+/// The counts of each quarter agree within 10 %, after 15 epochs in which the count grows to 2.5 times the points. Two shuffles of different seeds differ by as much as
+/// 7 %. With this scene, rounds by steps, each with the statistics of six groups, gave 22 % more in the detailed quarter and 22 % less in another.
 #[test]
 fn groups_of_views_grow_every_region_as_a_shuffle_does() {
     let folder = TempDir::new().unwrap();

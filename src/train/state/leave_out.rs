@@ -109,7 +109,7 @@ impl Draw<'_, '_> {
         let mut first = 0;
         for batch in self.batches {
             self.scene.gather_pages(batch, self.view.camera, self.now, self.working)?;
-            let rows = self.working.row_from_working.len();
+            let rows = self.working.columns.rows();
             if let Some(kept) = kept {
                 self.working.columns.retain_rows(|_, row| kept[first + row]);
             }
@@ -143,8 +143,58 @@ impl Draw<'_, '_> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::base::rng::{Purpose, Stream};
+    use crate::config::file::TrainConfig;
+    use crate::config::limits::RunOptions;
+    use crate::paging::pager::{Pager, PagerConfig};
+    use crate::render::cpu::CpuRenderer;
+    use crate::scene::columns::Columns;
+
+    /// More pages than a batch of any size below, in front of a camera that sees all of them.
+    fn scene(options: &RunOptions) -> PagedScene {
+        let mut draws = Stream::new(7, Purpose::Test, 0, 0);
+        let mut columns = Columns::zeros(2000, 1);
+        columns.means.iter_mut().for_each(|x| *x = draws.range(-2.0, 2.0) as f32);
+        columns.quats.chunks_exact_mut(4).for_each(|q| q[0] = 1.0);
+        columns.scales.iter_mut().for_each(|x| *x = draws.range(-4.0, -3.0) as f32);
+        columns.opacities.iter_mut().for_each(|x| *x = draws.range(-2.0, 3.0) as f32);
+        columns.sh0.iter_mut().for_each(|x| *x = draws.normal() as f32);
+        let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+        PagedScene::new(&columns, pager, options).unwrap()
+    }
+
+    /// A batch is gathered in parts, and the rows of all parts count.
+    #[test]
+    fn the_loss_is_the_same_for_any_batches() {
+        let options = RunOptions::new(&TrainConfig { page_rows: 16, sh_degree: 1, ..TrainConfig::default() }, 1.0);
+        let mut scene = scene(&options);
+        let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 4.5]];
+        let (near_plane, far_plane) = (0.01, 1e10);
+        let camera =
+            Camera { viewmat, fx: 50.0, fy: 50.0, cx: 40.0, cy: 30.0, width: 80, height: 60, near_plane, far_plane };
+        let rgb = (0..3 * camera.pixels()).map(|i| (i * 7 % 256) as u8).collect();
+        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let pages = scene.pager.pages_of_view(&camera).len();
+        assert!(pages > 2 * 48, "{pages} pages");
+        let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
+        let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| {
+            let view = Compared {
+                camera: &camera,
+                target: &target,
+                render: &render,
+                loss: &options.loss,
+                pages_most,
+                correct: None,
+            };
+            let now = (&mut scene, 0, &mut WorkingSet::default());
+            psnr_without_faint(now, &mut CpuRenderer::new(), &view).unwrap()
+        });
+        assert!(whole == few && few == parts && parts == all, "{whole:?} {few:?} {parts:?} {all:?}");
+        assert!(whole[0] != whole[1], "{whole:?}");
+    }
 
     #[test]
     fn a_quarter_of_the_drawn_rows_is_left_out_the_faintest_first() {

@@ -355,7 +355,10 @@ impl PagedScene {
             gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
             append(columns, &part);
             Ok::<(), PagingError>(())
-        })
+        })?;
+        // They are those of the last part, whose pages are not pinned any more.
+        row_from_working.clear();
+        Ok(())
     }
 
     /// Passes all rows, evaluated after `now` steps, to `each` in batches, in the order of page ids. Stored pages stay

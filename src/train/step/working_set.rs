@@ -6,7 +6,8 @@ use crate::scene::columns::{Columns, row_width};
 /// The rows of a batch, evaluated at one step, and their gradients. Steps reuse one working set and its allocations.
 #[derive(Default)]
 pub struct WorkingSet {
-    /// For each row of the working set, its row number in the pinned pages (consecutive across pages); ascending.
+    /// For each row of the working set, its row number in the pinned pages (consecutive across pages); ascending. Empty for rows that
+    /// [`super::pages::PagedScene::gather_pages`] has gathered, since their pages are not pinned.
     pub row_from_working: Vec<u32>,
     /// Values at this step; input of the renderer and of the update.
     pub columns: Columns,
