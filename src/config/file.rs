@@ -185,8 +185,8 @@ config_keys! {
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers before "false";
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
         /// side of a masked block is a 64th of the photo's longer side. Pixels beside a masked block that have its colour are
-        /// masked too. At most a quarter of the blocks of a photo is masked, from a tenth of the run on (step 500 at the latest). Masks of
-        /// your own work better: see --masks
+        /// masked too. At most a quarter of the blocks of a photo is masked, from a tenth of the run on (step 500 at the
+        /// latest). Masks of your own work better: see --masks
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers before "false";
         /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
         /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. poses.json has the

@@ -11,10 +11,11 @@
 //! measured: such a block is unmasked when the scene, trained on the other photos, shows it. Pixels beside masked blocks that belong to
 //! the same object do not count either ([`super::rims`]).
 //!
-//! Invariants: 1. running means are fixed-point numbers, and which blocks are masked follows from them, the photo and the blocks masked before; 2. at most
-//! a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its size.
+//! Invariants: 1. running means are fixed-point numbers, and which blocks are masked follows from them, the photo and the blocks
+//! masked before; 2. at most a quarter of the blocks of a view are masked; 3. the number of blocks of a view is bounded, whatever its
+//! size.
 
-use super::residuals::{BlockGrid, NO_PIXELS, PER_UNIT, contrasts, residuals};
+use super::residuals::{BlockGrid, NO_PIXELS, PER_UNIT, RESIDUAL_LEAST, contrasts, residuals};
 use super::rims::mask_rims;
 use super::{MAD_OF_NORMAL, median_and_deviation};
 use crate::scene::image::Target;
@@ -29,8 +30,6 @@ const DEVIATIONS: f64 = 4.0;
 const SCORE_LEAST: f64 = 0.7;
 /// Blocks beside a masked block, and blocks that were masked before, need this share of that distance from the median.
 const NEAR: f64 = 0.5;
-/// Blocks with a smaller residual are not masked (values in 0..1): six grey levels.
-const RESIDUAL_LEAST: f64 = 0.025;
 /// Added to the contrast, since plain areas of photos are noisy too.
 const CONTRAST_LEAST: f64 = 0.03;
 /// Blocks are judged after a tenth of the run, at the latest after [`FIRST_LOOK_LATEST`] steps.
@@ -131,8 +130,8 @@ pub fn look(before: &[BlockState], picture: &[f32], photo: &Target) -> Option<Ve
     Some(states)
 }
 
-/// Writes the photo without its masked blocks into `masked`, whose memory is used again. With the `picture` that the masks come
-/// from, the rims of the masked blocks ([`super::rims`]) are left out too.
+/// Writes the photo without its masked blocks into `masked`, whose memory is used again. With the `picture` (`[3][height][width]`, values
+/// in 0..1) that the masks come from, the rims of the masked blocks ([`super::rims`]) are left out too.
 pub fn mask(states: &[BlockState], picture: Option<&[f32]>, photo: &Target, masked: &mut Target) {
     let grid = BlockGrid::of(photo.width, photo.height);
     (masked.width, masked.height) = (photo.width, photo.height);

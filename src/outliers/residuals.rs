@@ -13,6 +13,8 @@ const BLOCKS_ALONG: usize = 64;
 const SIDE_LEAST: usize = 4;
 /// Fixed-point numbers per unit of a residual, of values in 0..1.
 pub(super) const PER_UNIT: f32 = 16_384.0;
+/// Residuals below this are noise of photos and rounding (values in 0..1): six grey levels.
+pub(super) const RESIDUAL_LEAST: f64 = 0.025;
 /// The residual of a block without used pixels.
 pub(super) const NO_PIXELS: u16 = u16::MAX >> 1;
 
@@ -49,7 +51,7 @@ impl BlockGrid {
         (x..(x + self.side).min(self.width), y..(y + self.side).min(self.height))
     }
 
-    /// Numbers of the pixels of a block, row by row.
+    /// Numbers of the pixels of a block (y * width + x), row by row.
     pub(super) fn pixel_numbers(&self, block: usize) -> impl Iterator<Item = usize> {
         let (columns, rows) = self.pixels(block);
         let width = self.width;
@@ -61,7 +63,7 @@ impl BlockGrid {
         self.side
     }
 
-    /// The blocks of a line of blocks.
+    /// The blocks of a line of blocks, from left to right; lines count from the top.
     pub(super) fn line(&self, line: usize) -> Range<usize> {
         line * self.columns()..((line + 1) * self.columns()).min(self.blocks())
     }

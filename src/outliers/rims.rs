@@ -10,16 +10,15 @@
 //! that was masked by mistake ends when the picture shows the place; 3. nothing is remembered: a rim follows from the masked blocks, the
 //! picture and the photo, so a step whose picture is not looked at has no rims.
 
-use super::residuals::BlockGrid;
+use super::residuals::{BlockGrid, RESIDUAL_LEAST};
 use crate::scene::image::Target;
 use rayon::prelude::*;
 
 /// A pixel belongs to the object if its distance from the colour of the object is at most this share of its distance from the
 /// picture.
 const OBJECT_MOST: f32 = 0.2;
-/// Pixels that differ less from the picture do not matter (values in 0..1): six grey levels.
-const RESIDUAL_LEAST: f32 = 0.025;
 
+/// Red, green and blue in 0..1.
 type Rgb = [f32; 3];
 
 /// Clears `mask` (one byte per pixel) where a pixel of a block beside those in `is_masked` belongs to their object. `picture` is
@@ -28,7 +27,7 @@ pub(super) fn mask_rims(is_masked: &[bool], picture: &[f32], photo: &Target, mas
     let grid = BlockGrid::of(photo.width, photo.height);
     let blocks = (0..grid.blocks()).into_par_iter().with_min_len(64);
     let objects: Vec<Option<Rgb>> =
-        blocks.map(|block| is_masked[block].then(|| mean_colour(&grid, block, photo)).flatten()).collect();
+        blocks.map(|block| is_masked[block].then(|| mean_rgb(&grid, block, photo)).flatten()).collect();
     let lines = mask.par_chunks_mut(grid.side() * photo.width as usize).enumerate();
     lines.for_each(|(line, mask)| {
         let first = line * grid.side() * photo.width as usize;
@@ -38,7 +37,7 @@ pub(super) fn mask_rims(is_masked: &[bool], picture: &[f32], photo: &Target, mas
                 continue;
             }
             for pixel in grid.pixel_numbers(block) {
-                if is_of_object(colour(photo, pixel), shown(picture, photo, pixel), &beside) {
+                if is_of_object(photo_rgb(photo, pixel), picture_rgb(picture, photo, pixel), &beside) {
                     mask[pixel - first] = 0;
                 }
             }
@@ -49,28 +48,29 @@ pub(super) fn mask_rims(is_masked: &[bool], picture: &[f32], photo: &Target, mas
 /// Whether one of the colours of objects explains a pixel of the photo far better than the picture does.
 fn is_of_object(pixel: Rgb, shown: Rgb, objects: &[Rgb]) -> bool {
     let residual = distance(pixel, shown);
-    residual >= RESIDUAL_LEAST && objects.iter().any(|&object| distance(pixel, object) <= OBJECT_MOST * residual)
+    f64::from(residual) >= RESIDUAL_LEAST
+        && objects.iter().any(|&object| distance(pixel, object) <= OBJECT_MOST * residual)
 }
 
 /// The mean colour of the used pixels of a block; `None` without one.
-fn mean_colour(grid: &BlockGrid, block: usize, photo: &Target) -> Option<Rgb> {
+fn mean_rgb(grid: &BlockGrid, block: usize, photo: &Target) -> Option<Rgb> {
     let (mut sums, mut count) = ([0f32; 3], 0u32);
     for pixel in grid.pixel_numbers(block).filter(|&pixel| photo.mask.as_ref().is_none_or(|mask| mask[pixel] != 0)) {
-        sums.iter_mut().zip(colour(photo, pixel)).for_each(|(sum, value)| *sum += value);
+        sums.iter_mut().zip(photo_rgb(photo, pixel)).for_each(|(sum, value)| *sum += value);
         count += 1;
     }
     (count > 0).then(|| sums.map(|sum| sum / count as f32))
 }
 
-fn colour(photo: &Target, pixel: usize) -> Rgb {
+fn photo_rgb(photo: &Target, pixel: usize) -> Rgb {
     std::array::from_fn(|c| f32::from(photo.rgb[3 * pixel + c]) / 255.0)
 }
 
-fn shown(picture: &[f32], photo: &Target, pixel: usize) -> Rgb {
+fn picture_rgb(picture: &[f32], photo: &Target, pixel: usize) -> Rgb {
     std::array::from_fn(|c| picture[c * photo.pixels() + pixel].clamp(0.0, 1.0))
 }
 
-/// Absolute difference, mean over channels.
+/// Absolute difference of two colours, mean over channels, in 0..1.
 fn distance(a: Rgb, b: Rgb) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0
 }

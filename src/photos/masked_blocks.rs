@@ -147,8 +147,8 @@ fn section(page: &mut Page, _: &Path, summary: &Value) {
     page.heading("Parts of photos that contradict the scene");
     page.paragraph(&format!(
         "At the end, blocks of {:.1} % of the area of the training photos did not count (--robust-pixels), because they differ \
-         from the pictures as cars, people or shadows that moved do; rims of objects come on top. Much more than such things take suggests wrong poses or changing \
-         exposures.",
+         from the pictures as cars, people or shadows that moved do; rims of objects come on top. Much more than such things \
+         take suggests wrong poses or changing exposures.",
         100.0 * share
     ));
 }
