@@ -356,7 +356,7 @@ impl PagedScene {
             append(columns, &part);
             Ok::<(), PagingError>(())
         })?;
-        // They are those of the last part, whose pages are not pinned any more.
+        // The row numbers are those of the last part, whose pages are not pinned any more.
         row_from_working.clear();
         Ok(())
     }
