@@ -149,11 +149,6 @@ fn an_order_that_was_chosen_is_kept_under_another_budget() {
         ["--steps", "60", "--frames", "330", "--spill-dir", text(&spill), "--keep-checkpoint", "--out", text(&out)];
     let begun = train(&[&[text(&scene)], &common[..], &begin].concat());
     assert!(begun.status.success(), "{}", stderr(&begun));
-    let order_of = |out: &Path| {
-        let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
-        let line = config.lines().find(|line| line.starts_with("view-order = ")).unwrap();
-        line.split('"').nth(1).unwrap().to_string()
-    };
     let order = order_of(&out);
     assert!(order.starts_with("groups:"), "{order}");
     // All pages fit now.
@@ -171,6 +166,40 @@ fn an_order_that_was_chosen_is_kept_under_another_budget() {
     let got = std::fs::read(out.join("point_cloud.ply")).unwrap();
     assert!(got == with_order(&order), "another scene than with {order} from the start");
     assert!(got != with_order("auto"), "in memory auto is a shuffle, so this shows nothing");
+}
+
+/// Rounds come at the ends of epochs where views come in groups, also where the run has chosen the groups. A resumed run finds the order
+/// by its name.
+#[test]
+fn an_order_that_was_chosen_has_the_rounds_of_the_same_order_by_name() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 150, 48, 32, 8000);
+    let path = |name: &str| folder.path().join(name);
+    let common =
+        "--steps 480 --page-rows 16 --strategy long-axis --refine-start 60 --max-gaussians 10000 --test-every 0";
+    let common: Vec<&str> = common.split(' ').chain(["--device", "cpu", "--quiet"]).collect();
+    let often = ["--refine-every", "60"];
+    let run = |name: &str, more: &[&str]| {
+        let output = train(&[&[text(&scene), "--out", text(&path(name))], &common[..], more].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        std::fs::read(path(name).join("point_cloud.ply")).unwrap()
+    };
+    let spill = path("spill");
+    let chosen = run("chosen", &[&["--frames", "330", "--spill-dir", text(&spill)], &often[..]].concat());
+    let order = order_of(&path("chosen"));
+    assert!(order.starts_with("groups:"), "{order}");
+    let named = ["--view-order", order.as_str()];
+    assert!(chosen == run("named", &[&named, &often[..]].concat()), "{order} by name gives another scene");
+    // An epoch has 150 steps. A round of it recycles as many rows as all rounds of the config's steps would.
+    let seldom = run("seldom", &[&named[..], &["--refine-every", "150"]].concat());
+    assert!(chosen != seldom, "the config of the rounds changes nothing, so this shows little");
+}
+
+/// The order of views in the config of a run.
+fn order_of(out: &Path) -> String {
+    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
+    let line = config.lines().find(|line| line.starts_with("view-order = ")).unwrap();
+    line.split('"').nth(1).unwrap().to_string()
 }
 
 #[test]

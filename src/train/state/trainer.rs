@@ -17,6 +17,7 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::RowCount;
+use crate::densify::strategy::Strategy;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::photos::{PhotoParameters, first_parameters};
@@ -40,6 +41,7 @@ use crate::train::step::train_step::{StepOutcome, train_step};
 use crate::train::step::view::rehearse;
 use crate::train::step::working_set::WorkingSet;
 use std::path::Path;
+use std::sync::Arc;
 use std::time::Instant;
 
 /// Views whose photos are prefetched.
@@ -85,6 +87,11 @@ pub struct Trainer {
     pub(super) ahead_failed: Option<TrainError>,
     /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
     pub(super) rows_of_views: Vec<u32>,
+}
+
+/// The strategy of a run whose views come in this order, from the strategy of its config.
+fn strategy_in(order: &ViewOrder, strategy: &Arc<dyn Strategy>) -> Arc<dyn Strategy> {
+    strategy.for_regions(order.regional_epoch()).unwrap_or_else(|| Arc::clone(strategy))
 }
 
 fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
@@ -140,8 +147,7 @@ impl Trainer {
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
         let train_views = dataset.train_views();
         let order = view_order(options.view_order, options.seed, dataset);
-        let strategy = options.strategy.for_regions(order.regional_epoch());
-        let options = RunOptions { strategy: strategy.unwrap_or_else(|| options.strategy.clone()), ..options };
+        let options = RunOptions { strategy: strategy_in(&order, &options.strategy), ..options };
         Trainer {
             scene,
             order,
@@ -207,9 +213,14 @@ impl Trainer {
         Ok(probed)
     }
 
-    /// Sets the view order before the first step, for orders that depend on the pages.
+    /// Sets the view order before the first step, for orders that depend on the pages. The run is then the one that was made with this
+    /// order: the steps of rounds follow from it.
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
         self.order = view_order(order, self.options.seed, dataset);
+        self.options.view_order = order;
+        // The rules of the pages hold the strategy of the config.
+        self.options.strategy = strategy_in(&self.order, &self.scene.rules.strategy);
+        self.held_out = HeldOut::new(&self.options.strategy, self.train_views.len());
     }
 
     /// The view order.
