@@ -35,7 +35,8 @@ use std::sync::Arc;
 
 /// Rows are recycled once this share of the cap is reached.
 const FULL_FROM: f64 = 0.9;
-/// The largest share of the weighed rows that a round recycles: places are free until the next round, which may be an epoch away.
+/// The largest share of the weighed rows that a round of an epoch recycles, unless the user asked for more: places are free until the
+/// next round, which may be an epoch away.
 const RECYCLED_MOST: f64 = 0.25;
 
 /// The value of `--growth-score`: which rows grow first.
@@ -125,7 +126,8 @@ impl Strategy for LongAxisStrategy {
         if first + u64::from(epoch) >= u64::from(at_ends.stop) {
             return Some(Arc::new(LongAxisStrategy { shares_room: true, ..*self }));
         }
-        let recycle = (self.recycle * f64::from(epoch) / f64::from(self.rounds.every)).min(RECYCLED_MOST);
+        let of_rounds = self.recycle * f64::from(epoch) / f64::from(self.rounds.every);
+        let recycle = of_rounds.min(RECYCLED_MOST.max(self.recycle));
         Some(Arc::new(LongAxisStrategy { rounds: at_ends, recycle, ..*self }))
     }
 

@@ -10,18 +10,23 @@ use serde::de::DeserializeOwned;
 
 /// The bytes are not a value of the type, or the value cannot be encoded.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("the bytes cannot be decoded: {0}")]
+#[error("the value cannot be encoded or decoded: {0}")]
 pub struct EncodingError(String);
 
-/// Longest value, bytes.
-pub const VALUE_BYTES_MAX: usize = 256 << 20;
+/// Longest value, bytes: the state of a run with more photos than any is known to have.
+pub const VALUE_BYTES_MAX: usize = 2 << 30;
 
 /// Encodes a value.
 ///
 /// # Errors
-/// The type contains something that cannot be encoded, such as a list of unknown length.
+/// The type contains something that cannot be encoded, such as a list of unknown length, or the value is too long to be decoded again.
 pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
-    bincode::serde::encode_to_vec(value, bincode::config::legacy()).map_err(|e| EncodingError(e.to_string()))
+    let bytes = bincode::serde::encode_to_vec(value, bincode::config::legacy());
+    let bytes = bytes.map_err(|e| EncodingError(e.to_string()))?;
+    match bytes.len() {
+        0..=VALUE_BYTES_MAX => Ok(bytes),
+        length => Err(EncodingError(format!("{length} bytes are more than the {VALUE_BYTES_MAX} that can be decoded"))),
+    }
 }
 
 /// Decodes the bytes of [`to_bytes`].
@@ -37,6 +42,7 @@ pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EncodingError>
         0x1001..=0x1_0000 => from_limited::<T, 0x1_0000>(bytes),
         0x1_0001..=0x10_0000 => from_limited::<T, 0x10_0000>(bytes),
         0x10_0001..=0x100_0000 => from_limited::<T, 0x100_0000>(bytes),
+        0x100_0001..=0x1000_0000 => from_limited::<T, 0x1000_0000>(bytes),
         _ => from_limited::<T, VALUE_BYTES_MAX>(bytes),
     }
 }

@@ -36,31 +36,34 @@ impl Trainer {
         }
         let started = Instant::now();
         self.drain()?;
-        let values = self.growth_values(dataset, targets)?;
-        let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
-        self.state.growth.checks.push(check);
+        // Without a view that counts the count stays as it is, too.
+        if let Some(values) = self.growth_values(dataset, targets)? {
+            let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
+            self.state.growth.checks.push(check);
+        }
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(())
     }
 
-    /// What the check measures; 0 if no view counts.
-    fn growth_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<GrowthValues, TrainError> {
+    /// What the check measures; `None` if all held-out views, or all that they are compared with, are masked as a whole.
+    fn growth_values(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<Option<GrowthValues>, TrainError> {
         let positions = self.held_out.positions();
         // The view after a held-out one is trained on in its place, so twice as often as others.
         let trained: Vec<usize> = positions.iter().map(|&at| (at + 2) % self.train_views.len()).collect();
         let [held_out, trained] = [positions, &trained].map(|at| at.iter().map(|&at| self.train_views[at]).collect());
-        let [psnr, lost] = self.mean_psnr(held_out, psnr_without_faint, (dataset, targets))?;
-        let [trained_psnr] = self.mean_psnr(trained, psnr_of_view, (dataset, targets))?;
-        Ok(GrowthValues { psnr, trained_psnr, lost: psnr - lost })
+        let held_out = self.mean_psnr(held_out, psnr_without_faint, (dataset, targets))?;
+        let trained = self.mean_psnr(trained, psnr_of_view, (dataset, targets))?;
+        let (Some([psnr, lost]), Some([trained_psnr])) = (held_out, trained) else { return Ok(None) };
+        Ok(Some(GrowthValues { psnr, trained_psnr, lost: psnr - lost }))
     }
 
-    /// Means of values of these views.
+    /// Means of values of these views; `None` if none of them counts.
     fn mean_psnr<const N: usize>(
         &mut self,
         views: Vec<usize>,
         of_view: impl Fn(Now<'_>, &mut dyn Renderer, &Compared<'_>) -> Result<[f64; N], TrainError>,
         (dataset, targets): (&Dataset, &TargetCache),
-    ) -> Result<[f64; N], TrainError> {
+    ) -> Result<Option<[f64; N]>, TrainError> {
         // Those of views that were trained on may have moved.
         let cameras: Vec<Camera> = views.iter().map(|&view| self.camera(dataset, view)).collect();
         self.fit_widest(&cameras);
@@ -85,7 +88,7 @@ impl Trainer {
             let now = (&mut self.scene, self.state.step, &mut self.working);
             values.push(of_view(now, &mut *self.renderer, &compared)?);
         }
-        let count = values.len().max(1) as f64;
-        Ok(std::array::from_fn(|k| values.iter().map(|of_view| of_view[k]).sum::<f64>() / count))
+        let mean = |k: usize| values.iter().map(|of_view| of_view[k]).sum::<f64>() / values.len() as f64;
+        Ok((!values.is_empty()).then(|| std::array::from_fn(mean)))
     }
 }
