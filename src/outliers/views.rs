@@ -10,7 +10,8 @@
 //!
 //! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step does not
 //! train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures fall
-//! fast at first.
+//! fast at first. Where views come in large groups, these are steps of the same group: a region that has just been trained says nothing
+//! about one that has not.
 //!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
 //! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
@@ -190,6 +191,11 @@ impl ViewOutliers {
         squared_error(picture, photo).is_some_and(|mse| measure(mse, variance) > most)
     }
 
+    /// Forgets the measures of the last steps: the coming ones show another region.
+    pub fn forget_recent(&mut self) {
+        self.recent.clear();
+    }
+
     /// Judges the views measured since the last call, at the end of the epoch with this number, from 0. Returns those that
     /// have become outliers, ascending.
     pub fn end_epoch(&mut self, epoch: u32) -> Vec<usize> {
@@ -364,6 +370,8 @@ mod tests {
         assert!(outliers.contradicts(&swapped, &photo), "outliers are no measure of others");
         let masked = Target { mask: Some(vec![0; 32]), ..photo.clone() };
         assert!(!outliers.contradicts(&swapped, &masked));
+        outliers.forget_recent();
+        assert!(!outliers.contradicts(&swapped, &photo), "nothing of this region was seen yet");
     }
 
     #[test]

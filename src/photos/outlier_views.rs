@@ -4,7 +4,7 @@
 //! Not here: the verdict.
 
 use super::PhotoOptions;
-use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
+use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep, STEPS_AFTER_RESET};
 use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
 use crate::outliers::views::{FIRST_EPOCHS, ViewOutliers, ViewState};
@@ -22,6 +22,8 @@ pub(super) const KIND: Kind = Kind { name: "outliers", file: None, first, check,
 
 /// Names that a warning lists.
 const NAMES_LISTED: usize = 20;
+/// A group of at least so many views is judged by its own views. A smaller one has hardly a view left after those that it is judged by.
+const JUDGED_ALONE: usize = 16;
 /// A view that is left out is measured once in this many epochs. In the others its turn goes to another view.
 const MEASURED_EVERY: usize = 4;
 
@@ -118,7 +120,12 @@ impl PhotoParameter for OutlierViews {
 
     /// Notes the error of the view, also of a step that was skipped, and after an epoch names the views that have become outliers.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        self.state.measure(outcome.view, outcome.mse, outcome.photo);
+        if !self.is_dark(outcome.after_reset) {
+            self.state.measure(outcome.view, outcome.mse, outcome.photo);
+        }
+        if outcome.ended_group.is_some_and(|views| views >= JUDGED_ALONE) {
+            self.state.forget_recent();
+        }
         let (done, views) = (outcome.step + 1, self.train_views);
         if !done.is_multiple_of(views) {
             return Vec::new();
@@ -138,6 +145,12 @@ impl PhotoParameter for OutlierViews {
 }
 
 impl OutlierViews {
+    /// Whether the picture of a step so many steps after an opacity reset is dark, whatever its photo. The view is not measured in that
+    /// epoch then. In short epochs each view misses one turn.
+    fn is_dark(&self, after_reset: Option<u32>) -> bool {
+        after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views))
+    }
+
     /// Names views that have become outliers.
     fn warning(&self, found: &[usize], step: u32, dataset: &Dataset) -> Option<String> {
         if found.is_empty() {
@@ -246,6 +259,14 @@ mod tests {
         assert!(leaves_out(29, false, &exchanged), "three epochs of ten views");
         assert!(!leaves_out(30, false, &exchanged));
         assert!(!leaves_out(29, true, &exchanged), "a rehearsal takes the whole step");
+    }
+
+    #[test]
+    fn pictures_soon_after_an_opacity_reset_are_dark() {
+        let short = outliers(&[]);
+        assert!(!short.is_dark(None) && short.is_dark(Some(1)) && short.is_dark(Some(10)) && !short.is_dark(Some(11)));
+        let long = OutlierViews { train_views: 2000, ..outliers(&[]) };
+        assert!(long.is_dark(Some(STEPS_AFTER_RESET)) && !long.is_dark(Some(STEPS_AFTER_RESET + 1)));
     }
 
     #[test]

@@ -36,6 +36,13 @@ pub struct Kind {
     pub section: Section,
 }
 
+/// Steps from the last opacity reset to step `step`; `None` before the first one.
+pub fn steps_after_reset(events: &EventLog, step: u32) -> Option<u32> {
+    let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
+    let reset = events.events().iter().rev().find(is_reset);
+    reset.map(|reset| step.saturating_sub(reset.step))
+}
+
 /// A coming step, or the rehearsal of one.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoStep<'a> {
@@ -54,14 +61,12 @@ pub struct PhotoStep<'a> {
 }
 
 /// Steps after an opacity reset in which pictures are too dark for a judgement.
-const STEPS_AFTER_RESET: u32 = 500;
+pub const STEPS_AFTER_RESET: u32 = 500;
 
 impl PhotoStep<'_> {
     /// Whether an opacity reset is so near that the picture says nothing about its photo.
     pub fn follows_reset(&self) -> bool {
-        let is_reset = |event: &&Event| matches!(event.kind, EventKind::ResetOpacity { .. });
-        let reset = self.events.events().iter().rev().find(is_reset);
-        reset.is_some_and(|reset| self.step - reset.step <= STEPS_AFTER_RESET)
+        steps_after_reset(self.events, self.step).is_some_and(|steps| steps <= STEPS_AFTER_RESET)
     }
 }
 
@@ -76,6 +81,10 @@ pub struct PhotoOutcome<'a> {
     pub is_skipped: bool,
     /// The view was left out: its picture was compared with the photo, and nothing else was done with it.
     pub is_left_out: bool,
+    /// The number of views of the group (`schedule::order`) that ends with this step, if one does.
+    pub ended_group: Option<usize>,
+    /// Steps since the last opacity reset.
+    pub after_reset: Option<u32>,
     /// Mean squared error of the picture.
     pub mse: f64,
     /// The photo.

@@ -73,6 +73,8 @@ pub struct ViewOrder {
     way: Arc<[u32]>,
     epoch: u64,
     drawn: Vec<u32>,
+    /// Where the groups of `drawn` end; empty without groups.
+    ends: Vec<usize>,
 }
 
 impl ViewOrder {
@@ -88,6 +90,7 @@ impl ViewOrder {
             way: way.into(),
             epoch: 0,
             drawn: Vec::new(),
+            ends: Vec::new(),
         };
         order.draw(0);
         order
@@ -106,6 +109,7 @@ impl ViewOrder {
     fn draw(&mut self, epoch: u64) {
         self.epoch = epoch;
         self.drawn.clear();
+        self.ends.clear();
         let mut draws = Stream::new(self.seed, Purpose::ViewOrder, epoch, 0);
         match self.order {
             Order::Shuffle => {
@@ -119,6 +123,7 @@ impl ViewOrder {
                 for group in &mut groups {
                     draws.shuffle(group);
                     self.drawn.extend_from_slice(group);
+                    self.ends.push(self.drawn.len());
                 }
             }
             Order::Tour => {
@@ -132,13 +137,25 @@ impl ViewOrder {
         }
     }
 
-    /// Position of the view of a 0-based step, in 0..views.
-    pub fn view_at(&mut self, step: u32) -> usize {
+    fn draw_epoch_of(&mut self, step: u32) {
         let epoch = u64::from(step) / self.views as u64;
         if epoch != self.epoch {
             self.draw(epoch);
         }
+    }
+
+    /// Position of the view of a 0-based step, in 0..views.
+    pub fn view_at(&mut self, step: u32) -> usize {
+        self.draw_epoch_of(step);
         self.drawn[step as usize % self.views] as usize
+    }
+
+    /// The number of views of the group that ends with this step; `None` within a group, and in an order without several groups.
+    pub fn group_ended_by(&mut self, step: u32) -> Option<usize> {
+        self.draw_epoch_of(step);
+        let end = step as usize % self.views + 1;
+        let group = self.ends.binary_search(&end).ok().filter(|_| self.ends.len() > 1)?;
+        Some(end - group.checked_sub(1).map_or(0, |before| self.ends[before]))
     }
 
     /// Positions of the views of the `count` steps from `step` on.
@@ -246,6 +263,26 @@ mod tests {
         }
         firsts.dedup();
         assert!(firsts.len() > 4, "epochs start in other places");
+    }
+
+    #[test]
+    fn groups_end_where_their_views_end() {
+        for (text, ends) in [("groups:9", 9), ("groups:1", 0), ("shuffle", 0), ("tour", 0)] {
+            let mut order = ViewOrder::new(text.parse().unwrap_or(Order::Tour), 1, &cameras(30));
+            for epoch in 0..3 {
+                let steps = epoch * 900..(epoch + 1) * 900;
+                let last: Vec<u32> = steps.filter(|&step| order.group_ended_by(step).is_some()).collect();
+                assert_eq!(last.len(), ends, "{text}");
+                assert!(ends == 0 || last.last() == Some(&(epoch * 900 + 899)), "{text}: {last:?}");
+                let sizes: Vec<usize> = last.iter().filter_map(|&step| order.group_ended_by(step)).collect();
+                assert!(ends == 0 || sizes.iter().sum::<usize>() == 900, "{text}: {sizes:?}");
+                assert!(
+                    last.windows(2)
+                        .zip(&sizes[1.min(ends)..])
+                        .all(|(pair, &size)| (pair[1] - pair[0]) as usize == size)
+                );
+            }
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@
 use super::trainer::Trainer;
 use crate::dataset::loader::Dataset;
 use crate::photos;
-use crate::photos::parameter::{PhotoOutcome, PhotoStep};
+use crate::photos::parameter::{PhotoOutcome, PhotoStep, steps_after_reset};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 use crate::train::step::train_step::StepOutcome;
@@ -32,7 +32,10 @@ impl Trainer {
     pub(super) fn end_step_of_photo(&mut self, view: usize, done: &StepOutcome, photo: &Target, dataset: &Dataset) {
         let StepOutcome { is_left_out, ref loss, .. } = *done;
         let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some(), loss.mse);
-        let outcome = PhotoOutcome { view, step, is_skipped, is_left_out, mse, photo, dataset };
+        let ended_group = self.order.group_ended_by(step);
+        let after_reset = steps_after_reset(self.scene.events(), step);
+        let outcome =
+            PhotoOutcome { view, step, is_skipped, is_left_out, ended_group, after_reset, mse, photo, dataset };
         let warnings = self.photos.iter_mut().flat_map(|parameter| parameter.end_step(&outcome));
         warnings.for_each(|warning| eprintln!("warning: {warning}"));
     }

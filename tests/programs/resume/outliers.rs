@@ -3,16 +3,18 @@
 use super::bench::{Bench, Place, ended, ply, refused, signal, succeeded};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 
-/// A city whose views share much, so that a photo in a wrong place is noticed within a few epochs. Two photos change places.
-fn swapped() -> Bench {
+/// A city whose views share much, so that a wrong photo is noticed within two epochs, before the first opacity reset. Two photos are negatives.
+fn with_negatives() -> Bench {
     let bench = Bench::new();
     std::fs::remove_dir_all(&bench.scene).unwrap();
     let size = CityOptions { seed: 5, views: 24, width: 64, height: 48, points: 1500, ..CityOptions::default() };
     write_city(&bench.scene, &size, &|_, _| {}).unwrap();
-    let [a, b] = ["view_0003.jpg", "view_0016.jpg"].map(|name| bench.scene.join("images").join(name));
-    let [photo_a, photo_b] = [&a, &b].map(|path| std::fs::read(path).unwrap());
-    std::fs::write(a, photo_b).unwrap();
-    std::fs::write(b, photo_a).unwrap();
+    for name in ["view_0003.jpg", "view_0016.jpg"] {
+        let path = bench.scene.join("images").join(name);
+        let mut photo = image::open(&path).unwrap().to_rgb8();
+        photo.iter_mut().for_each(|value| *value = 255 - *value);
+        photo.save(&path).unwrap();
+    }
     bench
 }
 
@@ -41,15 +43,14 @@ fn resumes_alike(bench: &Bench, flag: &str) -> Vec<u8> {
 
 #[test]
 fn a_run_without_wrong_views_resumes_without_them() {
-    let robust = resumes_alike(&swapped(), "--robust-views");
+    let robust = resumes_alike(&with_negatives(), "--robust-views");
     // What is left out matters: with everything, the scene is another.
-    let with = swapped();
-    assert!(with.alone(&[]).ply != robust, "no view was left out, so the test shows nothing");
+    assert!(with_negatives().alone(&[]).ply != robust, "no view was left out, so the test shows nothing");
 }
 
 #[test]
 fn a_run_that_masks_blocks_resumes_with_its_masks() {
-    // A photo in a wrong place differs in its blocks too.
-    let robust = resumes_alike(&swapped(), "--robust-pixels");
-    assert!(swapped().alone(&[]).ply != robust, "no block was masked, so the test shows nothing");
+    // A negative differs in its blocks too.
+    let robust = resumes_alike(&with_negatives(), "--robust-pixels");
+    assert!(with_negatives().alone(&[]).ply != robust, "no block was masked, so the test shows nothing");
 }
