@@ -1,12 +1,12 @@
-//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that the viewer moves.
+//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that the person watching moves.
 //!
-//! The run and the server share a [`Live`]. The server stores the latest request for a picture. The run draws the picture between two
+//! The run and the server share a [`Live`]. The server stores the requests for pictures. The run draws the oldest one between two
 //! steps and stores its PNG. The server reads curves from the run's `metrics.jsonl`, so they cost the run nothing.
 //!
 //! Not here: drawing, and how often the run does it (`train::run::live`).
 //!
-//! Invariants: 1. a page can only request pictures, so no request changes a result; 2. the server reads one file, the metrics; 3. a
-//! page that was closed costs the run at most one picture.
+//! Invariants: 1. a page can only request pictures, so no request changes a result; 2. the server reads one file, the metrics; 3. each
+//! request gets the picture of its own camera; 4. the run never draws for a page that was closed before the picture was begun.
 
 #[cfg(feature = "serve")]
 mod server;
@@ -15,8 +15,7 @@ use crate::base::error::{InputError, InputResult};
 use serde::{Deserialize, Serialize};
 use std::net::SocketAddr;
 use std::path::PathBuf;
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Widest picture, pixels.
 pub const WIDTH_MOST: u32 = 1280;
@@ -74,6 +73,9 @@ pub struct Status {
     pub picture_percent: u32,
 }
 
+/// A picture as PNG, or why it could not be drawn.
+pub type Picture = Result<Vec<u8>, String>;
+
 /// The number of a request for a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Ticket(u64);
@@ -84,16 +86,16 @@ struct State {
     metrics: Option<PathBuf>,
     status: Status,
     last: Ticket,
-    wanted: Option<(Ticket, Orbit)>,
-    /// The last picture as PNG, or why it could not be drawn.
-    drawn: Option<(Ticket, Result<Vec<u8>, String>)>,
+    /// Requests without an answer, the oldest first.
+    waiting: Vec<(Ticket, Orbit)>,
+    /// Answers that are not fetched yet.
+    answers: Vec<(Ticket, Arc<Picture>)>,
 }
 
 #[derive(Debug)]
 struct Shared {
     address: SocketAddr,
     state: Mutex<State>,
-    has_drawn: Condvar,
 }
 
 /// The state that a run and the server of its page share.
@@ -111,7 +113,7 @@ impl Live {
         let listener = std::net::TcpListener::bind(address).map_err(fail)?;
         listener.set_nonblocking(true).map_err(fail)?;
         let address = listener.local_addr().map_err(fail)?;
-        let live = Live(Arc::new(Shared { address, state: Mutex::default(), has_drawn: Condvar::new() }));
+        let live = Live(Arc::new(Shared { address, state: Mutex::default() }));
         live.serve(listener)?;
         Ok(live)
     }
@@ -147,36 +149,52 @@ impl Live {
         self.state().status = status;
     }
 
-    /// The latest request that is not answered yet.
+    /// The oldest request that is not answered yet.
     pub fn wanted(&self) -> Option<(Ticket, Orbit)> {
-        self.state().wanted
+        self.state().waiting.first().copied()
     }
 
-    /// Answers a request, and all older ones, with a PNG or the reason why the picture could not be drawn.
-    pub fn show(&self, ticket: Ticket, picture: Result<Vec<u8>, String>) {
+    /// Answers a request, and all others for the same camera.
+    pub fn show(&self, (ticket, orbit): (Ticket, Orbit), picture: Picture) {
         let mut state = self.state();
-        if state.wanted.is_some_and(|(wanted, _)| wanted <= ticket) {
-            state.wanted = None;
-        }
-        state.drawn = Some((ticket, picture));
-        self.0.has_drawn.notify_all();
+        let picture = Arc::new(picture);
+        let is_answered = |request: &(Ticket, Orbit)| request.0 == ticket || request.1 == orbit;
+        let (answered, waiting) = state.waiting.iter().partition(|request| is_answered(request));
+        let answered: Vec<(Ticket, Orbit)> = answered;
+        state.waiting = waiting;
+        state.answers.extend(answered.into_iter().map(|(ticket, _)| (ticket, Arc::clone(&picture))));
     }
 
-    /// Requests a picture and waits for the answer. `None` if there is none within `patience`.
-    pub fn ask(&self, orbit: Orbit, patience: Duration) -> Option<Result<Vec<u8>, String>> {
+    /// Requests a picture.
+    pub fn ask(&self, orbit: Orbit) -> Request {
         let mut state = self.state();
-        let ticket = Ticket(state.last.0 + 1);
-        (state.last, state.wanted) = (ticket, Some((ticket, orbit.bounded())));
-        let end = Instant::now() + patience;
-        loop {
-            if let Some((drawn, picture)) = &state.drawn
-                && *drawn >= ticket
-            {
-                return Some(picture.clone());
-            }
-            let rest = end.checked_duration_since(Instant::now())?;
-            state = self.0.has_drawn.wait_timeout(state, rest).unwrap_or_else(PoisonError::into_inner).0;
-        }
+        state.last = Ticket(state.last.0 + 1);
+        let ticket = state.last;
+        state.waiting.push((ticket, orbit.bounded()));
+        Request { live: self.clone(), ticket }
+    }
+}
+
+/// A request for a picture. Dropping it withdraws it.
+#[derive(Debug)]
+pub struct Request {
+    live: Live,
+    ticket: Ticket,
+}
+
+impl Request {
+    /// The picture, once it is drawn.
+    pub fn answer(&self) -> Option<Arc<Picture>> {
+        let state = self.live.state();
+        state.answers.iter().find(|(ticket, _)| *ticket == self.ticket).map(|(_, picture)| Arc::clone(picture))
+    }
+}
+
+impl Drop for Request {
+    fn drop(&mut self) {
+        let mut state = self.live.state();
+        state.waiting.retain(|(ticket, _)| *ticket != self.ticket);
+        state.answers.retain(|(ticket, _)| *ticket != self.ticket);
     }
 }
 
@@ -213,31 +231,22 @@ mod tests {
     }
 
     #[test]
-    fn the_latest_request_answers_the_older_ones() {
-        let shared = Shared {
-            address: SocketAddr::from(([127, 0, 0, 1], 0)),
-            state: Mutex::default(),
-            has_drawn: Condvar::new(),
-        };
-        let live = Live(Arc::new(shared));
-        assert_eq!(live.ask(Orbit::default(), Duration::ZERO), None, "nobody draws");
-        let later = Orbit { turn: 30.0, ..Orbit::default() };
-        assert_eq!(live.ask(later, Duration::ZERO), None);
-        let (ticket, orbit) = live.wanted().unwrap();
-        assert_eq!((ticket, orbit), (Ticket(2), later));
-        live.show(ticket, Ok(vec![1]));
-        assert_eq!(live.wanted(), None);
-        let drawer = live.clone();
-        let drawing = std::thread::spawn(move || {
-            let (ticket, _) = loop {
-                match drawer.wanted() {
-                    Some(wanted) => break wanted,
-                    None => std::thread::yield_now(),
-                }
-            };
-            drawer.show(ticket, Err("no".into()));
-        });
-        assert_eq!(live.ask(later, Duration::from_secs(60)), Some(Err("no".into())), "not the older picture");
-        drawing.join().unwrap();
+    fn each_request_gets_the_picture_of_its_camera_and_a_dropped_one_is_forgotten() {
+        let live = Live(Arc::new(Shared { address: SocketAddr::from(([127, 0, 0, 1], 0)), state: Mutex::default() }));
+        let [here, there] = [0.0, 30.0].map(|turn| Orbit { turn, ..Orbit::default() });
+        let [first, second, third] = [here, there, here].map(|orbit| live.ask(orbit));
+        let wanted = live.wanted().unwrap();
+        assert_eq!(wanted.1, here, "the oldest one");
+        live.show(wanted, Ok(vec![1]));
+        assert_eq!(first.answer().as_deref(), Some(&Ok(vec![1])));
+        assert_eq!(third.answer().as_deref(), Some(&Ok(vec![1])), "of the same camera");
+        assert_eq!(second.answer(), None, "of another camera");
+        let wanted = live.wanted().unwrap();
+        assert_eq!(wanted.1, there);
+        drop(second);
+        assert_eq!(live.wanted(), None, "nobody waits for it");
+        live.show(wanted, Err("too late".into()));
+        drop((first, third));
+        assert!(live.state().answers.is_empty(), "answers that nobody fetches are not kept");
     }
 }

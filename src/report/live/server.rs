@@ -14,20 +14,36 @@ use axum::http::{StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
 use serde::Deserialize;
 use std::io::{Read, Seek, SeekFrom};
 use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::path::Path;
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use tokio::sync::Semaphore;
+use tokio::time::sleep;
 
 /// Longest time that a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// Time between two looks whether a picture is drawn.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// Longest time until the head of a request is complete. A connection that says nothing for so long is closed.
+const HEAD_PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 1 } else { 15 });
+/// Most connections at once; a browser opens six. Others wait, so idle connections cannot take the files that the run needs.
+const CONNECTIONS_MOST: usize = 32;
+/// Time until the next try after a connection could not be accepted.
+const ACCEPT_AGAIN: Duration = Duration::from_millis(200);
 /// Most bytes of metrics in one answer.
 const METRICS_BYTES: u64 = 4 << 20;
+/// Header of an answer of metrics: the length of their file when it was read.
+const METRICS_LENGTH: &str = "x-metrics-length";
 
 /// Serves on a thread of its own for as long as the process lives.
 pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().max_blocking_threads(8).build()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
     let app = Router::new()
         .route("/", get(async || Html(include_str!("page.html"))))
         .route("/status", get(status))
@@ -36,15 +52,32 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
         .layer(from_fn_with_state(live.clone(), check_host))
         .with_state(live);
     std::thread::Builder::new().name("live page".into()).spawn(move || {
-        let served = runtime.block_on(async {
-            let listener = tokio::net::TcpListener::from_std(listener)?;
-            axum::serve(listener, app).await
-        });
-        if let Err(error) = served {
+        if let Err(error) = runtime.block_on(serve(listener, app)) {
             eprintln!("warning: the live page has stopped: {error}");
         }
     })?;
     Ok(())
+}
+
+/// Accepts connections for ever. A connection that cannot be accepted, for example because no file handle is left, is tried again.
+async fn serve(listener: TcpListener, app: Router) -> std::io::Result<()> {
+    let listener = tokio::net::TcpListener::from_std(listener)?;
+    let places = Arc::new(Semaphore::new(CONNECTIONS_MOST));
+    let mut http = http1::Builder::new();
+    http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE);
+    loop {
+        let place = Arc::clone(&places).acquire_owned().await.map_err(std::io::Error::other)?;
+        let Ok((stream, _)) = listener.accept().await else {
+            sleep(ACCEPT_AGAIN).await;
+            continue;
+        };
+        let served = http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(app.clone()));
+        tokio::spawn(async move {
+            // A peer that leaves in the middle of an answer is no fault of the run.
+            let _left = served.await;
+            drop(place);
+        });
+    }
 }
 
 /// Refuses a request to a loopback address whose host name is not this machine's. Otherwise a page of another site could read the
@@ -82,37 +115,93 @@ struct From {
 
 async fn metrics(State(live): State<Live>, Query(From { from }): Query<From>) -> Response {
     let file = live.state().metrics.clone();
-    let lines = file.map_or(Ok(Vec::new()), |file| lines_from(&file, from));
+    let lines = file.map_or(Ok((Vec::new(), 0)), |file| lines_from(&file, from));
     match lines {
-        Ok(lines) => fresh("application/jsonl", lines),
+        Ok((lines, length)) => {
+            ([(METRICS_LENGTH, length.to_string())], fresh("application/jsonl", lines)).into_response()
+        }
         Err(error) => (StatusCode::SERVICE_UNAVAILABLE, error.to_string()).into_response(),
     }
 }
 
-/// The whole lines of a file from a byte on, at most [`METRICS_BYTES`].
-fn lines_from(file: &Path, from: u64) -> std::io::Result<Vec<u8>> {
+/// The whole lines of a file from a byte on, at most [`METRICS_BYTES`], and the length of the file. A run that goes back to its last
+/// commit makes the file shorter: a page that has read further then begins again.
+fn lines_from(file: &Path, from: u64) -> std::io::Result<(Vec<u8>, u64)> {
     let mut file = std::fs::File::open(file)?;
+    let length = file.metadata()?.len();
     file.seek(SeekFrom::Start(from))?;
     let mut lines = Vec::new();
     file.take(METRICS_BYTES).read_to_end(&mut lines)?;
     let end = lines.iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1);
     lines.truncate(end);
-    Ok(lines)
+    Ok((lines, length))
 }
 
+/// Waits for a picture. The request is withdrawn when the page closes the connection, because the server then drops this future.
 async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Response {
-    let asked = tokio::task::spawn_blocking(move || live.ask(orbit, PATIENCE)).await;
-    match asked {
-        Ok(Some(Ok(png))) => fresh("image/png", png),
-        Ok(Some(Err(why))) => (StatusCode::SERVICE_UNAVAILABLE, why).into_response(),
-        _ => (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time: it may be busy").into_response(),
+    let (request, asked) = (live.ask(orbit), Instant::now());
+    while asked.elapsed() < PATIENCE {
+        match request.answer().as_deref() {
+            Some(Ok(png)) => return fresh("image/png", png.clone()),
+            Some(Err(why)) => return (StatusCode::SERVICE_UNAVAILABLE, why.clone()).into_response(),
+            None => sleep(LOOK_EVERY).await,
+        }
     }
+    (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time: it may be busy").into_response()
 }
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use std::io::Write;
+    use std::net::TcpStream;
+
+    fn request(live: &Live, path: &str) -> TcpStream {
+        let mut stream = TcpStream::connect(live.address()).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
+        write!(stream, "GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n").unwrap();
+        stream
+    }
+
+    fn live() -> Live {
+        Live::begin(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap()
+    }
+
+    /// Waits until a picture is wanted, or none any more.
+    fn wait_until_wanted(live: &Live, is_wanted: bool) {
+        let began = Instant::now();
+        while live.wanted().is_some() != is_wanted {
+            assert!(began.elapsed() < Duration::from_secs(60), "wanted: {:?}", live.wanted());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+    }
+
+    #[test]
+    fn silent_connections_are_closed_and_keep_nobody_out() {
+        let live = live();
+        let silent: Vec<TcpStream> =
+            (0..2 * CONNECTIONS_MOST).map(|_| TcpStream::connect(live.address()).unwrap()).collect();
+        let mut answer = String::new();
+        request(&live, "/status").read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+        drop(silent);
+    }
+
+    #[test]
+    fn a_page_that_closes_its_connection_withdraws_its_request() {
+        let live = live();
+        let closed = request(&live, "/picture?turn=7");
+        wait_until_wanted(&live, true);
+        drop(closed);
+        wait_until_wanted(&live, false);
+        let mut open = request(&live, "/picture?turn=8");
+        wait_until_wanted(&live, true);
+        live.show(live.wanted().unwrap(), Ok(vec![7, 8]));
+        let mut answer = Vec::new();
+        open.read_to_end(&mut answer).unwrap();
+        assert!(answer.starts_with(b"HTTP/1.1 200") && answer.ends_with(&[7, 8]));
+    }
 
     #[test]
     fn a_page_on_the_loopback_answers_to_its_own_names_alone() {
@@ -130,9 +219,9 @@ mod tests {
     fn metrics_end_with_a_whole_line() {
         let file = tempfile::NamedTempFile::new().unwrap();
         std::fs::write(file.path(), "{}\n{\"a\":1}\n{\"b").unwrap();
-        assert_eq!(lines_from(file.path(), 0).unwrap(), b"{}\n{\"a\":1}\n");
-        assert_eq!(lines_from(file.path(), 3).unwrap(), b"{\"a\":1}\n");
-        assert_eq!(lines_from(file.path(), 1000).unwrap(), b"");
+        assert_eq!(lines_from(file.path(), 0).unwrap(), (b"{}\n{\"a\":1}\n".to_vec(), 14));
+        assert_eq!(lines_from(file.path(), 3).unwrap(), (b"{\"a\":1}\n".to_vec(), 14));
+        assert_eq!(lines_from(file.path(), 1000).unwrap(), (Vec::new(), 14));
         assert!(lines_from(Path::new("nowhere/metrics.jsonl"), 0).is_err());
     }
 }

@@ -81,9 +81,19 @@ impl Trainer {
         }
     }
 
+    /// [`Trainer::fit_frames`] before a picture of the live page: any camera may ask for one, so it never raises the budget. A picture is
+    /// drawn in batches.
+    pub(crate) fn fit_picture(&mut self, camera: &Camera) {
+        self.fit_frames_within(camera, false);
+    }
+
     /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
     /// fit in one batch is cut into batches that do.
     pub(crate) fn fit_frames(&mut self, camera: &Camera) {
+        self.fit_frames_within(camera, true);
+    }
+
+    fn fit_frames_within(&mut self, camera: &Camera, may_raise: bool) {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
         let pages = self.scene.pager.pages_of_view(camera);
         let index = self.scene.pager.index();
@@ -93,7 +103,7 @@ impl Trainer {
         let view = self.view_memory_of(rows);
         let mut frames = budget.frames(&self.scene, view, needed);
         self.pages_most = usize::MAX;
-        if frames < needed && self.raise_for_frames(budget, needed) {
+        if frames < needed && may_raise && self.raise_for_frames(budget, needed) {
             frames = needed;
         } else if frames < needed {
             let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);

@@ -1,12 +1,12 @@
 //! Pictures for the live page of a run ([`crate::report::live`]), drawn between steps.
 //!
 //! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
-//! most 5 % of the time, after the first; 3. a picture that cannot be drawn gives the page an error and does not end
-//! the run.
+//! most 5 % of the time, after the first; the steps after a picture load again what it evicted, which is not counted; 3. a picture that
+//! cannot be drawn gives the page an error and does not end the run; 4. a run without a waiting page trains as if it had no page.
 
 use crate::base::trace;
 use crate::dataset::loader::Dataset;
-use crate::report::live::{Live, Orbit, Status};
+use crate::report::live::{Live, Orbit, Status, Ticket};
 use crate::scene::camera::Camera;
 use crate::scene::image::Image;
 use crate::train::error::TrainError;
@@ -30,18 +30,30 @@ pub struct LivePage {
     began: Instant,
     /// Time that pictures took.
     spent: Duration,
+    /// Time that the last picture took, which the next one is expected to take.
+    last: Duration,
     told: Option<Instant>,
 }
 
 impl LivePage {
     /// A page whose pictures have taken no time yet.
     pub fn new(live: Live) -> LivePage {
-        LivePage { live, began: Instant::now(), spent: Duration::ZERO, told: None }
+        LivePage { live, began: Instant::now(), spent: Duration::ZERO, last: Duration::ZERO, told: None }
+    }
+
+    /// The request that is to be drawn now, if there is one and the share of pictures allows it.
+    fn due(&self) -> Option<(Ticket, Orbit)> {
+        self.live.wanted().filter(|_| self.may_draw())
+    }
+
+    /// Whether a picture is to be drawn after the next step.
+    pub(super) fn is_due(&self) -> bool {
+        self.due().is_some()
     }
 
     /// Whether the share of pictures allows another one.
     fn may_draw(&self) -> bool {
-        100 * self.spent <= PICTURE_PERCENT * self.began.elapsed()
+        100 * (self.spent + self.last) <= PICTURE_PERCENT * self.began.elapsed()
     }
 }
 
@@ -59,15 +71,17 @@ impl Trainer {
                 picture_percent: PICTURE_PERCENT,
             });
         }
-        let Some((ticket, orbit)) = page.live.wanted().filter(|_| page.may_draw()) else { return };
+        // A step in flight is finished first; the page waits.
+        let Some((ticket, orbit)) = page.due().filter(|_| !self.is_ahead()) else { return };
         let started = Instant::now();
         let _span = trace::span("live picture");
         let picture = match self.live_picture(dataset, orbit) {
             Ok(image) => png(image).map_err(|e| format!("the picture cannot be written: {e}")),
             Err(error) => Err(format!("the picture cannot be drawn: {error}")),
         };
-        page.live.show(ticket, picture);
-        page.spent += started.elapsed();
+        page.live.show((ticket, orbit), picture);
+        page.last = started.elapsed();
+        page.spent += page.last;
     }
 
     /// The scene after the last step, from an orbit.
@@ -78,7 +92,7 @@ impl Trainer {
         let base = &dataset.views[view].camera;
         let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
         let camera = orbit_camera(base, pivot, self.options.up, orbit);
-        self.fit_widest([&camera]);
+        self.fit_picture(&camera);
         let render = self.render_options();
         let now = (&mut self.scene, self.state.step, &mut self.working);
         draw(now, &mut *self.renderer, &camera, &render)?;
@@ -158,10 +172,11 @@ mod tests {
             live: live.clone(),
             began: Instant::now().checked_sub(Duration::from_secs(seconds)).expect("the machine runs for minutes"),
             spent: Duration::from_secs(spent),
+            last: Duration::from_secs(spent.min(1)),
             told: None,
         };
         assert!(page(0, 0).may_draw());
-        assert!(page(4, 100).may_draw() && !page(6, 100).may_draw());
+        assert!(page(4, 110).may_draw() && !page(5, 110).may_draw(), "with the one that is due");
     }
 
     #[test]

@@ -103,7 +103,8 @@ impl Trainer {
         let due = |every: u32| every > 0 && done.is_multiple_of(every);
         let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;
         let is_due = outputs.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self));
-        !is_wanted && !is_due && outputs.live.is_none() && outputs.stop.exit_code().is_none() && !self.is_outgrown()
+        let is_shown = outputs.live.as_ref().is_some_and(LivePage::is_due);
+        !is_wanted && !is_due && !is_shown && outputs.stop.exit_code().is_none() && !self.is_outgrown()
     }
 
     /// The metrics of the last step, without an evaluation.
