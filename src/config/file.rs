@@ -245,14 +245,14 @@ config_keys! {
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
-        /// Format of the result: ply, or a PLY and another format for viewers: spz (about a tenth of the bytes) or sog (a folder
-        /// with levels of detail, which viewers load in parts)
+        /// Files of the result. A PLY is always written; spz adds a file of about a tenth of its bytes, sog a folder with levels of
+        /// detail, which web viewers load in parts. Values: ply, spz or sog
         export: ExportFormat = ExportFormat::Ply => Free;
-        /// Coordinates of the PLY: dataset or local
+        /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
-        /// Up in the PLY: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction of the
-        /// dataset). The PLY is turned so that up is -y, as viewers show it; training is not affected. The file
-        /// point_cloud.transform.json holds the transform back to the dataset
+        /// Up in the exported files: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction
+        /// of the dataset). They are turned so that viewers show up as up: -y in a PLY and a SOG, y in an SPZ. Training is not
+        /// affected. point_cloud.transform.json holds the transform back to the dataset
         [allow_hyphen_values = true] up: Up = Up::Auto => Free;
     }
     "Memory and disk" {

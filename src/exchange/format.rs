@@ -78,7 +78,7 @@ impl ExportFormat {
         }
     }
 
-    /// Removes the export `file` and the transform beside it, if they exist.
+    /// Removes the export `file` and its transform, if they exist.
     ///
     /// # Errors
     /// As [`ExportFormat::check_removable`], or the drive fails.
@@ -87,18 +87,13 @@ impl ExportFormat {
             Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
             _ => Ok(()),
         };
-        let named = match self {
+        match self {
             ExportFormat::Ply | ExportFormat::Spz => {
                 remove_file(file)?;
-                file
+                remove_file(&transform_path(file))
             }
-            ExportFormat::Sog => {
-                let folder = folder_of_tree(file)?;
-                remove_ours(folder, is_of_sog)?;
-                folder
-            }
-        };
-        remove_file(&transform_path(named))
+            ExportFormat::Sog => remove_ours(folder_of_tree(file)?, is_of_sog),
+        }
     }
 
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`.
@@ -119,15 +114,15 @@ impl ExportFormat {
         })
     }
 
-    /// Writes the transform from a file of this format to the dataset's coordinates, beside the file. `meta` is that of a PLY.
+    /// Writes the transform from a file of this format to the dataset's coordinates, beside the file. `meta` is that of a PLY. A folder of
+    /// SOGs holds its own already.
     ///
     /// # Errors
     /// The folder cannot be written.
     pub fn write_transform(self, path: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
         match self {
             ExportFormat::Ply => write_transform(path, meta, frame, meta.upright.map(|_| VIEWER_UP)),
-            // Beside the folder.
-            ExportFormat::Sog => write_transform(folder_of_tree(path)?, meta, frame, meta.upright.map(|_| VIEWER_UP)),
+            ExportFormat::Sog => Ok(()),
             ExportFormat::Spz => write_transform(path, &SpzWriter::spz_meta(meta), frame, meta.upright.map(|_| SPZ_UP)),
         }
     }

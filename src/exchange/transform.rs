@@ -1,4 +1,4 @@
-//! The transform file beside an exported file: maps its coordinates to those of the dataset and back, for programs that do
+//! The transform file of an export: maps its coordinates to those of the dataset and back, for programs that do
 //! not read the comments of a PLY.
 //!
 //! Not here: reading it. gsscale reads the comments.
@@ -12,10 +12,10 @@ use crate::scene::rotation::Rotation;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
-/// Ending of the file: in place of `.ply`, and after any other ending.
+/// Ending of the file beside a file: in place of `.ply`, and after any other ending. In an exported folder, its whole name.
 pub const TRANSFORM_ENDING: &str = "transform.json";
 
-/// The file beside the Gaussians in `file`.
+/// The file beside the Gaussians in `file`, which is no folder.
 pub fn transform_path(file: &Path) -> PathBuf {
     if file.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("ply")) {
         return file.with_extension(TRANSFORM_ENDING);
@@ -26,12 +26,20 @@ pub fn transform_path(file: &Path) -> PathBuf {
     file.with_file_name(name)
 }
 
-/// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`: two 4x4 matrices, row-major, for column vectors.
-/// `up` is the direction that points up in the file; `None` if the Gaussians were not turned.
+/// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`, beside the file. `up` is the direction that
+/// points up in the file; `None` if the Gaussians were not turned.
 ///
 /// # Errors
 /// The folder cannot be written.
 pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Option<[f64; 3]>) -> InputResult<()> {
+    write_whole(&transform_path(file), transform_text(file, meta, frame, up)?.as_bytes())
+}
+
+/// The text of the transform: two 4x4 matrices, row-major, for column vectors.
+///
+/// # Errors
+/// A number is not finite.
+pub fn transform_text(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Option<[f64; 3]>) -> InputResult<String> {
     let turned = meta.upright.unwrap_or(Rotation::IDENTITY);
     let (origin, scale) = match frame {
         ExportFrame::Dataset => ([0.0; 3], 1.0),
@@ -48,9 +56,8 @@ pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Op
         "file_to_dataset": back,
         "dataset_to_file": there,
     });
-    let path = transform_path(file);
-    let text = serde_json::to_string_pretty(&text).map_err(|e| InputError::io(&path, "writing", &e.into()))?;
-    write_whole(&path, (text + "\n").as_bytes())
+    let text = serde_json::to_string_pretty(&text);
+    text.map(|text| text + "\n").map_err(|e| InputError::io(file, "writing its transform", &e.into()))
 }
 
 /// `[A | b]` over `0 0 0 1`.

@@ -44,6 +44,7 @@ pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, 
     page.heading("Training");
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
+    add_export(&mut page, &summary["export"]);
     let tiers = tier_charts(&metrics);
     if !tiers.is_empty() {
         page.heading("Memory and disk");
@@ -271,6 +272,28 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let psnr = psnr.with("trained on", of("trained_psnr"), Mark::LineAndDots);
     let allowed = (rows.svg(), "What each check allowed.".to_string());
     page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
+}
+
+/// What lies in the file for viewers.
+fn add_export(page: &mut Page, export: &Value) {
+    let (Some(file), Some(bytes)) = (export["file"].as_str(), export["bytes"].as_u64()) else { return };
+    let count = |value: &Value| format_grouped(value.as_u64().unwrap_or(0));
+    let levels: Vec<String> = export["levels"].as_array().map_or(&[][..], Vec::as_slice).iter().map(count).collect();
+    let mut text = format!("{file}: {}, ", format_bytes(bytes));
+    text += &match &levels[..] {
+        [] => format!("{} Gaussians.", count(&export["gaussians"])),
+        levels => format!("levels of detail of {} Gaussians.", levels.join(", ")),
+    };
+    for (name, what) in [
+        ("always_shown", "giants lie in env/, beside every level."),
+        ("left_out", "Gaussians of the PLY lie beyond the range of its format and are left out."),
+    ] {
+        if export[name].as_u64().unwrap_or(0) > 0 {
+            text += &format!(" {} {what}", count(&export[name]));
+        }
+    }
+    page.heading("For viewers");
+    page.paragraph(&text);
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

@@ -82,10 +82,11 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
             text += &format!("{}\n", LevelCounts { rows, always_shown: done.always_shown });
         }
         if done.is_local {
-            text += "positions are local: the file's comments give origin and scale\n";
+            text += "positions are local: the file transform.json of the export leads back to the dataset's\n";
         }
         if done.skipped > 0 {
-            text += &format!("{} Gaussians are not finite and were left out\n", done.skipped);
+            text +=
+                &format!("{} Gaussians are not finite, or too far for the format, and were left out\n", done.skipped);
         }
         text
     })?;

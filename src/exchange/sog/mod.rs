@@ -1,4 +1,5 @@
-//! Streamed SOG, version 1, of SOGs of version 2: a folder that viewers load in parts, near parts in detail and far ones coarsely
+//! Writes Streamed SOG, version 1: a folder that viewers load in parts, near parts in detail and far ones coarsely. Each part is a SOG of
+//! version 2
 //! (`developer.playcanvas.com`, "The SOG Format" and "The Streamed SOG Format").
 //!
 //! Not here: reading it.

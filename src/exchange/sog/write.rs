@@ -3,7 +3,7 @@
 //! The writer takes rows in groups, in the order in which they come. It sorts a group by position, cuts it into leaves and writes its
 //! rows as one file of the finest level. It merges each leaf to a quarter, a sixteenth and a sixty-fourth of its rows and adds these to
 //! the open file of their level. Giants go to a folder of their own, which viewers always show: in a leaf, the box of a giant would
-//! contain every camera.
+//! contain every camera. The transform to the dataset's coordinates lies in the folder, so that it moves with it.
 //!
 //! Invariants: 1. memory is bounded by [`memory_bytes`] for any number of rows; 2. the bytes depend on the rows, their order and
 //! the metadata alone, not on the parts in which rows come; 3. the folder appears as a whole; 4. [`is_of_sog`] accepts
@@ -19,7 +19,9 @@ use crate::base::whole_folder::PartFolder;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::{GaussianSink, LEVELS_MAX, LevelCounts, Written};
+use crate::exchange::transform::{TRANSFORM_ENDING, transform_text};
 use crate::scene::columns::Columns;
+use crate::scene::rotation::VIEWER_UP;
 use rayon::prelude::*;
 use std::path::{Component, Path, PathBuf};
 
@@ -74,7 +76,7 @@ pub fn is_of_sog(inside: &Path) -> bool {
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
     let is_level = |folder: &str| folder.split_once('_').is_some_and(|(a, b)| is_number(a) && is_number(b));
     match names[..] {
-        [file] => file == TREE_FILE,
+        [file] => file == TREE_FILE || file == TRANSFORM_ENDING,
         [folder, file] => {
             (folder == GIANTS_FOLDER || is_level(folder)) && (file == META_FILE || PICTURES.contains(&file))
         }
@@ -94,6 +96,7 @@ pub struct SogWriter {
     folder: PartFolder,
     path: PathBuf,
     to_file: ExportRows,
+    meta: SceneMeta,
     sh_degree: u8,
     giant_log_scale: f64,
     group: Vec<ExportRow>,
@@ -121,6 +124,7 @@ impl SogWriter {
             path: path.to_path_buf(),
             giant_log_scale: libm::log(GIANT_RADII * meta.scene_radius / unit),
             to_file,
+            meta: meta.clone(),
             sh_degree,
             group: Vec::new(),
             giants: Vec::new(),
@@ -248,6 +252,9 @@ impl GaussianSink for SogWriter {
         }
         let environment = format!("{GIANTS_FOLDER}/{META_FILE}");
         let tree = text(&mut self.leaves, &self.files, (giants > 0).then_some(&environment), LEVELS);
+        let up = self.meta.upright.map(|_| VIEWER_UP);
+        let transform = transform_text(Path::new(TREE_FILE), &self.meta, self.to_file.frame(), up)?;
+        self.folder.write(Path::new(TRANSFORM_ENDING), transform.as_bytes())?;
         self.folder.write(Path::new(TREE_FILE), tree.as_bytes())?;
         let (bytes, rows) = (self.folder.bytes(), self.rows[0] + giants);
         self.folder.finish()?;

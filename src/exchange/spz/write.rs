@@ -45,6 +45,8 @@ pub struct SpzWriter {
     given: u64,
     rows: u64,
     reach: f32,
+    /// Rows left out because a coordinate is too large for the format.
+    far: u64,
 }
 
 impl SpzWriter {
@@ -77,6 +79,7 @@ impl SpzWriter {
             given: 0,
             rows: 0,
             reach: 0.0,
+            far: 0,
         })
     }
 
@@ -89,7 +92,7 @@ impl SpzWriter {
         let attributes = pack::attribute_bytes(self.sh_degree);
         let row_bytes = RAW_POSITION_BYTES + attributes.iter().sum::<usize>();
         let rows = self.rows_file.get_mut();
-        each_row(rows, row_bytes, |row| {
+        each_row(rows, (self.rows, row_bytes), |row| {
             let (numbers, _) = row[..RAW_POSITION_BYTES].as_chunks::<4>();
             let position = [0, 1, 2].map(|i| f32::from_le_bytes(numbers[i]));
             let packed: [u8; POSITION_BYTES] = pack::position(position, fraction_bits);
@@ -98,7 +101,7 @@ impl SpzWriter {
         let mut start = RAW_POSITION_BYTES;
         for length in attributes {
             if length > 0 {
-                each_row(rows, row_bytes, |row| gzip.write_all(&row[start..start + length]))?;
+                each_row(rows, (self.rows, row_bytes), |row| gzip.write_all(&row[start..start + length]))?;
             }
             start += length;
         }
@@ -118,6 +121,7 @@ impl GaussianSink for SpzWriter {
             let Some(mut row) = self.to_file.row(columns, row) else { continue };
             let reach = row.position.iter().fold(0.0f32, |most, x| most.max(x.abs()));
             if reach > pack::coordinate_max() {
+                self.far += 1;
                 continue;
             }
             row.quat = half_turn_of_own_axes(row.quat);
@@ -133,8 +137,13 @@ impl GaussianSink for SpzWriter {
 
     fn finish(mut self: Box<Self>) -> InputResult<Written> {
         if self.rows == 0 {
-            let problem = format!("none of the {} Gaussians is finite, so there is no row to write", self.given);
-            let remedy = "the training diverged or lost all Gaussians: lower the rates";
+            let far =
+                format!("all {} Gaussians lie beyond the {} units of this format", self.far, pack::coordinate_max());
+            let lost = format!("none of the {} Gaussians is finite, so there is no row to write", self.given);
+            let (problem, remedy) = match self.far {
+                0 => (lost, "the training diverged or lost all Gaussians: lower the rates"),
+                _ => (far, "export in local coordinates (--export-frame local), or as a PLY"),
+            };
             return Err(InputError::new(&self.path, problem, remedy));
         }
         if u32::try_from(self.rows).is_err() {
@@ -165,17 +174,18 @@ fn header(rows: u32, sh_degree: u8, fraction_bits: u8) -> [u8; 16] {
     header
 }
 
-/// Calls `take` with each row of a file of rows.
-fn each_row(file: &mut File, row_bytes: usize, mut take: impl FnMut(&[u8]) -> io::Result<()>) -> io::Result<()> {
+/// Calls `take` with each of `rows` rows of a file of rows.
+fn each_row(
+    file: &mut File,
+    (rows, row_bytes): (u64, usize),
+    mut take: impl FnMut(&[u8]) -> io::Result<()>,
+) -> io::Result<()> {
     file.rewind()?;
-    let mut rows = BufReader::with_capacity(BUFFER_BYTES, file);
+    let mut file = BufReader::with_capacity(BUFFER_BYTES, file);
     let mut row = vec![0; row_bytes];
-    loop {
-        match rows.read_exact(&mut row) {
-            Ok(()) => take(&row)?,
-            // Only whole rows were written.
-            Err(e) if e.kind() == io::ErrorKind::UnexpectedEof => return Ok(()),
-            Err(e) => return Err(e),
-        }
+    for _ in 0..rows {
+        file.read_exact(&mut row)?;
+        take(&row)?;
     }
+    Ok(())
 }

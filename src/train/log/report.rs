@@ -10,6 +10,7 @@ use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitReport;
 use crate::dataset::photo_header::read_header;
 use crate::densify::growth::GrowthCheck;
+use crate::exchange::sink::LEVELS_MAX;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
@@ -193,12 +194,34 @@ pub struct Summary {
     /// The checks by which the run decided its count; empty if it did not.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub growth: Vec<GrowthCheck>,
+    /// The file for viewers beside the PLY (`--export`), if it was asked for and written.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub export: Option<ExportFacts>,
     /// Traffic between the tiers, including import, evaluation and export.
     #[serde(flatten)]
     pub tiers: TierTraffic,
     /// Costs of the commits, if any; after a resume, of the commits since then.
     #[serde(flatten, skip_serializing_if = "Option::is_none", default)]
     pub commits: Option<CommitReport>,
+}
+
+/// A file for viewers in summary.json.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ExportFacts {
+    /// The file, inside the run's folder.
+    pub file: PathBuf,
+    /// Its bytes, or those of all files of its folder.
+    pub bytes: u64,
+    /// Gaussians in it, of its finest level.
+    pub gaussians: u64,
+    /// Gaussians of the PLY that its format cannot hold.
+    pub left_out: u64,
+    /// Gaussians of each level of detail, the finest first, if the format has levels.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub levels: Option<[u64; LEVELS_MAX]>,
+    /// Giants among them, which viewers show beside any level.
+    #[serde(default)]
+    pub always_shown: u64,
 }
 
 /// A PSNR for JSON: at most [`PSNR_PERFECT`]; NaN (a broken picture) becomes the worst value, 0.

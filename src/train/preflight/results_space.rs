@@ -14,8 +14,14 @@ use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::train::inputs::places::drive_of;
 use std::path::Path;
 
-/// Bytes of the files for viewers, over those of the PLY: .05 for SPZ, .1 for the levels of SOG.
-const EXPORT_SHARE: u64 = 8;
+/// Bytes of the files for viewers while they are written, in percent of those of the PLY. SPZ: 8, and 29 for its temporary file. SOG: 12.
+fn export_percent(format: ExportFormat) -> u64 {
+    match format {
+        ExportFormat::Ply => 0,
+        ExportFormat::Spz => 37,
+        ExportFormat::Sog => 12,
+    }
+}
 
 /// Refuses a drive that cannot hold a PLY of the first Gaussians, unless the run is resumed. Warns if the drive may not hold the results of
 /// the end: the PLY, the files for viewers and, where they lie on the same drive, the pages of the store or the checkpoint beyond the
@@ -40,7 +46,7 @@ pub(crate) fn check_drive_of_results(
         );
         return Err(InputError::new(out, problem, "free space on it, or choose another --out"));
     }
-    let results = last + if config.export == ExportFormat::Ply { 0 } else { last / EXPORT_SHARE };
+    let results = last + last / 100 * export_percent(config.export);
     let (pages, beside) = match config.residence() {
         Residence::Memory => (forecast.drive_bytes_most, " and the checkpoint"),
         Residence::SpillDir(folder) if is_same_drive(&drive, &drive_of(folder)) => {

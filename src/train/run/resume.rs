@@ -78,6 +78,10 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
+    // Not only at the end of the run, when its folder is to be replaced.
+    if let Some(file) = config.export.beside(&Trainer::ply_path(&request.out)) {
+        config.export.check_removable(&file)?;
+    }
     if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }

@@ -3,7 +3,8 @@
 //! Not here: whether the folder may be used ([`super::out_folder`]), the plan ([`super::begin`]), what the loop writes on its way.
 //!
 //! Invariants: 1. a run that is stopped or fails after its first step still writes the PLY of its last good step; 2. the
-//! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past.
+//! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past; 4. a file for
+//! viewers that cannot be written costs the run neither its evaluation nor its report, and leaves it to be resumed.
 
 use super::changes::with_absolute_paths;
 use super::costs::Meter;
@@ -33,7 +34,7 @@ use crate::train::inputs::places::absolute;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::facts::{Resolved, write_config};
 use crate::train::log::progress::{Count, Progress};
-use crate::train::log::report::{MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
+use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
@@ -152,7 +153,7 @@ pub(super) fn train_into(
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
     let ply = Trainer::ply_path(out);
-    let saved = save_result(request, dataset, &mut trainer, &ply);
+    let saved = save_result(dataset, &mut trainer, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
@@ -162,6 +163,7 @@ pub(super) fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
+    let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
@@ -175,9 +177,10 @@ pub(super) fn train_into(
     let summary = Summary {
         gaussians: written.rows + written.skipped,
         test: tested.as_ref().ok().copied().flatten(),
-        // A run without its evaluation is not finished: a resume evaluates it.
-        finished: trainer.steps_done() == config.steps && tested.is_ok() && asked.is_none(),
+        // A run without its evaluation or its export is not finished: a resume makes them.
+        finished: trainer.steps_done() == config.steps && tested.is_ok() && exported.is_ok() && asked.is_none(),
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
+        export: exported.as_ref().ok().cloned().flatten(),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
@@ -187,6 +190,7 @@ pub(super) fn train_into(
     trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
     write_report(request)?;
     tested?;
+    exported?;
     tiers.is_done = summary.finished;
     Ok(RunOutcome {
         summary: Some(summary),
@@ -196,31 +200,43 @@ pub(super) fn train_into(
     })
 }
 
-/// Writes the Gaussians at the current step as a PLY and in the format that was asked for, and beside them the way to the dataset's coordinates.
-fn save_result(
+/// Writes the Gaussians at the current step as a PLY, and its transform to the dataset's coordinates.
+fn save_result(dataset: &Dataset, trainer: &mut Trainer, ply: &Path) -> Result<Written, TrainError> {
+    let written = trainer.save(dataset, ply)?;
+    ExportFormat::Ply.write_transform(ply, &trainer.scene_meta(dataset), written.frame)?;
+    Ok(written)
+}
+
+/// Writes the Gaussians of the PLY also in the format that was asked for, with their transform. `None` if only the PLY was.
+fn export_beside(
     request: &RunRequest,
     dataset: &Dataset,
     trainer: &mut Trainer,
     ply: &Path,
-) -> Result<Written, TrainError> {
+    written: &Written,
+) -> Result<Option<ExportFacts>, TrainError> {
     let format = request.config.export;
-    let written = trainer.save(dataset, ply)?;
-    let meta = trainer.scene_meta(dataset);
-    ExportFormat::Ply.write_transform(ply, &meta, written.frame)?;
-    let Some(other) = format.beside(ply) else { return Ok(written) };
+    let Some(other) = format.beside(ply) else { return Ok(None) };
     let exported = trainer.export(dataset, &other, format)?;
-    format.write_transform(&other, &meta, exported.frame)?;
-    if exported.rows < written.rows {
-        let lost = written.rows - exported.rows;
+    format.write_transform(&other, &trainer.scene_meta(dataset), exported.frame)?;
+    let left_out = written.rows.saturating_sub(exported.rows);
+    if left_out > 0 {
         eprintln!(
-            "warning: {} cannot hold {lost} Gaussians: they lie outside the range of its format",
+            "warning: {} cannot hold {left_out} Gaussians: they lie outside the range of its format",
             other.display()
         );
     }
     if let (Some(levels), false) = (exported.levels, request.quiet) {
         eprintln!("{}: {levels}", other.display());
     }
-    Ok(written)
+    Ok(Some(ExportFacts {
+        file: other.strip_prefix(&request.out).unwrap_or(&other).to_path_buf(),
+        bytes: exported.bytes,
+        gaussians: exported.rows,
+        left_out,
+        levels: exported.levels.map(|levels| levels.rows),
+        always_shown: exported.levels.map_or(0, |levels| levels.always_shown),
+    }))
 }
 
 /// Evaluates the result, with pictures, and logs the evaluation.
@@ -293,6 +309,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         photos: BTreeMap::new(),
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
+        export: None,
         tiers: trainer.tier_traffic(),
         commits: None,
     }

@@ -133,14 +133,27 @@ fn a_run_and_an_export_write_the_same_spz() {
         said.contains("use .ply, .spz, or lod-meta.json in a folder of its own") && !bench.path("a.splat").exists(),
         "{said}"
     );
+    // A folder stands where the file is to be written: the run still has its evaluation and its report, and can be resumed.
+    std::fs::remove_file(out.join(files[0])).unwrap();
+    std::fs::create_dir(out.join(files[0])).unwrap();
+    let failed_export = train(&["--resume", text(&out), "--quiet"]);
+    let said = stderr(&failed_export);
+    assert!(failed_export.status.code() == Some(1) && said.contains("point_cloud.spz"), "{said}");
+    let done = summary(&out);
+    assert!(
+        done["finished"] == false && done["test"]["psnr"].is_number() && out.join("report.html").exists(),
+        "{done}"
+    );
+    std::fs::remove_dir(out.join(files[0])).unwrap();
     // A new start in the folder removes the files of the run before.
     bench.go_on(&[]);
+    assert_eq!(summary(&out)["finished"], true);
     assert!(std::fs::read(out.join(files[0])).unwrap() != want[0], "the end of the run wrote its own");
 }
 
-/// Every file of a folder of SOGs, with that of the transform beside it.
+/// Every file of a folder of SOGs.
 fn sog_files(sog: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut found = vec![sog.with_extension("transform.json")];
+    let mut found = Vec::new();
     for entry in std::fs::read_dir(sog).unwrap().map(|entry| entry.unwrap().path()) {
         match entry.is_dir() {
             true => found.extend(std::fs::read_dir(entry).unwrap().map(|entry| entry.unwrap().path())),
@@ -159,6 +172,12 @@ fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
     let want = sog_files(&bench.run_alone(&["--export", "sog"]).join(sog));
     let out = bench.stopped(&["--export", "sog"]);
     let early = sog_files(&out.join(sog));
+    let export = summary(&out)["export"].clone();
+    let finest = export["levels"][0].as_u64().unwrap();
+    assert_eq!(export["file"], "point_cloud_sog/lod-meta.json");
+    assert_eq!(Some(finest + export["always_shown"].as_u64().unwrap()), export["gaussians"].as_u64(), "{export}");
+    let report = std::fs::read_to_string(out.join("report.html")).unwrap();
+    assert!(report.contains("For viewers") && report.contains("point_cloud_sog/lod-meta.json: "));
     let said = ckpt(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json"))]);
     assert!(said.contains("levels of "), "{said}");
     assert!(sog_files(&bench.path(sog)) == early, "the export is not what the trainer wrote");
@@ -167,6 +186,23 @@ fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
     let said =
         failed(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json")), "--host-mem", "90MiB"]);
     assert!(said.contains("give at least"), "the writer's memory counts: {said}");
+    // A PLY beside the folder has a transform of its own.
+    let beside = bench.path(sog).with_extension("ply");
+    ckpt(&["export", text(&out), "--out", text(&beside)]);
+    let file_of = |path: PathBuf| -> Value {
+        serde_json::from_slice::<Value>(&std::fs::read(path).unwrap()).unwrap()["file"].clone()
+    };
+    assert_eq!(file_of(bench.path(sog).join("transform.json")), "lod-meta.json");
+    assert_eq!(file_of(beside.with_extension("transform.json")), "point_cloud_sog.ply");
+    // A folder that could not be replaced at the end is refused before the first step.
+    let foreign = out.join(sog).join("mine.txt");
+    std::fs::write(&foreign, b"").unwrap();
+    let logged = || std::fs::read(out.join("metrics.jsonl")).unwrap();
+    let before = logged();
+    let refused = train(&["--resume", text(&out), "--quiet"]);
+    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("mine.txt"), "{}", stderr(&refused));
+    assert!(logged() == before, "it trained before it refused");
+    std::fs::remove_file(foreign).unwrap();
     bench.go_on(&[]);
     assert!(sog_files(&out.join(sog)) == want, "the resumed run ended with other files");
     // A new run in the folder removes them, and nothing of others.
