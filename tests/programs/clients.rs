@@ -2,8 +2,8 @@
 //! splat-transform. A test runs where its client is installed, and elsewhere prints why it was skipped.
 //!
 //! `GSSCALE_PYTHON` names a Python that has the packages (`pip install plyfile pycolmap tensorboard`), `GSSCALE_NODE_BIN`
-//! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`; older versions do not
-//! turn the axes of an SPZ). `.ci/run` installs all but pycolmap.
+//! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`). `.ci/run` installs all
+//! but pycolmap.
 
 use crate::support::scenes::{city, eval, stderr, text, train};
 use gsscale::dataset::read::{ReadOptions, read_scene};
@@ -167,8 +167,9 @@ fn splat_transform_reads_results() {
     assert!((psnr_of(&copy, &scene) - psnr_of(&ply, &scene)).abs() < 0.01);
     // SPZ rounds colours to 1/255 and scales to 6 %: half a decibel on a picture of some 20 dB.
     let from_spz = folder.path().join("from_spz.ply");
-    let output =
-        Command::new(&program).args(["-w", text(&out.join("point_cloud.spz")), text(&from_spz)]).output().unwrap();
+    // It takes the axes of an SPZ for those of a PLY. Ours are those of the specification: right, up, back.
+    let spz = out.join("point_cloud.spz");
+    let output = Command::new(&program).args(["-w", text(&spz), "-r", "180,0,0", text(&from_spz)]).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(rows_of(&from_spz), rows_of(&ply));
     assert!((psnr_of(&from_spz, &scene) - psnr_of(&ply, &scene)).abs() < 0.5);
