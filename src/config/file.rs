@@ -252,7 +252,8 @@ config_keys! {
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the exported files: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction
         /// of the dataset). They are turned so that viewers show up as up: -y in a PLY and a SOG, y in an SPZ. Training is not
-        /// affected. point_cloud.transform.json holds the transform back to the dataset
+        /// affected. Each file has its transform back to the dataset: point_cloud.transform.json,
+        /// point_cloud.spz.transform.json, transform.json in the folder of a SOG
         [allow_hyphen_values = true] up: Up = Up::Auto => Free;
     }
     "Memory and disk" {

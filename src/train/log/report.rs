@@ -212,7 +212,7 @@ pub struct ExportFacts {
     pub file: PathBuf,
     /// Its bytes, or those of all files of its folder.
     pub bytes: u64,
-    /// Gaussians in it, of its finest level.
+    /// Gaussians in its finest level, and giants.
     pub gaussians: u64,
     /// Gaussians of the PLY that its format cannot hold.
     pub left_out: u64,

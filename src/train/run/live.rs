@@ -1,10 +1,13 @@
 //! Pictures for the live page of a run ([`crate::report::live`]), drawn between steps.
 //!
 //! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
-//! most 5 % of the time, after the first; the steps after a picture load again what it evicted, which is not counted; 3. a picture that
-//! cannot be drawn gives the page an error and does not end the run; 4. a run without a waiting page trains as if it had no page.
+//! most 5 % of the time before each is begun; the steps after a picture load again what it evicted, which is not counted; 3. a picture that
+//! cannot be drawn, or takes too much memory, gives the page an error and does not end the run; 4. a run without a waiting page trains
+//! as if it had no page.
 
+use crate::base::error::{InputError, InputResult};
 use crate::base::trace;
+use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
 use crate::report::live::{Live, Orbit, Status, Ticket};
 use crate::scene::camera::Camera;
@@ -20,6 +23,8 @@ use std::time::{Duration, Instant};
 
 /// Percent of a run's time that pictures may take.
 const PICTURE_PERCENT: u32 = 5;
+/// A picture may take this part of the budget, or as much as a view so far.
+const PICTURE_SHARE: u64 = 8;
 /// Time between two reports of the status.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
 
@@ -30,15 +35,13 @@ pub struct LivePage {
     began: Instant,
     /// Time that pictures took.
     spent: Duration,
-    /// Time that the last picture took, which the next one is expected to take.
-    last: Duration,
     told: Option<Instant>,
 }
 
 impl LivePage {
     /// A page whose pictures have taken no time yet.
     pub fn new(live: Live) -> LivePage {
-        LivePage { live, began: Instant::now(), spent: Duration::ZERO, last: Duration::ZERO, told: None }
+        LivePage { live, began: Instant::now(), spent: Duration::ZERO, told: None }
     }
 
     /// The request that is to be drawn now, if there is one and the share of pictures allows it.
@@ -53,7 +56,7 @@ impl LivePage {
 
     /// Whether the share of pictures allows another one.
     fn may_draw(&self) -> bool {
-        100 * (self.spent + self.last) <= PICTURE_PERCENT * self.began.elapsed()
+        100 * self.spent <= PICTURE_PERCENT * self.began.elapsed()
     }
 }
 
@@ -80,8 +83,7 @@ impl Trainer {
             Err(error) => Err(format!("the picture cannot be drawn: {error}")),
         };
         page.live.show((ticket, orbit), picture);
-        page.last = started.elapsed();
-        page.spent += page.last;
+        page.spent += started.elapsed();
     }
 
     /// The scene after the last step, from an orbit.
@@ -92,11 +94,27 @@ impl Trainer {
         let base = &dataset.views[view].camera;
         let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
         let camera = orbit_camera(base, pivot, self.options.up, orbit);
+        self.check_picture(&camera)?;
         self.fit_picture(&camera);
         let render = self.render_options();
         let now = (&mut self.scene, self.state.step, &mut self.working);
         draw(now, &mut *self.renderer, &camera, &render)?;
         Ok(self.renderer.image()?)
+    }
+
+    /// Refuses a picture for which the renderer would need much more memory than for any view so far. Batches bound the memory of rows, not
+    /// that of what the renderer keeps of each visible one.
+    fn check_picture(&self, camera: &Camera) -> InputResult<()> {
+        let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return Ok(()) };
+        let index = self.scene.pager.index();
+        let rows: u64 =
+            self.scene.pager.pages_of_view(camera).iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let needed = self.renderer.host_bytes_for_rows(rows);
+        if needed <= self.renderer.host_bytes_of_rows().max(budget.bytes / PICTURE_SHARE) {
+            return Ok(());
+        }
+        let problem = format!("{rows} Gaussians may be in view, which takes {} of memory", format_bytes(needed));
+        Err(InputError::new("--serve", problem, "move nearer"))
     }
 
     /// Median depth of the pages that a camera sees, local units; `None` if no page is in front of the camera.
@@ -172,11 +190,10 @@ mod tests {
             live: live.clone(),
             began: Instant::now().checked_sub(Duration::from_secs(seconds)).expect("the machine runs for minutes"),
             spent: Duration::from_secs(spent),
-            last: Duration::from_secs(spent.min(1)),
             told: None,
         };
         assert!(page(0, 0).may_draw());
-        assert!(page(4, 110).may_draw() && !page(5, 110).may_draw(), "with the one that is due");
+        assert!(page(4, 100).may_draw() && !page(6, 100).may_draw());
     }
 
     #[test]

@@ -78,12 +78,12 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
     config.check()?;
+    if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
+        return Ok(outcome);
+    }
     // Not only at the end of the run, when its folder is to be replaced.
     if let Some(file) = config.export.beside(&Trainer::ply_path(&request.out)) {
         config.export.check_removable(&file)?;
-    }
-    if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
-        return Ok(outcome);
     }
     let folder = stored_folder(&request.out, &config);
     if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {

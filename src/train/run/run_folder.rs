@@ -164,14 +164,17 @@ pub(super) fn train_into(
     };
     warn_of_ply(config, &written, &ply);
     let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
+    if let Err(error) = &exported {
+        eprintln!("warning: the file for viewers is not written: {error}");
+    }
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
         None => evaluate_result(request, dataset, &targets, &mut trainer, &mut metrics),
         Some(_) => Ok(None),
     });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps, &tested, tiers.checkpoint.as_mut()) {
-        // Commit again, with the result of the evaluation.
+    if let (true, Ok(_), Some(checkpoint)) = (keeps || exported.is_err(), &tested, tiers.checkpoint.as_mut()) {
+        // Commit again, with the result of the evaluation. A run whose export failed is resumed from this commit.
         checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
     }
     let summary = Summary {
