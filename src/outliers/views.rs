@@ -4,9 +4,9 @@
 //! the share of its photo's variance that its picture leaves unexplained, which photos of much and of little contrast have in
 //! common. The measure is the logarithm of mean squared error over variance.
 //!
-//! At the end of each epoch the views that were measured in it are judged together. A view whose measure lies far above the median of all views, by the
-//! median absolute deviation, gets a strike; any other view loses one. A view is an outlier from its second strike on, until it has lost
-//! all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
+//! At the end of each epoch the views that were measured in it are judged together. A view whose measure lies far above their median, by
+//! the median absolute deviation, gets a strike; any other of them loses one. A view is an outlier from its second strike on, until it
+//! has lost all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
 //!
 //! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step does not
 //! train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures fall

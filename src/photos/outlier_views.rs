@@ -22,8 +22,9 @@ pub(super) const KIND: Kind = Kind { name: "outliers", file: None, first, check,
 
 /// Names that a warning lists.
 const NAMES_LISTED: usize = 20;
-/// A group of at least so many views is judged by its own views. A smaller one has hardly a view left after those that it is judged by.
-const JUDGED_ALONE: usize = 16;
+/// In a group of at least so many views, a view is compared with earlier views of the group only. In a smaller group hardly a view would
+/// come after the first eight, which are compared with nothing.
+const COMPARED_WITHIN: usize = 16;
 /// A view that is left out is measured once in this many epochs. In the others its turn goes to another view.
 const MEASURED_EVERY: usize = 4;
 
@@ -123,7 +124,7 @@ impl PhotoParameter for OutlierViews {
         if !self.is_dark(outcome.after_reset) {
             self.state.measure(outcome.view, outcome.mse, outcome.photo);
         }
-        if outcome.ended_group.is_some_and(|views| views >= JUDGED_ALONE) {
+        if outcome.ended_group.is_some_and(|views| views >= COMPARED_WITHIN) {
             self.state.forget_recent();
         }
         let (done, views) = (outcome.step + 1, self.train_views);
@@ -145,8 +146,8 @@ impl PhotoParameter for OutlierViews {
 }
 
 impl OutlierViews {
-    /// Whether the picture of a step so many steps after an opacity reset is dark, whatever its photo. The view is not measured in that
-    /// epoch then. In short epochs each view misses one turn.
+    /// Whether a picture `after_reset` steps after an opacity reset is dark, whatever its photo shows. Such a picture is not measured: each
+    /// view misses one turn, and in epochs of more than [`STEPS_AFTER_RESET`] steps only some do.
     fn is_dark(&self, after_reset: Option<u32>) -> bool {
         after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views))
     }
@@ -204,8 +205,11 @@ fn section(page: &mut Page, _: &Path, summary: &Value) {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::dataset::frame::Frame;
     use crate::scene::camera::Camera;
     use crate::scene::events::EventLog;
+    use glam::DVec3;
+    use std::path::PathBuf;
 
     fn outliers(named: &[usize]) -> OutlierViews {
         let is_named = |view: usize| named.contains(&view);
@@ -259,6 +263,51 @@ mod tests {
         assert!(leaves_out(29, false, &exchanged), "three epochs of ten views");
         assert!(!leaves_out(30, false, &exchanged));
         assert!(!leaves_out(29, true, &exchanged), "a rehearsal takes the whole step");
+    }
+
+    /// Ends a step on a view, whose picture has this error.
+    fn end(outliers: &mut OutlierViews, step: u32, mse: f64, (ended_group, after_reset): (Option<usize>, Option<u32>)) {
+        let photo = Target { width: 4, height: 4, rgb: (0..48).map(|i| 5 * i).collect(), mask: None };
+        let dataset = Dataset {
+            views: Vec::new(),
+            points: Vec::new(),
+            colors: Vec::new(),
+            frame: Frame { origin: DVec3::ZERO, scale: 1.0 },
+            scene_scale: 1.0,
+            warnings: Vec::new(),
+            image_folder: PathBuf::new(),
+        };
+        let (view, photo, dataset) = (step as usize % 10, &photo, &dataset);
+        let [is_skipped, is_left_out] = [false; 2];
+        let outcome =
+            PhotoOutcome { view, step, is_skipped, is_left_out, ended_group, after_reset, mse, photo, dataset };
+        outliers.end_step(&outcome);
+    }
+
+    #[test]
+    fn steps_soon_after_an_opacity_reset_measure_nothing() {
+        let unexplained = |after_reset: Option<u32>| {
+            let mut outliers = outliers(&[]);
+            end(&mut outliers, 3, 0.02, (None, None));
+            end(&mut outliers, 13, 0.5, (None, after_reset));
+            outliers.state.unexplained(3)
+        };
+        assert!(unexplained(Some(10)) < 0.5, "dark");
+        assert!(unexplained(Some(11)) > 0.5 && unexplained(None) > 0.5);
+    }
+
+    #[test]
+    fn the_views_of_a_large_group_are_not_compared_with_those_of_the_group_before() {
+        let swapped: Vec<f32> = vec![1.0; 48];
+        let photo = Target { width: 4, height: 4, rgb: vec![0; 48], mask: None };
+        let contradicts = |ended_group: Option<usize>| {
+            let mut outliers = outliers(&[]);
+            (0..9).for_each(|step| end(&mut outliers, step, 0.02, (None, None)));
+            end(&mut outliers, 9, 0.02, (ended_group, None));
+            outliers.state.contradicts(&swapped, &photo)
+        };
+        assert!(contradicts(None) && contradicts(Some(COMPARED_WITHIN - 1)));
+        assert!(!contradicts(Some(COMPARED_WITHIN)));
     }
 
     #[test]

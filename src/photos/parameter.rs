@@ -83,9 +83,9 @@ pub struct PhotoOutcome<'a> {
     pub is_left_out: bool,
     /// The number of views of the group (`schedule::order`) that ends with this step, if one does.
     pub ended_group: Option<usize>,
-    /// Steps since the last opacity reset.
+    /// Steps since the last opacity reset; `None` before the first one.
     pub after_reset: Option<u32>,
-    /// Mean squared error of the picture.
+    /// Mean squared error of the picture, of values in 0..1.
     pub mse: f64,
     /// The photo.
     pub photo: &'a Target,

@@ -158,6 +158,9 @@ fn rows_that_no_spz_file_can_hold_are_left_out_and_counted() {
     let before = std::fs::read(&path).unwrap();
     columns.means.fill(f32::NAN);
     assert!(write(&columns).unwrap_err().to_string().contains("none of the 5"));
+    columns.means.fill(1e7);
+    let said = write(&columns).unwrap_err().to_string();
+    assert!(said.contains("all 5 Gaussians lie beyond") && said.contains("--export-frame local"), "{said}");
     assert_eq!(std::fs::read(&path).unwrap(), before, "the target is unchanged");
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     assert!(ExportFormat::of_path(Path::new("a.splat")).unwrap_err().to_string().contains(".spz"));

@@ -1,7 +1,7 @@
-//! Scenes as other programs export them train to the pictures of the same scene as a COLMAP model; and what a folder of photos
-//! alone is told.
+//! Scenes as other programs export them train to the pictures of the same scene as a COLMAP model; what a folder of photos alone is told;
+//! and a run whose own export fails.
 
-use crate::support::scenes::{TextModel, city, stderr, text, train};
+use crate::support::scenes::{TextModel, city, stderr, summary, text, train};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::fs;
 use std::path::Path;
@@ -77,4 +77,28 @@ fn photos_without_poses_are_told_how_to_get_them() {
         assert!(told.contains(&format!("--image_path {} ", scene.join("images").display())), "{told}");
         assert!(!out.exists());
     }
+}
+
+#[test]
+fn a_run_in_memory_whose_export_fails_has_its_report_and_can_be_resumed() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 12, 96, 64, 500);
+    let out = folder.path().join("out");
+    let spz = out.join("point_cloud.spz");
+    // A folder stands where the file is to be written.
+    fs::create_dir_all(&spz).unwrap();
+    let keys = ["--steps", "20", "--export", "spz", "--commit-every", "0", "--quiet", "--device", "cpu", "--overwrite"];
+    let output = train(&[&[text(&scene), "--out", text(&out)], &keys[..]].concat());
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("point_cloud.spz") && said.contains("could not be written"), "{said}");
+    let done = summary(&out);
+    assert!(done["finished"] == false && done["test"]["psnr"].is_number() && done["export"].is_null(), "{done}");
+    assert!(out.join("report.html").is_file());
+    let ply = || fs::read(out.join("point_cloud.ply")).unwrap();
+    let before = ply();
+    fs::remove_dir(&spz).unwrap();
+    let resumed = train(&["--resume", text(&out), "--quiet"]);
+    assert!(resumed.status.success() && spz.is_file(), "{}", stderr(&resumed));
+    assert!(summary(&out)["finished"] == true && ply() == before);
 }

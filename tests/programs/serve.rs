@@ -133,6 +133,26 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
 }
 
 #[test]
+fn a_picture_of_more_gaussians_than_the_budget_allows_is_refused_and_the_run_goes_on() {
+    let folder = TempDir::new().unwrap();
+    let scene = wide_city(folder.path(), 80_000);
+    let [out, spill] = ["out", "pages"].map(|name| folder.path().join(name));
+    let args = "--steps 200 --host-mem 64MiB --page-rows 512 --device cpu --strategy none";
+    let args: Vec<&str> = args.split(' ').collect();
+    let served = begin(&[&[text(&scene), "--out", text(&out), "--spill-dir", text(&spill)], &args[..]].concat());
+    served.picture("view=0&width=48");
+    // Far enough for the whole city.
+    let (head, body) = served.get("/picture?view=0&distance=100&width=48");
+    let said = String::from_utf8(body).unwrap();
+    assert!(
+        head.starts_with("HTTP/1.1 503") && said.contains("80000 Gaussians") && said.contains("move nearer"),
+        "{said}"
+    );
+    served.picture("view=0&width=48");
+    served.end();
+}
+
+#[test]
 fn an_address_that_cannot_be_served_is_refused_before_anything_is_written() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 8, 64, 48, 100);

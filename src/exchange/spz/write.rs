@@ -137,12 +137,12 @@ impl GaussianSink for SpzWriter {
 
     fn finish(mut self: Box<Self>) -> InputResult<Written> {
         if self.rows == 0 {
-            let far =
-                format!("all {} Gaussians lie beyond the {} units of this format", self.far, pack::coordinate_max());
-            let lost = format!("none of the {} Gaussians is finite, so there is no row to write", self.given);
-            let (problem, remedy) = match self.far {
-                0 => (lost, "the training diverged or lost all Gaussians: lower the rates"),
-                _ => (far, "export in local coordinates (--export-frame local), or as a PLY"),
+            let given = self.given;
+            let far = format!("all {given} Gaussians lie beyond the {} units of this format", pack::coordinate_max());
+            let lost = format!("none of the {given} Gaussians is finite, so there is no row to write");
+            let (problem, remedy) = match self.far == given {
+                true => (far, "export in local coordinates (--export-frame local), or as a PLY"),
+                false => (lost, "the training diverged or lost all Gaussians: lower the rates"),
             };
             return Err(InputError::new(&self.path, problem, remedy));
         }

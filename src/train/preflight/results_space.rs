@@ -14,7 +14,8 @@ use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::train::inputs::places::drive_of;
 use std::path::Path;
 
-/// Bytes of the files for viewers while they are written, in percent of those of the PLY. SPZ: 8, and up to 34 for its temporary file. SOG: 12.
+/// The most bytes of the file for viewers while it is written, in percent of those of the PLY. SPZ: 8, and up to 34 for its temporary
+/// file. SOG: 12.
 fn export_percent(format: ExportFormat) -> u64 {
     match format {
         ExportFormat::Ply => 0,

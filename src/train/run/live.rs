@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 
 /// Percent of a run's time that pictures may take.
 const PICTURE_PERCENT: u32 = 5;
-/// A picture may take this part of the budget, or as much as a view so far.
+/// The renderer may take this part of the budget for the rows of a picture, or as much as for a training view so far.
 const PICTURE_SHARE: u64 = 8;
 /// Time between two reports of the status.
 const STATUS_EVERY: Duration = Duration::from_millis(200);
@@ -102,8 +102,11 @@ impl Trainer {
         Ok(self.renderer.image()?)
     }
 
-    /// Refuses a picture for which the renderer would need much more memory than for any view so far. Batches bound the memory of rows, not
-    /// that of what the renderer keeps of each visible one.
+    /// Refuses a picture for which the renderer would need too much memory ([`PICTURE_SHARE`]). Batches bound the memory of gathered rows,
+    /// not that of the splats, which the renderer keeps for every visible row.
+    ///
+    /// # Errors
+    /// The camera may see too many Gaussians.
     fn check_picture(&self, camera: &Camera) -> InputResult<()> {
         let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return Ok(()) };
         let index = self.scene.pager.index();

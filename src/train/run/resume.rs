@@ -81,7 +81,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }
-    // Not only at the end of the run, when its folder is to be replaced.
+    // A folder of SOGs that holds other files is refused here, and not after the last step.
     if let Some(file) = config.export.beside(&Trainer::ply_path(&request.out)) {
         config.export.check_removable(&file)?;
     }

@@ -16,8 +16,7 @@ use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::densify::growth::GrowthCheck;
-use crate::densify::strategy::RowCount;
-use crate::densify::strategy::Strategy;
+use crate::densify::strategy::{RowCount, Strategy};
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::photos::{PhotoParameters, first_parameters};
@@ -213,8 +212,8 @@ impl Trainer {
         Ok(probed)
     }
 
-    /// Sets the view order before the first step, for orders that depend on the pages. The run is then the one that was made with this
-    /// order: the steps of rounds follow from it.
+    /// Sets the view order before the first step, for orders that depend on the pages. Rounds and held-out views follow from the order,
+    /// so the trainer then equals one that was created with it.
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
         self.order = view_order(order, self.options.seed, dataset);
         self.options.view_order = order;
