@@ -43,7 +43,9 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung]) -> String {
     page.charts(&[
         (
             seconds(|r| Some(r.seconds), "Seconds of training"),
-            "Training steps only, without loading and evaluation.".into(),
+            "Training steps only, without loading and evaluation, at the pace of the machine during the first rung where paces \
+             were measured."
+                .into(),
         ),
         (
             seconds(|r| r.cpu_seconds, "CPU seconds of training"),

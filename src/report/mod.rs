@@ -12,6 +12,7 @@ pub mod html;
 pub mod ladder_page;
 pub mod live;
 mod numbers;
+pub mod pace;
 pub mod page_map;
 pub mod picture;
 pub mod record;

@@ -1,6 +1,7 @@
 //! The result of one run as a line of JSON: settings, quality and costs.
 //!
-//! Invariant: the run's own process measured every figure except `wall_seconds`, the lifetime of that process.
+//! Invariant: the run's own process measured every figure except `wall_seconds`, the lifetime of that process, and
+//! `pace_seconds`, which two other runs measured.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -45,6 +46,9 @@ pub struct RunRecord {
     pub cpu_seconds: Option<f64>,
     /// Seconds from the start of the process to its end.
     pub wall_seconds: f64,
+    /// Seconds of a short training of the base, mean of one before and one after this run: the pace of the machine.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub pace_seconds: Option<f64>,
     /// Seconds that steps waited for the drive.
     pub stall_seconds: f64,
     /// Bytes that the steps read from the drive.

@@ -35,7 +35,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let sizes = ["--steps", "60", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seed", "3"];
-    let plain = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
+    let plain = [&["ladder", text(&scene), "--out", text(&out), "--pace-steps", "20"][..], &sizes].concat();
     let args = [&plain[..], &["--json"]].concat();
     let rungs = lines(&args);
     let labels: Vec<&str> = rungs.iter().map(|r| r["label"].as_str().unwrap()).collect();
@@ -56,6 +56,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert!(number(planned, "bytes_read") < number(deferred, "bytes_read"), "Belady reads less than LRU");
     assert!(number(memory, "bytes_read") == 0.0 && number(overlap, "drive_bytes_peak") > 0.0);
     assert!(rungs.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
+    assert!(rungs.iter().all(|r| number(r, "pace_seconds") > 0.0), "the pace of the machine at each rung");
     check_page(&out.join("ladder.html"), &["the same, byte for byte"], folder.path());
     assert!(names(&out.join("spill")).is_empty(), "scratch is removed");
     // Finished runs are not repeated.
@@ -78,13 +79,15 @@ fn rungs_on_a_device_end_alike() {
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let args = ["--steps", "30", "--page-rows", "16", "--strategy", "none", "--share", "70", "--device-mem", "6MiB"];
-    let more = ["--rungs", "overlap,memory,pages,ahead,split,resident", "--device", "gpu", "--json"];
+    let more =
+        ["--pace-steps", "0", "--rungs", "overlap,memory,pages,ahead,split,resident", "--device", "gpu", "--json"];
     let rungs = lines(&[&["ladder", text(&scene), "--out", text(&out)][..], &args, &more].concat());
     let [overlap, memory, pages, ahead, split, resident] = &rungs[..] else { panic!("{rungs:?}") };
     assert!(
         overlap["ply"] == memory["ply"] && [ahead, split, resident].iter().all(|r| r["ply"] == pages["ply"]),
         "{rungs:?}"
     );
+    assert!(rungs.iter().all(|r| r["pace_seconds"].is_null()), "no pace was wanted");
     assert!(number(split, "device_bytes_peak") <= 3.0 * 1048576.0, "{split}");
     assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
     assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{rungs:?}");
@@ -102,7 +105,7 @@ fn rungs_on_a_device_end_alike() {
 
 fn sweep<'a>(scene: &'a Path, out: &'a Path) -> Vec<&'a str> {
     let sizes = ["--steps", "20", "--page-rows", "16", "--strategy", "none", "--seeds", "1,2", "--setting-seeds", "2"];
-    let knobs = ["--knobs", "optimizer,budget,sh,resolution", "--json"];
+    let knobs = ["--pace-steps", "20", "--knobs", "optimizer,budget,sh,resolution", "--json"];
     [&["pareto", text(scene), "--out", text(out)][..], &sizes, &knobs].concat()
 }
 
@@ -175,6 +178,7 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let sparse = of("optimizer", "sparse", 1);
     assert_ne!(sparse["ply"], base["ply"]);
     assert_eq!(sparse["settings"]["optimizer"], "sparse");
+    assert!(records.iter().all(|r| number(r, "pace_seconds") > 0.0), "the pace of the machine at each run");
     // Quality is measured on the photos of the base: half of the resolution is worse there, and would be better on its
     // own photos.
     let small = of("resolution", "1/2", 1);

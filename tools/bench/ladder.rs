@@ -4,7 +4,7 @@
 //! ([`Rounding`]): all on the host but the first, which rewrites every Gaussian at every step; and those on a device.
 
 use super::facts::Facts;
-use super::sweep::{Planned, Sweep, SweepArgs, use_drive};
+use super::sweep::{PACE_STEPS_DEFAULT, Planned, Sweep, SweepArgs, use_drive};
 use super::table::{figure, table};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
@@ -19,6 +19,8 @@ use gsscale::page::format::codec::Codec;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::timing::Transfers;
 use gsscale::report::ladder_page::{LadderRung, Rounding, ladder_page};
+use gsscale::report::pace::convert_to_one_pace;
+use gsscale::report::record::RunRecord;
 use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
@@ -56,6 +58,9 @@ pub struct Args {
     /// Frames in percent of the pages, for all rungs but the last; raised to the need of the largest view
     #[arg(long, default_value_t = 50.0, value_name = "P")]
     share: f64,
+    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine; 0 = do not
+    #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
+    pace_steps: u32,
     /// Rungs to run [default: those that need no GPU]
     #[arg(long, value_delimiter = ',', value_name = "RUNG", hide_default_value = true)]
     #[arg(default_values = HOST_RUNGS, value_parser = PossibleValuesParser::new(RUNGS.map(|r| r.name)))]
@@ -196,7 +201,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     );
     eprintln!("{facts}");
     use_drive(&mut config, frames);
-    let mut sweep = Sweep::open(&args.common, &config, RESULTS)?;
+    let mut sweep = Sweep::open(&args.common, &config, RESULTS)?.with_pace(args.pace_steps);
     let mut done = Vec::new();
     for rung in chosen() {
         let environment = rung.environment;
@@ -205,13 +210,20 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;
         done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), rounding: rung.rounding, record });
-        write_whole(&page, ladder_page(&facts, &done).as_bytes())?;
+        write_whole(&page, ladder_page(&facts, &at_one_pace(&done)).as_bytes())?;
     }
     if !args.common.json {
-        gsscale::say!("{}", text_of(&done));
+        gsscale::say!("{}", text_of(&at_one_pace(&done)));
     }
     eprintln!("done: {}", page.display());
     Ok(())
+}
+
+/// The rungs with their times converted to one pace of the machine.
+fn at_one_pace(rungs: &[LadderRung]) -> Vec<LadderRung> {
+    let mut records: Vec<RunRecord> = rungs.iter().map(|rung| rung.record.clone()).collect();
+    convert_to_one_pace(&mut records);
+    rungs.iter().zip(records).map(|(rung, record)| LadderRung { record, ..rung.clone() }).collect()
 }
 
 /// The rungs as a table.

@@ -2,7 +2,7 @@
 
 use super::facts::Facts;
 use super::knobs::{KNOBS, Knobs};
-use super::sweep::{Planned, Surroundings, Sweep, SweepArgs, use_drive};
+use super::sweep::{PACE_STEPS_DEFAULT, Planned, Surroundings, Sweep, SweepArgs, use_drive};
 use super::table::{figure, table};
 use clap::Parser;
 use clap::builder::PossibleValuesParser;
@@ -13,6 +13,7 @@ use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::page::format::codec::Codec;
 use gsscale::report::front::{Setting, Verdict, against, settings};
+use gsscale::report::pace::convert_to_one_pace;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::sweep_page;
@@ -58,6 +59,9 @@ pub struct Args {
     /// Frames of the base, in percent of the pages; 0 = all pages in memory
     #[arg(long, default_value_t = 0.0, value_name = "P")]
     share: f64,
+    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine; 0 = do not
+    #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
+    pace_steps: u32,
 }
 
 /// Runs the sweep.
@@ -71,7 +75,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     if args.list {
         return list(args, &runs, &Surroundings::of(&args.common)?);
     }
-    let mut sweep = Sweep::open(&args.common, &base.config, RESULTS)?;
+    let mut sweep = Sweep::open(&args.common, &base.config, RESULTS)?.with_pace(args.pace_steps);
     let is_open = |r: &&Planned| successful_run(sweep.records(), &r.key(sweep.surroundings())).is_none();
     let open: Vec<&Planned> = runs.iter().filter(is_open).collect();
     let done = runs.len() - open.len();
@@ -171,13 +175,16 @@ fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<()
 }
 
 /// The runs of this plan that are done. Two settings may share a run; each has the name of the planned setting.
+/// Times are converted to one pace of the machine.
 fn of_plan(runs: &[Planned], sweep: &Sweep) -> Vec<RunRecord> {
     let of_run = |run: &Planned| {
         let key = run.key(sweep.surroundings());
         let record = sweep.records().iter().rev().find(|r| r.key == key)?;
         Some(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() })
     };
-    runs.iter().filter_map(of_run).collect()
+    let mut records: Vec<RunRecord> = runs.iter().filter_map(of_run).collect();
+    convert_to_one_pace(&mut records);
+    records
 }
 
 /// The settings as a table: means over seeds.

@@ -36,6 +36,8 @@ const PROBLEM_MAX: usize = 600;
 const LOCK: &str = "sweep.lock";
 /// Default steps of a run.
 pub const STEPS_DEFAULT: u32 = 3000;
+/// Default steps of the short trainings that show the pace of the machine.
+pub const PACE_STEPS_DEFAULT: u32 = 200;
 /// Default number of `--sh-every` intervals in a run: the last of three raises comes after three tenths.
 const SH_INTERVALS: u32 = 10;
 
@@ -139,6 +141,15 @@ pub struct Sweep {
     lock: File,
     log: ResultsLog,
     json: bool,
+    pace: Pace,
+}
+
+/// A short training of the base, which shows how fast the machine is before and after a run.
+struct Pace {
+    /// Its steps; 0 = the pace is not measured.
+    steps: u32,
+    /// Seconds after the last run, which are those before the next run.
+    after_last_run: Option<f64>,
 }
 
 /// Makes a config keep `frames` pages in memory and the others on the drive.
@@ -188,7 +199,13 @@ impl Sweep {
         // This process holds the lock, so no run uses these files.
         remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
         remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
-        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json: args.json })
+        let pace = Pace { steps: 0, after_last_run: None };
+        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json: args.json, pace })
+    }
+
+    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base in memory. 0 measures nothing.
+    pub fn with_pace(self, steps: u32) -> Sweep {
+        Sweep { pace: Pace { steps, after_last_run: None }, ..self }
     }
 
     /// The results so far.
@@ -211,7 +228,14 @@ impl Sweep {
         let record = match successful_run(self.log.records(), &key) {
             Some(done) => done.clone(),
             None => {
-                let record = self.train(planned, &key)?;
+                let before = match self.pace.after_last_run {
+                    None => self.measure_pace()?,
+                    measured => measured,
+                };
+                let mut record = self.train(planned, &key)?;
+                self.pace.after_last_run = self.measure_pace()?;
+                record.pace_seconds =
+                    before.zip(self.pace.after_last_run).map(|(before, after)| (before + after) / 2.0);
                 self.log.append(record.clone())?;
                 record
             }
@@ -223,6 +247,20 @@ impl Sweep {
             print(&serde_json::to_value(&record).unwrap_or_default());
         }
         Ok(record)
+    }
+
+    /// Seconds of a short training of the base in memory; `None` if it failed or is not wanted.
+    fn measure_pace(&self) -> InputResult<Option<f64>> {
+        if self.pace.steps == 0 {
+            return Ok(None);
+        }
+        let mut config = TrainConfig { steps: self.pace.steps, ..self.base.clone() };
+        (config.spill_dir, config.frames) = (String::new(), 0);
+        let planned = Planned::new("pace", "base", config);
+        let key = planned.key(&self.surroundings);
+        let record = self.train(&planned, &key)?;
+        remove(&self.out.join("runs").join(planned.name(&key)))?;
+        Ok(record.problem.is_none().then_some(record.seconds))
     }
 
     fn train(&self, planned: &Planned, key: &str) -> InputResult<RunRecord> {
