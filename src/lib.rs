@@ -34,7 +34,7 @@
 //! | [`poses`] | where the cameras of photos really stand: a small motion of each, its gradient from those of the rows, its values |
 //! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
 //! | [`photos`] | the one list of what a run learns of each photo: how each kind acts on a step, is saved, and shows in the report |
-//! | [`exchange`] | PLY in and out, SPZ and SOG out; what TensorBoard reads |
+//! | [`exchange`] | PLY in and out, SPZ out, SOG out and in for evaluation; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
@@ -105,7 +105,7 @@
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
 //!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
 //! 2. `exchange/format.rs`: the ending, the sink, the transform, the name in a run's folder, and how `--overwrite` removes it.
-//!    Runs and `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
+//!    Runs and `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it. `train/state/eval_file.rs` is where evaluation reads a format.
 //! 3. `config/choice.rs`: the word of `--export`. `config/file.rs`: the help of the key.
 //!
 //! **A resumable value**

@@ -1,4 +1,4 @@
-//! `gsscale-eval`: held-out PSNR and SSIM of a PLY (or of a run's PLY). Parses, calls the library, prints.
+//! `gsscale-eval`: held-out PSNR and SSIM of a PLY, of a run's PLY, or of the levels of SOGs. Parses, calls the library, prints.
 
 use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
@@ -7,11 +7,13 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::{folder_of, write_whole};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::exchange::sog::is_tree;
 use gsscale::render::lpips::InputRange;
+use gsscale::report::levels_page::{LevelFigures, levels_page};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::facts::read_resolved;
-use gsscale::train::state::eval::{EvalExtras, evaluate_ply};
+use gsscale::train::state::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -20,17 +22,18 @@ Examples:
   gsscale-eval runs/village
   gsscale-eval point_cloud.ply scans/village --data-factor 4 --test-every 83
   gsscale-eval runs/village scans/village --renders pictures --json eval.json
-  gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors --color-correct affine";
+  gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors --color-correct affine
+  gsscale-eval runs/village/point_cloud_sog/lod-meta.json scans/village --page levels.html";
 
 /// Evaluates Gaussians on the held-out photos of a scene.
 #[derive(Parser)]
 #[command(name = "gsscale-eval", version, after_help = EXAMPLES)]
 struct Args {
-    /// A run's output folder (its config.toml is used), or a PLY
+    /// A run's output folder (its config.toml is used), a PLY, or the lod-meta.json of a folder of SOGs, of which each level is measured
     model: PathBuf,
     /// The scene with the photos [default: that of the run]
     scene: Option<PathBuf>,
-    /// Config file; by default the run's own, or the defaults for a bare PLY. Flags override it
+    /// Config file; by default the run's own, or the defaults for a bare file. Flags override it
     #[arg(long)]
     config: Option<PathBuf>,
     /// Write pictures of render and photo side by side into this folder
@@ -45,6 +48,9 @@ struct Args {
     /// Also write the numbers to this file, as JSON
     #[arg(long)]
     json: Option<PathBuf>,
+    /// Write a page with charts of PSNR and SSIM by level of detail (lod-meta.json)
+    #[arg(long, value_name = "FILE")]
+    page: Option<PathBuf>,
     #[command(flatten)]
     keys: TrainOverrides,
 }
@@ -67,6 +73,10 @@ fn start(args: Args) -> Result<(), TrainError> {
     } else {
         (args.model.clone(), None)
     };
+    if args.page.is_some() && !is_tree(&ply) {
+        let remedy = "give the lod-meta.json of a folder of SOGs (--export sog), or leave --page out";
+        return Err(InputError::new("--page", format!("{} has no levels of detail", ply.display()), remedy).into());
+    }
     let scene = args.scene.clone().map_or_else(|| scene_of(&ply), Ok)?;
     let mut config = read_config(args.config.as_deref().or(run_config.as_deref()))?;
     args.keys.apply(&mut config);
@@ -75,21 +85,38 @@ fn start(args: Args) -> Result<(), TrainError> {
         pictures: args.renders.as_deref(),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range)),
     };
-    let report = evaluate_ply(&ply, &scene, &config, &extras)?;
+    let report = evaluate_file(&ply, &scene, &config, &extras)?;
     let text = serde_json::to_string_pretty(&report)
         .map_err(|e| InputError::new(&ply, format!("writing JSON failed: {e}"), "report this as a bug"))?;
     gsscale::say!("{text}");
     if let Some(path) = &args.json {
         write_whole(path, (text + "\n").as_bytes())?;
     }
+    if let Some(path) = &args.page {
+        write_whole(path, page_of(&report).as_bytes())?;
+    }
     Ok(())
 }
 
-/// The scene of the run that wrote `ply`.
+/// The page of the levels of a report.
+fn page_of(report: &EvalReport) -> String {
+    let of_level = |level: &LevelReport| LevelFigures {
+        gaussians: level.gaussians,
+        psnr: level.test.map(|test| test.psnr),
+        ssim: level.test.map(|test| test.ssim),
+    };
+    let levels: Vec<LevelFigures> = report.levels.iter().map(of_level).collect();
+    let views = report.test.map_or(0, |test| test.views);
+    let facts = format!("{views} held-out photos of {}; SSIM: {}", report.scene.display(), report.ssim_variant);
+    levels_page(&report.ply.display().to_string(), &facts, &levels)
+}
+
+/// The scene of the run that wrote `ply`, or of the run in whose folder the folder of SOGs lies.
 fn scene_of(ply: &Path) -> InputResult<PathBuf> {
-    let config = folder_of(ply).join(CONFIG_FILE);
+    let folder = if is_tree(ply) { folder_of(folder_of(ply)) } else { folder_of(ply) };
+    let config = folder.join(CONFIG_FILE);
     if !config.is_file() {
-        let problem = "a PLY outside of a run's folder does not say its scene";
+        let problem = "a file outside of a run's folder does not say its scene";
         return Err(InputError::new(ply, problem, "name the scene: gsscale-eval FILE SCENE"));
     }
     let scene = read_resolved(&config)?.scene;

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 /// A format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExportFormat {
-    /// All values as they are; the only one that training and evaluation read.
+    /// All values as they are; the only one that training reads.
     Ply,
     /// About a tenth of the bytes.
     Spz,

@@ -1,4 +1,4 @@
-//! Exchange with other programs: scenes in and out as PLY, out as SPZ and SOG, scalars for TensorBoard.
+//! Exchange with other programs: scenes in and out as PLY, out as SPZ and SOG, the levels of a SOG in, scalars for TensorBoard.
 
 pub mod format;
 pub mod frames;

@@ -43,8 +43,8 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung]) -> String {
     page.charts(&[
         (
             seconds(|r| Some(r.seconds), "Seconds of training"),
-            "Training steps only, without loading and evaluation, at the pace of the machine during the first rung where paces \
-             were measured."
+            "Training steps only, without loading and evaluation, at the median pace of the machine where paces were \
+             measured."
                 .into(),
         ),
         (

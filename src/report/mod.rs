@@ -10,6 +10,7 @@ pub mod dots;
 pub mod front;
 pub mod html;
 pub mod ladder_page;
+pub mod levels_page;
 pub mod live;
 mod numbers;
 pub mod pace;

@@ -8,12 +8,14 @@
 
 use super::record::RunRecord;
 
-/// Converts the times of all runs to the pace of the first run that has one. Runs without a pace keep their times.
+/// Converts the times of all runs to the median of their paces. Runs without a pace keep their times.
 pub fn convert_to_one_pace(records: &mut [RunRecord]) {
     let pace = |record: &RunRecord| record.pace_seconds.filter(|pace| pace.is_finite() && *pace > 0.0);
-    let Some(first) = records.iter().find_map(pace) else { return };
+    let mut paces: Vec<f64> = records.iter().filter_map(pace).collect();
+    paces.sort_unstable_by(f64::total_cmp);
+    let Some(&median) = paces.get(paces.len() / 2) else { return };
     for record in records {
-        let Some(factor) = pace(record).map(|own| first / own) else { continue };
+        let Some(factor) = pace(record).map(|own| median / own) else { continue };
         // A slow processor does not slow the drive.
         record.seconds = record.stall_seconds + (record.seconds - record.stall_seconds).max(0.0) * factor;
         record.cpu_seconds = record.cpu_seconds.map(|seconds| seconds * factor);
@@ -29,13 +31,13 @@ mod tests {
     }
 
     #[test]
-    fn times_are_those_at_the_pace_of_the_first_run_that_has_one() {
+    fn times_are_those_at_the_median_pace() {
         let slow = run(160.0, 0.0, Some(6.0));
-        let mut records = [run(50.0, 5.0, None), run(80.0, 0.0, Some(3.0)), slow, run(170.0, 10.0, Some(6.0))];
+        let mut records = [run(50.0, 5.0, None), run(80.0, 0.0, Some(3.0)), slow, run(70.0, 10.0, Some(2.0))];
         convert_to_one_pace(&mut records);
         assert_eq!(records[0], run(50.0, 5.0, None));
-        assert_eq!(records.each_ref().map(|record| record.seconds), [50.0, 80.0, 80.0, 90.0]);
-        assert_eq!(records.each_ref().map(|record| record.cpu_seconds), [100.0, 160.0, 160.0, 170.0].map(Some));
+        assert_eq!(records.each_ref().map(|record| record.seconds), [50.0, 80.0, 80.0, 100.0]);
+        assert_eq!(records.each_ref().map(|record| record.cpu_seconds), [100.0, 160.0, 160.0, 210.0].map(Some));
     }
 
     #[test]

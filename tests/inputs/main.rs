@@ -11,5 +11,6 @@ mod photos;
 mod ply;
 mod readers;
 mod sog;
+mod sog_read;
 mod spz;
 mod synthetic;

@@ -97,7 +97,7 @@ fn smallest_three(pixel: [u8; 4]) -> [f64; 4] {
     q
 }
 
-fn write(format: ExportFormat, path: &Path, parts: &[Columns], meta: &SceneMeta) -> Written {
+pub(super) fn write(format: ExportFormat, path: &Path, parts: &[Columns], meta: &SceneMeta) -> Written {
     let rows = parts.iter().map(|part| part.rows() as u64).sum();
     let mut sink = format.create(path, parts[0].sh_degree, rows, meta).unwrap();
     parts.iter().for_each(|part| sink.write(part).unwrap());

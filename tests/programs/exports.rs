@@ -5,6 +5,7 @@ use crate::support::scenes::{TextModel, city, stderr, summary, text, train};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::fs;
 use std::path::Path;
+use std::process::Command;
 use tempfile::TempDir;
 
 /// Trains a few steps and returns the pixels of the held-out pictures, render beside photo.
@@ -58,6 +59,42 @@ fn exports_of_other_programs_train_to_the_same_pictures() {
         assert!(mean < 0.2, "{name}: {mean} levels apart");
         fs::remove_file(scene.join(file)).unwrap();
     }
+}
+
+#[test]
+fn the_levels_of_a_sog_are_measured_and_charted() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 24, 96, 72, 2000);
+    let out = folder.path().join("out");
+    let args = "--steps 300 --export sog --test-every 6 --device cpu";
+    let args: Vec<&str> = args.split(' ').collect();
+    let output = train(&[&[text(&scene), "--out", text(&out)], &args[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let eval = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap();
+    let (sog, page) = (out.join("point_cloud_sog/lod-meta.json"), folder.path().join("levels.html"));
+    let pictures = folder.path().join("pictures");
+    // The folder lies in that of its run, which names the scene.
+    let options = ["--page", text(&page), "--renders", text(&pictures), "--test-every", "6", "--device", "cpu"];
+    let output = eval(&[&[text(&sog)], &options[..]].concat());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let levels = report["levels"].as_array().unwrap();
+    let of = |level: usize, part: &str| levels[level]["test"][part].as_f64().unwrap();
+    let exact = summary(&out)["test"]["psnr"].as_f64().unwrap();
+    // Codes of a byte cost a few tenths of a decibel, and each level more than the one before.
+    assert!(levels.len() == 4 && (of(0, "psnr") - exact).abs() < 0.3, "{exact} {report}");
+    for level in 1..4 {
+        assert!(of(level, "psnr") < of(level - 1, "psnr") && of(level, "ssim") < of(level - 1, "ssim"), "{report}");
+    }
+    assert_eq!((&report["test"], &report["gaussians"]), (&levels[0]["test"], &levels[0]["gaussians"]));
+    let html = fs::read_to_string(&page).unwrap();
+    let psnr = format!("{:.2}", of(3, "psnr"));
+    assert!(["PSNR by level", "<svg", &psnr].iter().all(|part| html.contains(part)), "{html}");
+    assert!(pictures.join("level_3").read_dir().unwrap().count() > 1);
+
+    let refused = eval(&[text(&out), "--page", text(&page), "--device", "cpu"]);
+    let said = stderr(&refused);
+    assert!(!refused.status.success() && said.contains("has no levels of detail") && said.contains("remedy"), "{said}");
 }
 
 #[test]

@@ -21,7 +21,7 @@ use gsscale::train::memory::estimate::reset_host_bytes_peak;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::out_folder::Existing;
 use gsscale::train::run::request::RunRequest;
-use gsscale::train::state::eval::{EvalExtras, evaluate_ply};
+use gsscale::train::state::eval_file::{EvalExtras, evaluate_file};
 use gsscale::train::state::trainer::Trainer;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -281,7 +281,7 @@ fn measure(args: &Args, out: &Path, config: &TrainConfig, summary: Summary) -> R
     let mut ours = Ours::new(summary, config);
     if args.lpips.is_some() || args.no_train {
         let extras = EvalExtras { pictures: None, lpips: args.lpips.as_deref().map(|file| (file, args.lpips_range)) };
-        let report = evaluate_ply(&Trainer::ply_path(out), &args.data, config, &extras)?;
+        let report = evaluate_file(&Trainer::ply_path(out), &args.data, config, &extras)?;
         (ours.test, ours.lpips_variant) = (report.test, report.lpips_variant);
     }
     Ok(ours)

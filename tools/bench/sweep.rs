@@ -229,7 +229,8 @@ impl Sweep {
             Some(done) => done.clone(),
             None => {
                 let before = match self.pace.after_last_run {
-                    None => self.measure_pace()?,
+                    // The first one also brings the photos into memory.
+                    None => self.measure_pace().and_then(|_| self.measure_pace())?,
                     measured => measured,
                 };
                 let mut record = self.train(planned, &key)?;

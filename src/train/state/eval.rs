@@ -9,16 +9,9 @@ use crate::appearance::fit::Pair;
 use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
-use crate::config::file::TrainConfig;
-use crate::config::limits::{self, RunOptions};
-use crate::dataset::loader::{Dataset, load_dataset};
-use crate::dataset::read::read_scene;
+use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::frames::to_local;
-use crate::exchange::ply::{PlyContent, read_ply};
-use crate::paging::pager::{Pager, PagerConfig};
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
-use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::render::{RenderOptions, Renderer};
@@ -26,11 +19,7 @@ use crate::report::run_files::VIEWS_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
-use crate::train::inputs::machine;
-use crate::train::inputs::prepare::ply_warnings;
-use crate::train::log::progress::Count;
 use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
-use crate::train::memory::estimate::{check_photos_fit, host_budget};
 use crate::train::step::pages::PagedScene;
 use crate::train::step::view::draw;
 use crate::train::step::working_set::WorkingSet;
@@ -167,97 +156,4 @@ fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
     }
     image::save_buffer(path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
         .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
-}
-
-/// Report of `gsscale-eval`.
-#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
-pub struct EvalReport {
-    /// The PLY.
-    pub ply: PathBuf,
-    /// Folder of the scene.
-    pub scene: PathBuf,
-    /// Gaussians in the PLY.
-    pub gaussians: u64,
-    /// Variant of SSIM.
-    pub ssim_variant: String,
-    /// Network and input range of LPIPS (`alex, signed`), if measured.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub lpips_variant: Option<String>,
-    /// Means over the held-out views; `None` without held-out views.
-    pub test: Option<TestMetrics>,
-}
-
-/// Optional outputs of the evaluation of a PLY.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct EvalExtras<'a> {
-    /// Folder for pictures.
-    pub pictures: Option<&'a Path>,
-    /// LPIPS weights and the input range of the network.
-    pub lpips: Option<(&'a Path, InputRange)>,
-}
-
-/// Evaluates a PLY of Gaussians on the held-out views of a scene.
-///
-/// # Errors
-/// The PLY, the scene or the weights cannot be used, or a picture cannot be written.
-pub fn evaluate_ply(
-    ply: &Path,
-    scene: &Path,
-    config: &TrainConfig,
-    extras: &EvalExtras<'_>,
-) -> Result<EvalReport, TrainError> {
-    machine::set_up(config)?;
-    let lpips = match extras.lpips {
-        None => None,
-        Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
-    };
-    let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(ply)? else {
-        let problem = "holds points, not Gaussians (no property f_dc_0)";
-        return Err(InputError::new(ply, problem, "give the point_cloud.ply of a run").into());
-    };
-    let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
-    check_photos_fit(&dataset, host_budget(config))?;
-    let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
-    for warning in dataset.warnings.iter().chain(&ply_warnings(ply, &meta, far)) {
-        eprintln!("warning: {warning}");
-    }
-    if columns.rows() == 0 {
-        let problem = "no Gaussian lies within the coordinate range of this scene";
-        return Err(InputError::new(ply, problem, "give a PLY that was trained on this scene").into());
-    }
-    let run = RunOptions::new(config, dataset.scene_scale);
-    let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
-    let gaussians = columns.rows() as u64;
-    // Evaluate with the file's SH degree; the config's is for training.
-    let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
-    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
-    let mut pages = PagedScene::new(&columns, pager, &bands)?;
-    drop(columns);
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let views = dataset.test_views();
-    let shown = Count::new("views compared", views.len() as u32, false);
-    let of_lpips = lpips.as_ref().map(|(lpips, range)| (lpips, *range));
-    let request = EvalRequest {
-        views: &views,
-        ssim: run.ssim_variant,
-        pictures: extras.pictures,
-        lpips: of_lpips,
-        color_correct: run.color_correct,
-        appearance: run.photos.appearance,
-        progress: &|done| shown.show(done),
-    };
-    let (mut renderer, word) = machine::renderer(config)?;
-    if let Some(word) = word {
-        eprintln!("{word}");
-    }
-    let now = (&mut pages, 0, &mut WorkingSet::default());
-    let test = evaluate(now, &mut *renderer, (&dataset, &targets), &render, &request)?;
-    Ok(EvalReport {
-        ply: ply.to_path_buf(),
-        scene: scene.to_path_buf(),
-        gaussians,
-        ssim_variant: config.ssim_variant.to_string(),
-        lpips_variant: of_lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
-        test,
-    })
 }

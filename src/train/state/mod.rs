@@ -2,6 +2,7 @@
 //! many Gaussians the scene needs.
 
 pub mod eval;
+pub mod eval_file;
 mod growth_checks;
 pub(crate) mod held_out;
 mod in_flight;

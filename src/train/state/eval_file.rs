@@ -1,0 +1,204 @@
+//! Evaluation of a file of Gaussians on the held-out photos of a scene: a PLY, or every level of a folder of SOGs.
+//!
+//! Not here: the figures of a view ([`super::eval`]).
+
+use super::eval::{EvalRequest, evaluate};
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::loader::{Dataset, load_dataset};
+use crate::dataset::read::read_scene;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::frames::to_local;
+use crate::exchange::meta::SceneMeta;
+use crate::exchange::ply::{PlyContent, read_ply};
+use crate::exchange::sog::{SogReader, is_tree};
+use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::lpips::weights::read_lpips;
+use crate::render::lpips::{InputRange, Lpips};
+use crate::render::{RenderOptions, Renderer};
+use crate::scene::columns::Columns;
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::inputs::prepare::ply_warnings;
+use crate::train::log::progress::Count;
+use crate::train::log::report::TestMetrics;
+use crate::train::memory::estimate::{check_photos_fit, host_budget};
+use crate::train::step::pages::PagedScene;
+use crate::train::step::working_set::WorkingSet;
+use std::path::{Path, PathBuf};
+
+/// Report of `gsscale-eval`.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct EvalReport {
+    /// The PLY, or the `lod-meta.json` of SOGs.
+    pub ply: PathBuf,
+    /// Folder of the scene.
+    pub scene: PathBuf,
+    /// Gaussians in the file; of the finest level.
+    pub gaussians: u64,
+    /// Variant of SSIM.
+    pub ssim_variant: String,
+    /// Network and input range of LPIPS (`alex, signed`), if measured.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub lpips_variant: Option<String>,
+    /// Means over the held-out views; `None` without held-out views. Of the finest level.
+    pub test: Option<TestMetrics>,
+    /// Each level of detail, the finest first; none of a PLY.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub levels: Vec<LevelReport>,
+}
+
+/// The evaluation of one level of detail, shown everywhere.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct LevelReport {
+    /// Gaussians of the level, with those that are always shown.
+    pub gaussians: u64,
+    /// Means over the held-out views; `None` without held-out views.
+    pub test: Option<TestMetrics>,
+}
+
+/// Optional outputs of the evaluation of a file.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct EvalExtras<'a> {
+    /// Folder for pictures; those of levels have folders in it (`level_0`).
+    pub pictures: Option<&'a Path>,
+    /// LPIPS weights and the input range of the network.
+    pub lpips: Option<(&'a Path, InputRange)>,
+}
+
+/// Evaluates the Gaussians of `file` on the held-out views of a scene.
+///
+/// # Errors
+/// The file, the scene or the weights cannot be used, or a picture cannot be written.
+pub fn evaluate_file(
+    file: &Path,
+    scene: &Path,
+    config: &TrainConfig,
+    extras: &EvalExtras<'_>,
+) -> Result<EvalReport, TrainError> {
+    machine::set_up(config)?;
+    let lpips = match extras.lpips {
+        None => None,
+        Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
+    };
+    let model = Model::open(file)?;
+    let mut photos = Photos::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
+    let mut levels: Vec<LevelReport> = Vec::with_capacity(model.levels());
+    for level in 0..model.levels() {
+        let folder = extras.pictures.map(|folder| match &model {
+            Model::Ply => folder.to_path_buf(),
+            Model::Sog(_) => folder.join(format!("level_{level}")),
+        });
+        levels.push(photos.evaluate(file, model.rows(file, level)?, folder.as_deref())?);
+    }
+    let LevelReport { gaussians, test } = levels[0].clone();
+    Ok(EvalReport {
+        ply: file.to_path_buf(),
+        scene: scene.to_path_buf(),
+        gaussians,
+        ssim_variant: config.ssim_variant.to_string(),
+        lpips_variant: photos.lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
+        test,
+        levels: if matches!(model, Model::Ply) { Vec::new() } else { levels },
+    })
+}
+
+/// Gaussians in a file.
+enum Model {
+    Ply,
+    Sog(SogReader),
+}
+
+impl Model {
+    fn open(file: &Path) -> InputResult<Model> {
+        Ok(if is_tree(file) { Model::Sog(SogReader::open(file)?) } else { Model::Ply })
+    }
+
+    /// At least 1.
+    fn levels(&self) -> usize {
+        match self {
+            Model::Ply => 1,
+            Model::Sog(sog) => sog.levels(),
+        }
+    }
+
+    fn rows(&self, file: &Path, level: usize) -> InputResult<(Columns, SceneMeta)> {
+        match self {
+            Model::Sog(sog) => Ok((sog.level(level)?, sog.meta()?)),
+            Model::Ply => match read_ply(file)? {
+                PlyContent::Gaussians { columns, meta, .. } => Ok((columns, meta)),
+                PlyContent::Points { .. } => {
+                    let problem = "holds points, not Gaussians (no property f_dc_0)";
+                    Err(InputError::new(file, problem, "give the point_cloud.ply of a run"))
+                }
+            },
+        }
+    }
+}
+
+/// The held-out photos of a scene, and what draws Gaussians from their places.
+struct Photos<'a> {
+    config: &'a TrainConfig,
+    dataset: Dataset,
+    targets: TargetCache,
+    renderer: Box<dyn Renderer>,
+    lpips: Option<(&'a Lpips, InputRange)>,
+}
+
+impl<'a> Photos<'a> {
+    fn open(
+        scene: &Path,
+        config: &'a TrainConfig,
+        lpips: Option<(&'a Lpips, InputRange)>,
+    ) -> Result<Photos<'a>, TrainError> {
+        let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
+        check_photos_fit(&dataset, host_budget(config))?;
+        dataset.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+        let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+        let (renderer, word) = machine::renderer(config)?;
+        if let Some(word) = word {
+            eprintln!("{word}");
+        }
+        Ok(Photos { config, dataset, targets, renderer, lpips })
+    }
+
+    /// Evaluates Gaussians that were read from `file`.
+    fn evaluate(
+        &mut self,
+        file: &Path,
+        (mut columns, meta): (Columns, SceneMeta),
+        pictures: Option<&Path>,
+    ) -> Result<LevelReport, TrainError> {
+        let frame = &self.dataset.frame;
+        let far = to_local(&mut columns, &meta, frame.origin.to_array(), frame.scale);
+        ply_warnings(file, &meta, far).iter().for_each(|warning| eprintln!("warning: {warning}"));
+        if columns.rows() == 0 {
+            let problem = "no Gaussian lies within the coordinate range of this scene";
+            return Err(InputError::new(file, problem, "give a file that was trained on this scene").into());
+        }
+        let run = RunOptions::new(self.config, self.dataset.scene_scale);
+        let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
+        let gaussians = columns.rows() as u64;
+        // Evaluate with the file's SH degree; the config's is for training.
+        let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
+        let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
+        let mut pages = PagedScene::new(&columns, pager, &bands)?;
+        drop(columns);
+        let views = self.dataset.test_views();
+        let shown = Count::new("views compared", views.len() as u32, false);
+        let request = EvalRequest {
+            views: &views,
+            ssim: run.ssim_variant,
+            pictures,
+            lpips: self.lpips,
+            color_correct: run.color_correct,
+            appearance: run.photos.appearance,
+            progress: &|done| shown.show(done),
+        };
+        let now = (&mut pages, 0, &mut WorkingSet::default());
+        let photos = (&self.dataset, &self.targets);
+        let test = evaluate(now, &mut *self.renderer, photos, &render, &request)?;
+        Ok(LevelReport { gaussians, test })
+    }
+}
