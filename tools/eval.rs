@@ -23,17 +23,17 @@ Examples:
   gsscale-eval point_cloud.ply scans/village --data-factor 4 --test-every 83
   gsscale-eval runs/village scans/village --renders pictures --json eval.json
   gsscale-eval runs/village scans/village --lpips lpips_alex.safetensors --color-correct affine
-  gsscale-eval runs/village/point_cloud_sog/lod-meta.json scans/village --page levels.html";
+  gsscale-eval runs/village/point_cloud_sog/lod-meta.json --page levels.html";
 
 /// Evaluates Gaussians on the held-out photos of a scene.
 #[derive(Parser)]
 #[command(name = "gsscale-eval", version, after_help = EXAMPLES)]
 struct Args {
-    /// A run's output folder (its config.toml is used), a PLY, or the lod-meta.json of a folder of SOGs, of which each level is measured
+    /// A run's output folder (its config.toml is used), a PLY, or the lod-meta.json of a folder of SOGs (each level is measured)
     model: PathBuf,
     /// The scene with the photos [default: that of the run]
     scene: Option<PathBuf>,
-    /// Config file; by default the run's own, or the defaults for a bare file. Flags override it
+    /// Config file; by default the run's own, or the defaults for a bare file with a scene. Flags override it
     #[arg(long)]
     config: Option<PathBuf>,
     /// Write pictures of render and photo side by side into this folder
@@ -77,7 +77,11 @@ fn start(args: Args) -> Result<(), TrainError> {
         let remedy = "give the lod-meta.json of a folder of SOGs (--export sog), or leave --page out";
         return Err(InputError::new("--page", format!("{} has no levels of detail", ply.display()), remedy).into());
     }
-    let scene = args.scene.clone().map_or_else(|| scene_of(&ply), Ok)?;
+    // A file whose run names the scene is measured on that run's photos.
+    let (scene, run_config) = match args.scene.clone() {
+        Some(scene) => (scene, run_config),
+        None => scene_of(&ply).map(|(scene, config)| (scene, Some(config)))?,
+    };
     let mut config = read_config(args.config.as_deref().or(run_config.as_deref()))?;
     args.keys.apply(&mut config);
     config.check()?;
@@ -101,9 +105,10 @@ fn start(args: Args) -> Result<(), TrainError> {
 /// The page of the levels of a report.
 fn page_of(report: &EvalReport) -> String {
     let of_level = |level: &LevelReport| LevelFigures {
-        gaussians: level.gaussians,
-        psnr: level.test.map(|test| test.psnr),
-        ssim: level.test.map(|test| test.ssim),
+        level: level.level,
+        gaussians: level.figures.gaussians,
+        psnr: level.figures.test.map(|test| test.psnr),
+        ssim: level.figures.test.map(|test| test.ssim),
     };
     let levels: Vec<LevelFigures> = report.levels.iter().map(of_level).collect();
     let views = report.test.map_or(0, |test| test.views);
@@ -111,19 +116,20 @@ fn page_of(report: &EvalReport) -> String {
     levels_page(&report.ply.display().to_string(), &facts, &levels)
 }
 
-/// The scene of the run that wrote `ply`, or of the run in whose folder the folder of SOGs lies.
-fn scene_of(ply: &Path) -> InputResult<PathBuf> {
-    let folder = if is_tree(ply) { folder_of(folder_of(ply)) } else { folder_of(ply) };
+/// The scene and the config file of the run that wrote `file`: a PLY in the run's folder, or a folder of SOGs there.
+fn scene_of(file: &Path) -> InputResult<(PathBuf, PathBuf)> {
+    let whole = std::path::absolute(file).map_err(|e| InputError::io(file, "finding its folder", &e))?;
+    let folder = if is_tree(&whole) { folder_of(folder_of(&whole)) } else { folder_of(&whole) };
     let config = folder.join(CONFIG_FILE);
     if !config.is_file() {
         let problem = "a file outside of a run's folder does not say its scene";
-        return Err(InputError::new(ply, problem, "name the scene: gsscale-eval FILE SCENE"));
+        return Err(InputError::new(file, problem, "name the scene: gsscale-eval FILE SCENE"));
     }
     let scene = read_resolved(&config)?.scene;
     if scene.exists() {
-        return Ok(scene);
+        return Ok((scene, config));
     }
-    let remedy = format!("if it was moved: gsscale-eval {} SCENE", ply.display());
+    let remedy = format!("if it was moved: gsscale-eval {} SCENE", file.display());
     Err(InputError::new(&scene, "the scene of this run is missing", remedy))
 }
 

@@ -43,9 +43,7 @@ pub fn ladder_page(facts: &str, rungs: &[LadderRung]) -> String {
     page.charts(&[
         (
             seconds(|r| Some(r.seconds), "Seconds of training"),
-            "Training steps only, without loading and evaluation, at the median pace of the machine where paces were \
-             measured."
-                .into(),
+            "Training steps only, without loading and evaluation.".into(),
         ),
         (
             seconds(|r| r.cpu_seconds, "CPU seconds of training"),

@@ -1,8 +1,9 @@
 //! The result of one run as a line of JSON: settings, quality and costs.
 //!
 //! Invariant: the run's own process measured every figure except `wall_seconds`, the lifetime of that process, and
-//! `pace_seconds`, which two other runs measured.
+//! `pace`, which two other runs measured.
 
+use super::pace::Pace;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
@@ -46,9 +47,9 @@ pub struct RunRecord {
     pub cpu_seconds: Option<f64>,
     /// Seconds from the start of the process to its end.
     pub wall_seconds: f64,
-    /// Seconds of a short training of the base, mean of one before and one after this run: the pace of the machine.
+    /// The pace of the machine, if it was measured.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub pace_seconds: Option<f64>,
+    pub pace: Option<Pace>,
     /// Seconds that steps waited for the drive.
     pub stall_seconds: f64,
     /// Bytes that the steps read from the drive.

@@ -94,8 +94,7 @@ fn explanation(settings: &[Setting]) -> String {
         "A point is the mean of a setting over its seeds; the bars are the range over seeds in both directions. A \
          difference within the bars of the base means nothing. Dots: no cost in accuracy; rings: a cost, or not known. \
          The grey line joins the settings that no other setting beats. Times are those of the training steps, without \
-         loading and evaluation, at the median pace of the machine where paces were measured. Bytes written include \
-         the commit after the last step. {rule}"
+         loading and evaluation. Bytes written include the commit after the last step. {rule}"
     )
 }
 

@@ -14,8 +14,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// A chunk, with what its values are rounded to.
-struct Chunk {
-    rows: Vec<Row>,
+pub(super) struct Chunk {
+    pub rows: Vec<Row>,
     /// Of the logarithms of positions.
     steps: [f64; 3],
     scales: Vec<f64>,
@@ -40,7 +40,7 @@ fn pixels(path: &Path) -> (usize, Vec<[u8; 4]>) {
     }
 }
 
-fn read_chunk(meta_file: &Path) -> Chunk {
+pub(super) fn read_chunk(meta_file: &Path) -> Chunk {
     let meta: Value = serde_json::from_slice(&std::fs::read(meta_file).unwrap()).unwrap();
     assert_eq!(meta["version"], 2);
     let count = meta["count"].as_u64().unwrap() as usize;
@@ -116,7 +116,7 @@ fn both(folder: &Path, columns: &Columns, meta: &SceneMeta) -> (Columns, PathBuf
     (columns, sog)
 }
 
-fn tree(sog: &Path) -> Value {
+pub(super) fn tree(sog: &Path) -> Value {
     serde_json::from_slice(&std::fs::read(sog.join("lod-meta.json")).unwrap()).unwrap()
 }
 
@@ -200,14 +200,14 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     found
 }
 
-struct Leaf {
+pub(super) struct Leaf {
     low: Vec<f64>,
     high: Vec<f64>,
     /// File, offset and count in each level.
-    parts: Vec<[usize; 3]>,
+    pub parts: Vec<[usize; 3]>,
 }
 
-fn leaves(node: &Value, found: &mut Vec<Leaf>) {
+pub(super) fn leaves(node: &Value, found: &mut Vec<Leaf>) {
     let [low, high] = ["min", "max"].map(|corner| numbers(&node["bound"][corner]));
     if let Some(children) = node["children"].as_array() {
         for child in children {

@@ -1,7 +1,8 @@
 //! Streamed SOG folders read back by the library, against what was written and against the tests' own reader.
 
 use super::ply::scene;
-use super::sog::write;
+use super::sog::{leaves, read_chunk, tree, write};
+use super::support::ExportedRow;
 use gsscale::base::error::InputResult;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::exchange::format::ExportFormat;
@@ -35,10 +36,10 @@ fn the_finest_level_holds_the_rows_in_the_coordinates_of_the_dataset() {
             let meta = SceneMeta { origin, scale: 2.0, scene_radius: 40.0, frame, upright, ..SceneMeta::default() };
             let (given, _folder, path) = written(400, sh_degree, &meta);
             let reader = SogReader::open(&path).unwrap();
-            assert_eq!(reader.levels(), 4);
-            let mut read = reader.level(0).unwrap();
+            assert_eq!(reader.levels(), [0, 1, 2, 3]);
+            let mut read = reader.rows(0).unwrap();
             assert_eq!((read.rows(), read.sh_degree), (400, sh_degree));
-            assert_eq!(to_local(&mut read, &reader.meta().unwrap(), origin, 2.0), 0);
+            assert_eq!(to_local(&mut read, reader.meta(), origin, 2.0), 0);
             let mut is_found = vec![false; 400];
             for row in 0..400 {
                 let apart = |of: &usize| {
@@ -49,7 +50,7 @@ fn the_finest_level_holds_the_rows_in_the_coordinates_of_the_dataset() {
                 assert!(!std::mem::replace(&mut is_found[of], true), "row {of} twice");
                 check_row(&read, row, &given, of);
             }
-            let counts: Vec<usize> = (0..4).map(|level| reader.level(level).unwrap().rows()).collect();
+            let counts: Vec<usize> = (0..4).map(|level| reader.rows(level).unwrap().rows()).collect();
             // Two giants are in every level, and the others merged to a quarter each.
             assert_eq!(counts, [400, 2 + 100, 2 + 25, 2 + 7]);
         }
@@ -72,18 +73,92 @@ fn check_row(read: &Columns, row: usize, given: &Columns, of: usize) {
     assert!((dot.abs() - 1.0).abs() < 5e-5, "row {of}: {dot}");
 }
 
+/// The rows of a level by the tests' own reader: those that are always shown, then those of the leaves in the order of files.
+fn rows_of_level(path: &Path, level: usize) -> Vec<ExportedRow> {
+    let (folder, tree) = (path.parent().unwrap(), tree(path.parent().unwrap()));
+    let mut found = Vec::new();
+    leaves(&tree["tree"], &mut found);
+    let mut parts: Vec<[usize; 3]> = found.iter().map(|leaf| leaf.parts[level]).collect();
+    parts.sort_unstable();
+    let mut rows = read_chunk(&folder.join(tree["environment"].as_str().unwrap())).rows;
+    for [file, first, count] in parts {
+        let name = tree["filenames"][file].as_str().unwrap();
+        rows.extend(read_chunk(&folder.join(name)).rows.drain(first..first + count));
+    }
+    rows
+}
+
 #[test]
-fn a_folder_without_a_transform_has_the_coordinates_of_the_dataset() {
-    let (_, _folder, path) = written(300, 0, &SceneMeta { scene_radius: 20.0, ..SceneMeta::default() });
-    std::fs::remove_file(path.with_file_name("transform.json")).unwrap();
-    assert_eq!(SogReader::open(&path).unwrap().meta().unwrap(), SceneMeta::default());
+fn levels_of_several_files_and_leaves_are_those_of_the_tests_own_reader() {
+    let (_, _folder, path) = written(70_000, 1, &SceneMeta { scene_radius: 20.0, ..SceneMeta::default() });
+    let reader = SogReader::open(&path).unwrap();
+    for level in 0..4 {
+        let (read, own) = (reader.rows(level).unwrap(), rows_of_level(&path, level));
+        assert_eq!(read.rows(), own.len());
+        for (row, own) in own.iter().enumerate() {
+            // f32 rounds at 6e-8 of a value.
+            let near = |column: Column, values: &[f64]| {
+                read.row(column, row)
+                    .iter()
+                    .zip(values)
+                    .all(|(&a, b)| (f64::from(a) - b).abs() < 2e-7 * (1.0 + b.abs()))
+            };
+            assert!(near(Column::Means, &own.position) && near(Column::Scales, &own.log_scales), "row {row}");
+            assert!(near(Column::Quats, &own.quat) && near(Column::Sh0, &own.sh0), "row {row}");
+            assert!(near(Column::ShN, &own.sh_n) && own.sh_n.len() == 9, "row {row}");
+        }
+    }
+}
+
+#[test]
+fn files_of_other_programs_may_lack_what_ours_have() {
+    let (_, _folder, path) = written(300, 1, &SceneMeta { scene_radius: 20.0, ..SceneMeta::default() });
+    let inside = |name: &str| path.with_file_name(name);
+    let edit = |name: &str, change: &dyn Fn(&mut serde_json::Value)| {
+        let file = inside(name);
+        let mut value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+        change(&mut value);
+        std::fs::write(file, value.to_string()).unwrap();
+    };
+    let whole = SogReader::open(&path).unwrap();
+    let whole: Vec<Columns> = (0..4).map(|level| whole.rows(level).unwrap()).collect();
+    // No transform, a path with a dot, no level 1, no harmonics in one file, no first code, compensated opacities.
+    std::fs::remove_file(inside("transform.json")).unwrap();
+    edit("lod-meta.json", &|tree| {
+        tree["asset"]["generator"] = "another program".into();
+        tree["filenames"][0] = "./0_0/meta.json".into();
+        tree["tree"]["lods"].as_object_mut().unwrap().remove("1");
+    });
+    edit("env/meta.json", &|meta| {
+        meta.as_object_mut().unwrap().remove("shN");
+    });
+    edit("0_0/meta.json", &|meta| {
+        meta["scales"]["codebook"][0] = serde_json::Value::Null;
+        meta["antialias"] = true.into();
+    });
+    let reader = SogReader::open(&path).unwrap();
+    assert_eq!(reader.levels(), [0, 2, 3]);
+    assert_eq!(*reader.meta(), SceneMeta { antialiased: true, ..SceneMeta::default() });
+    let rows: Vec<Columns> = (0..3).map(|level| reader.rows(level).unwrap()).collect();
+    assert!(rows[1].means == whole[2].means && rows[2].scales == whole[3].scales, "other levels stay");
+    let [read, given] = [&rows[0], &whole[0]];
+    assert!(read.sh_degree == 1 && read.means == given.means);
+    // The two giants of the first file have no harmonics now.
+    assert!(read.sh_n[..18].iter().all(|&v| v == 0.0) && read.sh_n[18..] == given.sh_n[18..]);
+    let least = given.scales[6..].iter().copied().fold(f32::INFINITY, f32::min);
+    let moved = read.scales.iter().zip(&given.scales).filter(|(a, b)| a != b);
+    // The first code is now a 255th of the range below the second.
+    assert!(
+        moved.clone().count() > 0 && moved.clone().all(|(a, &b)| b == least && (a - b).abs() < 1.0),
+        "{:?}",
+        moved.count()
+    );
 }
 
 /// All levels of a folder.
 fn read_all(path: &Path) -> InputResult<Vec<Columns>> {
     let reader = SogReader::open(path)?;
-    reader.meta()?;
-    (0..reader.levels()).map(|level| reader.level(level)).collect()
+    (0..reader.levels().len()).map(|level| reader.rows(level)).collect()
 }
 
 #[test]
@@ -142,15 +217,29 @@ fn names_that_leave_the_folder_and_numbers_that_files_lack_are_refused() {
     refuses(&path, "0_0/meta.json", "../a/0_0/meta.json", "which is not in its folder");
     refuses(&path, "0_0/meta.json", "/0_0/meta.json", "which is not in its folder");
     refuses(&chunk, "means_l.webp", "../0_0/means_l.webp", "which is not in its folder");
-    refuses(&path, "\"offset\":0", "\"offset\":9", "are not in");
-    refuses(&path, "\"offset\":0", "\"offset\":18446744073709551615", "are not in");
-    refuses(&path, "\"file\":0", "\"file\":77", "names file 77");
-    refuses(&chunk, "\"count\":298", "\"count\":4000000000", "at most");
-    refuses(&chunk, "\"count\":298", "\"count\":4000000", "was expected");
+    refuses(&path, "\"offset\":0", "\"offset\":9", "which do not exist");
+    refuses(&path, "\"offset\":0", "\"offset\":18446744073709551615", "which do not exist");
+    refuses(&path, "\"file\":0", "\"file\":77", "of file 77, which do not exist");
+    refuses(&chunk, "\"count\":298", "\"count\":4000000000", "at most 4194304");
+    refuses(&chunk, "\"count\":298", "\"count\":4000000", "are needed");
     refuses(&chunk, "\"bands\":1", "\"bands\":4", "4 bands");
-    refuses(&chunk, "\"version\":2", "\"version\":1", "of version 1");
+    refuses(&chunk, "\"version\":2", "\"version\":1", "version 1 of SOG");
     let [from, to] = ["1.0", "1.5"].map(|first| format!("\"file_to_dataset\": [\n    [\n      {first}"));
-    refuses(&inside("transform.json"), &from, &to, "is not the transform of an export");
+    refuses(&inside("transform.json"), &from, &to, "file_to_dataset: is no scale");
+    let leaf = serde_json::from_slice::<serde_json::Value>(&std::fs::read(&path).unwrap()).unwrap()["tree"].to_string();
+    refuses(&path, &leaf, &format!("{{\"children\":[{leaf},{leaf}]}}"), "two leaves have row 0 of file 0");
+    refuses(&path, "1_0/meta.json", "0_0/./meta.json", "names the file '0_0/./meta.json' twice");
+    refuses(&path, "\"version\":1", "\"version\":2", "version 2 of Streamed SOG");
+    refuses(
+        &inside("0_0/meta.json"),
+        "\"codebook\":[",
+        "\"codebook\":[null,",
+        "scales.codebook: a codebook has 1 to 256",
+    );
+    std::fs::rename(inside("transform.json"), inside("moved.json")).unwrap();
+    let error = read_all(&path).map(|_| ()).unwrap_err().to_string();
+    assert!(error.contains("transform.json") && error.contains("check the path"), "{error}");
+    std::fs::rename(inside("moved.json"), inside("transform.json")).unwrap();
     std::fs::remove_file(inside("0_0/sh0.webp")).unwrap();
     let error = read_all(&path).map(|_| ()).unwrap_err().to_string();
     assert!(error.contains("sh0.webp") && error.contains("remedy"), "{error}");

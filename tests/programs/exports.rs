@@ -73,8 +73,8 @@ fn the_levels_of_a_sog_are_measured_and_charted() {
     let eval = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap();
     let (sog, page) = (out.join("point_cloud_sog/lod-meta.json"), folder.path().join("levels.html"));
     let pictures = folder.path().join("pictures");
-    // The folder lies in that of its run, which names the scene.
-    let options = ["--page", text(&page), "--renders", text(&pictures), "--test-every", "6", "--device", "cpu"];
+    // The folder lies in that of its run, which names the scene and its held-out photos.
+    let options = ["--page", text(&page), "--renders", text(&pictures), "--device", "cpu"];
     let output = eval(&[&[text(&sog)], &options[..]].concat());
     assert!(output.status.success(), "{}", stderr(&output));
     let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();

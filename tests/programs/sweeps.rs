@@ -56,7 +56,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert!(number(planned, "bytes_read") < number(deferred, "bytes_read"), "Belady reads less than LRU");
     assert!(number(memory, "bytes_read") == 0.0 && number(overlap, "drive_bytes_peak") > 0.0);
     assert!(rungs.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
-    assert!(rungs.iter().all(|r| number(r, "pace_seconds") > 0.0), "the pace of the machine at each rung");
+    assert!(rungs.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each rung");
     check_page(&out.join("ladder.html"), &["the same, byte for byte"], folder.path());
     assert!(names(&out.join("spill")).is_empty(), "scratch is removed");
     // Finished runs are not repeated.
@@ -66,7 +66,27 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let words: Vec<&str> = table.lines().filter_map(|line| line.split_whitespace().next()).collect();
     assert_eq!(words, ["rung", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
     assert!(table.contains(&format!("{:.2}", number(memory, "psnr"))), "{table}");
-    assert_eq!(parse(&std::fs::read_to_string(out.join("ladder.jsonl")).unwrap()), rungs);
+    let results = out.join("ladder.jsonl");
+    assert_eq!(parse(&std::fs::read_to_string(&results).unwrap()), rungs);
+    // A machine that was three times as slow during the last rung: a third of its 90 seconds at the pace of the others.
+    let mut paced = rungs.clone();
+    paced.iter_mut().for_each(|rung| rung["pace"]["seconds"] = 2.0.into());
+    (paced[4]["pace"]["seconds"], paced[4]["seconds"]) = (6.0.into(), 90.0.into());
+    let text_of = |rungs: &[Value]| rungs.iter().map(|rung| format!("{rung}\n")).collect::<String>();
+    std::fs::write(&results, text_of(&paced)).unwrap();
+    let seconds_in_memory = || {
+        let output = bench(&plain);
+        let table = String::from_utf8(output.stdout).unwrap();
+        let line = table.lines().find(|line| line.starts_with("memory")).unwrap();
+        let seconds = line.split_whitespace().nth(1).unwrap().to_string();
+        (seconds, String::from_utf8(output.stderr).unwrap())
+    };
+    let (seconds, said) = seconds_in_memory();
+    assert!(seconds == "30.0" && said.contains("converted to the median pace"), "{seconds} {said}");
+    paced[0]["pace"]["key"] = "another".into();
+    std::fs::write(&results, text_of(&paced)).unwrap();
+    let (seconds, said) = seconds_in_memory();
+    assert!(seconds == "90.0" && said.contains("times as measured"), "{seconds} {said}");
 }
 
 /// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
@@ -87,7 +107,7 @@ fn rungs_on_a_device_end_alike() {
         overlap["ply"] == memory["ply"] && [ahead, split, resident].iter().all(|r| r["ply"] == pages["ply"]),
         "{rungs:?}"
     );
-    assert!(rungs.iter().all(|r| r["pace_seconds"].is_null()), "no pace was wanted");
+    assert!(rungs.iter().all(|r| r["pace"].is_null()), "no pace was wanted");
     assert!(number(split, "device_bytes_peak") <= 3.0 * 1048576.0, "{split}");
     assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
     assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{rungs:?}");
@@ -178,7 +198,7 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let sparse = of("optimizer", "sparse", 1);
     assert_ne!(sparse["ply"], base["ply"]);
     assert_eq!(sparse["settings"]["optimizer"], "sparse");
-    assert!(records.iter().all(|r| number(r, "pace_seconds") > 0.0), "the pace of the machine at each run");
+    assert!(records.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each run");
     // Quality is measured on the photos of the base: half of the resolution is worse there, and would be better on its
     // own photos.
     let small = of("resolution", "1/2", 1);

@@ -58,7 +58,8 @@ pub struct Args {
     /// Frames in percent of the pages, for all rungs but the last; raised to the need of the largest view
     #[arg(long, default_value_t = 50.0, value_name = "P")]
     share: f64,
-    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine; 0 = do not
+    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine where every run has
+    /// these; 0 = do not
     #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
     pace_steps: u32,
     /// Rungs to run [default: those that need no GPU]
@@ -210,20 +211,24 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;
         done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), rounding: rung.rounding, record });
-        write_whole(&page, ladder_page(&facts, &at_one_pace(&done)).as_bytes())?;
+        let (rungs, times) = at_one_pace(&done);
+        write_whole(&page, ladder_page(&format!("{facts}; {times}"), &rungs).as_bytes())?;
     }
     if !args.common.json {
-        gsscale::say!("{}", text_of(&at_one_pace(&done)));
+        let (rungs, times) = at_one_pace(&done);
+        gsscale::say!("{}", text_of(&rungs));
+        eprintln!("{times}");
     }
     eprintln!("done: {}", page.display());
     Ok(())
 }
 
-/// The rungs with their times converted to one pace of the machine.
-fn at_one_pace(rungs: &[LadderRung]) -> Vec<LadderRung> {
+/// The rungs with their times converted to one pace of the machine, and what the times are.
+fn at_one_pace(rungs: &[LadderRung]) -> (Vec<LadderRung>, &'static str) {
     let mut records: Vec<RunRecord> = rungs.iter().map(|rung| rung.record.clone()).collect();
-    convert_to_one_pace(&mut records);
-    rungs.iter().zip(records).map(|(rung, record)| LadderRung { record, ..rung.clone() }).collect()
+    let times = convert_to_one_pace(&mut records);
+    let converted = rungs.iter().zip(records).map(|(rung, record)| LadderRung { record, ..rung.clone() });
+    (converted.collect(), times)
 }
 
 /// The rungs as a table.

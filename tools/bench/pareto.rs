@@ -59,7 +59,8 @@ pub struct Args {
     /// Frames of the base, in percent of the pages; 0 = all pages in memory
     #[arg(long, default_value_t = 0.0, value_name = "P")]
     share: f64,
-    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine; 0 = do not
+    /// Train the base for this many steps before and after each run, and convert times to one pace of the machine where every run has
+    /// these; 0 = do not
     #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
     pace_steps: u32,
 }
@@ -88,7 +89,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     }
     write_page(args, &base, &runs, &sweep)?;
     if !args.common.json {
-        gsscale::say!("{}", text_of(&of_plan(&runs, &sweep)));
+        let (records, times) = of_plan(&runs, &sweep);
+        gsscale::say!("{}", text_of(&records));
+        eprintln!("{times}");
     }
     eprintln!("done: {}", args.common.out.join("pareto.html").display());
     Ok(())
@@ -175,16 +178,16 @@ fn list(args: &Args, runs: &[Planned], surroundings: &Surroundings) -> Result<()
 }
 
 /// The runs of this plan that are done. Two settings may share a run; each has the name of the planned setting.
-/// Times are converted to one pace of the machine.
-fn of_plan(runs: &[Planned], sweep: &Sweep) -> Vec<RunRecord> {
+/// Times are converted to one pace of the machine, if possible; also returns what the times are.
+fn of_plan(runs: &[Planned], sweep: &Sweep) -> (Vec<RunRecord>, &'static str) {
     let of_run = |run: &Planned| {
         let key = run.key(sweep.surroundings());
         let record = sweep.records().iter().rev().find(|r| r.key == key)?;
         Some(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() })
     };
     let mut records: Vec<RunRecord> = runs.iter().filter_map(of_run).collect();
-    convert_to_one_pace(&mut records);
-    records
+    let times = convert_to_one_pace(&mut records);
+    (records, times)
 }
 
 /// The settings as a table: means over seeds.
@@ -215,12 +218,12 @@ fn text_of(records: &[RunRecord]) -> String {
 
 /// Writes the page of the runs of this plan that are done.
 fn write_page(args: &Args, base: &Planned, runs: &[Planned], sweep: &Sweep) -> Result<(), TrainError> {
-    let of_plan = of_plan(runs, sweep);
+    let (of_plan, times) = of_plan(runs, sweep);
     let config = &base.config;
     let place = if config.frames > 0 { format!("{} frames", config.frames) } else { "in memory".to_string() };
     let machine = of_plan.first().map_or(String::new(), |r| format!("; {} threads of {}", r.threads, r.cpu));
     let facts = format!(
-        "base: {} steps, {}, {place}, pages of {} rows, SH {}, {}{machine}",
+        "base: {} steps, {}, {place}, pages of {} rows, SH {}, {}{machine}; {times}",
         config.steps,
         config.view_order.word(),
         config.page_rows,

@@ -14,6 +14,7 @@ use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::values::ByteSize;
 use gsscale::photos::outlier_views;
+use gsscale::report::pace::Pace;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
@@ -141,15 +142,10 @@ pub struct Sweep {
     lock: File,
     log: ResultsLog,
     json: bool,
-    pace: Pace,
-}
-
-/// A short training of the base, which shows how fast the machine is before and after a run.
-struct Pace {
-    /// Its steps; 0 = the pace is not measured.
-    steps: u32,
-    /// Seconds after the last run, which are those before the next run.
-    after_last_run: Option<f64>,
+    /// Steps of the short trainings that show the pace of the machine; 0 = the pace is not measured.
+    pace_steps: u32,
+    /// The pace after the last run, which is that before the next run.
+    pace_after_last_run: Option<Pace>,
 }
 
 /// Makes a config keep `frames` pages in memory and the others on the drive.
@@ -199,13 +195,13 @@ impl Sweep {
         // This process holds the lock, so no run uses these files.
         remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
         remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
-        let pace = Pace { steps: 0, after_last_run: None };
-        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json: args.json, pace })
+        let (pace_steps, pace_after_last_run, json) = (0, None, args.json);
+        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json, pace_steps, pace_after_last_run })
     }
 
-    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base in memory. 0 measures nothing.
+    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base. 0 measures nothing.
     pub fn with_pace(self, steps: u32) -> Sweep {
-        Sweep { pace: Pace { steps, after_last_run: None }, ..self }
+        Sweep { pace_steps: steps, ..self }
     }
 
     /// The results so far.
@@ -228,16 +224,14 @@ impl Sweep {
         let record = match successful_run(self.log.records(), &key) {
             Some(done) => done.clone(),
             None => {
-                let before = match self.pace.after_last_run {
-                    // The first one also brings the photos into memory.
-                    None => self.measure_pace().and_then(|_| self.measure_pace())?,
-                    measured => measured,
-                };
+                let before = self.pace_before_run()?;
                 let mut record = self.train(planned, &key)?;
-                self.pace.after_last_run = self.measure_pace()?;
-                record.pace_seconds =
-                    before.zip(self.pace.after_last_run).map(|(before, after)| (before + after) / 2.0);
+                let after = self.measure_pace();
+                // An interrupted pace does not take the run with it.
+                record.pace =
+                    before.zip(after.as_ref().ok().cloned().flatten()).map(|(before, after)| mean(&before, &after));
                 self.log.append(record.clone())?;
+                self.pace_after_last_run = after?;
                 record
             }
         };
@@ -250,18 +244,34 @@ impl Sweep {
         Ok(record)
     }
 
-    /// Seconds of a short training of the base in memory; `None` if it failed or is not wanted.
-    fn measure_pace(&self) -> InputResult<Option<f64>> {
-        if self.pace.steps == 0 {
+    /// The pace of the machine before a run.
+    fn pace_before_run(&mut self) -> InputResult<Option<Pace>> {
+        if self.pace_after_last_run.is_none() {
+            // The first training also brings the photos into memory.
+            self.measure_pace()?;
+            self.pace_after_last_run = self.measure_pace()?;
+        }
+        Ok(self.pace_after_last_run.take())
+    }
+
+    /// The pace of a short training of the base; `None` if it is not wanted. A training that fails is the last one.
+    fn measure_pace(&mut self) -> InputResult<Option<Pace>> {
+        if self.pace_steps == 0 {
             return Ok(None);
         }
-        let mut config = TrainConfig { steps: self.pace.steps, ..self.base.clone() };
-        (config.spill_dir, config.frames) = (String::new(), 0);
-        let planned = Planned::new("pace", "base", config);
+        let planned = Planned::new("pace", "base", TrainConfig { steps: self.pace_steps, ..self.base.clone() });
         let key = planned.key(&self.surroundings);
         let record = self.train(&planned, &key)?;
         remove(&self.out.join("runs").join(planned.name(&key)))?;
-        Ok(record.problem.is_none().then_some(record.seconds))
+        if let Some(problem) = record.problem {
+            eprintln!(
+                "warning: the pace of the machine is not measured, because {} steps of the base failed: {problem}",
+                self.pace_steps
+            );
+            self.pace_steps = 0;
+            return Ok(None);
+        }
+        Ok(Some(Pace { key, seconds: record.seconds - record.stall_seconds, cpu_seconds: record.cpu_seconds }))
     }
 
     fn train(&self, planned: &Planned, key: &str) -> InputResult<RunRecord> {
@@ -371,6 +381,12 @@ impl Sweep {
         }
         command.output().map_err(|e| InputError::io(&path, "starting the program", &e))
     }
+}
+
+/// The mean of two paces of one training.
+fn mean(a: &Pace, b: &Pace) -> Pace {
+    let cpu_seconds = a.cpu_seconds.zip(b.cpu_seconds).map(|(a, b)| (a + b) / 2.0);
+    Pace { key: a.key.clone(), seconds: (a.seconds + b.seconds) / 2.0, cpu_seconds }
 }
 
 /// Keys of `config` that differ from `base`, except the seed.

@@ -2,31 +2,38 @@
 //!
 //! Not here: one SOG ([`super::read_chunk`]).
 //!
-//! Invariants: 1. memory follows from the rows of the level and the largest SOG, not from numbers that a file states; 2. no name
-//! leaves the folder.
+//! Invariants: 1. a level has each row of a file at most once, so its memory follows from files that exist, not from numbers in
+//! `lod-meta.json`; 2. no name leaves the folder.
 
-use super::read_chunk::{malformed, named_in, read_chunk, read_json};
+use super::read_chunk::{Chunk, malformed, named_in, read_json, unknown};
 use super::tree::{Part, TREE_FILE};
 use crate::base::error::InputResult;
+use crate::base::room;
 use crate::base::whole_file::folder_of;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::transform::TRANSFORM_ENDING;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::rotation::Rotation;
 use serde::Deserialize;
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io::ErrorKind;
+use std::path::Path;
 
 /// Largest deviation of the transform from a rotation and a scale, over the scale.
 const TRANSFORM_TOLERANCE: f64 = 1e-9;
 
 #[derive(Deserialize)]
 struct TreeText {
-    #[serde(rename = "lodLevels")]
-    levels: u32,
+    version: Option<u32>,
+    asset: Option<Asset>,
     filenames: Vec<String>,
     environment: Option<String>,
     tree: Node,
+}
+
+#[derive(Deserialize)]
+struct Asset {
+    generator: Option<String>,
 }
 
 #[derive(Deserialize)]
@@ -51,113 +58,142 @@ struct Transform {
     file_to_dataset: [[f64; 4]; 4],
 }
 
+/// A level: its number, the finest is 0, and its parts in the order of files.
+#[derive(Debug)]
+struct Level {
+    number: u32,
+    parts: Vec<Part>,
+}
+
 /// A folder that is open for reading.
 #[derive(Debug)]
 pub struct SogReader {
-    path: PathBuf,
-    files: Vec<PathBuf>,
-    always_shown: Option<PathBuf>,
-    /// The parts of each level, in the order of files.
-    parts: Vec<Vec<Part>>,
+    files: Vec<Chunk>,
+    always_shown: Option<Chunk>,
+    levels: Vec<Level>,
+    meta: SceneMeta,
 }
 
 impl SogReader {
-    /// Opens the folder of the `lod-meta.json` at `path`.
-    ///
-    /// # Errors
-    /// The file cannot be read, or is not as the format says.
-    pub fn open(path: &Path) -> InputResult<SogReader> {
-        let text: TreeText = read_json(path)?;
-        let files: Vec<PathBuf> =
-            text.filenames.iter().map(|name| named_in(path, name)).collect::<InputResult<Vec<PathBuf>>>()?;
-        let always_shown = text.environment.map(|name| named_in(path, &name)).transpose()?;
-        let mut by_level: BTreeMap<u32, Vec<Part>> = BTreeMap::new();
-        let mut open = vec![text.tree];
-        while let Some(node) = open.pop() {
-            for (level, part) in node.lods {
-                if part.file >= files.len() || level >= text.levels {
-                    let problem = format!("a leaf names file {} of {} at level {level}", part.file, files.len());
-                    return Err(malformed(path, problem));
-                }
-                by_level.entry(level).or_default().push(Part { file: part.file, first: part.offset, rows: part.count });
-            }
-            open.extend(node.children);
-        }
-        let mut parts: Vec<Vec<Part>> = by_level.into_values().collect();
-        if parts.is_empty() {
-            return Err(malformed(path, "has no leaf with Gaussians"));
-        }
-        parts.iter_mut().for_each(|parts| parts.sort_unstable_by_key(|part| (part.file, part.first)));
-        Ok(SogReader { path: path.to_path_buf(), files, always_shown, parts })
-    }
-
-    /// Number of levels.
-    pub fn levels(&self) -> usize {
-        self.parts.len()
-    }
-
-    /// The rows of a level, the finest is 0, with the rows that are always shown, in the coordinates of the files.
+    /// Opens the folder of the `lod-meta.json` at `path`, and reads everything but the pictures.
     ///
     /// # Errors
     /// A file cannot be read, or is not as the format says.
-    pub fn level(&self, level: usize) -> InputResult<Columns> {
+    pub fn open(path: &Path) -> InputResult<SogReader> {
+        let text: TreeText = read_json(path)?;
+        if let Some(version) = text.version.filter(|version| *version > 1) {
+            return Err(unknown(path, format!("version {version} of Streamed SOG; version 1 is read")).at("version"));
+        }
+        let mut named = BTreeSet::new();
+        let mut open = |name: &String| {
+            let file = named_in(path, name)?;
+            match named.insert(file.clone()) {
+                true => Chunk::open(&file),
+                false => Err(malformed(path, format!("names the file '{name}' twice"))),
+            }
+        };
+        let files: Vec<Chunk> = text.filenames.iter().map(&mut open).collect::<InputResult<_>>()?;
+        let always_shown = text.environment.as_ref().map(&mut open).transpose()?;
+        let levels = levels_of(path, text.tree, &files)?;
+        let is_ours = text.asset.and_then(|asset| asset.generator).is_some_and(|name| name.starts_with("gsscale"));
+        let antialiased = files.iter().chain(&always_shown).any(Chunk::is_antialiased);
+        let meta = SceneMeta { antialiased, ..read_transform(path, is_ours)? };
+        Ok(SogReader { files, always_shown, levels, meta })
+    }
+
+    /// The numbers of the levels, at least one, ascending; the finest level is 0.
+    pub fn levels(&self) -> Vec<u32> {
+        self.levels.iter().map(|level| level.number).collect()
+    }
+
+    /// The rows of the level at `index` in [`SogReader::levels`], with the rows that are always shown, in the coordinates of the
+    /// files.
+    ///
+    /// # Errors
+    /// A picture cannot be read, or is not as the format says.
+    pub fn rows(&self, index: usize) -> InputResult<Columns> {
         let mut rows = match &self.always_shown {
-            Some(file) => read_chunk(file)?,
+            Some(file) => file.read()?,
             None => Columns::zeros(0, 0),
         };
-        for of_file in self.parts[level].chunk_by(|a, b| a.file == b.file) {
-            let file = &self.files[of_file[0].file];
-            let mut chunk = read_chunk(file)?;
+        for of_file in self.levels[index].parts.chunk_by(|a, b| a.file == b.file) {
+            let mut chunk = self.files[of_file[0].file].read()?;
             if rows.sh_degree < chunk.sh_degree {
                 rows.raise_sh_degree(chunk.sh_degree);
             }
             chunk.raise_sh_degree(rows.sh_degree);
-            for part in of_file {
-                append(&mut rows, &chunk, part).ok_or_else(|| {
-                    let (first, count) = (part.first, part.rows);
-                    malformed(&self.path, format!("rows {first} to {first} + {count} are not in {}", file.display()))
-                })?;
-            }
+            of_file.iter().for_each(|part| append(&mut rows, &chunk, part));
         }
         Ok(rows)
     }
 
-    /// How the coordinates of the files relate to those of the dataset: as the folder's transform says, and as a file of the
-    /// dataset's coordinates without one.
-    ///
-    /// # Errors
-    /// The transform cannot be read, or is no rotation with a scale and an offset.
-    pub fn meta(&self) -> InputResult<SceneMeta> {
-        let path = folder_of(&self.path).join(TRANSFORM_ENDING);
-        if !path.exists() {
-            return Ok(SceneMeta::default());
-        }
-        let Transform { up_in_dataset, file_to_dataset: matrix } = read_json(&path)?;
-        let upright = up_in_dataset.and_then(Rotation::upright);
-        let squares = matrix[..3].iter().flat_map(|row| &row[..3]).map(|x| x * x).sum::<f64>();
-        let scale = libm::sqrt(squares / 3.0);
-        let back = upright.unwrap_or(Rotation::IDENTITY).inverse().matrix();
-        let off = |i: usize, j: usize| (matrix[i][j] - scale * back[i][j]).abs() / scale;
-        let is_known = (0..9).all(|k| off(k / 3, k % 3) <= TRANSFORM_TOLERANCE);
-        let origin = [0, 1, 2].map(|i| matrix[i][3]);
-        if !is_known || !origin.iter().all(|x| x.is_finite()) {
-            return Err(malformed(&path, "is not the transform of an export"));
-        }
-        Ok(SceneMeta { origin, scale, frame: ExportFrame::Local, upright, scene_radius: scale, ..SceneMeta::default() })
+    /// How the coordinates of the files relate to those of the dataset, as the folder's transform says. Without a transform the files
+    /// are taken to be in the coordinates of the dataset.
+    pub fn meta(&self) -> &SceneMeta {
+        &self.meta
     }
 }
 
-/// Appends a part of a file; `None` if the file lacks rows of it.
-fn append(rows: &mut Columns, chunk: &Columns, part: &Part) -> Option<()> {
-    let end = part.first.checked_add(part.rows)?;
-    if end > chunk.rows() {
-        return None;
+/// The levels of a tree whose parts lie in `files`.
+fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>> {
+    let mut by_level: BTreeMap<u32, Vec<Part>> = BTreeMap::new();
+    let mut open = vec![tree];
+    while let Some(node) = open.pop() {
+        for (level, PartText { file, offset, count }) in node.lods {
+            let end = offset.checked_add(count);
+            if files.get(file).zip(end).is_none_or(|(file, end)| end > file.rows()) {
+                let problem =
+                    format!("a leaf has rows {offset} to {offset} + {count} of file {file}, which do not exist");
+                return Err(malformed(path, problem).at(format!("level {level}")));
+            }
+            by_level.entry(level).or_default().push(Part { file, first: offset, rows: count });
+        }
+        open.extend(node.children);
     }
+    let mut levels: Vec<Level> = by_level.into_iter().map(|(number, parts)| Level { number, parts }).collect();
+    if levels.is_empty() {
+        return Err(malformed(path, "has no leaf with Gaussians"));
+    }
+    for Level { number, parts } in &mut levels {
+        parts.sort_unstable_by_key(|part| (part.file, part.first));
+        let twice = parts.array_windows().find(|[a, b]| a.file == b.file && b.first < a.first + a.rows);
+        if let Some([_, part]) = twice {
+            let problem = format!("two leaves have row {} of file {}", part.first, part.file);
+            return Err(malformed(path, problem).at(format!("level {number}")));
+        }
+    }
+    Ok(levels)
+}
+
+/// Reads the transform beside the `lod-meta.json` at `path`. A folder of gsscale has one.
+fn read_transform(path: &Path, is_ours: bool) -> InputResult<SceneMeta> {
+    let path = folder_of(path).join(TRANSFORM_ENDING);
+    let Transform { up_in_dataset, file_to_dataset: matrix } = match read_json(&path) {
+        Err(e) if e.kind == Some(ErrorKind::NotFound) && !is_ours => return Ok(SceneMeta::default()),
+        read => read?,
+    };
+    let upright = up_in_dataset.and_then(Rotation::upright);
+    let squares = matrix[..3].iter().flat_map(|row| &row[..3]).map(|x| x * x).sum::<f64>();
+    let scale = libm::sqrt(squares / 3.0);
+    let back = upright.unwrap_or(Rotation::IDENTITY).inverse().matrix();
+    let off = |i: usize, j: usize| (matrix[i][j] - scale * back[i][j]).abs() / scale;
+    let is_known = (0..9).all(|k| off(k / 3, k % 3) <= TRANSFORM_TOLERANCE);
+    let origin = [0, 1, 2].map(|i| matrix[i][3]);
+    if !is_known || !origin.iter().all(|x| x.is_finite()) {
+        return Err(
+            malformed(&path, "is no scale, offset and turn to the direction that points up").at("file_to_dataset")
+        );
+    }
+    Ok(SceneMeta { origin, scale, frame: ExportFrame::Local, upright, scene_radius: scale, ..SceneMeta::default() })
+}
+
+/// Appends a part of a file.
+fn append(rows: &mut Columns, chunk: &Columns, part: &Part) {
+    let end = part.first + part.rows;
     for column in Column::ALL {
         let width = column.width(chunk.sh_degree);
-        rows.column_mut(column).extend_from_slice(&chunk.column(column)[width * part.first..width * end]);
+        room::extend(rows.column_mut(column), &chunk.column(column)[width * part.first..width * end]);
     }
-    Some(())
 }
 
 /// Whether `path` is named like the `lod-meta.json` of a folder.

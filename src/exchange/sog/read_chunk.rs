@@ -1,7 +1,7 @@
 //! Reads one SOG: the pictures that [`super::chunk`] describes, back into rows.
 //!
-//! Invariants: 1. a picture is decoded only if its size fits the number of rows, which [`ROWS_MAX`] limits; 2. every value is
-//! finite; 3. no name leaves the folder of `meta.json`.
+//! Invariants: 1. a picture is decoded only if its size fits the number of rows, which [`ROWS_MAX`] limits, and rows are allocated
+//! only after their pictures; 2. every value is finite; 3. no name leaves the folder of `meta.json`.
 
 use super::codebook::CODES;
 use crate::base::error::{InputError, InputResult};
@@ -14,7 +14,7 @@ use serde::de::DeserializeOwned;
 use std::io::Cursor;
 use std::path::{Component, Path, PathBuf};
 
-/// Most rows of a SOG. The pictures of so many take 64 MiB.
+/// Most rows of a SOG. They take up to 1 GB, and their pictures .1 GB.
 const ROWS_MAX: usize = 1 << 22;
 /// Entries in a row of the palette's picture.
 const ENTRIES_PER_LINE: usize = 64;
@@ -23,10 +23,12 @@ const LOG_MAX: f64 = 88.0;
 /// Opacities of 0 and 1, whose logits are infinite, become this and 1 less this.
 const OPACITY_MIN: f32 = 1e-6;
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct Meta {
     version: u32,
     count: usize,
+    #[serde(default)]
+    antialias: bool,
     means: Means,
     quats: Uncoded,
     scales: Coded,
@@ -35,36 +37,229 @@ struct Meta {
     sh_n: Option<Harmonics>,
 }
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct Means {
     mins: [f64; 3],
     maxs: [f64; 3],
     files: [String; 2],
 }
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct Uncoded {
     files: [String; 1],
 }
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct Coded {
-    codebook: Vec<f32>,
+    codebook: Vec<Option<f32>>,
     files: [String; 1],
 }
 
-#[derive(Deserialize)]
+#[derive(Debug, Deserialize)]
 struct Harmonics {
     count: usize,
     bands: u8,
-    codebook: Vec<f32>,
+    codebook: Vec<Option<f32>>,
     /// Palette, labels.
     files: [String; 2],
 }
 
-/// An error of a file that is not what it should be.
+/// A SOG whose `meta.json` was read.
+#[derive(Debug)]
+pub struct Chunk {
+    path: PathBuf,
+    meta: Meta,
+}
+
+impl Chunk {
+    /// Reads the `meta.json` at `path`.
+    ///
+    /// # Errors
+    /// The file cannot be read, or describes no SOG that [`Chunk::read`] could read.
+    pub fn open(path: &Path) -> InputResult<Chunk> {
+        let meta: Meta = read_json(path)?;
+        if meta.version != 2 {
+            return Err(unknown(path, format!("version {} of SOG; version 2 is read", meta.version)).at("version"));
+        }
+        if meta.count > ROWS_MAX {
+            return Err(unknown(path, format!("{} Gaussians; at most {ROWS_MAX} are read", meta.count)).at("count"));
+        }
+        if let Some(sh) = meta.sh_n.as_ref().filter(|sh| sh.bands > 3 || !(1..=1 << 16).contains(&sh.count)) {
+            let problem =
+                format!("{} bands in a palette of {}; at most 3 in one of 1 to 65,536 are read", sh.bands, sh.count);
+            return Err(unknown(path, problem).at("shN"));
+        }
+        if !meta.means.mins.iter().chain(&meta.means.maxs).all(|log| log.abs() <= LOG_MAX) {
+            return Err(malformed(path, "a position is beyond the range of numbers").at("means"));
+        }
+        Ok(Chunk { path: path.to_path_buf(), meta })
+    }
+
+    /// Number of rows.
+    pub fn rows(&self) -> usize {
+        self.meta.count
+    }
+
+    /// Whether the Gaussians were trained with compensated opacities, which this renderer lacks.
+    pub fn is_antialiased(&self) -> bool {
+        self.meta.antialias
+    }
+
+    /// Reads the rows.
+    ///
+    /// # Errors
+    /// A picture cannot be read, or is not as `meta.json` says.
+    pub fn read(&self) -> InputResult<Columns> {
+        let Meta { count, means, quats, scales, sh0, sh_n, .. } = &self.meta;
+        let picture = |name: &str| Picture::read(&named_in(&self.path, name)?, *count);
+        let (low, high) = (picture(&means.files[0])?, picture(&means.files[1])?);
+        let (turns, sizes, colours) = (picture(&quats.files[0])?, picture(&scales.files[0])?, picture(&sh0.files[0])?);
+        let harmonics = match sh_n.as_ref().filter(|sh| sh.bands > 0) {
+            Some(sh) => Some((sh, HarmonicCodes::read(&self.path, sh, *count)?)),
+            None => None,
+        };
+        let mut columns = Columns::zeros(*count, harmonics.as_ref().map_or(0, |(sh, _)| sh.bands));
+        for (row, mean) in columns.means.as_chunks_mut::<3>().0.iter_mut().enumerate() {
+            *mean = [0, 1, 2].map(|i| position(low.pixels[row][i], high.pixels[row][i], means.mins[i], means.maxs[i]));
+        }
+        for (row, quat) in columns.quats.as_chunks_mut::<4>().0.iter_mut().enumerate() {
+            let named = quaternion(turns.pixels[row]);
+            *quat = named.ok_or_else(|| {
+                malformed(&turns.path, "the alpha of a quaternion is 252 to 255").at(format!("pixel {row}"))
+            })?;
+        }
+        let book = self.codebook("scales.codebook", &scales.codebook)?;
+        for (log_scales, pixel) in columns.scales.as_chunks_mut::<3>().0.iter_mut().zip(&sizes.pixels) {
+            *log_scales = coded(&book, *pixel);
+        }
+        let book = self.codebook("sh0.codebook", &sh0.codebook)?;
+        for (row, pixel) in colours.pixels.iter().take(*count).enumerate() {
+            columns.row_mut(Column::Sh0, row).copy_from_slice(&coded(&book, *pixel));
+            columns.opacities[row] = logit((f32::from(pixel[3]) / 255.0).clamp(OPACITY_MIN, 1.0 - OPACITY_MIN));
+        }
+        if let Some((sh, codes)) = harmonics {
+            codes.decode(&self.codebook("shN.codebook", &sh.codebook)?, sh.bands, &mut columns)?;
+        }
+        Ok(columns)
+    }
+
+    /// The values of a codebook. Some programs write fewer than 256, and no number for the first one, which then follows from the
+    /// distance of the others, as PlayCanvas' engine has it.
+    fn codebook(&self, place: &str, values: &[Option<f32>]) -> InputResult<[f32; CODES]> {
+        let wrong = || malformed(&self.path, format!("a codebook has 1 to {CODES} finite values")).at(place);
+        let last = values.last().copied().flatten().filter(|_| values.len() <= CODES).ok_or_else(wrong)?;
+        let mut book = [last; CODES];
+        for (i, value) in values.iter().enumerate() {
+            let second = values.get(1).copied().flatten();
+            let extrapolated = || second.filter(|_| i == 0).map(|second| second + (second - last) / 255.0);
+            book[i] = value.or_else(extrapolated).ok_or_else(wrong)?;
+        }
+        if book.iter().all(|v| v.is_finite()) { Ok(book) } else { Err(wrong()) }
+    }
+}
+
+/// The pictures of the bands above the constant one.
+struct HarmonicCodes {
+    palette: Picture,
+    labels: Picture,
+    entries: usize,
+}
+
+impl HarmonicCodes {
+    fn read(path: &Path, sh: &Harmonics, rows: usize) -> InputResult<HarmonicCodes> {
+        let line = ENTRIES_PER_LINE * sh_n_width(sh.bands) / 3;
+        let palette = Picture::read(&named_in(path, &sh.files[0])?, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
+        if palette.width != line {
+            return Err(malformed(&palette.path, format!("{} pixels wide; a palette has {line}", palette.width)));
+        }
+        Ok(HarmonicCodes { palette, labels: Picture::read(&named_in(path, &sh.files[1])?, rows)?, entries: sh.count })
+    }
+
+    fn decode(&self, book: &[f32; CODES], bands: u8, columns: &mut Columns) -> InputResult<()> {
+        let width = sh_n_width(bands);
+        let coefficients = width / 3;
+        for (row, sh_n) in columns.sh_n.chunks_exact_mut(width).enumerate() {
+            let label = self.labels.pixels[row];
+            let label = usize::from(u16::from_le_bytes([label[0], label[1]]));
+            if label >= self.entries {
+                let problem = format!("label {label} of a palette of {} entries", self.entries);
+                return Err(malformed(&self.labels.path, problem).at(format!("pixel {row}")));
+            }
+            // Lines hold whole entries, so the entries follow each other.
+            let entry = &self.palette.pixels[label * coefficients..][..coefficients];
+            for (values, pixel) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(entry) {
+                *values = coded(book, *pixel);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A coordinate between the least and the largest, all as logarithms.
+fn position(low: u8, high: u8, least: f64, largest: f64) -> f32 {
+    let share = f64::from(u16::from_le_bytes([low, high])) / 65535.0;
+    let log = least + share * (largest - least);
+    libm::copysign(libm::expm1(log.abs()), log) as f32
+}
+
+/// The quaternion of a pixel, w first; `None` if its alpha names no component.
+fn quaternion(pixel: [u8; 4]) -> Option<[f32; 4]> {
+    let largest = usize::from(pixel[3].checked_sub(252)?);
+    let mut quat = [0.0f64; 4];
+    for (&byte, i) in pixel.iter().zip((0..4).filter(|&i| i != largest)) {
+        quat[i] = (f64::from(byte) / 255.0 - 0.5) * std::f64::consts::SQRT_2;
+    }
+    quat[largest] = libm::sqrt((1.0 - quat.iter().map(|v| v * v).sum::<f64>()).max(0.0));
+    Some(quat.map(|v| v as f32))
+}
+
+/// The values that red, green and blue stand for.
+fn coded(book: &[f32; CODES], pixel: [u8; 4]) -> [f32; 3] {
+    [0, 1, 2].map(|i| book[usize::from(pixel[i])])
+}
+
+/// A decoded picture.
+struct Picture {
+    path: PathBuf,
+    width: usize,
+    /// RGBA.
+    pixels: Vec<[u8; 4]>,
+}
+
+impl Picture {
+    /// Reads a lossless picture of at least `least` pixels.
+    fn read(path: &Path, least: usize) -> InputResult<Picture> {
+        let wrong = |e: image_webp::DecodingError| malformed(path, format!("cannot be decoded: {e}"));
+        let mut decoder = WebPDecoder::new(Cursor::new(read_file(path)?)).map_err(wrong)?;
+        let (width, height) = decoder.dimensions();
+        let count = width as usize * height as usize;
+        // A picture that is nearly square, and the palette's, have a few lines more than their values need.
+        let most = 2 * least + (1 << 16);
+        if decoder.is_lossy() || decoder.is_animated() {
+            return Err(unknown(path, "not a lossless picture"));
+        }
+        if !(least..=most).contains(&count) {
+            return Err(malformed(path, format!("{width} x {height} pixels where {least} to {most} are needed")));
+        }
+        let channels = if decoder.has_alpha() { 4 } else { 3 };
+        let mut bytes = vec![0; count * channels];
+        decoder.read_image(&mut bytes).map_err(wrong)?;
+        let pixels = match channels {
+            4 => bytes.as_chunks::<4>().0.to_vec(),
+            _ => bytes.as_chunks::<3>().0.iter().map(|&[r, g, b]| [r, g, b, u8::MAX]).collect(),
+        };
+        Ok(Picture { path: path.to_path_buf(), width: width as usize, pixels })
+    }
+}
+
+/// An error of a file that contradicts itself or its folder.
 pub(super) fn malformed(path: &Path, problem: impl Into<String>) -> InputError {
-    InputError::new(path, problem, "export the scene again: gsscale-ckpt export RUN --out DIR/lod-meta.json")
+    InputError::new(path, problem, "the folder is damaged: copy it again, or export it again")
+}
+
+/// An error of a file that may be right, but is not read.
+pub(super) fn unknown(path: &Path, problem: impl Into<String>) -> InputError {
+    InputError::new(path, problem, "give a folder that gsscale wrote, or evaluate the PLY that the folder was made of")
 }
 
 /// Reads a JSON file.
@@ -80,124 +275,14 @@ pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> InputResult<T> {
 /// # Errors
 /// The path leads out of the folder.
 pub(super) fn named_in(from: &Path, name: &str) -> InputResult<PathBuf> {
-    let inside = Path::new(name);
-    match !name.is_empty() && inside.components().all(|part| matches!(part, Component::Normal(_))) {
-        true => Ok(folder_of(from).join(inside)),
+    let is_inside = |part: Component<'_>| matches!(part, Component::Normal(_) | Component::CurDir);
+    let path = Path::new(name);
+    match path.file_name().is_some() && path.components().all(is_inside) {
+        true => {
+            Ok(folder_of(from).join(path.components().filter(|part| *part != Component::CurDir).collect::<PathBuf>()))
+        }
         false => Err(malformed(from, format!("names the file '{name}', which is not in its folder"))),
     }
-}
-
-/// Reads the SOG of the `meta.json` at `path`.
-///
-/// # Errors
-/// A file cannot be read, or is not as the format says.
-pub fn read_chunk(path: &Path) -> InputResult<Columns> {
-    let meta: Meta = read_json(path)?;
-    if meta.version != 2 || meta.count > ROWS_MAX {
-        let problem =
-            format!("{} Gaussians of version {}; at most {ROWS_MAX} of version 2 are read", meta.count, meta.version);
-        return Err(malformed(path, problem));
-    }
-    let pixels = |name: &str| pixels(&named_in(path, name)?, meta.count);
-    let degree = meta.sh_n.as_ref().map_or(0, |sh| sh.bands);
-    if degree > 3 {
-        return Err(malformed(path, format!("{degree} bands of harmonics; at most 3 are read")));
-    }
-    let mut columns = Columns::zeros(meta.count, degree);
-    read_means(path, &meta.means, [&pixels(&meta.means.files[0])?, &pixels(&meta.means.files[1])?], &mut columns)?;
-    let quats = pixels(&meta.quats.files[0])?;
-    for (quat, &pixel) in columns.quats.as_chunks_mut::<4>().0.iter_mut().zip(&quats) {
-        *quat = quaternion(pixel).ok_or_else(|| malformed(path, "a quaternion names no component"))?;
-    }
-    let (scales, sizes) = (codebook(path, &meta.scales.codebook)?, pixels(&meta.scales.files[0])?);
-    for (log_scales, pixel) in columns.scales.as_chunks_mut::<3>().0.iter_mut().zip(&sizes) {
-        *log_scales = [0, 1, 2].map(|i| scales[usize::from(pixel[i])]);
-    }
-    let (colours, sh0) = (codebook(path, &meta.sh0.codebook)?, pixels(&meta.sh0.files[0])?);
-    for (row, pixel) in sh0.iter().take(meta.count).enumerate() {
-        let rgb = [0, 1, 2].map(|i| colours[usize::from(pixel[i])]);
-        columns.row_mut(Column::Sh0, row).copy_from_slice(&rgb);
-        columns.opacities[row] = logit((f32::from(pixel[3]) / 255.0).clamp(OPACITY_MIN, 1.0 - OPACITY_MIN));
-    }
-    if let Some(sh) = meta.sh_n.filter(|sh| sh.bands > 0) {
-        read_harmonics(path, &sh, &pixels(&sh.files[1])?, &mut columns)?;
-    }
-    Ok(columns)
-}
-
-fn read_means(path: &Path, means: &Means, [low, high]: [&[[u8; 4]]; 2], columns: &mut Columns) -> InputResult<()> {
-    if !means.mins.iter().chain(&means.maxs).all(|log| log.abs() <= LOG_MAX) {
-        return Err(malformed(path, "a position is beyond the range of numbers"));
-    }
-    for (mean, (low, high)) in columns.means.as_chunks_mut::<3>().0.iter_mut().zip(low.iter().zip(high)) {
-        *mean = [0, 1, 2].map(|i| {
-            let share = f64::from(u16::from_le_bytes([low[i], high[i]])) / 65535.0;
-            let log = means.mins[i] + share * (means.maxs[i] - means.mins[i]);
-            libm::copysign(libm::expm1(log.abs()), log) as f32
-        });
-    }
-    Ok(())
-}
-
-/// Reads the bands above the constant one: a label for each row, and the palette.
-fn read_harmonics(path: &Path, sh: &Harmonics, labels: &[[u8; 4]], columns: &mut Columns) -> InputResult<()> {
-    let width = sh_n_width(sh.bands);
-    let coefficients = width / 3;
-    if sh.count == 0 || sh.count > 1 << 16 {
-        return Err(malformed(path, format!("a palette of {} entries", sh.count)));
-    }
-    let book = codebook(path, &sh.codebook)?;
-    let palette = pixels(&named_in(path, &sh.files[0])?, sh.count.next_multiple_of(ENTRIES_PER_LINE) * coefficients)?;
-    for (sh_n, label) in columns.sh_n.chunks_exact_mut(width).zip(labels) {
-        let label = usize::from(u16::from_le_bytes([label[0], label[1]]));
-        if label >= sh.count {
-            return Err(malformed(path, format!("label {label} of a palette of {} entries", sh.count)));
-        }
-        // Lines hold whole entries, so the entries follow each other.
-        let entry = &palette[label * coefficients..][..coefficients];
-        for (values, pixel) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(entry) {
-            *values = [0, 1, 2].map(|i| book[usize::from(pixel[i])]);
-        }
-    }
-    Ok(())
-}
-
-/// The quaternion of a pixel, w first; `None` if its alpha names no component.
-fn quaternion(pixel: [u8; 4]) -> Option<[f32; 4]> {
-    let largest = usize::from(pixel[3].checked_sub(252)?);
-    let mut quat = [0.0f64; 4];
-    for (&byte, i) in pixel.iter().zip((0..4).filter(|&i| i != largest)) {
-        quat[i] = (f64::from(byte) / 255.0 - 0.5) * std::f64::consts::SQRT_2;
-    }
-    quat[largest] = libm::sqrt((1.0 - quat.iter().map(|v| v * v).sum::<f64>()).max(0.0));
-    Some(quat.map(|v| v as f32))
-}
-
-fn codebook<'a>(path: &Path, values: &'a [f32]) -> InputResult<&'a [f32; CODES]> {
-    let values: Option<&[f32; CODES]> = values.try_into().ok();
-    let finite = values.filter(|values| values.iter().all(|v| v.is_finite()));
-    finite.ok_or_else(|| malformed(path, format!("a codebook needs {CODES} finite values")))
-}
-
-/// RGBA pixels of a lossless picture of at least `least` pixels.
-fn pixels(path: &Path, least: usize) -> InputResult<Vec<[u8; 4]>> {
-    let wrong = |e: image_webp::DecodingError| malformed(path, format!("cannot be decoded: {e}"));
-    let mut decoder = WebPDecoder::new(Cursor::new(read_file(path)?)).map_err(wrong)?;
-    let (width, height) = decoder.dimensions();
-    let count = width as usize * height as usize;
-    // A picture that is nearly square, and the palette's, have a few lines more than their values need.
-    let most = 2 * least + (1 << 16);
-    if decoder.is_lossy() || decoder.is_animated() || !(least..=most).contains(&count) {
-        let problem = format!("{width} x {height} pixels; a lossless picture of {least} to {most} pixels was expected");
-        return Err(malformed(path, problem));
-    }
-    let channels = if decoder.has_alpha() { 4 } else { 3 };
-    let mut bytes = vec![0; count * channels];
-    decoder.read_image(&mut bytes).map_err(wrong)?;
-    Ok(match channels {
-        4 => bytes.as_chunks::<4>().0.to_vec(),
-        _ => bytes.as_chunks::<3>().0.iter().map(|&[r, g, b]| [r, g, b, u8::MAX]).collect(),
-    })
 }
 
 /// The bytes of a regular file.

@@ -60,7 +60,7 @@ pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
             from.clone_from(&ply);
             let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             let giants = remove_giants(&mut columns, LogScaleRange::of_scene(dataset.scene_scale));
-            dataset.warnings.extend(ply_warnings(&ply, &meta, far));
+            dataset.warnings.extend(file_warnings(&ply, &meta, far));
             dataset.warnings.extend(giants_warning(&ply, giants));
             let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
             (truncate_sh(columns, config.sh_degree), in_use)
@@ -140,21 +140,21 @@ pub(crate) fn giants_warning(ply: &Path, giants: u64) -> Option<String> {
     (giants > 0).then(|| format!("{}: {giants} {problem}", ply.display()))
 }
 
-/// Warnings about Gaussians read from `ply`, of which `far` were dropped by the change of frame.
-pub fn ply_warnings(ply: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
+/// Warnings about Gaussians read from `file`, of which `far` were dropped by the change of frame.
+pub fn file_warnings(file: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
     let mut warnings = Vec::new();
     if meta.dropped > 0 {
-        warnings.push(format!("{}: {} Gaussians are not finite and are dropped", ply.display(), meta.dropped));
+        warnings.push(format!("{}: {} Gaussians are not finite and are dropped", file.display(), meta.dropped));
     }
     if meta.opacities_clamped > 0 {
-        let (file, count) = (ply.display(), meta.opacities_clamped);
+        let (file, count) = (file.display(), meta.opacities_clamped);
         warnings.push(format!("{file}: {count} opacities are exactly 0 or 1, and are read as 1e-6 or 0.999999"));
     }
     if far > 0 {
-        warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", ply.display()));
+        warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", file.display()));
     }
     if meta.antialiased {
-        let file = ply.display();
+        let file = file.display();
         warnings.push(format!("{file}: trained with opacity compensation (antialiased), which is not rendered here"));
     }
     warnings

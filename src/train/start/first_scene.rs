@@ -31,7 +31,7 @@ use crate::train::inputs::dataset_print::view_print;
 use crate::train::inputs::dataset_print::{GaussiansPrint, points_print};
 use crate::train::inputs::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead};
 use crate::train::inputs::places::folder_beside;
-use crate::train::inputs::prepare::ply_warnings;
+use crate::train::inputs::prepare::file_warnings;
 use crate::train::inputs::prepare::{Prepared, check_first_rows, check_train_views, giants_warning, prepare};
 use crate::train::memory::estimate::check_photos_fit;
 use crate::train::step::pages::{PagedScene, first_pages};
@@ -145,7 +145,7 @@ impl Start {
             rows += columns.rows() as u64;
             Ok(())
         })?;
-        dataset.warnings.extend(ply_warnings(file, &meta, far));
+        dataset.warnings.extend(file_warnings(file, &meta, far));
         dataset.warnings.extend(giants_warning(file, giants));
         check_first_rows(file, config, rows)?;
         let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));

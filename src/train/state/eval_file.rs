@@ -20,7 +20,7 @@ use crate::render::{RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
-use crate::train::inputs::prepare::ply_warnings;
+use crate::train::inputs::prepare::file_warnings;
 use crate::train::log::progress::Count;
 use crate::train::log::report::TestMetrics;
 use crate::train::memory::estimate::{check_photos_fit, host_budget};
@@ -49,13 +49,23 @@ pub struct EvalReport {
     pub levels: Vec<LevelReport>,
 }
 
-/// The evaluation of one level of detail, shown everywhere.
-#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
-pub struct LevelReport {
-    /// Gaussians of the level, with those that are always shown.
+/// The figures of some Gaussians.
+#[derive(Debug, Clone, Copy, serde::Serialize, serde::Deserialize)]
+pub struct Figures {
+    /// Gaussians that were drawn.
     pub gaussians: u64,
     /// Means over the held-out views; `None` without held-out views.
     pub test: Option<TestMetrics>,
+}
+
+/// The evaluation of one level of detail, shown everywhere with the Gaussians that are always shown.
+#[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
+pub struct LevelReport {
+    /// Number of the level; the finest is 0.
+    pub level: u32,
+    /// Its figures.
+    #[serde(flatten)]
+    pub figures: Figures,
 }
 
 /// Optional outputs of the evaluation of a file.
@@ -82,63 +92,50 @@ pub fn evaluate_file(
         None => None,
         Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
     };
+    // Before the photos: a file that cannot be used is said at once.
     let model = Model::open(file)?;
-    let mut photos = Photos::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
-    let mut levels: Vec<LevelReport> = Vec::with_capacity(model.levels());
-    for level in 0..model.levels() {
-        let folder = extras.pictures.map(|folder| match &model {
-            Model::Ply => folder.to_path_buf(),
-            Model::Sog(_) => folder.join(format!("level_{level}")),
-        });
-        levels.push(photos.evaluate(file, model.rows(file, level)?, folder.as_deref())?);
-    }
-    let LevelReport { gaussians, test } = levels[0].clone();
+    let mut evaluator = Evaluator::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
+    let (finest, levels) = match model {
+        Model::Ply(rows, meta) => (evaluator.evaluate(file, rows, &meta, extras.pictures)?, Vec::new()),
+        Model::Sog(sog) => {
+            let levels = evaluator.evaluate_levels(file, &sog, extras.pictures)?;
+            (levels[0].figures, levels)
+        }
+    };
     Ok(EvalReport {
         ply: file.to_path_buf(),
         scene: scene.to_path_buf(),
-        gaussians,
+        gaussians: finest.gaussians,
         ssim_variant: config.ssim_variant.to_string(),
-        lpips_variant: photos.lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
-        test,
-        levels: if matches!(model, Model::Ply) { Vec::new() } else { levels },
+        lpips_variant: evaluator.lpips.map(|(lpips, range)| format!("{}, {}", lpips.network().name(), range.name())),
+        test: finest.test,
+        levels,
     })
 }
 
 /// Gaussians in a file.
 enum Model {
-    Ply,
-    Sog(SogReader),
+    Ply(Columns, SceneMeta),
+    Sog(Box<SogReader>),
 }
 
 impl Model {
     fn open(file: &Path) -> InputResult<Model> {
-        Ok(if is_tree(file) { Model::Sog(SogReader::open(file)?) } else { Model::Ply })
-    }
-
-    /// At least 1.
-    fn levels(&self) -> usize {
-        match self {
-            Model::Ply => 1,
-            Model::Sog(sog) => sog.levels(),
+        if is_tree(file) {
+            return Ok(Model::Sog(Box::new(SogReader::open(file)?)));
         }
-    }
-
-    fn rows(&self, file: &Path, level: usize) -> InputResult<(Columns, SceneMeta)> {
-        match self {
-            Model::Sog(sog) => Ok((sog.level(level)?, sog.meta()?)),
-            Model::Ply => match read_ply(file)? {
-                PlyContent::Gaussians { columns, meta, .. } => Ok((columns, meta)),
-                PlyContent::Points { .. } => {
-                    let problem = "holds points, not Gaussians (no property f_dc_0)";
-                    Err(InputError::new(file, problem, "give the point_cloud.ply of a run"))
-                }
-            },
+        match read_ply(file)? {
+            PlyContent::Gaussians { columns, meta, .. } => Ok(Model::Ply(columns, meta)),
+            PlyContent::Points { .. } => {
+                let problem = "holds points, not Gaussians (no property f_dc_0)";
+                Err(InputError::new(file, problem, "give the point_cloud.ply of a run"))
+            }
         }
     }
 }
 
 /// The held-out photos of a scene, and what draws Gaussians from their places.
-struct Photos<'a> {
+struct Evaluator<'a> {
     config: &'a TrainConfig,
     dataset: Dataset,
     targets: TargetCache,
@@ -146,12 +143,12 @@ struct Photos<'a> {
     lpips: Option<(&'a Lpips, InputRange)>,
 }
 
-impl<'a> Photos<'a> {
+impl<'a> Evaluator<'a> {
     fn open(
         scene: &Path,
         config: &'a TrainConfig,
         lpips: Option<(&'a Lpips, InputRange)>,
-    ) -> Result<Photos<'a>, TrainError> {
+    ) -> Result<Evaluator<'a>, TrainError> {
         let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
         check_photos_fit(&dataset, host_budget(config))?;
         dataset.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
@@ -160,19 +157,36 @@ impl<'a> Photos<'a> {
         if let Some(word) = word {
             eprintln!("{word}");
         }
-        Ok(Photos { config, dataset, targets, renderer, lpips })
+        Ok(Evaluator { config, dataset, targets, renderer, lpips })
+    }
+
+    /// Evaluates every level of a folder of SOGs, the finest first. Pictures go to a folder for each level.
+    fn evaluate_levels(
+        &mut self,
+        file: &Path,
+        sog: &SogReader,
+        pictures: Option<&Path>,
+    ) -> Result<Vec<LevelReport>, TrainError> {
+        let mut levels = Vec::new();
+        for (index, level) in sog.levels().into_iter().enumerate() {
+            let folder = pictures.map(|folder| folder.join(format!("level_{level}")));
+            let figures = self.evaluate(file, sog.rows(index)?, sog.meta(), folder.as_deref())?;
+            levels.push(LevelReport { level, figures });
+        }
+        Ok(levels)
     }
 
     /// Evaluates Gaussians that were read from `file`.
     fn evaluate(
         &mut self,
         file: &Path,
-        (mut columns, meta): (Columns, SceneMeta),
+        mut columns: Columns,
+        meta: &SceneMeta,
         pictures: Option<&Path>,
-    ) -> Result<LevelReport, TrainError> {
+    ) -> Result<Figures, TrainError> {
         let frame = &self.dataset.frame;
-        let far = to_local(&mut columns, &meta, frame.origin.to_array(), frame.scale);
-        ply_warnings(file, &meta, far).iter().for_each(|warning| eprintln!("warning: {warning}"));
+        let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
+        file_warnings(file, meta, far).iter().for_each(|warning| eprintln!("warning: {warning}"));
         if columns.rows() == 0 {
             let problem = "no Gaussian lies within the coordinate range of this scene";
             return Err(InputError::new(file, problem, "give a file that was trained on this scene").into());
@@ -199,6 +213,6 @@ impl<'a> Photos<'a> {
         let now = (&mut pages, 0, &mut WorkingSet::default());
         let photos = (&self.dataset, &self.targets);
         let test = evaluate(now, &mut *self.renderer, photos, &render, &request)?;
-        Ok(LevelReport { gaussians, test })
+        Ok(Figures { gaussians, test })
     }
 }
