@@ -96,7 +96,10 @@ pub fn evaluate_file(
     let model = Model::open(file)?;
     let mut evaluator = Evaluator::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
     let (finest, levels) = match model {
-        Model::Ply(rows, meta) => (evaluator.evaluate(file, rows, &meta, extras.pictures)?, Vec::new()),
+        Model::Ply(read) => {
+            let (rows, meta) = *read;
+            (evaluator.evaluate(file, rows, &meta, extras.pictures)?, Vec::new())
+        }
         Model::Sog(sog) => {
             let levels = evaluator.evaluate_levels(file, &sog, extras.pictures)?;
             (levels[0].figures, levels)
@@ -115,7 +118,7 @@ pub fn evaluate_file(
 
 /// Gaussians in a file.
 enum Model {
-    Ply(Columns, SceneMeta),
+    Ply(Box<(Columns, SceneMeta)>),
     Sog(Box<SogReader>),
 }
 
@@ -125,7 +128,7 @@ impl Model {
             return Ok(Model::Sog(Box::new(SogReader::open(file)?)));
         }
         match read_ply(file)? {
-            PlyContent::Gaussians { columns, meta, .. } => Ok(Model::Ply(columns, meta)),
+            PlyContent::Gaussians { columns, meta, .. } => Ok(Model::Ply(Box::new((columns, meta)))),
             PlyContent::Points { .. } => {
                 let problem = "holds points, not Gaussians (no property f_dc_0)";
                 Err(InputError::new(file, problem, "give the point_cloud.ply of a run"))
