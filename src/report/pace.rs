@@ -6,19 +6,7 @@
 //! Invariants: 1. only paces of one training are compared; 2. times of computing change in proportion to the pace. Time that a run waited
 //! for the drive, bytes, counts and quality stay as measured.
 
-use super::record::RunRecord;
-use serde::{Deserialize, Serialize};
-
-/// The pace of the machine at a run: means of a short training before and one after the run.
-#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Pace {
-    /// Digest of the short training and of everything that its time depends on.
-    pub key: String,
-    /// Seconds of its steps, without waiting for the drive.
-    pub seconds: f64,
-    /// CPU seconds of its steps, where the system counts them.
-    pub cpu_seconds: Option<f64>,
-}
+use super::record::{Pace, RunRecord};
 
 /// Converts the times of all runs to the median of their paces. Returns a sentence that says what the times are: they stay as
 /// measured unless every run that succeeded has a pace of the same training.

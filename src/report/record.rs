@@ -3,9 +3,19 @@
 //! Invariant: the run's own process measured every figure except `wall_seconds`, the lifetime of that process, and
 //! `pace`, which two other runs measured.
 
-use super::pace::Pace;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// The pace of the machine at a run: means of a short training before and one after the run.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Pace {
+    /// Digest of the short training and of everything that its time depends on.
+    pub key: String,
+    /// Seconds of its steps, without waiting for the drive.
+    pub seconds: f64,
+    /// CPU seconds of its steps, where the system counts them.
+    pub cpu_seconds: Option<f64>,
+}
 
 /// A run of a ladder or of a sweep.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]

@@ -165,9 +165,7 @@ pub(super) fn train_into(
     warn_of_ply(config, &written, &ply);
     let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
     if exported.is_err() {
-        eprintln!(
-            "warning: the file for viewers could not be written; the evaluation and the report follow, then the reason"
-        );
+        eprintln!("warning: the file for viewers could not be written; evaluation and report follow, then the reason");
     }
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
