@@ -1,4 +1,5 @@
-//! `gsscale-eval`: held-out PSNR and SSIM of a PLY, of a run's PLY, or of the levels of SOGs. Parses, calls the library, prints.
+//! `gsscale-eval`: held-out PSNR and SSIM of a PLY, of a run's PLY, or of the levels of SOGs. Parses, calls the library,
+//! prints.
 
 use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;

@@ -5,7 +5,7 @@
 use super::meta::{ExportFrame, SceneMeta};
 use super::ply::PlyWriter;
 use super::sink::GaussianSink;
-use super::sog::{SogWriter, TREE_FILE, folder_of_tree, is_of_sog, memory_bytes};
+use super::sog::{SogWriter, TREE_FILE, folder_of_tree, is_of_sog, is_tree, memory_bytes};
 use super::spz::{SPZ_UP, SpzWriter};
 use super::transform::{transform_path, write_transform};
 use crate::base::error::{InputError, InputResult};
@@ -41,7 +41,7 @@ impl ExportFormat {
         match () {
             () if is("ply") => Ok(ExportFormat::Ply),
             () if is("spz") => Ok(ExportFormat::Spz),
-            () if path.file_name().is_some_and(|name| name == TREE_FILE) => Ok(ExportFormat::Sog),
+            () if is_tree(path) => Ok(ExportFormat::Sog),
             () => {
                 let remedy = format!("use {}", ExportFormat::NAMES);
                 Err(InputError::new(path, "no export format has this file name", remedy))

@@ -8,8 +8,8 @@
 
 use super::record::{Pace, RunRecord};
 
-/// Converts the times of all runs to the median of their paces. Returns a sentence that says what the times are: they stay as
-/// measured unless every run that succeeded has a pace of the same training.
+/// Converts `seconds` and `cpu_seconds` of all runs to the median of their paces, in place. Times stay as measured unless every run that
+/// succeeded has a pace of the same training. Returns a sentence for readers that says which of the two the times are.
 pub fn convert_to_one_pace(records: &mut [RunRecord]) -> &'static str {
     let paces: Vec<Option<&Pace>> = records.iter().filter(|r| r.problem.is_none()).map(|r| r.pace.as_ref()).collect();
     let first = paces.first().copied().flatten();

@@ -238,9 +238,9 @@ fn names_that_leave_the_folder_and_numbers_that_files_lack_are_refused() {
     );
     std::fs::rename(inside("transform.json"), inside("moved.json")).unwrap();
     let error = read_all(&path).map(|_| ()).unwrap_err().to_string();
-    assert!(error.contains("transform.json") && error.contains("check the path"), "{error}");
+    assert!(error.contains("transform.json") && error.contains("the folder is not whole"), "{error}");
     std::fs::rename(inside("moved.json"), inside("transform.json")).unwrap();
     std::fs::remove_file(inside("0_0/sh0.webp")).unwrap();
     let error = read_all(&path).map(|_| ()).unwrap_err().to_string();
-    assert!(error.contains("sh0.webp") && error.contains("remedy"), "{error}");
+    assert!(error.contains("sh0.webp") && error.contains("the folder is not whole"), "{error}");
 }

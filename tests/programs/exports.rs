@@ -92,6 +92,13 @@ fn the_levels_of_a_sog_are_measured_and_charted() {
     assert!(["PSNR by level", "<svg", &psnr].iter().all(|part| html.contains(part)), "{html}");
     assert!(pictures.join("level_3").read_dir().unwrap().count() > 1);
 
+    // A PLY in the folder of its run has the run's held-out photos as well.
+    let output = eval(&[text(&out.join("point_cloud.ply")), "--device", "cpu"]);
+    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let off = report["test"]["psnr"].as_f64().unwrap() - exact;
+    // Values of the PLY are those of the run but for quaternions, which are normalised.
+    assert!(off.abs() < 0.01 && report["levels"].is_null(), "{report}");
+
     let refused = eval(&[text(&out), "--page", text(&page), "--device", "cpu"]);
     let said = stderr(&refused);
     assert!(!refused.status.success() && said.contains("has no levels of detail") && said.contains("remedy"), "{said}");

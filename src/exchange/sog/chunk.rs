@@ -32,7 +32,7 @@ pub const PICTURES: [&str; 7] =
 /// Rows for each entry of the palette, which then takes about as many bytes as the labels.
 const ROWS_PER_ENTRY: usize = 16;
 /// Entries in a row of the palette's picture.
-const ENTRIES_PER_LINE: usize = 64;
+pub const ENTRIES_PER_LINE: usize = 64;
 
 /// Writes the files of `rows` into the folder `inside` of `folder`.
 ///

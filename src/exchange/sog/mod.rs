@@ -1,6 +1,5 @@
-//! Writes and reads Streamed SOG, version 1: a folder that viewers load in parts, near parts in detail and far ones coarsely. Each part is a SOG of
-//! version 2
-//! (`developer.playcanvas.com`, "The SOG Format" and "The Streamed SOG Format").
+//! Writes and reads Streamed SOG, version 1: a folder that viewers load in parts, near parts in detail and far ones coarsely. Each part is
+//! a SOG of version 2 (`developer.playcanvas.com`, "The SOG Format" and "The Streamed SOG Format").
 //!
 //! `lod-meta.json` holds a tree of boxes. A leaf has its rows once in every level, as a range of a SOG: a folder of pictures, whose
 //! pixels are the values of one Gaussian each. The axes are those of a PLY.
@@ -25,6 +24,6 @@ mod symmetric;
 mod tree;
 mod write;
 
-pub use read::{SogReader, is_tree};
-pub use tree::TREE_FILE;
+pub use read::SogReader;
+pub use tree::{TREE_FILE, is_tree};
 pub use write::{SogWriter, folder_of_tree, is_of_sog, memory_bytes};

@@ -6,7 +6,7 @@
 //! `lod-meta.json`; 2. no name leaves the folder.
 
 use super::read_chunk::{Chunk, malformed, named_in, read_json, unknown};
-use super::tree::{Part, TREE_FILE};
+use super::tree::Part;
 use crate::base::error::InputResult;
 use crate::base::room;
 use crate::base::whole_file::folder_of;
@@ -194,9 +194,4 @@ fn append(rows: &mut Columns, chunk: &Columns, part: &Part) {
         let width = column.width(chunk.sh_degree);
         room::extend(rows.column_mut(column), &chunk.column(column)[width * part.first..width * end]);
     }
-}
-
-/// Whether `path` is named like the `lod-meta.json` of a folder.
-pub fn is_tree(path: &Path) -> bool {
-    path.file_name().is_some_and(|name| name == TREE_FILE)
 }

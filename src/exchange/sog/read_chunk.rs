@@ -3,6 +3,7 @@
 //! Invariants: 1. a picture is decoded only if its size fits the number of rows, which [`ROWS_MAX`] limits, and rows are allocated
 //! only after their pictures; 2. every value is finite; 3. no name leaves the folder of `meta.json`.
 
+use super::chunk::ENTRIES_PER_LINE;
 use super::codebook::CODES;
 use crate::base::error::{InputError, InputResult};
 use crate::base::math::logit;
@@ -11,13 +12,11 @@ use crate::scene::columns::{Column, Columns, sh_n_width};
 use image_webp::WebPDecoder;
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use std::io::Cursor;
+use std::io::{Cursor, ErrorKind};
 use std::path::{Component, Path, PathBuf};
 
 /// Most rows of a SOG. They take up to 1 GB, and their pictures .1 GB.
 const ROWS_MAX: usize = 1 << 22;
-/// Entries in a row of the palette's picture.
-const ENTRIES_PER_LINE: usize = 64;
 /// Largest logarithm of a position: f32 holds its exponential.
 const LOG_MAX: f64 = 88.0;
 /// Opacities of 0 and 1, whose logits are infinite, become this and 1 less this.
@@ -287,7 +286,13 @@ pub(super) fn named_in(from: &Path, name: &str) -> InputResult<PathBuf> {
 
 /// The bytes of a regular file.
 fn read_file(path: &Path) -> InputResult<Vec<u8>> {
-    let io = |e: std::io::Error| InputError::io(path, "reading", &e);
+    let io = |e: std::io::Error| match InputError::io(path, "reading", &e) {
+        missing if e.kind() == ErrorKind::NotFound => {
+            let remedy = "check the path; if it is right, the folder is not whole: copy it again, or export it again";
+            InputError { remedy: remedy.into(), ..missing }
+        }
+        other => other,
+    };
     // Checked before opening: opening a pipe would block until somebody writes to it.
     if !std::fs::metadata(path).map_err(io)?.is_file() {
         return Err(malformed(path, "this is not a regular file"));

@@ -3,9 +3,15 @@
 //! Invariant: the text depends on the leaves and their order alone.
 
 use serde_json::{Map, Value, json};
+use std::path::Path;
 
 /// Name of the file.
 pub const TREE_FILE: &str = "lod-meta.json";
+
+/// Whether `path` is named like the tree of a folder.
+pub fn is_tree(path: &Path) -> bool {
+    path.file_name().is_some_and(|name| name == TREE_FILE)
+}
 
 /// Rows of a leaf in one level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -26,6 +26,7 @@ use crate::train::log::report::TestMetrics;
 use crate::train::memory::estimate::{check_photos_fit, host_budget};
 use crate::train::step::pages::PagedScene;
 use crate::train::step::working_set::WorkingSet;
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 /// Report of `gsscale-eval`.
@@ -77,7 +78,8 @@ pub struct EvalExtras<'a> {
     pub lpips: Option<(&'a Path, InputRange)>,
 }
 
-/// Evaluates the Gaussians of `file` on the held-out views of a scene.
+/// Evaluates the Gaussians of `file`, a PLY or a `lod-meta.json`, on the held-out views of the scene in the folder `scene`. All rows of a
+/// PLY, or of one level at a time, are in memory.
 ///
 /// # Errors
 /// The file, the scene or the weights cannot be used, or a picture cannot be written.
@@ -144,6 +146,8 @@ struct Evaluator<'a> {
     targets: TargetCache,
     renderer: Box<dyn Renderer>,
     lpips: Option<(&'a Lpips, InputRange)>,
+    /// Warnings that were printed: those of one level are mostly those of all.
+    printed: BTreeSet<String>,
 }
 
 impl<'a> Evaluator<'a> {
@@ -160,7 +164,7 @@ impl<'a> Evaluator<'a> {
         if let Some(word) = word {
             eprintln!("{word}");
         }
-        Ok(Evaluator { config, dataset, targets, renderer, lpips })
+        Ok(Evaluator { config, dataset, targets, renderer, lpips, printed: BTreeSet::new() })
     }
 
     /// Evaluates every level of a folder of SOGs, the finest first. Pictures go to a folder for each level.
@@ -189,7 +193,11 @@ impl<'a> Evaluator<'a> {
     ) -> Result<Figures, TrainError> {
         let frame = &self.dataset.frame;
         let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
-        file_warnings(file, meta, far).iter().for_each(|warning| eprintln!("warning: {warning}"));
+        for warning in file_warnings(file, meta, far) {
+            if self.printed.insert(warning.clone()) {
+                eprintln!("warning: {warning}");
+            }
+        }
         if columns.rows() == 0 {
             let problem = "no Gaussian lies within the coordinate range of this scene";
             return Err(InputError::new(file, problem, "give a file that was trained on this scene").into());
