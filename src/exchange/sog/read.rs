@@ -5,7 +5,7 @@
 //! Invariants: 1. a level has each row of a file at most once, so its memory follows from files that exist, not from numbers in
 //! `lod-meta.json`; 2. no name leaves the folder.
 
-use super::read_chunk::{Chunk, malformed, named_in, read_json, unknown};
+use super::read_chunk::{Chunk, malformed, path_in_folder, read_json, unsupported};
 use super::tree::Part;
 use crate::base::error::InputResult;
 use crate::base::room;
@@ -82,11 +82,13 @@ impl SogReader {
     pub fn open(path: &Path) -> InputResult<SogReader> {
         let text: TreeText = read_json(path)?;
         if let Some(version) = text.version.filter(|version| *version > 1) {
-            return Err(unknown(path, format!("version {version} of Streamed SOG; version 1 is read")).at("version"));
+            return Err(
+                unsupported(path, format!("version {version} of Streamed SOG; version 1 is read")).at("version")
+            );
         }
         let mut named = BTreeSet::new();
         let mut open = |name: &String| {
-            let file = named_in(path, name)?;
+            let file = path_in_folder(path, name)?;
             match named.insert(file.clone()) {
                 true => Chunk::open(&file),
                 false => Err(malformed(path, format!("names the file '{name}' twice"))),

@@ -19,7 +19,7 @@ use std::path::{Component, Path, PathBuf};
 const ROWS_MAX: usize = 1 << 22;
 /// Largest logarithm of a position: f32 holds its exponential.
 const LOG_MAX: f64 = 88.0;
-/// Opacities of 0 and 1, whose logits are infinite, become this and 1 less this.
+/// Least opacity; the largest is 1 less this. The logits of 0 and 1 are infinite.
 const OPACITY_MIN: f32 = 1e-6;
 
 #[derive(Debug, Deserialize)]
@@ -78,15 +78,15 @@ impl Chunk {
     pub fn open(path: &Path) -> InputResult<Chunk> {
         let meta: Meta = read_json(path)?;
         if meta.version != 2 {
-            return Err(unknown(path, format!("version {} of SOG; version 2 is read", meta.version)).at("version"));
+            return Err(unsupported(path, format!("version {} of SOG; version 2 is read", meta.version)).at("version"));
         }
         if meta.count > ROWS_MAX {
-            return Err(unknown(path, format!("{} Gaussians; at most {ROWS_MAX} are read", meta.count)).at("count"));
+            return Err(unsupported(path, format!("{} Gaussians; at most {ROWS_MAX} are read", meta.count)).at("count"));
         }
         if let Some(sh) = meta.sh_n.as_ref().filter(|sh| sh.bands > 3 || !(1..=1 << 16).contains(&sh.count)) {
             let problem =
                 format!("{} bands in a palette of {}; at most 3 in one of 1 to 65,536 are read", sh.bands, sh.count);
-            return Err(unknown(path, problem).at("shN"));
+            return Err(unsupported(path, problem).at("shN"));
         }
         if !meta.means.mins.iter().chain(&meta.means.maxs).all(|log| log.abs() <= LOG_MAX) {
             return Err(malformed(path, "a position is beyond the range of numbers").at("means"));
@@ -110,7 +110,7 @@ impl Chunk {
     /// A picture cannot be read, or is not as `meta.json` says.
     pub fn read(&self) -> InputResult<Columns> {
         let Meta { count, means, quats, scales, sh0, sh_n, .. } = &self.meta;
-        let picture = |name: &str| Picture::read(&named_in(&self.path, name)?, *count);
+        let picture = |name: &str| Picture::read(&path_in_folder(&self.path, name)?, *count);
         let (low, high) = (picture(&means.files[0])?, picture(&means.files[1])?);
         let (turns, sizes, colours) = (picture(&quats.files[0])?, picture(&scales.files[0])?, picture(&sh0.files[0])?);
         let harmonics = match sh_n.as_ref().filter(|sh| sh.bands > 0) {
@@ -167,11 +167,15 @@ struct HarmonicCodes {
 impl HarmonicCodes {
     fn read(path: &Path, sh: &Harmonics, rows: usize) -> InputResult<HarmonicCodes> {
         let line = ENTRIES_PER_LINE * sh_n_width(sh.bands) / 3;
-        let palette = Picture::read(&named_in(path, &sh.files[0])?, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
+        let palette = Picture::read(&path_in_folder(path, &sh.files[0])?, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
         if palette.width != line {
             return Err(malformed(&palette.path, format!("{} pixels wide; a palette has {line}", palette.width)));
         }
-        Ok(HarmonicCodes { palette, labels: Picture::read(&named_in(path, &sh.files[1])?, rows)?, entries: sh.count })
+        Ok(HarmonicCodes {
+            palette,
+            labels: Picture::read(&path_in_folder(path, &sh.files[1])?, rows)?,
+            entries: sh.count,
+        })
     }
 
     fn decode(&self, book: &[f32; CODES], bands: u8, columns: &mut Columns) -> InputResult<()> {
@@ -235,7 +239,7 @@ impl Picture {
         // A picture that is nearly square, and the palette's, have a few lines more than their values need.
         let most = 2 * least + (1 << 16);
         if decoder.is_lossy() || decoder.is_animated() {
-            return Err(unknown(path, "not a lossless picture"));
+            return Err(unsupported(path, "not a lossless picture"));
         }
         if !(least..=most).contains(&count) {
             return Err(malformed(path, format!("{width} x {height} pixels where {least} to {most} are needed")));
@@ -257,7 +261,7 @@ pub(super) fn malformed(path: &Path, problem: impl Into<String>) -> InputError {
 }
 
 /// An error of a file that may be right, but is not read.
-pub(super) fn unknown(path: &Path, problem: impl Into<String>) -> InputError {
+pub(super) fn unsupported(path: &Path, problem: impl Into<String>) -> InputError {
     InputError::new(path, problem, "give a folder that gsscale wrote, or evaluate the PLY that the folder was made of")
 }
 
@@ -273,7 +277,7 @@ pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> InputResult<T> {
 ///
 /// # Errors
 /// The path leads out of the folder.
-pub(super) fn named_in(from: &Path, name: &str) -> InputResult<PathBuf> {
+pub(super) fn path_in_folder(from: &Path, name: &str) -> InputResult<PathBuf> {
     let is_inside = |part: Component<'_>| matches!(part, Component::Normal(_) | Component::CurDir);
     let path = Path::new(name);
     match path.file_name().is_some() && path.components().all(is_inside) {

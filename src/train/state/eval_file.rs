@@ -94,7 +94,7 @@ pub fn evaluate_file(
         None => None,
         Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
     };
-    // Before the photos: a file that cannot be used is said at once.
+    // The file is opened before the photos, so that an unusable file is reported at once.
     let model = Model::open(file)?;
     let mut evaluator = Evaluator::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
     let (finest, levels) = match model {
