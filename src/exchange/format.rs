@@ -70,9 +70,14 @@ impl ExportFormat {
     /// Checks that [`ExportFormat::remove`] may remove the export `file`.
     ///
     /// # Errors
-    /// The folder of the export holds files that no export wrote, or cannot be listed.
+    /// A folder has the name of the file, or the folder of the export holds files that no export wrote, or cannot be listed.
     pub fn check_removable(self, file: &Path) -> InputResult<()> {
         match self {
+            ExportFormat::Ply | ExportFormat::Spz if file.is_dir() => Err(InputError::new(
+                file,
+                "is a folder where a file of the results belongs",
+                "move or rename the folder",
+            )),
             ExportFormat::Ply | ExportFormat::Spz => Ok(()),
             ExportFormat::Sog => check_ours(folder_of_tree(file)?, is_of_sog),
         }

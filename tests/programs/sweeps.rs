@@ -35,7 +35,8 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
     let sizes = ["--steps", "60", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seed", "3"];
-    let plain = [&["ladder", text(&scene), "--out", text(&out), "--pace-steps", "20"][..], &sizes].concat();
+    let command = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
+    let plain = [&command[..], &["--pace-steps", "20"]].concat();
     let args = [&plain[..], &["--json"]].concat();
     let rungs = lines(&args);
     let labels: Vec<&str> = rungs.iter().map(|r| r["label"].as_str().unwrap()).collect();
@@ -74,18 +75,20 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     (paced[4]["pace"]["seconds"], paced[4]["seconds"]) = (6.0.into(), 90.0.into());
     let text_of = |rungs: &[Value]| rungs.iter().map(|rung| format!("{rung}\n")).collect::<String>();
     std::fs::write(&results, text_of(&paced)).unwrap();
-    let seconds_in_memory = || {
-        let output = bench(&plain);
+    let seconds_in_memory = |pace_steps: &str| {
+        let output = bench(&[&command[..], &["--pace-steps", pace_steps]].concat());
         let table = String::from_utf8(output.stdout).unwrap();
         let line = table.lines().find(|line| line.starts_with("memory")).unwrap();
         let seconds = line.split_whitespace().nth(1).unwrap().to_string();
         (seconds, String::from_utf8(output.stderr).unwrap())
     };
-    let (seconds, said) = seconds_in_memory();
+    let (seconds, said) = seconds_in_memory("20");
     assert!(seconds == "30.0" && said.contains("converted to the median pace"), "{seconds} {said}");
+    let (seconds, said) = seconds_in_memory("0");
+    assert!(seconds == "90.0" && said.contains("times as measured"), "{seconds} {said}");
     paced[0]["pace"]["key"] = "another".into();
     std::fs::write(&results, text_of(&paced)).unwrap();
-    let (seconds, said) = seconds_in_memory();
+    let (seconds, said) = seconds_in_memory("20");
     assert!(seconds == "90.0" && said.contains("times as measured"), "{seconds} {said}");
 }
 

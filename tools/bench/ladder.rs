@@ -19,7 +19,6 @@ use gsscale::page::format::codec::Codec;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::timing::Transfers;
 use gsscale::report::ladder_page::{LadderRung, Rounding, ladder_page};
-use gsscale::report::pace::convert_to_one_pace;
 use gsscale::report::record::RunRecord;
 use gsscale::schedule::order::Order;
 use gsscale::train::error::TrainError;
@@ -59,7 +58,7 @@ pub struct Args {
     #[arg(long, default_value_t = 50.0, value_name = "P")]
     share: f64,
     /// Train the base for this many steps before and after each run, and convert times to one pace of the machine where every run has
-    /// these; 0 = do not
+    /// these; 0 = do neither
     #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
     pace_steps: u32,
     /// Rungs to run [default: those that need no GPU]
@@ -211,11 +210,11 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         eprintln!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;
         done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), rounding: rung.rounding, record });
-        let (rungs, times) = at_one_pace(&done);
+        let (rungs, times) = at_one_pace(&sweep, &done);
         write_whole(&page, ladder_page(&format!("{facts}; {times}"), &rungs).as_bytes())?;
     }
     if !args.common.json {
-        let (rungs, times) = at_one_pace(&done);
+        let (rungs, times) = at_one_pace(&sweep, &done);
         gsscale::say!("{}", text_of(&rungs));
         eprintln!("{times}");
     }
@@ -224,9 +223,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
 }
 
 /// The rungs with their times converted to one pace of the machine, and what the times are.
-fn at_one_pace(rungs: &[LadderRung]) -> (Vec<LadderRung>, &'static str) {
+fn at_one_pace(sweep: &Sweep, rungs: &[LadderRung]) -> (Vec<LadderRung>, &'static str) {
     let mut records: Vec<RunRecord> = rungs.iter().map(|rung| rung.record.clone()).collect();
-    let times = convert_to_one_pace(&mut records);
+    let times = sweep.at_one_pace(&mut records);
     let converted = rungs.iter().zip(records).map(|(rung, record)| LadderRung { record, ..rung.clone() });
     (converted.collect(), times)
 }

@@ -13,7 +13,6 @@ use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::page::format::codec::Codec;
 use gsscale::report::front::{Setting, Verdict, against, settings};
-use gsscale::report::pace::convert_to_one_pace;
 use gsscale::report::record::RunRecord;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::sweep_page;
@@ -60,7 +59,7 @@ pub struct Args {
     #[arg(long, default_value_t = 0.0, value_name = "P")]
     share: f64,
     /// Train the base for this many steps before and after each run, and convert times to one pace of the machine where every run has
-    /// these; 0 = do not
+    /// these; 0 = do neither
     #[arg(long, default_value_t = PACE_STEPS_DEFAULT, value_name = "N")]
     pace_steps: u32,
 }
@@ -186,7 +185,7 @@ fn of_plan(runs: &[Planned], sweep: &Sweep) -> (Vec<RunRecord>, &'static str) {
         Some(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() })
     };
     let mut records: Vec<RunRecord> = runs.iter().filter_map(of_run).collect();
-    let times = convert_to_one_pace(&mut records);
+    let times = sweep.at_one_pace(&mut records);
     (records, times)
 }
 

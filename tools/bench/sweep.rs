@@ -14,6 +14,7 @@ use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::values::ByteSize;
 use gsscale::photos::outlier_views;
+use gsscale::report::pace::convert_to_one_pace;
 use gsscale::report::record::{Pace, RunRecord};
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
@@ -198,9 +199,14 @@ impl Sweep {
         Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json, pace_steps, pace_after_last_run })
     }
 
-    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base. 0 measures nothing.
+    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base. 0 measures and converts nothing.
     pub fn with_pace(self, steps: u32) -> Sweep {
         Sweep { pace_steps: steps, ..self }
+    }
+
+    /// Converts times of runs to one pace of the machine, where that is possible and wanted. Returns what the times are.
+    pub fn at_one_pace(&self, records: &mut [RunRecord]) -> &'static str {
+        if self.pace_steps == 0 { "times as measured" } else { convert_to_one_pace(records) }
     }
 
     /// The results so far.

@@ -178,7 +178,7 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
         return Ok(remove_files(out, |tells| tells == Tells::Steps)?);
     }
     // Before anything is removed: without its config the rest would not be taken for a run's.
-    exports(out).try_for_each(|(format, file)| format.check_removable(&file))?;
+    ExportFormat::ALL.into_iter().try_for_each(|format| check_results(out, format))?;
     // First, because an active run in the folder makes this fail.
     remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
     Ok(remove_files(out, |_| true)?)
@@ -202,6 +202,16 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
         }
     })
+}
+
+/// Refuses an output folder in which the PLY or the export `format` of a run cannot be replaced.
+///
+/// # Errors
+/// As [`ExportFormat::check_removable`].
+pub(super) fn check_results(out: &Path, format: ExportFormat) -> InputResult<()> {
+    let ply = out.join(PLY_FILE);
+    ExportFormat::Ply.check_removable(&ply)?;
+    format.beside(&ply).map_or(Ok(()), |file| format.check_removable(&file))
 }
 
 /// The exports that a run can have written beside its PLY.
@@ -290,6 +300,21 @@ mod tests {
             std::fs::write(out.join(CONFIG_FILE), "").unwrap();
             make(out, Existing::Overwrite).unwrap();
             assert!(is_empty(out), "{word}: {:?}", std::fs::read_dir(out).unwrap().collect::<Vec<_>>());
+        }
+    }
+
+    #[test]
+    fn folders_in_the_place_of_results_are_refused() {
+        for name in [PLY_FILE, "point_cloud.spz"] {
+            let folder = tempfile::tempdir().unwrap();
+            let out = folder.path();
+            std::fs::write(out.join(CONFIG_FILE), "").unwrap();
+            std::fs::create_dir(out.join(name)).unwrap();
+            let refused = make(out, Existing::Overwrite).unwrap_err().to_string();
+            assert!(refused.contains(name) && refused.contains("move or rename"), "{refused}");
+            assert!(out.join(CONFIG_FILE).is_file());
+            assert_eq!(check_results(out, ExportFormat::Ply).is_err(), name == PLY_FILE);
+            assert!(check_results(out, ExportFormat::Spz).is_err());
         }
     }
 }

@@ -81,10 +81,8 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }
-    // A folder of SOGs that holds other files is refused here, and not after the last step.
-    if let Some(file) = config.export.beside(&Trainer::ply_path(&request.out)) {
-        config.export.check_removable(&file)?;
-    }
+    // What lies in the place of a result is refused here, and not after the last step.
+    out_folder::check_results(&request.out, config.export)?;
     let folder = stored_folder(&request.out, &config);
     if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
         drop(lock);
