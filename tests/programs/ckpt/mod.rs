@@ -133,9 +133,17 @@ fn a_run_and_an_export_write_the_same_spz() {
         said.contains("use .ply, .spz, or lod-meta.json in a folder of its own") && !bench.path("a.splat").exists(),
         "{said}"
     );
-    // A folder stands where the file is to be written: the run still has its evaluation and its report, and can be resumed.
+    // A folder stands where the file is to be written: refused before the first step.
     std::fs::remove_file(out.join(files[0])).unwrap();
     std::fs::create_dir(out.join(files[0])).unwrap();
+    let refused = train(&["--resume", text(&out), "--quiet"]);
+    let said = stderr(&refused);
+    assert!(refused.status.code() == Some(1) && said.contains("is a folder where a file"), "{said}");
+    assert!(summary(&out)["test"].is_null(), "no step was trained");
+    std::fs::remove_dir(out.join(files[0])).unwrap();
+    // The export fails at the end, at its transform: the run still has its evaluation and its report, and can be resumed.
+    std::fs::remove_file(out.join(files[1])).unwrap();
+    std::fs::create_dir(out.join(files[1])).unwrap();
     let failed_export = train(&["--resume", text(&out), "--quiet"]);
     let said = stderr(&failed_export);
     assert!(failed_export.status.code() == Some(1) && said.contains("point_cloud.spz"), "{said}");
@@ -144,7 +152,7 @@ fn a_run_and_an_export_write_the_same_spz() {
         done["finished"] == false && done["test"]["psnr"].is_number() && out.join("report.html").exists(),
         "{done}"
     );
-    std::fs::remove_dir(out.join(files[0])).unwrap();
+    std::fs::remove_dir(out.join(files[1])).unwrap();
     // A new start in the folder removes the files of the run before.
     bench.go_on(&[]);
     assert_eq!(summary(&out)["finished"], true);
