@@ -225,7 +225,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
 /// The rungs with their times converted to one pace of the machine, and what the times are.
 fn at_one_pace(sweep: &Sweep, rungs: &[LadderRung]) -> (Vec<LadderRung>, &'static str) {
     let mut records: Vec<RunRecord> = rungs.iter().map(|rung| rung.record.clone()).collect();
-    let times = sweep.at_one_pace(&mut records);
+    let times = sweep.convert_times(&mut records);
     let converted = rungs.iter().zip(records).map(|(rung, record)| LadderRung { record, ..rung.clone() });
     (converted.collect(), times)
 }

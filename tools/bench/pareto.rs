@@ -185,7 +185,7 @@ fn of_plan(runs: &[Planned], sweep: &Sweep) -> (Vec<RunRecord>, &'static str) {
         Some(RunRecord { knob: run.knob.clone(), label: run.label.clone(), ..record.clone() })
     };
     let mut records: Vec<RunRecord> = runs.iter().filter_map(of_run).collect();
-    let times = sweep.at_one_pace(&mut records);
+    let times = sweep.convert_times(&mut records);
     (records, times)
 }
 

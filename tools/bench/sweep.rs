@@ -204,8 +204,9 @@ impl Sweep {
         Sweep { pace_steps: steps, ..self }
     }
 
-    /// Converts times of runs to one pace of the machine, where that is possible and wanted. Returns what the times are.
-    pub fn at_one_pace(&self, records: &mut [RunRecord]) -> &'static str {
+    /// Converts times of runs to one pace of the machine if all runs have a pace, unless the pace is not wanted (0 steps). Returns what the
+    /// times are.
+    pub fn convert_times(&self, records: &mut [RunRecord]) -> &'static str {
         if self.pace_steps == 0 { "times as measured" } else { convert_to_one_pace(records) }
     }
 

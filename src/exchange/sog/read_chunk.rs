@@ -260,7 +260,7 @@ pub(super) fn malformed(path: &Path, problem: impl Into<String>) -> InputError {
     InputError::new(path, problem, "the folder is damaged: copy it again, or export it again")
 }
 
-/// An error of a file that may be right, but is not read.
+/// An error of a file that may follow the format, but that this reader does not support.
 pub(super) fn unsupported(path: &Path, problem: impl Into<String>) -> InputError {
     InputError::new(path, problem, "give a folder that gsscale wrote, or evaluate the PLY that the folder was made of")
 }

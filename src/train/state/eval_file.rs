@@ -146,7 +146,7 @@ struct Evaluator<'a> {
     targets: TargetCache,
     renderer: Box<dyn Renderer>,
     lpips: Option<(&'a Lpips, InputRange)>,
-    /// Warnings that were printed: those of one level are mostly those of all.
+    /// Warnings that were printed. Most levels cause the same ones.
     printed: BTreeSet<String>,
 }
 
