@@ -246,7 +246,7 @@ struct Scratch(PathBuf);
 impl Drop for Scratch {
     fn drop(&mut self) {
         if let Err(error) = std::fs::remove_dir_all(&self.0) {
-            eprintln!("warning: {} could not be removed: {error}", self.0.display());
+            gsscale::tell!("warning: {} could not be removed: {error}", self.0.display());
         }
     }
 }

@@ -51,7 +51,7 @@ fn main() {
         return;
     }
     let Ok(gpu) = Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions::default()) else {
-        eprintln!("SKIPPED: there is no usable GPU adapter; mesa-vulkan-drivers has a software one");
+        gsscale::tell!("SKIPPED: there is no usable GPU adapter; mesa-vulkan-drivers has a software one");
         return;
     };
     let rate = checked(copy_rate(&gpu, COPY_BYTES, 12));
@@ -62,7 +62,7 @@ fn main() {
     for real in PHOTO_CASES.iter().filter(|c| args.wants(c.name)) {
         match photo_case(real, VIEWS) {
             Some(case) => measure(&args, &case, rate),
-            None => eprintln!("SKIPPED {}: no such scene; set GSSCALE_DATA to the folder that has it", real.name),
+            None => gsscale::tell!("SKIPPED {}: no such scene; set GSSCALE_DATA to the folder that has it", real.name),
         }
     }
     let sizes = if args.sizes.is_empty() { TERRAINS.to_vec() } else { args.sizes.clone() };

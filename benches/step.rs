@@ -108,7 +108,7 @@ fn measure(args: &Args, name: &str, floor: Floor, make: impl Fn() -> Option<Case
         return;
     }
     let Some(mut case) = make() else {
-        eprintln!("SKIPPED {name}: no such scene; set GSSCALE_DATA to the folder that has it");
+        gsscale::tell!("SKIPPED {name}: no such scene; set GSSCALE_DATA to the folder that has it");
         return;
     };
     case.name = name.to_string();

@@ -43,7 +43,7 @@ impl Args {
     /// Reads the program's arguments; ends the program if an option is unknown.
     pub fn read() -> Args {
         Args::parse(std::env::args().skip(1)).unwrap_or_else(|problem| {
-            eprintln!("error: {problem}");
+            gsscale::tell!("error: {problem}");
             std::process::exit(2)
         })
     }

@@ -78,6 +78,7 @@ const UNSAFE_FILES: &[&str] = &[
     "src/page/engine/mmap.rs",
     "src/page/engine/registered.rs",
     "src/page/engine/uring.rs",
+    "src/train/inputs/signals.rs",
 ];
 
 const FUNCTION_LINES_MAX: usize = 80;
@@ -247,7 +248,8 @@ fn unsafe_stands_only_where_it_is_argued() {
 
 #[test]
 fn files_say_what_they_are_and_leave_no_markers() {
-    let markers = ["todo!(", "unimplemented!(", "dbg!(", "FIXME", "XXX", "(being written)"];
+    // `eprintln!` ends the program when its line cannot be written: `say!` and `tell!` do not.
+    let markers = ["todo!(", "unimplemented!(", "dbg!(", "FIXME", "XXX", "(being written)", "eprintln!(", "eprint!("];
     let mut wrong = Vec::new();
     for (name, text) in rust_files(&["src", "tools", "benches"]) {
         if !text.starts_with("//!") {

@@ -89,7 +89,7 @@ fn main() -> ExitCode {
     match done {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }

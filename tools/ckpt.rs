@@ -83,9 +83,9 @@ fn main() -> ExitCode {
         Command::Salvage(args) => salvage::run(&args),
     };
     done.unwrap_or_else(|error| {
-        eprintln!("error: {error}");
+        gsscale::tell!("error: {error}");
         if is_damaged_map(&error) {
-            eprintln!(
+            gsscale::tell!(
                 "  remedy: gsscale-ckpt salvage DIR --out TO rebuilds the map from the pages, and never writes to DIR"
             );
         }

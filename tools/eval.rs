@@ -62,7 +62,7 @@ fn main() -> ExitCode {
     match start(parse_command_line()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }

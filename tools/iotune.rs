@@ -61,7 +61,7 @@ fn main() -> ExitCode {
     match run(&Flags::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }

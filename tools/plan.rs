@@ -174,7 +174,7 @@ fn main() -> ExitCode {
             ExitCode::SUCCESS
         }
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }

@@ -101,12 +101,12 @@ fn main() -> ExitCode {
     let trace = args.trace.as_deref().filter(|_| !args.dry_run);
     let outcome = begin_trace(trace).and_then(|()| start(args));
     if let Err(error) = trace::finish() {
-        eprintln!("warning: {error}");
+        gsscale::tell!("warning: {error}");
     }
     match outcome {
         Ok(outcome) => finish(&outcome, quiet),
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }
@@ -131,7 +131,7 @@ fn list_devices() {
 fn begin_live(address: Option<SocketAddr>) -> InputResult<Option<Live>> {
     let live = address.map(Live::begin).transpose()?;
     if let Some(live) = &live {
-        eprintln!("live page: http://{}/", live.address());
+        gsscale::tell!("live page: http://{}/", live.address());
     }
     Ok(live)
 }
@@ -205,7 +205,7 @@ fn demo_scene(out: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf, 
 
 fn make_city(scene: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf, TrainError> {
     if !quiet {
-        eprintln!("generating a city in {}", scene.display());
+        gsscale::tell!("generating a city in {}", scene.display());
     }
     let options = CityOptions { seed: config.seed, overwrite: true, ..CityOptions::default() };
     let shown = Count::new("photos made", options.photos(), quiet);
@@ -244,7 +244,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             None if summary.finished => String::from("no photos held out"),
             None => String::from("not evaluated"),
         };
-        eprintln!(
+        gsscale::tell!(
             "{} {} steps, {} Gaussians, {} of training",
             if summary.finished { "done:" } else { "stopped after" },
             format_grouped(summary.steps.into()),
@@ -252,14 +252,14 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             format_seconds(summary.train_seconds),
         );
         let out = &outcome.out;
-        eprintln!("  quality     {test}");
-        eprintln!("  Gaussians   {}", out.join(PLY_FILE).display());
-        eprintln!("  report      {}", out.join(REPORT_FILE).display());
+        gsscale::tell!("  quality     {test}");
+        gsscale::tell!("  Gaussians   {}", out.join(PLY_FILE).display());
+        gsscale::tell!("  report      {}", out.join(REPORT_FILE).display());
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
-            eprintln!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
+            gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
             if !outcome.keeps_checkpoint {
-                eprintln!(
+                gsscale::tell!(
                     "              (from the PLY, without Adam's moments; runs with --keep-checkpoint go on exactly)"
                 );
             }

@@ -22,13 +22,13 @@ pub fn run_with_arguments(
     // Cargo adds --bench.
     let arguments: Vec<OsString> = std::env::args_os().filter(|argument| argument != "--bench").collect();
     if arguments.len() < 2 {
-        eprintln!("SKIPPED {name}: it needs arguments; see cargo bench --bench {name} -- --help");
+        gsscale::tell!("SKIPPED {name}: it needs arguments; see cargo bench --bench {name} -- --help");
         return ExitCode::SUCCESS;
     }
     match start(&arguments, &mut |line| gsscale::say!("{line}")) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error}");
+            gsscale::tell!("error: {error}");
             ExitCode::FAILURE
         }
     }

@@ -1,6 +1,12 @@
-//! Lines on standard output; a closed pipe is no error.
+//! All lines that programs print: results on standard output ([`say!`](crate::say)), words about the work on standard error
+//! ([`tell!`](crate::tell)).
+//!
+//! Invariants: 1. a terminal that is gone, a closed pipe or a full drive behind standard error ends no program: such lines
+//! are lost; 2. nothing that a file's name holds can move the cursor or turn the direction of a line: control characters
+//! and direction marks are printed as escapes (`\u202e`, as in JSON).
 
-use std::fmt::Arguments;
+use std::borrow::Cow;
+use std::fmt::{Arguments, Write as _};
 use std::io::{ErrorKind, Write};
 
 /// As `println!`, except that a closed pipe (`| head`) is ignored and the program continues.
@@ -9,14 +15,66 @@ macro_rules! say {
     ($($text:tt)*) => { $crate::base::say::say_line(format_args!($($text)*)) };
 }
 
+/// As `eprintln!`, except that a failure is ignored: the work is worth more than a line about it.
+#[macro_export]
+macro_rules! tell {
+    ($($text:tt)*) => { $crate::base::say::tell_line(format_args!($($text)*)) };
+}
+
 /// Implementation of [`say!`](crate::say). If standard output fails for another reason (a file on a full drive), prints
 /// the error and ends the program with a non-zero exit code by unwinding, so that destructors run.
 pub fn say_line(text: Arguments<'_>) {
-    match writeln!(std::io::stdout(), "{text}") {
+    match write_line(&mut std::io::stdout(), text) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            eprintln!("error: standard output: {error}\n  remedy: redirect it to a drive with free space");
+            crate::tell!("error: standard output: {error}\n  remedy: redirect it to a drive with free space");
             std::panic::resume_unwind(Box::new("standard output failed"));
         }
         _ => {}
+    }
+}
+
+/// Implementation of [`tell!`](crate::tell).
+pub fn tell_line(text: Arguments<'_>) {
+    // Nobody is left to be told of a failure here.
+    let _ = write_line(&mut std::io::stderr(), text);
+}
+
+/// One call of `write`, so that lines of several threads or processes do not mix.
+fn write_line(stream: &mut dyn Write, text: Arguments<'_>) -> std::io::Result<()> {
+    let line = format!("{text}\n");
+    stream.write_all(visible(&line).as_bytes())
+}
+
+/// The text with its control characters (but for line breaks and tabs) and direction marks as escapes.
+pub fn visible(text: &str) -> Cow<'_, str> {
+    if !text.chars().any(is_hidden) {
+        return Cow::Borrowed(text);
+    }
+    let mut shown = String::with_capacity(text.len() + 16);
+    for char in text.chars() {
+        if is_hidden(char) {
+            // A `String` takes every character.
+            let _ = write!(shown, "\\u{:04x}", u32::from(char));
+        } else {
+            shown.push(char);
+        }
+    }
+    Cow::Owned(shown)
+}
+
+fn is_hidden(char: char) -> bool {
+    let is_direction =
+        matches!(char, '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}');
+    is_direction || (char.is_control() && !matches!(char, '\n' | '\t'))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_name_cannot_turn_the_line() {
+        assert_eq!(visible("straße\tZürich 東京\n"), "straße\tZürich 東京\n");
+        assert_eq!(visible("a\u{202e}gpj.b\u{1b}[2J\u{2066}"), "a\\u202egpj.b\\u001b[2J\\u2066");
     }
 }

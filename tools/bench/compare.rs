@@ -32,6 +32,6 @@ pub struct Args {
 /// A folder holds no run, or the page cannot be written.
 pub fn start(args: &Args) -> Result<(), TrainError> {
     write_whole(&args.out, compare_report(&args.runs)?.as_bytes())?;
-    eprintln!("{}", args.out.display());
+    gsscale::tell!("{}", args.out.display());
     Ok(())
 }

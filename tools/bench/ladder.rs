@@ -199,7 +199,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         facts.largest_view,
         config.view_order.word(),
     );
-    eprintln!("{facts}");
+    gsscale::tell!("{facts}");
     use_drive(&mut config, frames);
     let mut sweep = Sweep::open(&args.common, &config, RESULTS)?.with_pace(args.pace_steps);
     let mut done = Vec::new();
@@ -207,7 +207,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         let environment = rung.environment;
         let mut planned = Planned { environment, ..Planned::new("ladder", rung.name, config.clone()) };
         (rung.change)(&mut planned.config);
-        eprintln!("{}: {}", rung.name, rung.what);
+        gsscale::tell!("{}: {}", rung.name, rung.what);
         let record = sweep.run(&planned, print)?;
         done.push(LadderRung { name: rung.name.into(), what: rung.what.into(), rounding: rung.rounding, record });
         let (rungs, times) = at_one_pace(&sweep, &done);
@@ -216,9 +216,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     if !args.common.json {
         let (rungs, times) = at_one_pace(&sweep, &done);
         gsscale::say!("{}", text_of(&rungs));
-        eprintln!("{times}");
+        gsscale::tell!("{times}");
     }
-    eprintln!("done: {}", page.display());
+    gsscale::tell!("done: {}", page.display());
     Ok(())
 }
 

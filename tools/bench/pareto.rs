@@ -80,9 +80,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let open: Vec<&Planned> = runs.iter().filter(is_open).collect();
     let done = runs.len() - open.len();
     let count = open.len().min(args.max_runs.unwrap_or(usize::MAX));
-    eprintln!("{done} of {} runs are done; {count} to do now", runs.len());
+    gsscale::tell!("{done} of {} runs are done; {count} to do now", runs.len());
     for (i, run) in open.iter().take(count).enumerate() {
-        eprintln!("run {} of {count}: {} {}, seed {}", i + 1, run.knob, run.label, run.config.seed);
+        gsscale::tell!("run {} of {count}: {} {}, seed {}", i + 1, run.knob, run.label, run.config.seed);
         sweep.run(run, print)?;
         write_page(args, &base, &runs, &sweep)?;
     }
@@ -90,9 +90,9 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     if !args.common.json {
         let (records, times) = of_plan(&runs, &sweep);
         gsscale::say!("{}", text_of(&records));
-        eprintln!("{times}");
+        gsscale::tell!("{times}");
     }
-    eprintln!("done: {}", args.common.out.join("pareto.html").display());
+    gsscale::tell!("done: {}", args.common.out.join("pareto.html").display());
     Ok(())
 }
 

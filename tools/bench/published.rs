@@ -204,7 +204,7 @@ fn held_out(raw: &RawScene, config: &TrainConfig) -> usize {
 
 fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
     let tier = setting.run.tier_of(config).unwrap_or("none");
-    eprintln!(
+    gsscale::tell!(
         "run     {} ({}), tier {tier}, {} laid out as {}",
         setting.run.name,
         setting.run.facts.title,
@@ -212,7 +212,7 @@ fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
         setting.layout.name()
     );
     for caveat in &setting.caveats {
-        eprintln!("warning: not the published run: {caveat}");
+        gsscale::tell!("warning: not the published run: {caveat}");
     }
 }
 
@@ -237,7 +237,7 @@ fn train(
     let (name, data, all) = (args.run.display(), args.data.display(), setting.out.display());
     let resume = format!("gsscale-train --resume {}", out.display());
     let more = if args.with_defaults { " --with-defaults" } else { "" };
-    eprintln!(
+    gsscale::tell!(
         "stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train"
     );
     Ok(Err(ExitCode::from(outcome.exit_code as u8)))
@@ -259,7 +259,7 @@ fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, Exit
     let config = TrainConfig::of_new_run(None, &keys)?;
     config.check()?;
     if !args.quiet {
-        eprintln!("run     the same photos with the defaults of gsscale, into {}", out.display());
+        gsscale::tell!("run     the same photos with the defaults of gsscale, into {}", out.display());
     }
     reset_host_bytes_peak();
     Ok(match train(args, (setting, &out), &config)? {
@@ -308,7 +308,7 @@ fn report(
     write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;
     write_whole(&setting.out.join("published.html"), comparison.page().as_bytes())?;
     if !args.quiet {
-        eprintln!("{}", comparison.text());
+        gsscale::tell!("{}", comparison.text());
     }
     print(&json);
     Ok(())

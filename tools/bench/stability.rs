@@ -156,7 +156,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let is_open = |sweep: &Sweep, r: &Planned| successful_run(sweep.records(), &r.key(sweep.surroundings())).is_none();
     let open = runs().filter(|run| is_open(&sweep, run)).count();
     let mut left = open.min(args.max_runs.unwrap_or(usize::MAX));
-    eprintln!("{} of {} runs are done; {left} to do now", runs().count() - open, runs().count());
+    gsscale::tell!("{} of {} runs are done; {left} to do now", runs().count() - open, runs().count());
     for scene in &scenes {
         let open: Vec<&Planned> = scene.runs.iter().filter(|run| is_open(&sweep, run)).take(left).collect();
         if open.is_empty() {
@@ -166,7 +166,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         remove(&scene.folder)?;
         write_disturbed(&scene.folder, &dataset, &scene.disturbance, scene.seed)?;
         for run in &open {
-            eprintln!("{}, remedy {}, seed {}; {left} runs left", run.knob, run.label, run.config.seed);
+            gsscale::tell!("{}, remedy {}, seed {}; {left} runs left", run.knob, run.label, run.config.seed);
             sweep.run(run, print)?;
             left -= 1;
             write_page(args, &records_of(runs(), &sweep))?;
@@ -178,7 +178,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     if !args.common.json {
         gsscale::say!("{}", text_of(&records));
     }
-    eprintln!("done: {}", args.common.out.join("stability.html").display());
+    gsscale::tell!("done: {}", args.common.out.join("stability.html").display());
     Ok(())
 }
 

@@ -242,7 +242,7 @@ impl Sweep {
             }
         };
         if let Some(problem) = &record.problem {
-            eprintln!("warning: the run failed: {problem}");
+            gsscale::tell!("warning: the run failed: {problem}");
         }
         if self.json {
             print(&serde_json::to_value(&record).unwrap_or_default());
@@ -270,7 +270,7 @@ impl Sweep {
         let record = self.train(&planned, &key)?;
         remove(&self.out.join("runs").join(planned.name(&key)))?;
         if let Some(problem) = record.problem {
-            eprintln!(
+            gsscale::tell!(
                 "warning: the pace of the machine is not measured, because {} steps of the base failed: {problem}",
                 self.pace_steps
             );

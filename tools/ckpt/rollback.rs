@@ -32,7 +32,7 @@ pub fn run(args: &Args) -> Result<ExitCode, TrainError> {
     if done.is_done || done.dropped.is_empty() {
         return Ok(ExitCode::SUCCESS);
     }
-    eprintln!("nothing was changed\n  remedy: give --yes to roll back");
+    gsscale::tell!("nothing was changed\n  remedy: give --yes to roll back");
     Ok(ExitCode::FAILURE)
 }
 

@@ -223,7 +223,7 @@ fn stages_out_of_order_are_errors_and_change_nothing() {
 #[test]
 fn avx2_and_avx512_agree_to_the_bit() {
     if !SimdPath::Avx512.is_supported() {
-        println!("SKIPPED: this machine has no AVX-512");
+        crate::tell!("SKIPPED: this machine has no AVX-512");
         return;
     }
     let (rows, camera) = scene(3000, 100, 60);

@@ -53,7 +53,7 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
         .with_state(live);
     std::thread::Builder::new().name("live page".into()).spawn(move || {
         if let Err(error) = runtime.block_on(serve(listener, app)) {
-            eprintln!("warning: the live page has stopped: {error}");
+            crate::tell!("warning: the live page has stopped: {error}");
         }
     })?;
     Ok(())

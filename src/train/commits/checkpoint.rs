@@ -216,11 +216,11 @@ impl Checkpoint {
         match result {
             Err(error) if self.is_optional && error.is_out_of_space() => {
                 if !std::mem::replace(&mut self.warned_full, true) {
-                    eprintln!("warning: nothing can be committed: {error}");
+                    crate::tell!("warning: nothing can be committed: {error}");
                 }
                 // The next commit would hold another step, so drop the name.
                 if let Some(name) = self.name.take() {
-                    eprintln!("warning: {name} is not kept");
+                    crate::tell!("warning: {name} is not kept");
                 }
                 self.last = Instant::now();
                 Ok(())
@@ -243,7 +243,7 @@ impl Checkpoint {
         match first.make(&mut trainer.scene.pager) {
             Ok((spill, commits)) => (self.spill, self.commits) = (Some(spill), Some(commits)),
             Err(error) if error.is_out_of_space() => return Err(error),
-            Err(error) => eprintln!("warning: this run is not committed, so it cannot be resumed: {error}"),
+            Err(error) => crate::tell!("warning: this run is not committed, so it cannot be resumed: {error}"),
         }
         self.first = None;
         Ok(())
@@ -321,7 +321,7 @@ impl Checkpoint {
     pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         match self.commit(trainer, metrics) {
             Err(error) if error.is_out_of_space() => {
-                eprintln!("warning: the last steps are not committed: {error}");
+                crate::tell!("warning: the last steps are not committed: {error}");
                 Ok(())
             }
             done => done,

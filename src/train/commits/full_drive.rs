@@ -95,7 +95,7 @@ impl Checkpoint {
         let is_full = result.as_ref().is_err_and(|e| e.is_out_of_space() && self.other_drive(e).is_none());
         let commits = self.commits.as_mut().filter(|_| is_full);
         if commits.map_or(Ok(false), Commits::give_up_reserve)? {
-            eprintln!("warning: the drive of {} is full: the reserve is used up", self.folder.display());
+            crate::tell!("warning: the drive of {} is full: the reserve is used up", self.folder.display());
             result = self.commit(trainer, metrics);
         }
         result?;
@@ -120,7 +120,7 @@ impl Checkpoint {
         let until = self.full_wait.as_secs_f64();
         let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
         if !is_told {
-            eprintln!(
+            crate::tell!(
                 "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to \
                  {until:.0} s (--disk-full-wait) for space, then continues; Ctrl-C stops it"
             );
@@ -135,7 +135,7 @@ impl Checkpoint {
             match self.commit(trainer, metrics) {
                 Ok(()) => {
                     if !is_told {
-                        eprintln!(
+                        crate::tell!(
                             "there is space again after {:.0} s: training goes on",
                             began.elapsed().as_secs_f64()
                         );

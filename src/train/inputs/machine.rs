@@ -26,7 +26,7 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let (asked, most) = (config.threads as usize, THREADS_LEAST_BOUND.max(THREADS_PER_CORE * cores));
         if asked > most {
-            eprintln!(
+            crate::tell!(
                 "warning: --threads {asked}: {most} are started, since this machine has {cores} cores and every thread \
                  takes memory; the result does not depend on them"
             );

@@ -3,6 +3,7 @@
 //! Invariants: 1. a line, and a bar on a terminal of 80 columns, fits 80 columns for any number of steps and Gaussians;
 //! 2. rate and time left follow from the last half minute, since steps become slower while a scene grows.
 
+use crate::base::say::visible;
 use crate::base::units::{format_count, format_seconds};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::collections::VecDeque;
@@ -89,7 +90,7 @@ impl Progress {
         let words = words(Shown { psnr, ..shown }, rate, self.total.saturating_sub(done));
         match &self.bar {
             Some(bar) => bar.set_message(words),
-            None => eprintln!("step {done}/{}  {words}", self.total),
+            None => crate::tell!("step {done}/{}  {words}", self.total),
         }
     }
 
@@ -97,8 +98,8 @@ impl Progress {
     pub fn say(&self, line: &str) {
         match &self.bar {
             _ if self.quiet => {}
-            Some(bar) => bar.println(line),
-            None => eprintln!("{line}"),
+            Some(bar) => bar.println(visible(line)),
+            None => crate::tell!("{line}"),
         }
     }
 
@@ -185,7 +186,7 @@ impl Count {
         let mut last = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
         if !self.quiet && last.elapsed() >= LINE_EVERY {
             *last = Instant::now();
-            eprintln!("{done}/{} {}", self.total, self.what);
+            crate::tell!("{done}/{} {}", self.total, self.what);
         }
     }
 }

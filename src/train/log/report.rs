@@ -307,7 +307,7 @@ impl MetricsLog {
         let there = file.metadata().map_err(io)?.len();
         let kept = if there < bytes { end_of_whole_lines(&file).map_err(io)? } else { bytes };
         if there < bytes {
-            eprintln!(
+            crate::tell!(
                 "warning: {} has only {there} of {bytes} bytes: the curves of the report have a gap",
                 path.display()
             );

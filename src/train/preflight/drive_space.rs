@@ -75,7 +75,7 @@ pub(super) fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2]
             0 => (String::new(), ""),
             kept => (format!(" and {kept} named checkpoints"), ", keep fewer checkpoints with --save-every"),
         };
-        eprintln!(
+        crate::tell!(
             "warning: the scene with its last two commits{named} may take {} on the drive, which has {} free: lower \
              --max-gaussians{fewer}, or commit less often with --commit-every",
             format_bytes(with_past),

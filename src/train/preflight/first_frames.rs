@@ -148,7 +148,7 @@ pub(super) fn in_batches(config: &TrainConfig, memory: &mut MemoryEstimate, page
 pub(super) fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
     let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
-    eprintln!(
+    crate::tell!(
         "warning: the run needs {} from its start, more than {}, the default share of the free memory: it takes more \
          as long as the machine has it; --host-mem sets a limit",
         format_bytes(least),

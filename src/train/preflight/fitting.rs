@@ -161,7 +161,7 @@ impl Trainer {
     fn raise_budget(&mut self, budget: HostBudget, bytes: u64) -> bool {
         let Some(raised) = budget.raised(bytes) else { return false };
         if !budget.is_raised {
-            eprintln!(
+            crate::tell!(
                 "warning: from step {} on the scene needs more than {}, the default share of the free memory: the run \
                  takes more as long as the machine has it; --host-mem sets a limit",
                 self.state.step,

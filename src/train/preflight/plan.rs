@@ -242,7 +242,7 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
         _ if then <= left => return,
         cap => format!("with --max-gaussians {cap} the view may need {then} pages with {left} frames"),
     };
-    eprintln!(
+    crate::tell!(
         "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has \
          grown about {times:.1} times, steps on such views take several batches and read more; more --frames or --host-mem \
          avoid it"
@@ -271,7 +271,7 @@ fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>
         return Err(InputError::new("--host-mem", problem, remedy));
     }
     if most.total() > budget {
-        eprintln!(
+        crate::tell!(
             "warning: the run may need {} but has {}: beyond that, its pages move between memory and its checkpoint; \
              name a folder on a fast drive with --spill-dir, or lower --max-gaussians, --image-cache, --sh-degree or \
              the size of the photos",

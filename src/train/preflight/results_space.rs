@@ -57,7 +57,7 @@ pub(crate) fn check_drive_of_results(
     };
     let needed = results.saturating_add(pages.saturating_sub(stored));
     if free < needed {
-        eprintln!(
+        crate::tell!(
             "warning: the results{beside} may take {} more in {}, whose drive has {} free: free space, choose another --out, or \
              lower --max-gaussians",
             format_bytes(needed),

@@ -99,7 +99,7 @@ pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
     if let Some(spill_dir) = config.residence().spill_dir()
         && remove_uncommitted(spill_dir, false)?
     {
-        eprintln!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     Ok(())
 }
@@ -135,7 +135,7 @@ pub(super) fn first_trainer(
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
     // Drop the tiers after the trainer, whose pages may lie there.
     let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
-    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
     }
@@ -152,10 +152,10 @@ pub(crate) fn begin(
     start: &Start,
 ) -> Result<(Box<dyn Renderer>, RunOptions, u64), TrainError> {
     for warning in &start.dataset.warnings {
-        eprintln!("warning: {warning}");
+        crate::tell!("warning: {warning}");
     }
     if keeps_first_count(config, &start.dataset) {
-        eprintln!("warning: {}", too_few_to_decide(&start.dataset));
+        crate::tell!("warning: {}", too_few_to_decide(&start.dataset));
     }
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
@@ -182,7 +182,7 @@ pub(crate) fn begin(
         Device::Gpu(_) => host_bytes_now().unwrap_or(0).saturating_sub(before),
     };
     if let Some(word) = word.filter(|_| !quiet) {
-        eprintln!("{word}");
+        crate::tell!("{word}");
     }
     Ok((renderer, options, driver))
 }
@@ -264,7 +264,7 @@ pub(super) fn plan_and_train(
     begun: Begun,
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
-    trainer.start_photos(dataset).iter().for_each(|warning| eprintln!("warning: {warning}"));
+    trainer.start_photos(dataset).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver), DriveRate::COMMON)?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
@@ -274,7 +274,7 @@ pub(super) fn plan_and_train(
         match request.dry_run {
             // What was asked for goes to standard output.
             true => crate::say!("{plan}"),
-            false => eprintln!("{plan}"),
+            false => crate::tell!("{plan}"),
         }
     }
     let slots = trainer.scene.pager.slot_space().map_or(0, |slots| slots.total);
@@ -294,9 +294,12 @@ pub(super) fn plan_and_train(
     if tiers.can_resume() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);
-        eprintln!("to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}", request.out.display());
+        crate::tell!(
+            "to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}",
+            request.out.display()
+        );
     }
-    tiers.close().iter().for_each(|word| eprintln!("warning: {word}"));
+    tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
     outcome
 }
 

@@ -61,7 +61,7 @@ impl Finished<'_> {
             return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
         }
         let kept = keep_result(out, summary.steps)?;
-        eprintln!(
+        crate::tell!(
             "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
              lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
             out.display(),

@@ -39,7 +39,7 @@ impl Trainer {
         // Warn once: without the budget, later steps do not try again.
         self.budget = None;
         let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else {
-            eprintln!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
+            crate::tell!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
             return Ok(());
         };
         let commits = Some(checkpoint.commits_done());
@@ -50,11 +50,13 @@ impl Trainer {
         match checkpoint.commit(self, outputs.metrics) {
             Ok(()) if checkpoint.has_commit() => {}
             Ok(()) => {
-                eprintln!("warning: {outgrown} (--host-mem), and without commits its pages cannot be moved to a drive");
+                crate::tell!(
+                    "warning: {outgrown} (--host-mem), and without commits its pages cannot be moved to a drive"
+                );
                 return Ok(());
             }
             Err(error) if error.is_out_of_space() => {
-                eprintln!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
+                crate::tell!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
                 // Try again after the next successful commit.
                 self.budget = Some(budget.with_failure_after(commits));
                 return Ok(());
@@ -62,7 +64,7 @@ impl Trainer {
             Err(error) => return Err(error),
         }
         checkpoint.set_optional(false);
-        eprintln!(
+        crate::tell!(
             "warning: {outgrown} (--host-mem): its pages move between memory and {}; a new run with --spill-dir can \
              choose a view order that moves fewer pages",
             checkpoint.folder().display()
@@ -85,7 +87,7 @@ impl Trainer {
                 false => Ok(()),
             };
             if let Err(second) = done {
-                eprintln!("warning: the run could not be committed: {second}");
+                crate::tell!("warning: the run could not be committed: {second}");
             }
         }
         let TrainError::Paging(source @ PagingError::WorkingSet { pages, .. }) = error else { return error };

@@ -47,7 +47,9 @@ pub fn go_on(
     for restart in 1..=most {
         match ended {
             Err(error) if error.is_device_lost() && can_go_on(&request.out) => {
-                eprintln!("warning: {error}\n  the run goes on in this process (restart {restart} of at most {most})");
+                crate::tell!(
+                    "warning: {error}\n  the run goes on in this process (restart {restart} of at most {most})"
+                );
                 ended = resume(request);
             }
             ended => return ended,

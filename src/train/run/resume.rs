@@ -152,7 +152,7 @@ impl Earlier {
             let remedy = "name that output folder, or one that does not exist yet";
             return Err(InputError::new(&request.out, problem, remedy).into());
         }
-        eprintln!("warning: {} is missing: restoring it from the checkpoint", path.display());
+        crate::tell!("warning: {} is missing: restoring it from the checkpoint", path.display());
         // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
         let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.origin.run.scene));
@@ -229,7 +229,7 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
     check_restart(&request.out)?;
     let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
-    eprintln!("{} was cut off before its first commit: it begins again", out.display());
+    crate::tell!("{} was cut off before its first commit: it begins again", out.display());
     let existing = Existing::BeginAgain;
     run(&RunRequest { scene, out, config, dry_run: false, existing, quiet, live: request.live.clone() })
 }
@@ -286,7 +286,7 @@ fn resume_from(
     print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
     let (pager, tiers) = Tiers::resume(stored, &config, host_mem.unwrap_or(u64::MAX))?;
-    tiers.notes.iter().for_each(|note| eprintln!("warning: {note}"));
+    tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
         false => restore_pages(pager, &restore_options(&options, &state), &state)?,
@@ -359,11 +359,14 @@ fn print_resume(
 ) {
     if renderer.device() != state.device {
         let (there, here) = (&state.device, renderer.device());
-        eprintln!("warning: the renderer was {there} and is {here}: its rounding differs");
+        crate::tell!("warning: the renderer was {there} and is {here}: its rounding differs");
     }
-    changes.numbers.iter().for_each(|line| eprintln!("warning: accepted from step {} on: {line}", state.trainer.step));
+    changes
+        .numbers
+        .iter()
+        .for_each(|line| crate::tell!("warning: accepted from step {} on: {line}", state.trainer.step));
     if !changes.numbers.is_empty() {
-        eprintln!("warning: every page is updated to that step by the old rules and rewritten once");
+        crate::tell!("warning: every page is updated to that step by the old rules and rewritten once");
     }
     if request.quiet {
         return;
@@ -372,7 +375,7 @@ fn print_resume(
         [] => String::new(),
         free => format!("; {}", free.join(", ")),
     };
-    eprintln!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
+    crate::tell!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
 }
 
 /// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
@@ -389,7 +392,7 @@ fn finished_outcome(
     let is_its_place = folder == stored_folder(&request.out, &earlier.config);
     let stored = if SpillDir::exists_in(&folder) {
         open_own(&folder, earlier.claim(request), config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
-            eprintln!("warning: {} is left alone: {error}", folder.display());
+            crate::tell!("warning: {} is left alone: {error}", folder.display());
             None
         })
     } else {
@@ -409,7 +412,7 @@ fn finished_outcome(
     if !request.quiet {
         let more = if is_kept { "" } else { " from its PLY" };
         let (out, steps) = (request.out.display(), summary.steps);
-        eprintln!("{out} is finished: all {steps} steps, with results; --steps N continues it{more}");
+        crate::tell!("{out} is finished: all {steps} steps, with results; --steps N continues it{more}");
     }
     Ok(Some(RunOutcome {
         summary: Some(summary),
@@ -435,7 +438,7 @@ fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) ->
     let old = restore_options(&RunOptions::new(&then, state.origin.dataset.scene_scale), state);
     let mut pages = restore_pages(pager, &old, state)?;
     if pages.change_rules(options, state.trainer.step)? {
-        eprintln!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
+        crate::tell!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
     }
     Ok(pages)
 }

@@ -157,7 +157,7 @@ pub(super) fn train_into(
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
-            eprintln!("warning: {} cannot be written: {other}", ply.display());
+            crate::tell!("warning: {} cannot be written: {other}", ply.display());
             return Err(error);
         }
         (looped, saved) => (looped, saved?),
@@ -165,7 +165,9 @@ pub(super) fn train_into(
     warn_of_ply(config, &written, &ply);
     let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
     if exported.is_err() {
-        eprintln!("warning: the file for viewers could not be written; evaluation and report follow, then the reason");
+        crate::tell!(
+            "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
+        );
     }
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
@@ -224,13 +226,13 @@ fn export_beside(
     format.write_transform(&other, &trainer.scene_meta(dataset), exported.frame)?;
     let left_out = written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
-        eprintln!(
+        crate::tell!(
             "warning: {} cannot hold {left_out} Gaussians: they lie outside the range of its format",
             other.display()
         );
     }
     if let (Some(levels), false) = (exported.levels, request.quiet) {
-        eprintln!("{}: {levels}", other.display());
+        crate::tell!("{}: {levels}", other.display());
     }
     Ok(Some(ExportFacts {
         file: other.strip_prefix(&request.out).unwrap_or(&other).to_path_buf(),
@@ -283,14 +285,14 @@ fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<
 /// Warns if the final PLY differs from the request.
 fn warn_of_ply(config: &TrainConfig, written: &Written, ply: &Path) {
     if written.frame == ExportFrame::Local && config.export_frame == ExportFrame::Dataset {
-        eprintln!(
+        crate::tell!(
             "warning: dataset coordinates exceed the precision of f32, so {} holds local positions; \
              its comments give origin and scale",
             ply.display()
         );
     }
     if written.skipped > 0 {
-        eprintln!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
+        crate::tell!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
     }
 }
 

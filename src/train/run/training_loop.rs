@@ -209,7 +209,7 @@ impl Trainer {
     fn save_if_space(&mut self, dataset: &Dataset, path: &Path) -> Result<(), TrainError> {
         match self.save(dataset, path) {
             Err(error) if error.is_out_of_space() => {
-                eprintln!("warning: {} is not written: {error}", path.display());
+                crate::tell!("warning: {} is not written: {error}", path.display());
                 Ok(())
             }
             done => done.map(|_| ()),

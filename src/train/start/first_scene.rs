@@ -226,7 +226,7 @@ impl Start {
         let insert = &mut |id, state: SceneState| Ok(scene.insert_first_page(id, &state)?);
         let moved = self.for_each_page(options, &folder, host_mem, insert)?;
         if moved > 0 {
-            eprintln!(
+            crate::tell!(
                 "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved \
                  into its range"
             );

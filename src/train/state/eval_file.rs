@@ -158,11 +158,11 @@ impl<'a> Evaluator<'a> {
     ) -> Result<Evaluator<'a>, TrainError> {
         let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
         check_photos_fit(&dataset, host_budget(config))?;
-        dataset.warnings.iter().for_each(|warning| eprintln!("warning: {warning}"));
+        dataset.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
         let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
         let (renderer, word) = machine::renderer(config)?;
         if let Some(word) = word {
-            eprintln!("{word}");
+            crate::tell!("{word}");
         }
         Ok(Evaluator { config, dataset, targets, renderer, lpips, printed: BTreeSet::new() })
     }
@@ -195,7 +195,7 @@ impl<'a> Evaluator<'a> {
         let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
         for warning in file_warnings(file, meta, far) {
             if self.printed.insert(warning.clone()) {
-                eprintln!("warning: {warning}");
+                crate::tell!("warning: {warning}");
             }
         }
         if columns.rows() == 0 {

@@ -37,6 +37,6 @@ impl Trainer {
         let outcome =
             PhotoOutcome { view, step, is_skipped, is_left_out, ended_group, after_reset, mse, photo, dataset };
         let warnings = self.photos.iter_mut().flat_map(|parameter| parameter.end_step(&outcome));
-        warnings.for_each(|warning| eprintln!("warning: {warning}"));
+        warnings.for_each(|warning| crate::tell!("warning: {warning}"));
     }
 }

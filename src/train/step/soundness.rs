@@ -58,7 +58,7 @@ pub(crate) fn note_soundness(
 ) -> Result<(), TrainError> {
     let step = state.step;
     if outcome.rows_skipped > 0 && state.rows_skipped == 0 {
-        eprintln!(
+        crate::tell!(
             "warning: at step {step}, view {view}, {} Gaussians keep their values because their gradients are not \
              finite or above 1e18; later ones are counted in summary.json",
             outcome.rows_skipped
@@ -66,7 +66,9 @@ pub(crate) fn note_soundness(
     }
     if outcome.skipped.is_some() && state.steps_skipped == 0 {
         let problem = problem_of(outcome);
-        eprintln!("warning: step {step} is skipped: {problem} (view {view}); later ones are counted in summary.json");
+        crate::tell!(
+            "warning: step {step} is skipped: {problem} (view {view}); later ones are counted in summary.json"
+        );
     }
     state.rows_skipped += outcome.rows_skipped;
     state.steps_skipped += u32::from(outcome.skipped.is_some());
@@ -144,7 +146,9 @@ impl Idle {
             return fail(problem, remedy);
         }
         if !std::mem::replace(&mut self.is_told, true) {
-            eprintln!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
+            crate::tell!(
+                "warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch"
+            );
         }
         Ok(())
     }
