@@ -11,6 +11,7 @@ pub mod ids;
 pub mod machine;
 pub mod math;
 pub mod png_pixels;
+pub mod png_rows;
 pub mod rng;
 pub mod room;
 pub mod say;

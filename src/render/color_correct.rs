@@ -11,7 +11,8 @@
 //!   unsaturated pixels, in five rounds that each start from the result of the last.
 //!
 //! Invariants: 1. renders are clamped to 0..1 before and after; 2. pixels with mask byte 0 are ignored; 3. sums are f64
-//! in row order, so the bits are the same for any number of threads; 4. NaN at an unmasked pixel gives NaN.
+//! in row order, so the bits are the same for any number of threads; 4. NaN at an unmasked pixel gives NaN; 5. nothing of a
+//! pixel is stored: memory grows with the rows of a photo, not with its pixels.
 
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
@@ -62,114 +63,124 @@ type Rgb = [f64; 3];
 /// When picture and target differ in size.
 pub fn color_corrected_psnr(image: &Image, target: &Target, fit: ColorCorrect) -> f64 {
     assert_eq!((image.width, image.height), (target.width, target.height), "picture and photo differ in size");
-    let rows = pairs(image, target);
-    if rows.iter().any(|row| row.iter().any(|(render, _)| render.iter().any(|x| x.is_nan()))) {
-        return f64::NAN;
+    let pair = Pair { image, target };
+    match fit {
+        ColorCorrect::Affine => {
+            let fits = [0, 1, 2].map(|c| pair.affine(c));
+            pair.psnr(|render| affine_inverse(&fits, render))
+        }
+        ColorCorrect::Quadratic => {
+            let rounds = pair.quadratic();
+            pair.psnr(|render| after_rounds(&rounds, render))
+        }
     }
-    let corrected = match fit {
-        ColorCorrect::Affine => affine(&rows),
-        ColorCorrect::Quadratic => quadratic(&rows),
-    };
-    let [squares, count] = sum(&corrected, &rows, |fitted, (_, photo)| {
-        let squares: f64 = (0..3).map(|c| (fitted[c] - photo[c]) * (fitted[c] - photo[c])).sum();
-        [squares, 3.0]
-    });
-    let mse = squares / count;
-    if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
 }
 
-/// Unmasked pixels by picture row: (render clamped to 0..1, photo).
-fn pairs(image: &Image, target: &Target) -> Vec<Vec<(Rgb, Rgb)>> {
-    let (width, pixels) = (image.width as usize, image.pixels());
-    let counts = |i: usize| target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
-    let pair = |i: usize| {
-        let render = std::array::from_fn(|c| f64::from(image.rgb[c * pixels + i].clamp(0.0, 1.0)));
-        (render, std::array::from_fn(|c| f64::from(target.rgb[3 * i + c]) / 255.0))
-    };
-    let rows = (0..image.height as usize).into_par_iter();
-    rows.map(|row| (row * width..(row + 1) * width).filter(|&i| counts(i)).map(pair).collect()).collect()
+/// A render and its photo.
+struct Pair<'a> {
+    image: &'a Image,
+    target: &'a Target,
 }
 
-/// Sums `of` over all pixels: rows in parallel, then the row sums in order. `renders` replaces the renders in `rows`.
-fn sum<const N: usize>(
-    renders: &[Vec<Rgb>],
-    rows: &[Vec<(Rgb, Rgb)>],
-    of: impl Fn(&Rgb, &(Rgb, Rgb)) -> [f64; N] + Sync,
-) -> [f64; N] {
-    let add = |mut all: [f64; N], one: [f64; N]| {
-        all.iter_mut().zip(one).for_each(|(a, b)| *a += b);
-        all
-    };
-    let of_row = |(renders, pairs): (&Vec<Rgb>, &Vec<(Rgb, Rgb)>)| {
-        renders.iter().zip(pairs).map(|(render, pair)| of(render, pair)).fold([0.0; N], add)
-    };
-    let sums: Vec<[f64; N]> = renders.par_iter().zip(rows).map(of_row).collect();
-    sums.into_iter().fold([0.0; N], add)
-}
+impl Pair<'_> {
+    /// Sums `of` (render clamped to 0..1, photo) over all unmasked pixels: rows in parallel, then the row sums in order.
+    fn sum<const N: usize>(&self, of: impl Fn(Rgb, Rgb) -> [f64; N] + Sync) -> [f64; N] {
+        let (width, pixels) = (self.image.width as usize, self.image.pixels());
+        let add = |mut all: [f64; N], one: [f64; N]| {
+            all.iter_mut().zip(one).for_each(|(a, b)| *a += b);
+            all
+        };
+        let of_pixel = |i: usize| {
+            let render = std::array::from_fn(|c| f64::from(self.image.rgb[c * pixels + i].clamp(0.0, 1.0)));
+            of(render, std::array::from_fn(|c| f64::from(self.target.rgb[3 * i + c]) / 255.0))
+        };
+        let counts = |i: &usize| self.target.mask.as_ref().is_none_or(|mask| mask[*i] != 0);
+        let of_row = |y: usize| (y * width..(y + 1) * width).filter(counts).map(of_pixel).fold([0.0; N], add);
+        let sums: Vec<[f64; N]> = (0..self.image.height as usize).into_par_iter().map(of_row).collect();
+        sums.into_iter().fold([0.0; N], add)
+    }
 
-fn map(renders: &[Vec<Rgb>], of: impl Fn(&Rgb) -> Rgb + Sync) -> Vec<Vec<Rgb>> {
-    renders.par_iter().map(|row| row.iter().map(&of).collect()).collect()
-}
+    /// PSNR of the fitted render. A comparison with NaN would lose the NaN of a render in the clamps of a fit, so the sum
+    /// takes up the render, too.
+    fn psnr(&self, fitted: impl Fn(Rgb) -> Rgb + Sync) -> f64 {
+        let [squares, count] = self.sum(|render, photo| {
+            if render.iter().any(|x| x.is_nan()) {
+                return [f64::NAN, 3.0];
+            }
+            let fitted = fitted(render);
+            let squares: f64 = (0..3).map(|c| (fitted[c] - photo[c]) * (fitted[c] - photo[c])).sum();
+            [squares, 3.0]
+        });
+        let mse = squares / count;
+        if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
+    }
 
-fn renders(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
-    rows.par_iter().map(|row| row.iter().map(|(render, _)| *render).collect()).collect()
-}
-
-fn affine(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
-    let renders = renders(rows);
-    let of = |c: usize| {
-        let [n, photo, render] = sum(&renders, rows, |r, (_, p)| [1.0, p[c], r[c]]);
+    /// Slope and offset of a channel.
+    fn affine(&self, c: usize) -> (f64, f64) {
+        let [n, photo, render] = self.sum(|r, p| [1.0, p[c], r[c]]);
         let (photo, render) = (photo / n, render / n);
         // Centred on the means, which avoids cancellation.
-        let [square, product] = sum(&renders, rows, |r, (_, p)| {
+        let [square, product] = self.sum(|r, p| {
             let p = p[c] - photo;
             [p * p, p * (r[c] - render)]
         });
         let slope = product / n / (square / n).max(DIVISOR_MIN);
         (slope, render - slope * photo)
-    };
-    let fits = [of(0), of(1), of(2)];
-    map(&renders, |render| {
-        std::array::from_fn(|c| {
-            let (slope, offset) = fits[c];
-            ((render[c] - offset) / if slope.abs() < DIVISOR_MIN { 1.0 } else { slope }).clamp(0.0, 1.0)
-        })
+    }
+
+    /// The polynomials of all rounds.
+    fn quadratic(&self) -> Vec<Polynomials> {
+        let is_unsaturated = |x: f64| (SATURATION_MARGIN..=1.0 - SATURATION_MARGIN).contains(&x);
+        let mut rounds = Vec::with_capacity(ROUNDS);
+        for _ in 0..ROUNDS {
+            let of = |c: usize| {
+                // The upper triangle of the normal equations, row by row, then the right-hand side.
+                const SUMS: usize = TERMS * (TERMS + 1) / 2 + TERMS;
+                let sums: [f64; SUMS] = self.sum(|first, photo| {
+                    // Earlier rounds are applied again: keeping their results would take 24 bytes a pixel.
+                    let render = after_rounds(&rounds, first);
+                    if ![first[c], render[c], photo[c]].into_iter().all(is_unsaturated) {
+                        return [0.0; SUMS];
+                    }
+                    let t = terms(&render);
+                    let mut at = 0;
+                    let mut sums = [0.0; SUMS];
+                    for i in 0..TERMS {
+                        for j in i..TERMS {
+                            sums[at] = t[i] * t[j];
+                            at += 1;
+                        }
+                    }
+                    (0..TERMS).for_each(|i| sums[at + i] = t[i] * photo[c]);
+                    sums
+                });
+                let (upper, right) = sums.split_at(SUMS - TERMS);
+                solve(upper, right)
+            };
+            let round = [of(0), of(1), of(2)];
+            rounds.push(round);
+        }
+        rounds
+    }
+}
+
+/// A render under the inverse of slopes and offsets.
+fn affine_inverse(fits: &[(f64, f64); 3], render: Rgb) -> Rgb {
+    std::array::from_fn(|c| {
+        let (slope, offset) = fits[c];
+        ((render[c] - offset) / if slope.abs() < DIVISOR_MIN { 1.0 } else { slope }).clamp(0.0, 1.0)
     })
 }
 
-fn quadratic(rows: &[Vec<(Rgb, Rgb)>]) -> Vec<Vec<Rgb>> {
-    let is_unsaturated = |x: f64| (SATURATION_MARGIN..=1.0 - SATURATION_MARGIN).contains(&x);
-    let mut fitted = renders(rows);
-    for _ in 0..ROUNDS {
-        let of = |c: usize| {
-            // The upper triangle of the normal equations, row by row, then the right-hand side.
-            const SUMS: usize = TERMS * (TERMS + 1) / 2 + TERMS;
-            let sums: [f64; SUMS] = sum(&fitted, rows, |render, (first, photo)| {
-                if ![first[c], render[c], photo[c]].into_iter().all(is_unsaturated) {
-                    return [0.0; SUMS];
-                }
-                let t = terms(render);
-                let mut at = 0;
-                let mut sums = [0.0; SUMS];
-                for i in 0..TERMS {
-                    for j in i..TERMS {
-                        sums[at] = t[i] * t[j];
-                        at += 1;
-                    }
-                }
-                (0..TERMS).for_each(|i| sums[at + i] = t[i] * photo[c]);
-                sums
-            });
-            let (upper, right) = sums.split_at(SUMS - TERMS);
-            solve(upper, right)
-        };
-        let weights = [of(0), of(1), of(2)];
-        fitted = map(&fitted, |render| {
-            let t = terms(render);
-            std::array::from_fn(|c| weights[c].iter().zip(t).map(|(w, t)| w * t).sum::<f64>().clamp(0.0, 1.0))
-        });
-    }
-    fitted
+/// Weights of a polynomial for each channel.
+type Polynomials = [[f64; TERMS]; 3];
+
+/// A render after some rounds of the quadratic fit.
+fn after_rounds(rounds: &[Polynomials], render: Rgb) -> Rgb {
+    rounds.iter().fold(render, |render, weights| {
+        let t = terms(&render);
+        std::array::from_fn(|c| weights[c].iter().zip(t).map(|(w, t)| w * t).sum::<f64>().clamp(0.0, 1.0))
+    })
 }
 
 /// Terms of the polynomial: rr, rg, rb, gg, gb, bb, r, g, b, 1.

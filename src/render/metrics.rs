@@ -10,32 +10,39 @@ pub use crate::kernels::image_loss::SsimVariant;
 use crate::kernels::image_loss::{ImagePair, mean_ssim};
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Mean squared difference over unmasked pixels and channels, values clamped to 0..1; NaN when every pixel is masked.
 ///
 /// # Panics
 /// When picture and target differ in size.
 pub fn mse(image: &Image, target: &Target) -> f64 {
-    let counted = ImagePair::new(image, target).counted_pixels();
-    let (width, pixels) = (image.width as usize, image.pixels());
-    let rows: Vec<f64> = (0..image.height as usize)
-        .into_par_iter()
-        .map(|row| {
-            let mut sum = 0.0;
-            for i in row * width..(row + 1) * width {
-                if target.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
-                    continue;
-                }
-                for c in 0..3 {
-                    let x = f64::from(image.rgb[c * pixels + i].clamp(0.0, 1.0));
-                    let difference = x - f64::from(target.rgb[3 * i + c]) / 255.0;
-                    sum += difference * difference;
-                }
+    assert_eq!((image.width, image.height), (target.width, target.height), "picture and photo differ in size");
+    mse_of_columns(&image.rgb, target, 0..image.width as usize)
+}
+
+/// [`mse`] of some columns of pixels of a picture, `[3][height][width]`.
+fn mse_of_columns(picture: &[f32], target: &Target, columns: Range<usize>) -> f64 {
+    let (width, pixels) = (target.width as usize, target.pixels());
+    assert_eq!(picture.len(), 3 * pixels, "picture and photo differ in size");
+    let of_row = |row: usize| {
+        let (mut sum, mut counted) = (0.0, 0u64);
+        for i in row * width + columns.start..row * width + columns.end {
+            if target.mask.as_ref().is_some_and(|mask| mask[i] == 0) {
+                continue;
             }
-            sum
-        })
-        .collect();
-    rows.iter().sum::<f64>() / (3.0 * counted as f64)
+            counted += 1;
+            for c in 0..3 {
+                let x = f64::from(picture[c * pixels + i].clamp(0.0, 1.0));
+                let difference = x - f64::from(target.rgb[3 * i + c]) / 255.0;
+                sum += difference * difference;
+            }
+        }
+        (sum, counted)
+    };
+    let rows: Vec<(f64, u64)> = (0..target.height as usize).into_par_iter().map(of_row).collect();
+    let counted: u64 = rows.iter().map(|(_, counted)| counted).sum();
+    rows.iter().map(|(sum, _)| sum).sum::<f64>() / (3.0 * counted as f64)
 }
 
 /// Peak signal-to-noise ratio, dB: -10 log10 of [`mse`] for a peak of 1. A picture equal to its photo has PSNR
@@ -44,7 +51,18 @@ pub fn mse(image: &Image, target: &Target) -> f64 {
 /// # Panics
 /// When picture and target differ in size.
 pub fn psnr(image: &Image, target: &Target) -> f64 {
-    let mse = mse(image, target);
+    decibels(mse(image, target))
+}
+
+/// [`psnr`] of some columns of pixels of a picture, `[3][height][width]`.
+///
+/// # Panics
+/// When picture and target differ in size.
+pub fn psnr_of_columns(picture: &[f32], target: &Target, columns: Range<usize>) -> f64 {
+    decibels(mse_of_columns(picture, target, columns))
+}
+
+fn decibels(mse: f64) -> f64 {
     if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
 }
 

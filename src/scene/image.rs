@@ -37,14 +37,20 @@ impl Image {
 
     /// An interleaved 8-bit copy, clamped and rounded to nearest.
     pub fn to_rgb8(&self) -> Vec<u8> {
-        let n = self.pixels();
-        let mut out = Vec::with_capacity(3 * n);
-        for i in 0..n {
-            for c in 0..3 {
-                out.push((self.rgb[c * n + i].clamp(0.0, 1.0) * 255.0 + 0.5) as u8);
+        let mut out = vec![0; 3 * self.pixels()];
+        let rows = out.chunks_exact_mut((3 * self.width as usize).max(1)).enumerate();
+        rows.for_each(|(y, row)| self.row_to_rgb8(y, row));
+        out
+    }
+
+    /// Writes row `y` of [`Image::to_rgb8`] to `row`, which holds `3 * width` bytes.
+    pub fn row_to_rgb8(&self, y: usize, row: &mut [u8]) {
+        let (width, n) = (self.width as usize, self.pixels());
+        for (x, pixel) in row.chunks_exact_mut(3).enumerate() {
+            for (c, byte) in pixel.iter_mut().enumerate() {
+                *byte = (self.rgb[c * n + y * width + x].clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
             }
         }
-        out
     }
 }
 

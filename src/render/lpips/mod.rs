@@ -162,9 +162,14 @@ impl Lpips {
         let mut sum = 0.0;
         for layer in self.network.layers() {
             match layer {
-                Layer::Pool { size } => (a, b) = (max_pool(&a, *size), max_pool(&b, *size)),
+                // One after the other: the input of the first is gone before the second is made.
+                Layer::Pool { size } => {
+                    a = max_pool(&a, *size);
+                    b = max_pool(&b, *size);
+                }
                 Layer::Conv { tap: is_tap, .. } => {
-                    (a, b) = (self.convs[conv].apply(&a, self.simd), self.convs[conv].apply(&b, self.simd));
+                    a = self.convs[conv].apply(&a, self.simd);
+                    b = self.convs[conv].apply(&b, self.simd);
                     conv += 1;
                     if *is_tap {
                         sum += mean_difference(&a, &b, &self.channel_weights[tap]);
@@ -174,6 +179,30 @@ impl Lpips {
             }
         }
         sum
+    }
+}
+
+impl Network {
+    /// The most bytes that features of a picture and its photo of this size, pixels, take at once.
+    pub fn bytes(self, [width, height]: [u32; 2]) -> u64 {
+        let bytes = |channels: usize, [width, height]: [usize; 2]| (4 * channels * width * height) as u64;
+        let (mut channels, mut size) = (3, [width as usize, height as usize]);
+        let mut input = bytes(channels, size);
+        let mut most = 2 * input;
+        for layer in self.layers() {
+            match *layer {
+                Layer::Pool { size: window } => size = size.map(|side| side.saturating_sub(window) / 2 + 1),
+                Layer::Conv { shape, kernel, stride, padding, .. } => {
+                    channels = shape[1];
+                    size = size.map(|side| (side + 2 * padding).saturating_sub(kernel) / stride + 1);
+                }
+            }
+            let output = bytes(channels, size);
+            // The layer is applied to the picture, then to the photo.
+            most = most.max(input + output + input.max(output));
+            input = output;
+        }
+        most
     }
 }
 

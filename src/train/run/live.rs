@@ -6,6 +6,7 @@
 //! as if it had no page.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::png_rows::write_rgb_rows;
 use crate::base::trace;
 use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
@@ -16,9 +17,6 @@ use crate::train::error::TrainError;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::view::draw;
 use glam::{Mat3, Vec3};
-use image::ExtendedColorType;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
-use image::{ImageEncoder, ImageError};
 use std::time::{Duration, Instant};
 
 /// Percent of a run's time that pictures may take.
@@ -159,14 +157,9 @@ fn orbit_camera(base: &Camera, pivot: f32, up: Option<[f64; 3]>, orbit: Orbit) -
     }
 }
 
-fn png(image: &Image) -> Result<Vec<u8>, ImageError> {
+fn png(image: &Image) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
-    PngEncoder::new_with_quality(&mut bytes, CompressionType::Fast, FilterType::Adaptive).write_image(
-        &image.to_rgb8(),
-        image.width,
-        image.height,
-        ExtendedColorType::Rgb8,
-    )?;
+    write_rgb_rows(&mut bytes, [image.width, image.height], |y, row| image.row_to_rgb8(y, row))?;
     Ok(bytes)
 }
 

@@ -8,12 +8,13 @@ use crate::appearance::AppearanceMode;
 use crate::appearance::fit::Pair;
 use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
+use crate::base::png_rows::write_rgb_rows;
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::{InputRange, Lpips};
-use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
+use crate::render::metrics::{SsimVariant, mean, psnr, psnr_of_columns, ssim};
 use crate::render::{RenderOptions, Renderer};
 use crate::report::run_files::VIEWS_FILE;
 use crate::scene::camera::Camera;
@@ -23,6 +24,8 @@ use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_ps
 use crate::train::step::pages::PagedScene;
 use crate::train::step::view::draw;
 use crate::train::step::working_set::WorkingSet;
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
@@ -75,7 +78,6 @@ pub fn evaluate(
             of_view.0 = psnrs.last().copied();
             let fit = request.color_correct;
             corrected.extend(fit.map(|how| json_psnr(color_corrected_psnr(image, &target, how))));
-            halves.extend(half_fitted(image, &target, camera, request.appearance));
             // NaN: every SSIM window is masked although some border pixels are not.
             of_view.1 = Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan());
             ssims.extend(of_view.1);
@@ -88,6 +90,10 @@ pub fn evaluate(
             write_pair(&path, image, &target)?;
             let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
+        }
+        if request.appearance.is_on() {
+            // Last, since it changes the picture in its place.
+            halves.extend(half_fitted(renderer.picture_mut()?, &target, camera, request.appearance));
         }
         (request.progress)(i as u32 + 1);
     }
@@ -109,26 +115,19 @@ pub fn evaluate(
     Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, color_corrected, half_fitted }))
 }
 
-/// PSNR of the right half of a picture: as it is, and under the correction that brings the left half closest to the
-/// photo. `None` if nothing is to be fitted, or a half is masked.
-fn half_fitted(image: &Image, target: &Target, camera: &Camera, mode: AppearanceMode) -> Option<[f64; 2]> {
-    if !mode.is_on() {
-        return None;
-    }
-    let width = image.width as usize;
-    let is_right = |i: usize| i % width >= width / 2;
-    let counts = |i: usize| is_right(i) && target.mask.as_ref().is_none_or(|mask| mask[i] != 0);
-    let mask = (0..image.pixels()).map(|i| if counts(i) { u8::MAX } else { 0 }).collect();
-    let right = Target { mask: Some(mask), ..target.clone() };
-    if !right.counts() {
-        return None;
-    }
+/// PSNR of the right half of a picture, `[3][height][width]`: as it is, and under the correction that brings the left half
+/// closest to the photo, which is applied in place. `None` if a half is masked.
+fn half_fitted(picture: &mut [f32], target: &Target, camera: &Camera, mode: AppearanceMode) -> Option<[f64; 2]> {
+    let width = target.width as usize;
+    let right = width / 2..width;
+    let as_it_is = psnr_of_columns(picture, target, right.clone());
     let start = Look { lens: Lens::of(camera), ..Look::default() };
-    let pair = Pair { drawn: &image.rgb, photo: target };
-    let values = pair.image_values(&start, mode.image_values(), 0..width / 2, FIT_ROUNDS)?;
-    let mut fitted = image.clone();
-    Look { image: values, ..start }.correct(&mut fitted.rgb, width, None);
-    Some([image, &fitted].map(|picture| json_psnr(psnr(picture, &right))))
+    let pair = Pair { drawn: picture, photo: target };
+    // NaN: no pixel of the right half counts, or the picture is not finite.
+    let values =
+        pair.image_values(&start, mode.image_values(), 0..width / 2, FIT_ROUNDS).filter(|_| !as_it_is.is_nan())?;
+    Look { image: values, ..start }.correct(picture, width, None);
+    Some([as_it_is, psnr_of_columns(picture, target, right)].map(json_psnr))
 }
 
 /// File of a view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
@@ -147,13 +146,13 @@ fn picture_path(folder: &Path, dataset: &Dataset, view: usize) -> PathBuf {
 fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
     let folder = path.parent().unwrap_or(path);
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder for pictures", &e))?;
-    let (w, h) = (image.width as usize, image.height as usize);
-    let render = image.to_rgb8();
-    let mut both = Vec::with_capacity(6 * w * h);
-    for y in 0..h {
-        both.extend_from_slice(&render[3 * w * y..3 * w * (y + 1)]);
-        both.extend_from_slice(&target.rgb[3 * w * y..3 * w * (y + 1)]);
-    }
-    image::save_buffer(path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
-        .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
+    let row_bytes = 3 * image.width as usize;
+    let fill = |y: usize, row: &mut [u8]| {
+        let (render, photo) = row.split_at_mut(row_bytes);
+        image.row_to_rgb8(y, render);
+        photo.copy_from_slice(&target.rgb[row_bytes * y..row_bytes * (y + 1)]);
+    };
+    let mut file = BufWriter::new(File::create(path).map_err(|e| InputError::io(path, "writing the picture", &e))?);
+    let written = write_rgb_rows(&mut file, [2 * image.width, image.height], fill).and_then(|()| file.flush());
+    written.map_err(|e| InputError::io(path, "writing the picture", &e))
 }
