@@ -166,8 +166,11 @@ impl fmt::Display for GrowthCheck {
         if *is_trial {
             return write!(f, "step {step}: Gaussians up to {allowed} on trial; held-out photos have {psnr:.2} dB");
         }
-        let what = if self.grows() { "up to" } else { "at most" };
-        write!(f, "step {step}: Gaussians {what} {allowed}; faint ones are worth {lost:.3} dB, {pays_from:.3} pay")
+        let (what, against) = if self.grows() { ("up to", "more") } else { ("stay at", "less") };
+        write!(
+            f,
+            "step {step}: Gaussians {what} {allowed}: a faint quarter adds {lost:.3} dB, {against} than {pays_from:.3}"
+        )
     }
 }
 

@@ -28,6 +28,9 @@ const COMPARED_WITHIN: usize = 16;
 /// A view that is left out is measured once in this many epochs. In the others its turn goes to another view.
 const MEASURED_EVERY: usize = 4;
 
+/// A run that trains on such views warns of none before this many epochs, nor before half of its steps.
+const WARNED_FROM_EPOCH: u32 = 10;
+
 struct OutlierViews {
     state: ViewOutliers,
     are_left_out: bool,
@@ -38,6 +41,10 @@ struct OutlierViews {
     is_rehearsal: bool,
     /// The picture contradicts its photo.
     is_contradicted: bool,
+    /// Steps of the run.
+    steps: u32,
+    /// Views that this process has named, ascending.
+    told: Vec<usize>,
 }
 
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
@@ -48,6 +55,8 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
         looks: false,
         is_rehearsal: false,
         is_contradicted: false,
+        steps: options.steps,
+        told: Vec::new(),
     }))
 }
 
@@ -131,7 +140,15 @@ impl PhotoParameter for OutlierViews {
         if !done.is_multiple_of(views) {
             return Vec::new();
         }
-        let found = self.state.end_epoch(done / views - 1);
+        let mut found = self.state.end_epoch(done / views - 1);
+        if !self.are_left_out {
+            if !self.is_late(done) {
+                return Vec::new();
+            }
+            found = self.state.named().filter(|view| self.told.binary_search(view).is_err()).collect();
+            self.told.extend(&found);
+            self.told.sort_unstable();
+        }
         self.warning(&found, done, outcome.dataset).into_iter().collect()
     }
 
@@ -150,6 +167,12 @@ impl OutlierViews {
     /// view misses one turn, and in epochs of more than [`STEPS_AFTER_RESET`] steps only some do.
     fn is_dark(&self, after_reset: Option<u32>) -> bool {
         after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views))
+    }
+
+    /// Whether the pictures after `done` steps say something about photos that only get a warning: early pictures are rough, and
+    /// those of sound photos at the rim of the scene stay rough the longest.
+    fn is_late(&self, done: u32) -> bool {
+        done >= WARNED_FROM_EPOCH * self.train_views && done >= self.steps / 2
     }
 
     /// Names views that have become outliers.
@@ -224,7 +247,16 @@ mod tests {
             looks: false,
             is_rehearsal: false,
             is_contradicted: false,
+            steps: 400,
+            told: Vec::new(),
         }
+    }
+
+    #[test]
+    fn a_warning_comes_after_ten_epochs_and_half_of_the_steps() {
+        let of_steps = |steps: u32| OutlierViews { steps, ..outliers(&[3]) };
+        assert!(!of_steps(400).is_late(199) && of_steps(400).is_late(200));
+        assert!(!of_steps(90).is_late(90) && of_steps(0).is_late(100));
     }
 
     #[test]

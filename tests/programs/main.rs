@@ -44,6 +44,8 @@ mod report;
 mod resume;
 mod serve;
 mod sweeps;
+#[cfg(target_os = "linux")] // /dev/full, and the options of GNU env
+mod terminal;
 mod tiers;
 mod train;
 mod upright;

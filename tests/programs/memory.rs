@@ -1,7 +1,10 @@
 //! The memory that `--dry-run` announces against the peak memory of the run that follows.
 
-use crate::support::scenes::{city, stderr, summary, text, told, train};
+#[cfg(target_os = "linux")]
+use crate::support::memory_group::MemoryGroup;
+use crate::support::scenes::{city, classic, eval, stderr, summary, text, told, train};
 use std::path::Path;
+use std::process::Output;
 use tempfile::TempDir;
 
 /// The documented error is a tenth. On a small test scene, the memory of the bare program (code, libraries, stacks)
@@ -50,4 +53,72 @@ fn the_announced_memory_is_what_a_run_takes() {
         ["--max-gaussians", "150000", "--refine-start", "9", "--refine-every", "5", "--grow-grad2d", "0.00002"];
     let gaussians = check(folder.path(), &scene, "grown", &[&two[..], &growing, &["--sh-start", "3"]].concat());
     assert!(gaussians > 140_000, "the scene hardly grew ({gaussians}), so the last case shows little");
+}
+
+/// Runs a program within exactly this memory; `false` where the system cannot limit it.
+#[cfg(target_os = "linux")]
+fn succeeds_within(mebibytes: f64, program: &str, arguments: &[&str]) -> bool {
+    let group = match MemoryGroup::new((mebibytes * f64::from(1 << 20)) as u64) {
+        Ok(group) => group,
+        Err(why) => {
+            println!("SKIPPED: no memory control group here: {why}");
+            return false;
+        }
+    };
+    let arguments: Vec<std::ffi::OsString> = arguments.iter().map(Into::into).collect();
+    let output = group.command(Path::new(program), &arguments).output().unwrap();
+    assert!(output.status.success(), "{arguments:?} in {mebibytes} MiB: {:?} {}", output.status, stderr(&output));
+    true
+}
+
+/// The memory, MiB, that a refusal names as the least.
+fn least(refused: &Output) -> f64 {
+    let said = stderr(refused);
+    assert_eq!(refused.status.code(), Some(1), "{said}");
+    let number = said.split("give at least ").nth(1).unwrap_or_else(|| panic!("no memory is named: {said}"));
+    assert_eq!(number.split(' ').nth(1), Some("MiB"), "{said}");
+    number.split(' ').next().unwrap().parse().unwrap()
+}
+
+/// Every option that looks at whole photos, with photos of 8.3 million pixels: the run stays within exactly the memory that it says is
+/// the least, and the announced peak is right within a tenth.
+#[test]
+#[cfg(target_os = "linux")]
+fn no_option_takes_more_memory_than_promised_with_large_photos() {
+    let folder = TempDir::new().unwrap();
+    let scene = city(folder.path(), 13, 240, 135, 2_000);
+    // A photo may be larger than its camera states.
+    for entry in std::fs::read_dir(scene.join("images")).unwrap() {
+        let path = entry.unwrap().path();
+        let small = image::open(&path).unwrap().into_rgb8();
+        image::imageops::resize(&small, 3840, 2160, image::imageops::FilterType::Nearest).save(&path).unwrap();
+    }
+    let fixed =
+        ["--threads", "2", "--steps", "4", "--device", "cpu", "--image-cache", "1MiB", "--max-gaussians", "2000"];
+    let figures = ["--eval-every", "2", "--color-correct", "quadratic"];
+    let remedies = ["--robust-pixels", "--robust-views", "--refine-poses", "--appearance", "full"];
+    for (name, flags) in [
+        ("plain", &[][..]),
+        ("evaluation", &figures[..]),
+        ("remedies", &[&remedies[..], &figures].concat()),
+        ("exports", &["--export", "sog", "--appearance", "exposure"]),
+    ] {
+        let flags = [&fixed[..], flags].concat();
+        check(folder.path(), &scene, name, &flags);
+        let (spill, out) = (folder.path().join("spill"), folder.path().join("limited"));
+        let places = [text(&scene), "--out", text(&out), "--overwrite", "--spill-dir", text(&spill), "--quiet"];
+        let least = least(&train(&[&places, &flags[..], &["--host-mem", "20MiB"]].concat()));
+        let host_mem = format!("{least}MiB");
+        let arguments = [&places, &flags[..], &["--host-mem", &host_mem], &classic(&flags)].concat();
+        succeeds_within(least, env!("CARGO_BIN_EXE_gsscale-train"), &arguments);
+        std::fs::remove_dir_all(&spill).ok();
+    }
+    // The evaluation of a file on the same photos.
+    let run = folder.path().join("plain");
+    let arguments = [text(&run), text(&scene), "--image-cache", "1MiB", "--color-correct", "quadratic", "--host-mem"];
+    let least = least(&eval(&[&arguments[..], &["20MiB"]].concat()));
+    let host_mem = format!("{least}MiB");
+    let pictures = folder.path().join("pictures");
+    let arguments = [&arguments[..], &[&host_mem, "--renders", text(&pictures)]].concat();
+    succeeds_within(least, env!("CARGO_BIN_EXE_gsscale-eval"), &arguments);
 }

@@ -24,6 +24,7 @@ use crate::train::inputs::prepare::file_warnings;
 use crate::train::log::progress::Count;
 use crate::train::log::report::TestMetrics;
 use crate::train::memory::estimate::{check_photos_fit, host_budget};
+use crate::train::memory::eval_needs::check_evaluation_fits;
 use crate::train::step::pages::PagedScene;
 use crate::train::step::working_set::WorkingSet;
 use std::collections::BTreeSet;
@@ -202,6 +203,13 @@ impl<'a> Evaluator<'a> {
             let problem = "no Gaussian lies within the coordinate range of this scene";
             return Err(InputError::new(file, problem, "give a file that was trained on this scene").into());
         }
+        check_evaluation_fits(
+            file,
+            &columns,
+            &self.dataset,
+            self.config,
+            self.lpips.map(|(lpips, _)| lpips.network()),
+        )?;
         let run = RunOptions::new(self.config, self.dataset.scene_scale);
         let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
         let gaussians = columns.rows() as u64;
