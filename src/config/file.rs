@@ -267,7 +267,8 @@ config_keys! {
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
         /// Most pages in memory; 0 = as many as --host-mem allows
         frames: u32 = 0 => Free;
-        /// I/O engine for pages: auto, uring, mmap or pread. Never changes results
+        /// I/O engine for pages: auto, uring, mmap or pread. Never changes results. mmap reads through memory maps: if another
+        /// program makes a page file shorter during a read, the system ends the run (SIGBUS), and --resume continues it
         io: IoEngine = IoEngine::Auto => Free;
         /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
         /// raw; gsscale-iotune advises zstd for slow drives). Never changes results

@@ -2,7 +2,10 @@
 //!
 //! First it makes two commits, which free the slots of old versions; the reserve is released to make room for them. If
 //! that is not enough, training waits, with its state in memory, until the user frees space, and then continues. After
-//! `--disk-full-wait` the run stops.
+//! `--disk-full-wait` the run stops. A run in memory waits as well, because it would lose all steps since its last commit if
+//! it ended; but its steps need no drive, so after the wait it goes on without commits where there is room for its results.
+//!
+//! Not here: the results after the last step ([`super::results_wait`]).
 //!
 //! Invariants: 1. waiting does not change the run; 2. the last commit always stays intact.
 
@@ -10,6 +13,7 @@ use super::checkpoint::Checkpoint;
 use crate::base::units::format_bytes;
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::map::commit::Commits;
+use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::report::MetricsLog;
@@ -18,11 +22,13 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Interval between checks of the drive.
-const POLL: Duration = Duration::from_secs(1);
+pub(super) const POLL: Duration = Duration::from_secs(1);
 /// The reserve is filled only if it takes less than 1/4 of the free bytes.
 const RESERVE_SHARE: u64 = 4;
 /// Bytes required on the drive of the results during a run: metrics take a few hundred bytes per line.
 const OTHER_BYTES: u64 = 1 << 20;
+/// The results take less than 1/2 of the bytes of the rows' state, of which the PLY takes a third.
+const RESULTS_SHARE: u64 = 2;
 
 impl TrainError {
     /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
@@ -66,8 +72,12 @@ impl Checkpoint {
             return Err(why);
         }
         if self.is_optional {
-            // All pages are in memory: abandon the commit; the step needs no write.
-            return self.give_up(trainer, why);
+            // All pages are in memory: abandon the commit in progress; the step needs no write.
+            self.give_up(trainer);
+            if self.goes_without {
+                self.miss();
+                return Ok(());
+            }
         }
         let is_own = self.other_drive(&why).is_none();
         let now = (trainer.steps_done(), is_own, Instant::now());
@@ -112,14 +122,19 @@ impl Checkpoint {
         let other = self.other_drive(&lacks);
         let needed = match other {
             Some(_) => OTHER_BYTES,
-            None => trainer.scene.pager.slot_space().map_or(0, |space| space.segment_bytes) + self.map_growth(),
+            None => {
+                // The first commit of a run in memory stores all pages.
+                let pager = &trainer.scene.pager;
+                let all = (pager.index().len() * pager.frame_bytes()) as u64;
+                pager.slot_space().map_or(all, |space| space.segment_bytes) + self.map_growth()
+            }
         };
         let full = other.unwrap_or_else(|| self.folder.clone());
         let free = free_bytes(&full).ok().flatten();
         let free_then = free.map_or(String::from("unknown"), format_bytes);
         let until = self.full_wait.as_secs_f64();
         let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
-        if !is_told {
+        if !is_told && stop.exit_code().is_none() {
             crate::tell!(
                 "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to \
                  {until:.0} s (--disk-full-wait) for space, then continues; Ctrl-C stops it"
@@ -147,9 +162,27 @@ impl Checkpoint {
                 Err(error) => return Err(error),
             }
         }
+        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64 / RESULTS_SHARE;
+        let has_room = || free_bytes(&full).ok().flatten().is_some_and(|free| free >= room);
         match stop.exit_code() {
             Some(_) => Ok(()),
-            None => Err(TrainError::DriveFull { folder, needed: needed_text, last_step: self.last_step() }),
+            None if self.is_optional && has_room() => {
+                crate::tell!(
+                    "warning: training goes on in memory without commits: if it ends now, the steps since {} are lost. There is \
+                     room for the results, and commits begin again once there is room for them",
+                    self.last_step()
+                        .map_or("its beginning".to_string(), |step| format!("the commit after step {step}"))
+                );
+                self.goes_without = true;
+                self.miss();
+                Ok(())
+            }
+            None => Err(TrainError::DriveFull {
+                folder,
+                needed: needed_text,
+                last_step: self.last_step(),
+                elsewhere: String::new(),
+            }),
         }
     }
 

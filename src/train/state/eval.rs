@@ -8,7 +8,7 @@ use crate::appearance::AppearanceMode;
 use crate::appearance::fit::Pair;
 use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
-use crate::base::whole_file::write_whole;
+use crate::base::whole_file::{write_whole, write_whole_with};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
@@ -23,6 +23,8 @@ use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_ps
 use crate::train::step::pages::PagedScene;
 use crate::train::step::view::draw;
 use crate::train::step::working_set::WorkingSet;
+use image::codecs::png::PngEncoder;
+use image::{ExtendedColorType, ImageEncoder, ImageError};
 use std::path::{Path, PathBuf};
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
@@ -154,6 +156,12 @@ fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
         both.extend_from_slice(&render[3 * w * y..3 * w * (y + 1)]);
         both.extend_from_slice(&target.rgb[3 * w * y..3 * w * (y + 1)]);
     }
-    image::save_buffer(path, &both, 2 * image.width, image.height, image::ExtendedColorType::Rgb8)
-        .map_err(|e| InputError::new(path, format!("writing the picture failed: {e}"), "check the disk and its space"))
+    write_whole_with(path, |mut out| {
+        let picture =
+            PngEncoder::new(&mut out).write_image(&both, 2 * image.width, image.height, ExtendedColorType::Rgb8);
+        picture.map_err(|error| match error {
+            ImageError::IoError(error) => error,
+            other => std::io::Error::other(other),
+        })
+    })
 }
