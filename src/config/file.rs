@@ -277,7 +277,8 @@ config_keys! {
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
         /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
-        /// Seconds to wait for space on a full drive before the run stops with its last commit
+        /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
+        /// without commits if its results have room
         disk_full_wait: f64 = 600.0 => Free;
         /// Which page to evict: belady (farthest next use) or lru. Never changes results
         evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free;

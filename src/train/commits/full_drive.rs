@@ -15,6 +15,7 @@ use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::map::commit::Commits;
 use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
+use crate::train::inputs::places::drive_of;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
@@ -27,8 +28,8 @@ pub(super) const POLL: Duration = Duration::from_secs(1);
 const RESERVE_SHARE: u64 = 4;
 /// Bytes required on the drive of the results during a run: metrics take a few hundred bytes per line.
 const OTHER_BYTES: u64 = 1 << 20;
-/// The results take less than 1/2 of the bytes of the rows' state, of which the PLY takes a third.
-const RESULTS_SHARE: u64 = 2;
+/// The results take less than 160 % of the bytes of the rows: the PLY 106, a file for viewers 42, and the report.
+const RESULTS_PERCENT: u64 = 160;
 
 impl TrainError {
     /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
@@ -87,8 +88,8 @@ impl Checkpoint {
         if !is_stuck {
             self.space_made = Some(now);
         }
-        // Commits and reserve free space only on the store's drive.
-        if !is_stuck && is_own {
+        // Commits and reserve free space only on the store's drive, and a first commit frees none.
+        if !is_stuck && is_own && !self.is_only_of_results(&lacks) {
             match self.commit_with_reserve(trainer, metrics) {
                 Ok(()) => return Ok(()),
                 Err(error) if error.is_out_of_space() => lacks = error,
@@ -120,8 +121,10 @@ impl Checkpoint {
         (began, is_told): (Instant, bool),
     ) -> Result<(), TrainError> {
         let other = self.other_drive(&lacks);
+        let is_of_results = self.is_only_of_results(&lacks);
         let needed = match other {
             Some(_) => OTHER_BYTES,
+            None if is_of_results => OTHER_BYTES,
             None => {
                 // The first commit of a run in memory stores all pages.
                 let pager = &trainer.scene.pager;
@@ -129,7 +132,8 @@ impl Checkpoint {
                 pager.slot_space().map_or(all, |space| space.segment_bytes) + self.map_growth()
             }
         };
-        let full = other.unwrap_or_else(|| self.folder.clone());
+        // The folder of a first commit that failed is gone.
+        let full = drive_of(other.as_deref().unwrap_or(&self.folder));
         let free = free_bytes(&full).ok().flatten();
         let free_then = free.map_or(String::from("unknown"), format_bytes);
         let until = self.full_wait.as_secs_f64();
@@ -147,7 +151,11 @@ impl Checkpoint {
             if free_now.zip(free).is_some_and(|(now, then)| now < needed && now <= then) {
                 continue;
             }
-            match self.commit(trainer, metrics) {
+            let done = match is_of_results {
+                true => metrics.sync().map(drop).map_err(TrainError::from),
+                false => self.commit(trainer, metrics),
+            };
+            match done {
                 Ok(()) => {
                     if !is_told {
                         crate::tell!(
@@ -162,8 +170,8 @@ impl Checkpoint {
                 Err(error) => return Err(error),
             }
         }
-        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64 / RESULTS_SHARE;
-        let has_room = || free_bytes(&full).ok().flatten().is_some_and(|free| free >= room);
+        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64 / 100 * RESULTS_PERCENT;
+        let has_room = || free_bytes(&full).ok().flatten().is_none_or(|free| free >= room);
         match stop.exit_code() {
             Some(_) => Ok(()),
             None if self.is_optional && has_room() => {
@@ -184,6 +192,12 @@ impl Checkpoint {
                 elsewhere: String::new(),
             }),
         }
+    }
+
+    /// Whether a file of the results found no space and needs no commit: all pages of the run are in memory.
+    fn is_only_of_results(&self, error: &TrainError) -> bool {
+        let TrainError::Input(error) = error else { return false };
+        self.is_optional && !error.file.starts_with(&self.folder)
     }
 
     /// The folder of the file that found no space, if it lies on another drive than the store.

@@ -126,8 +126,8 @@ impl Results<'_> {
 
     fn drive_full(&self, error: &TrainError) -> TrainError {
         let needed = match error {
-            TrainError::Input(error) => format!("space for {}, and more for the other results:", error.file.display()),
-            _ => "space".to_string(),
+            TrainError::Input(error) => format!("space for {}, and perhaps", error.file.display()),
+            _ => "space for the last commit, and perhaps".to_string(),
         };
         TrainError::DriveFull {
             folder: self.out.display().to_string(),

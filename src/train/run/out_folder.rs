@@ -259,7 +259,10 @@ pub(super) fn has_results(out: &Path) -> bool {
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
-    has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    // A PLY without a summary is that of a run without commits that was killed while it wrote its results: beginning again gives
+    // the same one, which replaces it as a whole.
+    let has_ply = has(PLY_FILE) && metrics.is_empty();
+    has_ply || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Refuses to begin a run again that left results.
