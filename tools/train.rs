@@ -258,10 +258,11 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
             gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
+            gsscale::tell!(
+                "              (rates stay at their final values; a new run with more steps gives another result)"
+            );
             if !outcome.keeps_checkpoint {
-                gsscale::tell!(
-                    "              (from the PLY, without Adam's moments; runs with --keep-checkpoint go on exactly)"
-                );
+                gsscale::tell!("              (from the PLY, without Adam's moments; --keep-checkpoint keeps them)");
             }
         }
     }

@@ -267,7 +267,8 @@ config_keys! {
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
         /// Most pages in memory; 0 = as many as --host-mem allows
         frames: u32 = 0 => Free;
-        /// I/O engine for pages: auto, uring, mmap or pread. Never changes results
+        /// I/O engine for pages: auto, uring, mmap or pread. Never changes results. mmap reads through memory maps: if another
+        /// program makes a page file shorter during a read, the system ends the run (SIGBUS), and --resume continues it
         io: IoEngine = IoEngine::Auto => Free;
         /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
         /// raw; gsscale-iotune advises zstd for slow drives). Never changes results
@@ -276,7 +277,8 @@ config_keys! {
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
         /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
-        /// Seconds to wait for space on a full drive before the run stops with its last commit
+        /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
+        /// without commits if its results have room
         disk_full_wait: f64 = 600.0 => Free;
         /// Which page to evict: belady (farthest next use) or lru. Never changes results
         evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free;

@@ -5,6 +5,8 @@
 
 /// Every setting of the run, with the facts resolved at its start. A folder without it is not a run's.
 pub const CONFIG_FILE: &str = "config.toml";
+/// Settings of a run that has no config.toml yet. The run that writes it also removes it, so it is not in [`RUN_FILES`].
+pub const BEGUN_FILE: &str = ".gsscale-begun.toml";
 /// One line of JSON per logged step.
 pub const METRICS_FILE: &str = "metrics.jsonl";
 /// Folder of the curves for TensorBoard.

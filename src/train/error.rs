@@ -31,7 +31,7 @@ pub enum TrainError {
     #[error(
         "the drive of {folder} is full: it needs {needed} more{kept}\n  remedy: free space on it, then continue from \
          the last commit with gsscale-train --resume and the output folder; a run without commits starts again \
-         with another --out",
+         with another --out{elsewhere}",
         kept = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} is intact"))
     )]
     DriveFull {
@@ -41,6 +41,8 @@ pub enum TrainError {
         needed: String,
         /// Step of the last commit of this process.
         last_step: Option<u32>,
+        /// What can be saved on another drive now, as text that follows the remedy; may be empty.
+        elsewhere: String,
     },
     /// The scene has outgrown its frames.
     #[error("{source}")]

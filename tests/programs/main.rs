@@ -18,6 +18,8 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+#[cfg(unix)]
+mod full_memory_run;
 mod gpu_bytes;
 mod gpu_ends;
 mod gpu_events;

@@ -4,8 +4,9 @@
 //! Coherence: writes go through the page cache (no direct I/O here), and a shared map shows the same cached pages, so a
 //! read submitted after a write completed sees its bytes. Submitting a read starts its read-ahead (`WILLNEED`). A
 //! worker then faults the pages in with `POPULATE_READ`, which reports an I/O error where touching the page would raise
-//! SIGBUS, and copies them. (SIGBUS remains possible on systems without `POPULATE_READ`, and if the system drops a page
-//! in between and cannot read it again; `--io uring` and `--io pread` have no such case.)
+//! SIGBUS, and copies them. A file that another program has made shorter is an error, because its length is looked at before
+//! each copy. (SIGBUS remains possible on systems without `POPULATE_READ`, if the system drops a page in between and cannot
+//! read it again, and if a file is made shorter during a copy; `--io uring` and `--io pread` have no such case.)
 //!
 //! Invariant: no reference to mapped bytes is ever made, only copies through raw pointers, because a write changes the
 //! bytes under a map.
@@ -52,7 +53,7 @@ impl SegmentMaps {
     pub fn copy_out(&self, file: &File, transfer: &mut Transfer) -> io::Result<()> {
         let map = self.of(transfer.place.segment, file)?;
         let out = &mut transfer.buffer.as_mut_slice()[..transfer.bytes];
-        let beyond = || io::Error::new(io::ErrorKind::UnexpectedEof, "the place lies beyond the end of the map");
+        let beyond = || io::Error::new(io::ErrorKind::UnexpectedEof, "the place lies beyond the end of the file");
         let start = usize::try_from(transfer.place.offset).map_err(|_| beyond())?;
         if start.checked_add(out.len()).is_none_or(|end| end > map.len()) {
             return Err(beyond());
@@ -65,10 +66,15 @@ impl SegmentMaps {
             match error.raw_os_error() {
                 // EINVAL: a kernel before 5.14. The copy faults the pages in.
                 Some(22) => {}
-                // EFAULT: the page could not be read.
+                // EFAULT: the file ends before the page, or the page could not be read.
+                Some(14) if (start + out.len()) as u64 > file.metadata()?.len() => return Err(beyond()),
                 Some(14) => return Err(io::Error::from_raw_os_error(5)),
                 _ => return Err(error),
             }
+        }
+        // A map stays as long as it was, but touching it behind the end of its file ends the process.
+        if (start + out.len()) as u64 > file.metadata()?.len() {
+            return Err(beyond());
         }
         // SAFETY: start + out.len() <= map.len() was checked, the map is readable for its whole life, and `out` is a
         // page buffer, which cannot overlap the map of a file. The file under the range is not written meanwhile: two

@@ -6,9 +6,14 @@
 //! | `/status` | [`super::Status`] as JSON |
 //! | `/metrics?from=BYTE` | the run's metrics.jsonl from that byte on, whole lines |
 //! | `/picture?view=..&turn=..&tilt=..&distance=..&width=..` | a PNG of [`super::Orbit`] |
+//!
+//! Invariant: whatever peers do, they hold at most [`CONNECTIONS_MOST`] connections, [`METRICS_MOST`] answers of metrics and
+//! [`PICTURES_MOST`] pictures in memory, each for a bounded time.
 
+use super::patient::Patient;
 use super::{Live, Orbit};
 use axum::Router;
+use axum::body::Bytes;
 use axum::extract::{Query, Request, State};
 use axum::http::{StatusCode, header};
 use axum::middleware::{Next, from_fn_with_state};
@@ -23,7 +28,7 @@ use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::time::sleep;
 
 /// Longest time that a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
@@ -36,10 +41,33 @@ const HEAD_PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 1 } else { 1
 const CONNECTIONS_MOST: usize = 32;
 /// Time until the next try after a connection could not be accepted.
 const ACCEPT_AGAIN: Duration = Duration::from_millis(200);
+/// Most bytes of the head of a request and its buffer.
+const HEAD_BYTES: usize = 16 << 10;
 /// Most bytes of metrics in one answer.
-const METRICS_BYTES: u64 = 4 << 20;
+const METRICS_BYTES: u64 = 1 << 20;
+/// Most answers of metrics in memory. Other requests wait.
+const METRICS_MOST: usize = 4;
+/// Most pictures that are asked for, or in memory, at once. They are drawn one by one, so others wait as well without.
+const PICTURES_MOST: usize = 4;
 /// Header of an answer of metrics: the length of their file when it was read.
 const METRICS_LENGTH: &str = "x-metrics-length";
+
+/// What all requests share.
+#[derive(Clone)]
+struct Served {
+    live: Live,
+    metrics: Arc<Semaphore>,
+    pictures: Arc<Semaphore>,
+}
+
+/// The bytes of an answer and its place, which is free again when the bytes are sent.
+struct Held(Vec<u8>, #[allow(dead_code)] Option<OwnedSemaphorePermit>); // the place is held by being there
+
+impl AsRef<[u8]> for Held {
+    fn as_ref(&self) -> &[u8] {
+        &self.0
+    }
+}
 
 /// Serves on a thread of its own for as long as the process lives.
 pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
@@ -50,7 +78,11 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
         .route("/metrics", get(metrics))
         .route("/picture", get(picture))
         .layer(from_fn_with_state(live.clone(), check_host))
-        .with_state(live);
+        .with_state(Served {
+            live,
+            metrics: Arc::new(Semaphore::new(METRICS_MOST)),
+            pictures: Arc::new(Semaphore::new(PICTURES_MOST)),
+        });
     std::thread::Builder::new().name("live page".into()).spawn(move || {
         if let Err(error) = runtime.block_on(serve(listener, app)) {
             crate::tell!("warning: the live page has stopped: {error}");
@@ -64,14 +96,14 @@ async fn serve(listener: TcpListener, app: Router) -> std::io::Result<()> {
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let places = Arc::new(Semaphore::new(CONNECTIONS_MOST));
     let mut http = http1::Builder::new();
-    http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE);
+    http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE).max_buf_size(HEAD_BYTES);
     loop {
         let place = Arc::clone(&places).acquire_owned().await.map_err(std::io::Error::other)?;
         let Ok((stream, _)) = listener.accept().await else {
             sleep(ACCEPT_AGAIN).await;
             continue;
         };
-        let served = http.serve_connection(TokioIo::new(stream), TowerToHyperService::new(app.clone()));
+        let served = http.serve_connection(TokioIo::new(Patient::new(stream)), TowerToHyperService::new(app.clone()));
         tokio::spawn(async move {
             // A peer that leaves in the middle of an answer is no fault of the run.
             let _left = served.await;
@@ -98,11 +130,17 @@ fn is_own_host(address: SocketAddr, host: &str) -> bool {
 }
 
 /// An answer that no cache keeps.
-fn fresh(kind: &'static str, body: Vec<u8>) -> Response {
+fn fresh(kind: &'static str, body: impl Into<Bytes>) -> Response {
+    let body: Bytes = body.into();
     ([(header::CONTENT_TYPE, kind), (header::CACHE_CONTROL, "no-store")], body).into_response()
 }
 
-async fn status(State(live): State<Live>) -> Response {
+/// A place among `places`, which is always `Some`, since they are never closed.
+async fn place(places: &Arc<Semaphore>) -> Option<OwnedSemaphorePermit> {
+    Arc::clone(places).acquire_owned().await.ok()
+}
+
+async fn status(State(Served { live, .. }): State<Served>) -> Response {
     let status = live.state().status.clone();
     fresh("application/json", serde_json::to_vec(&status).unwrap_or_default())
 }
@@ -113,12 +151,15 @@ struct From {
     from: u64,
 }
 
-async fn metrics(State(live): State<Live>, Query(From { from }): Query<From>) -> Response {
+async fn metrics(State(served): State<Served>, Query(From { from }): Query<From>) -> Response {
+    let place = place(&served.metrics).await;
+    let live = served.live;
     let file = live.state().metrics.clone();
     let lines = file.map_or(Ok((Vec::new(), 0)), |file| lines_from(&file, from));
     match lines {
         Ok((lines, length)) => {
-            ([(METRICS_LENGTH, length.to_string())], fresh("application/jsonl", lines)).into_response()
+            ([(METRICS_LENGTH, length.to_string())], fresh("application/jsonl", Bytes::from_owner(Held(lines, place))))
+                .into_response()
         }
         Err(error) => (StatusCode::SERVICE_UNAVAILABLE, error.to_string()).into_response(),
     }
@@ -138,11 +179,13 @@ fn lines_from(file: &Path, from: u64) -> std::io::Result<(Vec<u8>, u64)> {
 }
 
 /// Waits for a picture. The request is withdrawn when the page closes the connection, because the server then drops this future.
-async fn picture(State(live): State<Live>, Query(orbit): Query<Orbit>) -> Response {
+async fn picture(State(served): State<Served>, Query(orbit): Query<Orbit>) -> Response {
+    let place = place(&served.pictures).await;
+    let live = served.live;
     let (request, asked) = (live.ask(orbit), Instant::now());
     while asked.elapsed() < PATIENCE {
         match request.answer().as_deref() {
-            Some(Ok(png)) => return fresh("image/png", png.clone()),
+            Some(Ok(png)) => return fresh("image/png", Bytes::from_owner(Held(png.clone(), place))),
             Some(Err(why)) => return (StatusCode::SERVICE_UNAVAILABLE, why.clone()).into_response(),
             None => sleep(LOOK_EVERY).await,
         }
@@ -186,6 +229,40 @@ mod tests {
         request(&live, "/status").read_to_string(&mut answer).unwrap();
         assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
         drop(silent);
+    }
+
+    /// Peers ask for metrics and pictures, in one connection after the other, and never read the answers.
+    #[test]
+    fn answers_that_nobody_reads_are_dropped_and_keep_nobody_out() {
+        let live = live();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "{\"step\":1}\n".repeat(1 << 17)).unwrap();
+        live.set_metrics(file.path().to_path_buf());
+        let asked = |path: &str| {
+            let mut stream = TcpStream::connect(live.address()).unwrap();
+            let one = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n");
+            // More answers than the system's buffers of a connection hold.
+            let _ = stream.write_all(one.repeat(64).as_bytes());
+            stream
+        };
+        let unread: Vec<TcpStream> = (0..2 * CONNECTIONS_MOST).map(|_| asked("/metrics")).collect();
+        let mut answer = String::new();
+        request(&live, "/status").read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+        answer.clear();
+        request(&live, "/metrics").read_to_string(&mut answer).unwrap();
+        assert!(answer.starts_with("HTTP/1.1 200") && answer.len() as u64 > METRICS_BYTES / 2, "{}", answer.len());
+        drop(unread);
+        // Pictures: no more than a few are asked for, so no more lie in memory.
+        let unread: Vec<TcpStream> = (0..CONNECTIONS_MOST).map(|i| asked(&format!("/picture?turn={i}"))).collect();
+        wait_until_wanted(&live, true);
+        let (began, mut most) = (Instant::now(), 0);
+        while began.elapsed() < Duration::from_secs(1) {
+            most = most.max(live.state().waiting.len());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        assert_eq!(most, PICTURES_MOST);
+        drop(unread);
     }
 
     #[test]

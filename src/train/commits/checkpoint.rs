@@ -6,8 +6,7 @@
 //!
 //! Invariants: 1. commits happen between steps and do not change the run; 2. a commit holds all state on which later
 //! steps depend: a run resumed from it ends with the same bytes; 3. clocks decide only when to commit; 4. a run in
-//! memory creates its checkpoint at its first commit, so a short run writes none; on a full drive such a run loses its
-//! commits and continues.
+//! memory creates its checkpoint at its first commit, so a short run writes none.
 
 use super::first_commit::FirstCommit;
 use crate::base::trace;
@@ -48,8 +47,8 @@ pub struct Checkpoint {
     pub(crate) folder: PathBuf,
     /// The run can continue without commits: all pages are in memory.
     pub(super) is_optional: bool,
-    /// A commit found no space, and the warning was printed.
-    warned_full: bool,
+    /// The run has waited for space in vain and goes on without commits, until one finds space.
+    pub(super) goes_without: bool,
     /// How long to wait for space.
     pub(super) full_wait: Duration,
     /// Step at which space was last made, whether on the store's drive, and when. A second attempt at the same step
@@ -66,6 +65,11 @@ pub struct Checkpoint {
     done: u64,
     /// Step of the last commit.
     last_step: Option<u32>,
+}
+
+/// `--disk-full-wait`.
+pub(crate) fn full_wait(config: &TrainConfig) -> Duration {
+    Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default()
 }
 
 /// A commit in progress beside training.
@@ -100,8 +104,8 @@ impl Checkpoint {
             name: None,
             folder: folder.to_path_buf(),
             is_optional: false,
-            warned_full: false,
-            full_wait: Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default(),
+            goes_without: false,
+            full_wait: full_wait(config),
             space_made: None,
             interval: CommitInterval::new(config.commit_every),
             started: now,
@@ -120,7 +124,7 @@ impl Checkpoint {
         (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
     }
 
-    /// Sets whether the run continues without commits on a full drive.
+    /// Sets whether all pages are in memory, so that the run can continue without commits.
     pub fn set_optional(&mut self, is_optional: bool) {
         self.is_optional = is_optional;
     }
@@ -183,7 +187,7 @@ impl Checkpoint {
             // A failed write abandoned it; the next step returns the error.
             self.beside = None;
         }
-        let result = match &self.beside {
+        match &self.beside {
             // A commit named after a step must hold that step.
             _ if self.name.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
@@ -191,8 +195,7 @@ impl Checkpoint {
             None if self.may_be_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
             Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
             _ => Ok(()),
-        };
-        self.tolerate_full_drive(result)
+        }
     }
 
     /// Whether [`Checkpoint::between_steps`] may have something to do now.
@@ -211,29 +214,19 @@ impl Checkpoint {
         self.interval.is_due(self.last.elapsed().as_secs_f64())
     }
 
-    /// For a run in memory, turns a lack of space into a warning; the next attempt follows one interval later.
-    fn tolerate_full_drive(&mut self, result: Result<(), TrainError>) -> Result<(), TrainError> {
-        match result {
-            Err(error) if self.is_optional && error.is_out_of_space() => {
-                if !std::mem::replace(&mut self.warned_full, true) {
-                    crate::tell!("warning: nothing can be committed: {error}");
-                }
-                // The next commit would hold another step, so drop the name.
-                if let Some(name) = self.name.take() {
-                    crate::tell!("warning: {name} is not kept");
-                }
-                self.last = Instant::now();
-                Ok(())
-            }
-            done => done,
+    /// Leaves out a commit for which there is no space; the next attempt follows one interval later.
+    pub(super) fn miss(&mut self) {
+        // The next commit would hold another step, so drop the name.
+        if let Some(name) = self.name.take() {
+            crate::tell!("warning: {name} is not kept: there is no space for a commit");
         }
+        self.last = Instant::now();
     }
 
-    /// Abandons the commit in progress after `why`, a lack of space; the run continues without it.
-    pub(super) fn give_up(&mut self, trainer: &mut Trainer, why: TrainError) -> Result<(), TrainError> {
+    /// Abandons the commit in progress of a run whose pages are all in memory.
+    pub(super) fn give_up(&mut self, trainer: &mut Trainer) {
         self.beside = None;
         trainer.scene.pager.thaw();
-        self.tolerate_full_drive(Err(why))
     }
 
     /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;
@@ -331,6 +324,9 @@ impl Checkpoint {
     fn acknowledged(&mut self, step: u32, cut: Instant, waited: f64, bytes: u64) {
         self.done += 1;
         self.last_step = Some(step);
+        if std::mem::take(&mut self.goes_without) {
+            crate::tell!("there is space again: step {step} is committed");
+        }
         let until_durable = cut.elapsed().as_secs_f64();
         let at_risk = self.last_cut.elapsed().as_secs_f64();
         self.interval.add(CommitCost { waited, until_durable, bytes, at_risk });

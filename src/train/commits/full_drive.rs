@@ -2,7 +2,10 @@
 //!
 //! First it makes two commits, which free the slots of old versions; the reserve is released to make room for them. If
 //! that is not enough, training waits, with its state in memory, until the user frees space, and then continues. After
-//! `--disk-full-wait` the run stops.
+//! `--disk-full-wait` the run stops. A run in memory waits as well, because it would lose all steps since its last commit if
+//! it ended; but its steps need no drive, so after the wait it goes on without commits where there is room for its results.
+//!
+//! Not here: the results after the last step ([`super::results_wait`]).
 //!
 //! Invariants: 1. waiting does not change the run; 2. the last commit always stays intact.
 
@@ -10,7 +13,9 @@ use super::checkpoint::Checkpoint;
 use crate::base::units::format_bytes;
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::map::commit::Commits;
+use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
+use crate::train::inputs::places::drive_of;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
@@ -18,11 +23,13 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// Interval between checks of the drive.
-const POLL: Duration = Duration::from_secs(1);
+pub(super) const POLL: Duration = Duration::from_secs(1);
 /// The reserve is filled only if it takes less than 1/4 of the free bytes.
 const RESERVE_SHARE: u64 = 4;
 /// Bytes required on the drive of the results during a run: metrics take a few hundred bytes per line.
 const OTHER_BYTES: u64 = 1 << 20;
+/// The results take less than 160 % of the bytes of the rows: the PLY 106, a file for viewers 42, and the report.
+const RESULTS_PERCENT: u64 = 160;
 
 impl TrainError {
     /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
@@ -66,8 +73,12 @@ impl Checkpoint {
             return Err(why);
         }
         if self.is_optional {
-            // All pages are in memory: abandon the commit; the step needs no write.
-            return self.give_up(trainer, why);
+            // All pages are in memory: abandon the commit in progress; the step needs no write.
+            self.give_up(trainer);
+            if self.goes_without {
+                self.miss();
+                return Ok(());
+            }
         }
         let is_own = self.other_drive(&why).is_none();
         let now = (trainer.steps_done(), is_own, Instant::now());
@@ -77,8 +88,8 @@ impl Checkpoint {
         if !is_stuck {
             self.space_made = Some(now);
         }
-        // Commits and reserve free space only on the store's drive.
-        if !is_stuck && is_own {
+        // Commits and reserve free space only on the store's drive, and a first commit frees none.
+        if !is_stuck && is_own && !self.is_only_of_results(&lacks) {
             match self.commit_with_reserve(trainer, metrics) {
                 Ok(()) => return Ok(()),
                 Err(error) if error.is_out_of_space() => lacks = error,
@@ -110,16 +121,24 @@ impl Checkpoint {
         (began, is_told): (Instant, bool),
     ) -> Result<(), TrainError> {
         let other = self.other_drive(&lacks);
+        let is_of_results = self.is_only_of_results(&lacks);
         let needed = match other {
             Some(_) => OTHER_BYTES,
-            None => trainer.scene.pager.slot_space().map_or(0, |space| space.segment_bytes) + self.map_growth(),
+            None if is_of_results => OTHER_BYTES,
+            None => {
+                // The first commit of a run in memory stores all pages.
+                let pager = &trainer.scene.pager;
+                let all = (pager.index().len() * pager.frame_bytes()) as u64;
+                pager.slot_space().map_or(all, |space| space.segment_bytes) + self.map_growth()
+            }
         };
-        let full = other.unwrap_or_else(|| self.folder.clone());
+        // The folder of a first commit that failed is gone.
+        let full = drive_of(other.as_deref().unwrap_or(&self.folder));
         let free = free_bytes(&full).ok().flatten();
         let free_then = free.map_or(String::from("unknown"), format_bytes);
         let until = self.full_wait.as_secs_f64();
         let (needed_text, folder) = (format_bytes(needed), full.display().to_string());
-        if !is_told {
+        if !is_told && stop.exit_code().is_none() {
             crate::tell!(
                 "paused: {lacks}\n  {folder} needs {needed_text} more and has {free_then} free. Training waits up to \
                  {until:.0} s (--disk-full-wait) for space, then continues; Ctrl-C stops it"
@@ -132,7 +151,11 @@ impl Checkpoint {
             if free_now.zip(free).is_some_and(|(now, then)| now < needed && now <= then) {
                 continue;
             }
-            match self.commit(trainer, metrics) {
+            let done = match is_of_results {
+                true => metrics.sync().map(drop).map_err(TrainError::from),
+                false => self.commit(trainer, metrics),
+            };
+            match done {
                 Ok(()) => {
                     if !is_told {
                         crate::tell!(
@@ -147,10 +170,34 @@ impl Checkpoint {
                 Err(error) => return Err(error),
             }
         }
+        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64 / 100 * RESULTS_PERCENT;
+        let has_room = || free_bytes(&full).ok().flatten().is_none_or(|free| free >= room);
         match stop.exit_code() {
             Some(_) => Ok(()),
-            None => Err(TrainError::DriveFull { folder, needed: needed_text, last_step: self.last_step() }),
+            None if self.is_optional && has_room() => {
+                crate::tell!(
+                    "warning: training goes on in memory without commits: if it ends now, the steps since {} are lost. There is \
+                     room for the results, and commits begin again once there is room for them",
+                    self.last_step()
+                        .map_or("its beginning".to_string(), |step| format!("the commit after step {step}"))
+                );
+                self.goes_without = true;
+                self.miss();
+                Ok(())
+            }
+            None => Err(TrainError::DriveFull {
+                folder,
+                needed: needed_text,
+                last_step: self.last_step(),
+                elsewhere: String::new(),
+            }),
         }
+    }
+
+    /// Whether a file of the results found no space and needs no commit: all pages of the run are in memory.
+    fn is_only_of_results(&self, error: &TrainError) -> bool {
+        let TrainError::Input(error) = error else { return false };
+        self.is_optional && !error.file.starts_with(&self.folder)
     }
 
     /// The folder of the file that found no space, if it lies on another drive than the store.

@@ -4,4 +4,5 @@ pub mod checkpoint;
 pub(crate) mod first_commit;
 pub mod full_drive;
 pub(crate) mod reserve;
+pub(crate) mod results_wait;
 mod save;

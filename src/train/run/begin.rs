@@ -2,8 +2,9 @@
 //!
 //! Not here: what happens in the output folder (`run_folder`).
 //!
-//! Invariant: the output folder is created after the dataset was read, so bad input leaves no files.
+//! Invariant: bad input leaves no files. A run that is killed before it has a config.toml leaves its settings (`beginning`).
 
+use super::beginning::{self, Beginning};
 use super::changes::with_absolute_paths;
 use super::out_folder::{self, Existing};
 use super::request::{RunOutcome, RunRequest};
@@ -52,6 +53,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     config.check()?;
     machine::set_up(config)?;
     check_folders(request)?;
+    let _mark = Beginning::mark(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
     let request = &suit_photos(request, &start);
@@ -288,6 +290,9 @@ pub(super) fn plan_and_train(
     // Take the lock before removing files; hold it to the end.
     let _lock = out_folder::lock(&request.out)?;
     if begun.past.is_none() {
+        if request.out.join(CONFIG_FILE).is_file() && request.existing == Existing::Overwrite {
+            beginning::write_mark(request)?;
+        }
         out_folder::make(&request.out, request.existing)?;
     }
     let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);

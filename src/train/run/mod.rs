@@ -3,6 +3,7 @@
 //! [`begin`] is the page to read first.
 
 pub mod begin;
+mod beginning;
 mod changes;
 pub mod costs;
 pub mod live;

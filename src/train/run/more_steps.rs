@@ -3,7 +3,8 @@
 //! Kept: the Gaussians, the number of steps, and with it the schedule, the metrics and the identity of the run. Lost with the
 //! checkpoint: Adam's moments and the statistics of densification. Adam's first updates without moments are up to three
 //! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
-//! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]).
+//! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]): the steps are those that the run would have done next. With and
+//! without it, the rates stay at the values with which the schedule ended.
 //!
 //! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
 //! is renamed before the scene was found; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
@@ -15,8 +16,10 @@ use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::units::format_grouped;
 use crate::base::whole_file::sync_folder;
 use crate::config::file::TrainConfig;
+use crate::config::limits::schedule_steps;
 use crate::report::live::Live;
 use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
@@ -27,6 +30,19 @@ use crate::train::log::report::Summary;
 use crate::train::memory::estimate::host_budget;
 use crate::train::start::first_scene::Start;
 use std::path::{Path, PathBuf};
+
+/// What more steps mean for the rates; `None` if the schedule is as long as the run. A run that goes on keeps its schedule, because
+/// rates that rose again would undo what the last steps have settled.
+pub(super) fn told_of_rates(config: &TrainConfig) -> Option<String> {
+    let end = schedule_steps(config);
+    (end < config.steps).then(|| {
+        let [end, steps] = [end, config.steps].map(|steps| format_grouped(steps.into()));
+        format!(
+            "rates   they stay at their final values after step {end}, so the result is not that of a run that has {steps} steps \
+             from its start"
+        )
+    })
+}
 
 /// A finished run, and the config with which it goes on.
 pub(super) struct Finished<'a> {
@@ -67,6 +83,9 @@ impl Finished<'_> {
             out.display(),
             kept.display()
         );
+        if let Some(rates) = told_of_rates(&self.config) {
+            crate::tell!("{rates}");
+        }
         let init_ply = absolute(&kept).to_string_lossy().into_owned();
         let config = TrainConfig { init_ply, ..self.config };
         let host_mem = host_budget(&config);

@@ -12,10 +12,14 @@ use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::photos;
-use crate::report::run_files::{CONFIG_FILE, PLY_FILE, RUN_FILES, RunFile, Tells, is_saved_ply};
+use crate::report::run_files::{
+    BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, is_saved_ply,
+};
 use crate::train::error::TrainError;
 use crate::train::log::facts::read_resolved;
+use crate::train::log::report::StepLine;
 use crate::train::stores::ownership::{check_removable, remove_checkpoint_in};
+use std::ffi::OsStr;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::{Path, PathBuf};
 
@@ -61,9 +65,10 @@ pub(super) fn refuse_in_use(out: &Path) -> InputResult<()> {
     if out.join(LOCK).is_file() { lock(out).map(drop) } else { Ok(()) }
 }
 
-/// Whether a folder is empty except for the lock file.
+/// Whether a folder is empty except for the lock file and the mark of a run that had no config.toml yet.
 pub fn is_empty(out: &Path) -> bool {
-    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| e.file_name() == LOCK)))
+    let is_ours = |name: &OsStr| name == LOCK || name == BEGUN_FILE;
+    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| is_ours(&e.file_name()))))
 }
 
 /// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
@@ -170,7 +175,8 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     let probe = out.join(".gsscale-probe");
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
     // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
-    if existing == Existing::Refuse || !out.join(CONFIG_FILE).is_file() {
+    let is_runs = [CONFIG_FILE, BEGUN_FILE].iter().any(|file| out.join(file).is_file());
+    if existing == Existing::Refuse || !is_runs {
         return Ok(());
     }
     if existing == Existing::BeginAgain {
@@ -244,6 +250,36 @@ fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputR
     }
     let _ = std::fs::remove_dir(folder);
     Ok(())
+}
+
+/// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
+/// lie elsewhere.
+pub(super) fn has_results(out: &Path) -> bool {
+    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
+    let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
+    let has = |name: &str| out.join(name).exists();
+    let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
+    // A PLY without a summary is that of a run without commits that was killed while it wrote its results: beginning again gives
+    // the same one, which replaces it as a whole.
+    let has_ply = has(PLY_FILE) && metrics.is_empty();
+    has_ply || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+}
+
+/// Refuses to begin a run again that left results.
+///
+/// # Errors
+/// There are results, which would be replaced.
+pub(super) fn check_restart(out: &Path) -> InputResult<()> {
+    if !has_results(out) {
+        return Ok(());
+    }
+    let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
+                   removes its checkpoint";
+    let remedy = format!(
+        "start a new run from its Gaussians with another --out and --init-ply {}",
+        out.join(PLY_FILE).display()
+    );
+    Err(InputError::new(out, problem, remedy))
 }
 
 /// The PLY files that `--save-every` wrote.

@@ -7,9 +7,10 @@
 //! run is neither used nor removed (`ownership`).
 
 use super::begin::{begin, plan_and_train, run};
+use super::beginning::settings_of_mark;
 use super::changes::{Changes, kept_config};
-use super::more_steps::Finished;
-use super::out_folder::{self, Existing};
+use super::more_steps::{Finished, told_of_rates};
+use super::out_folder::{self, Existing, check_restart, has_results};
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
@@ -29,13 +30,13 @@ use crate::paging::pager::Pager;
 use crate::photos;
 use crate::render::Renderer;
 use crate::report::live::Live;
-use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
+use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::places::absolute;
 use crate::train::log::facts::{Resolved, read_resolved};
-use crate::train::log::report::{StepLine, Summary};
+use crate::train::log::report::Summary;
 use crate::train::memory::estimate::host_budget;
 use crate::train::start::first_scene::Start;
 use crate::train::start::first_scene::dataset_print;
@@ -74,6 +75,11 @@ pub struct ResumeRequest {
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // Do not read or remove files of an active run.
     let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
+    if let Some(marked) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
+        drop(lock);
+        crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
+        return begin_again(request, marked, Existing::Overwrite);
+    }
     let earlier = Earlier::find(request)?;
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
@@ -134,8 +140,8 @@ impl Earlier {
         let folder = named.map_or_else(|| checkpoint_folder(&request.out), PathBuf::from);
         let nothing = || {
             let problem = format!("there is neither a config.toml nor a checkpoint in {}", folder.display());
-            let remedy =
-                "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir";
+            let remedy = "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir; a run \
+                          that was stopped while it read its photos is started with its first command";
             InputError::new(&request.out, problem, remedy)
         };
         if !SpillDir::exists_in(&folder) {
@@ -195,42 +201,22 @@ pub(super) fn read_summary(out: &Path) -> Option<Summary> {
     serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
 }
 
-/// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
-/// lie elsewhere.
-fn has_results(out: &Path) -> bool {
-    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
-    let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
-    let has = |name: &str| out.join(name).exists();
-    let has_saved = || out_folder::saved(out).is_ok_and(|saved| !saved.is_empty());
-    has(PLY_FILE) || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
-}
-
-/// Refuses to begin a run again that left results.
-///
-/// # Errors
-/// There are results, which would be replaced.
-pub(super) fn check_restart(out: &Path) -> InputResult<()> {
-    if !has_results(out) {
-        return Ok(());
-    }
-    let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
-                   removes its checkpoint";
-    let remedy = format!(
-        "start a new run from its Gaussians with another --out and --init-ply {}",
-        out.join(PLY_FILE).display()
-    );
-    Err(InputError::new(out, problem, remedy))
-}
-
 /// Restarts a run that was cut off before its first commit, from its config.
 ///
 /// # Errors
 /// The run left results that would be replaced; else as [`run`].
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
     check_restart(&request.out)?;
-    let (out, scene, quiet) = (request.out.clone(), earlier.scene.clone(), request.quiet);
-    crate::tell!("{} was cut off before its first commit: it begins again", out.display());
-    let existing = Existing::BeginAgain;
+    crate::tell!("{} was cut off before its first commit: it begins again", request.out.display());
+    begin_again(request, (config, earlier.scene.clone()), Existing::BeginAgain)
+}
+
+fn begin_again(
+    request: &ResumeRequest,
+    (config, scene): (TrainConfig, PathBuf),
+    existing: Existing,
+) -> Result<RunOutcome, TrainError> {
+    let (out, quiet) = (request.out.clone(), request.quiet);
     run(&RunRequest { scene, out, config, dry_run: false, existing, quiet, live: request.live.clone() })
 }
 
@@ -376,6 +362,9 @@ fn print_resume(
         free => format!("; {}", free.join(", ")),
     };
     crate::tell!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
+    if let Some(rates) = told_of_rates(config) {
+        crate::tell!("{rates}");
+    }
 }
 
 /// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left

@@ -4,8 +4,10 @@
 //!
 //! Invariant: no file is changed, even while another process trains the run.
 
-use super::out_folder;
-use super::resume::{Earlier, ResumeRequest, check_restart, goal, read_summary, result_to_continue, stored_folder};
+use super::beginning::settings_of_mark;
+use super::more_steps::told_of_rates;
+use super::out_folder::{self, check_restart};
+use super::resume::{Earlier, ResumeRequest, goal, read_summary, result_to_continue, stored_folder};
 use crate::base::units::{format_grouped, format_seconds};
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::TrainConfig;
@@ -24,6 +26,9 @@ use std::path::Path;
 pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
     out_folder::refuse_in_use(&request.out)?;
     let out = request.out.display();
+    if settings_of_mark(&request.out, &request.keys, request.scene.as_deref())?.is_some() {
+        return Ok(format!("resume  {out} was cut off before its first step: it begins again"));
+    }
     let earlier = Earlier::find(request)?;
     let mut config = earlier.config.clone();
     request.keys.clone().apply(&mut config);
@@ -78,7 +83,11 @@ fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> Strin
         }
         None => String::new(),
     };
-    format!("resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}", out.display())
+    let rates = told_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
+    format!(
+        "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",
+        out.display()
+    )
 }
 
 /// Seconds of a step by the metrics of the second half of the run.

@@ -6,6 +6,7 @@
 //! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past; 4. a file for
 //! viewers that cannot be written costs the run neither its evaluation nor its report, and leaves it to be resumed.
 
+use super::beginning::remove_mark;
 use super::changes::with_absolute_paths;
 use super::costs::Meter;
 use super::live::LivePage;
@@ -28,7 +29,8 @@ use crate::exchange::sink::Written;
 use crate::photos;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
-use crate::train::commits::checkpoint::Checkpoint;
+use crate::train::commits::checkpoint::{Checkpoint, full_wait};
+use crate::train::commits::results_wait::Results;
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::inputs::signals::StopFlag;
@@ -40,6 +42,7 @@ use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::time::Duration;
 
 /// The past of a resumed run.
 pub(super) struct Past {
@@ -131,8 +134,8 @@ pub(super) fn train_into(
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
+    remove_mark(out);
     let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
-    let keeps = tiers.keeps_checkpoint();
     let mut checkpoint = tiers.checkpoint.as_mut();
     if let Some(checkpoint) = &mut checkpoint {
         checkpoint.set_origin(origin);
@@ -152,8 +155,18 @@ pub(super) fn train_into(
     let mut outputs = LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint, live };
     let looped = trainer.run(dataset, &targets, &mut outputs);
     let costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
+    let mut results = Results {
+        trainer: &mut trainer,
+        metrics: &mut metrics,
+        checkpoint: tiers.checkpoint.as_mut(),
+        out,
+        stop,
+        // A run that has failed, perhaps after such a wait, ends.
+        wait: looped.as_ref().map_or(Duration::ZERO, |()| full_wait(config)),
+        has_ply: false,
+    };
     let ply = Trainer::ply_path(out);
-    let saved = save_result(dataset, &mut trainer, &ply);
+    let saved = results.write(|results| save_result(dataset, results.trainer, &ply));
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
@@ -162,23 +175,54 @@ pub(super) fn train_into(
         }
         (looped, saved) => (looped, saved?),
     };
+    results.has_ply = true;
     warn_of_ply(config, &written, &ply);
-    let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
+    let summary = write_results(request, dataset, &targets, results, (looped, &written, costs))?;
+    tiers.is_done = summary.finished;
+    Ok(RunOutcome {
+        summary: Some(summary),
+        exit_code: stop.exit_code().unwrap_or(0),
+        out: out.clone(),
+        keeps_checkpoint: config.keep_checkpoint,
+    })
+}
+
+/// Writes what follows the PLY: the file for viewers, the evaluation, the last commit, the summary and the report. The run has ended its
+/// loop with `looped`.
+///
+/// # Errors
+/// That of the loop, or a result cannot be written.
+fn write_results(
+    request: &RunRequest,
+    dataset: &Dataset,
+    targets: &TargetCache,
+    mut results: Results<'_>,
+    (looped, written, costs): (Result<(), TrainError>, &Written, StepCosts),
+) -> Result<Summary, TrainError> {
+    let (config, out) = (&request.config, &request.out);
+    let ply = Trainer::ply_path(out);
+    let exported = results.write(|results| export_beside(request, dataset, results.trainer, &ply, written));
     if exported.is_err() {
         crate::tell!(
             "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
         );
     }
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
-    let asked = stop.exit_code();
+    let asked = results.stop.exit_code();
     let tested = looped.and_then(|()| match asked {
-        None => evaluate_result(request, dataset, &targets, &mut trainer, &mut metrics),
+        None => evaluate_result(request, dataset, targets, &mut results),
         Some(_) => Ok(None),
     });
-    if let (true, Ok(_), Some(checkpoint)) = (keeps || exported.is_err(), &tested, tiers.checkpoint.as_mut()) {
+    if (config.keep_checkpoint || exported.is_err()) && tested.is_ok() {
         // Commit again, with the result of the evaluation. A run whose export failed is resumed from this commit.
-        checkpoint.commit_or_warn(&mut trainer, &mut metrics)?;
+        match results.write(Results::commit) {
+            Err(error) if error.is_out_of_space() => {
+                crate::tell!("warning: the last steps are not committed: {error}");
+            }
+            done => done?,
+        }
     }
+    let trainer = &*results.trainer;
     let summary = Summary {
         gaussians: written.rows + written.skipped,
         test: tested.as_ref().ok().copied().flatten(),
@@ -187,22 +231,20 @@ pub(super) fn train_into(
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
         export: exported.as_ref().ok().cloned().flatten(),
         costs,
-        commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
-        ..summary_of(request, &trainer)
+        commits: results.checkpoint.as_deref().map(Checkpoint::report),
+        ..summary_of(request, trainer)
     };
-    write_summary(&out.join(SUMMARY_FILE), &summary)?;
-    write_page_map(&out.join(PAGES_FILE), dataset, &trainer)?;
-    trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
-    write_report(request)?;
+    results.write(|results| {
+        let trainer = &*results.trainer;
+        // The summary says that all is written, so it comes last but for the report, which shows it and is made again by a resume.
+        write_page_map(&out.join(PAGES_FILE), dataset, trainer)?;
+        trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
+        write_summary(&out.join(SUMMARY_FILE), &summary)?;
+        Ok(write_report(request)?)
+    })?;
     tested?;
     exported?;
-    tiers.is_done = summary.finished;
-    Ok(RunOutcome {
-        summary: Some(summary),
-        exit_code: stop.exit_code().unwrap_or(0),
-        out: out.clone(),
-        keeps_checkpoint: config.keep_checkpoint,
-    })
+    Ok(summary)
 }
 
 /// Writes the Gaussians at the current step as a PLY, and its transform to the dataset's coordinates.
@@ -249,18 +291,22 @@ fn evaluate_result(
     request: &RunRequest,
     dataset: &Dataset,
     targets: &TargetCache,
-    trainer: &mut Trainer,
-    metrics: &mut MetricsLog,
+    results: &mut Results<'_>,
 ) -> Result<Option<TestMetrics>, TrainError> {
-    let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
     let pictures = request.out.join(PICTURES_FOLDER);
     // A run that was killed after the commit of its last evaluation has the line already.
-    let is_logged = trainer.state.test.is_some_and(|test| test.step == trainer.state.step);
-    let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
-    if let Some(test) = test.filter(|_| !is_logged) {
-        metrics.write_evaluation(trainer.steps_done(), test, &pictures)?;
-    }
-    Ok(test)
+    let state = &results.trainer.state;
+    let mut is_logged = state.test.is_some_and(|test| test.step == state.step);
+    results.write(|Results { trainer, metrics, .. }| {
+        let shown = Count::new("held-out views compared", dataset.test_views().len() as u32, request.quiet);
+        let test = trainer.evaluate(dataset, targets, Some(&pictures), &|done| shown.show(done))?;
+        match test.filter(|_| !std::mem::replace(&mut is_logged, true)) {
+            Some(test) => metrics.write_evaluation(trainer.steps_done(), test, &pictures)?,
+            // What found no space before waits in the log.
+            None => drop(metrics.sync()?),
+        }
+        Ok(test)
+    })
 }
 
 fn write_report(request: &RunRequest) -> InputResult<()> {

@@ -211,11 +211,6 @@ impl Tiers {
         self.spill.as_ref().is_some_and(SpillDir::made_folder)
     }
 
-    /// Whether the checkpoint stays at a clean end.
-    pub fn keeps_checkpoint(&self) -> bool {
-        self.keeps
-    }
-
     fn has_checkpoint(&self) -> bool {
         self.has_resumed || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
     }

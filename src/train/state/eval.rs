@@ -9,7 +9,7 @@ use crate::appearance::fit::Pair;
 use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_rows::write_rgb_rows;
-use crate::base::whole_file::write_whole;
+use crate::base::whole_file::{write_whole, write_whole_with};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
@@ -24,8 +24,6 @@ use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_ps
 use crate::train::step::pages::PagedScene;
 use crate::train::step::view::draw;
 use crate::train::step::working_set::WorkingSet;
-use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
@@ -152,7 +150,5 @@ fn write_pair(path: &Path, image: &Image, target: &Target) -> InputResult<()> {
         image.row_to_rgb8(y, render);
         photo.copy_from_slice(&target.rgb[row_bytes * y..row_bytes * (y + 1)]);
     };
-    let mut file = BufWriter::new(File::create(path).map_err(|e| InputError::io(path, "writing the picture", &e))?);
-    let written = write_rgb_rows(&mut file, [2 * image.width, image.height], fill).and_then(|()| file.flush());
-    written.map_err(|e| InputError::io(path, "writing the picture", &e))
+    write_whole_with(path, |out| write_rgb_rows(out, [2 * image.width, image.height], fill))
 }

@@ -3,6 +3,7 @@
 mod appearance;
 mod bench;
 mod changes;
+mod ends;
 mod events;
 mod growth;
 mod kills;

@@ -1,0 +1,154 @@
+//! The results of a run on a full drive: what finds no space is written again once there is space.
+//!
+//! All results share one wait of `--disk-full-wait`. Meanwhile the run tries to commit its last step, so that no step is lost if
+//! no space is freed, and says what can be saved on another drive. A run that was asked to stop does not wait.
+//!
+//! Not here: commits and metrics between steps ([`super::full_drive`]), what the results are (`run_folder`).
+//!
+//! Invariant: waiting does not change the results.
+
+use super::checkpoint::Checkpoint;
+use super::full_drive::POLL;
+use crate::base::units::format_bytes;
+use crate::page::folder::file_system::free_bytes;
+use crate::report::run_files::PLY_FILE;
+use crate::train::error::TrainError;
+use crate::train::inputs::signals::StopFlag;
+use crate::train::log::report::MetricsLog;
+use crate::train::state::trainer::Trainer;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+/// What the results of a run are written with.
+pub(crate) struct Results<'a> {
+    /// The run after its last step.
+    pub trainer: &'a mut Trainer,
+    /// Writer of metrics.jsonl.
+    pub metrics: &'a mut MetricsLog,
+    /// The run's checkpoint, if it has one.
+    pub checkpoint: Option<&'a mut Checkpoint>,
+    /// Output folder.
+    pub out: &'a Path,
+    /// Stop request.
+    pub stop: &'a StopFlag,
+    /// What is left of `--disk-full-wait`.
+    pub wait: Duration,
+    /// The PLY of the last step is written.
+    pub has_ply: bool,
+}
+
+impl Results<'_> {
+    /// Writes a result with `write`, again and again while the drive is full.
+    ///
+    /// # Errors
+    /// No space was freed in time, or an error other than a lack of space.
+    pub fn write<T>(&mut self, mut write: impl FnMut(&mut Self) -> Result<T, TrainError>) -> Result<T, TrainError> {
+        let mut paused = None;
+        loop {
+            match write(self) {
+                Err(error) if error.is_out_of_space() && self.stop.exit_code().is_none() => {
+                    let is_first = paused.is_none();
+                    let began = *paused.get_or_insert_with(Instant::now);
+                    self.commit_last_step();
+                    if is_first && !self.wait.is_zero() {
+                        self.tell_pause(&error);
+                    }
+                    self.await_space(began);
+                    if began.elapsed() >= self.wait {
+                        self.wait = Duration::ZERO;
+                        return Err(self.drive_full(&error));
+                    }
+                }
+                done => {
+                    if let (Some(began), Ok(_)) = (paused, &done) {
+                        crate::tell!(
+                            "there is space again after {:.0} s: the run goes on",
+                            began.elapsed().as_secs_f64()
+                        );
+                        self.wait = self.wait.saturating_sub(began.elapsed());
+                    }
+                    return done;
+                }
+            }
+        }
+    }
+
+    /// Commits the last step at once.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::commit`].
+    pub fn commit(&mut self) -> Result<(), TrainError> {
+        let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
+        checkpoint.commit(self.trainer, self.metrics)
+    }
+
+    /// Commits the last step if no commit holds it. A failure changes nothing: the result is tried again anyway.
+    fn commit_last_step(&mut self) {
+        if !self.has_last_step() {
+            let _ = self.commit();
+        }
+    }
+
+    fn has_last_step(&self) -> bool {
+        let last = self.checkpoint.as_deref().and_then(Checkpoint::last_step);
+        last == Some(self.trainer.steps_done())
+    }
+
+    fn free(&self) -> Option<u64> {
+        free_bytes(self.out).ok().flatten()
+    }
+
+    fn tell_pause(&self, error: &TrainError) {
+        let free = self.free().map_or(String::from("unknown"), format_bytes);
+        crate::tell!(
+            "paused: {error}\n  the drive of {} has {free} free. The results wait up to {:.0} s (--disk-full-wait) for space; \
+             Ctrl-C ends the run without them{}",
+            self.out.display(),
+            self.wait.as_secs_f64(),
+            self.elsewhere()
+        );
+    }
+
+    /// Waits until there is more space, a stop is requested, or the time is over; where the system does not tell the space, or
+    /// a quota limits it, until the next look.
+    fn await_space(&self, began: Instant) {
+        let then = self.free();
+        // A result that is tried in vain costs time: an evaluation draws all held-out views.
+        let (asked, is_over) = (Instant::now(), || began.elapsed() >= self.wait || self.stop.exit_code().is_some());
+        while !is_over() {
+            std::thread::sleep(POLL.min(self.wait / 20));
+            let is_same = self.free().zip(then).is_some_and(|(now, then)| now <= then);
+            if !is_same || asked.elapsed() >= 10 * POLL {
+                return;
+            }
+        }
+    }
+
+    fn drive_full(&self, error: &TrainError) -> TrainError {
+        let needed = match error {
+            TrainError::Input(error) => format!("space for {}, and perhaps", error.file.display()),
+            _ => "space for the last commit, and perhaps".to_string(),
+        };
+        TrainError::DriveFull {
+            folder: self.out.display().to_string(),
+            needed,
+            last_step: self.checkpoint.as_deref().and_then(Checkpoint::last_step),
+            elsewhere: self.elsewhere(),
+        }
+    }
+
+    /// What can be saved on another drive now, as a line of a message.
+    fn elsewhere(&self) -> String {
+        let (out, step) = (self.out.display(), self.trainer.steps_done());
+        match (self.has_ply, self.has_last_step()) {
+            (true, _) => {
+                format!("\n  {} is whole and can be copied to another drive", self.out.join(PLY_FILE).display())
+            }
+            (false, true) => format!(
+                "\n  to save the Gaussians of step {step} on another drive, from the last commit, once this run has ended: \
+                 gsscale-ckpt export {out} --out OTHER_DRIVE/point_cloud.ply"
+            ),
+            (false, false) => String::new(),
+        }
+    }
+}
