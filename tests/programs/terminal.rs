@@ -6,12 +6,13 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use tempfile::TempDir;
 
-const STEPS: [&str; 8] = ["--steps", "60", "--strategy", "none", "--device", "cpu", "--threads", "1"];
+const FIXED: [&str; 6] = ["--strategy", "none", "--device", "cpu", "--threads", "1"];
+const SHORT: [&str; 2] = ["--steps", "60"];
 
 /// A run of `scene` into `out`, started by `before`, whose lines go nowhere yet.
 fn run(before: &[&str], scene: &Path, out: &Path, more: &[&str]) -> Command {
     let words =
-        [before, &[env!("CARGO_BIN_EXE_gsscale-train"), text(scene), "--out", text(out)], &STEPS, more].concat();
+        [before, &[env!("CARGO_BIN_EXE_gsscale-train"), text(scene), "--out", text(out)], &FIXED, more].concat();
     let mut command = Command::new(words[0]);
     command.args(&words[1..]).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
     command
@@ -26,18 +27,18 @@ fn a_run_whose_lines_cannot_be_written_trains_to_the_end() {
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 12, 48, 36, 400);
     let whole = folder.path().join("whole");
-    assert!(run(&[], &scene, &whole, &[]).status().unwrap().success());
+    assert!(run(&[], &scene, &whole, &SHORT).status().unwrap().success());
     // The reader of both streams is gone before the first line, as in `2>&1 | head -0`.
     let out = folder.path().join("no reader");
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
-    let mut command = run(&[], &scene, &out, &[]);
+    let mut command = run(&[], &scene, &out, &SHORT);
     assert!(command.stdout(writer.try_clone().unwrap()).stderr(writer).status().unwrap().success());
     assert!(ply(&out) == ply(&whole));
     // The log is on a full drive.
     let out = folder.path().join("full log");
     let full = OpenOptions::new().write(true).open("/dev/full").unwrap();
-    assert!(run(&[], &scene, &out, &[]).stderr(full).status().unwrap().success());
+    assert!(run(&[], &scene, &out, &SHORT).stderr(full).status().unwrap().success());
     assert!(ply(&out) == ply(&whole));
     // Every other program that warns or fails keeps its exit code.
     for program in [env!("CARGO_BIN_EXE_gsscale-eval"), env!("CARGO_BIN_EXE_gsscale-ckpt")] {
@@ -82,7 +83,8 @@ fn a_run_whose_terminal_is_closed_commits_and_one_under_nohup_goes_on() {
         assert!(out.join("checkpoint/map.redb").exists() && summary(&out)["finished"] == false);
     }
     let out = folder.path().join("nohup");
-    let mut child = run(&["env", "--ignore-signal=HUP"], &scene, &out, &["--log-every", "1"]).spawn().unwrap();
+    let mut child =
+        run(&["env", "--ignore-signal=HUP"], &scene, &out, &["--steps", "60", "--log-every", "1"]).spawn().unwrap();
     wait_for_first_step(&mut child, &out);
     hang_up(&child, "-HUP");
     assert!(child.wait().unwrap().success());

@@ -49,7 +49,8 @@ fn text_of_forecast(scene: &Scene) -> String {
     };
     let drive = match forecast.tiers.frames {
         Some(_) => format!(
-            "{} of pages, about {} to write without commits",
+            "up to {} ({} of pages and their versions of the last commits), about {} to write without commits",
+            format_bytes(forecast.drive_bytes_most),
             format_bytes(forecast.drive_bytes),
             format_bytes(forecast.bytes_written as u64)
         ),
@@ -123,7 +124,7 @@ pub fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
          \nworst 20 bytes read and written\
          \nwait     for a drive that reads {}/s and writes {}/s,\
          \n         and steps of {:.4} s{}\
-         \ntime     of all {} steps, without growth\
+         \ntime     of all {} steps at the Gaussians of now: compares the rows; the run takes the time named at the top\
          \nwritten  by import and all steps, without commits; life: share of {}",
         size(scene.drive.read_rate),
         size(scene.drive.write_rate),

@@ -5,7 +5,8 @@
 //!
 //! Not here: which budgets are refused ([`super::plan`]), and the words (`plan_text`).
 //!
-//! Invariants: 1. the run does not depend on its forecast; 2. bytes of memory and drive depend on no clock.
+//! Invariants: 1. the run does not depend on its forecast; 2. bytes of memory depend on no clock, and
+//! those of the drive only through the number of commits in the time of the run.
 
 use super::drive_space::{DriveUse, StepUse, VERSIONS};
 use super::first_frames::{LargestNeed, obey};
@@ -18,6 +19,7 @@ use crate::densify::growth::GrowthCheck;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::state::row_bytes;
+use crate::train::commits::reserve::reserve_bytes;
 use crate::train::memory::estimate::{MemoryEstimate, rows_at_most};
 
 /// Gaussians that a round of densification adds without a cap, if rounds are [`ROUND_STEPS`] apart. Neither the size of the photos nor the
@@ -120,7 +122,8 @@ pub struct Forecast {
     pub host_mem: Option<u64>,
     /// Bytes of one version of all pages on the drive, at the end.
     pub drive_bytes: u64,
-    /// Most bytes on the drive: with the pages of the commits that are kept, or the checkpoint of a run in memory.
+    /// Most bytes on the drive, all files counted: the pages with their versions of the commits that are kept, or the checkpoint of a
+    /// run in memory.
     pub drive_bytes_most: u64,
     /// Bytes of the PLY.
     pub ply_bytes: u64,
@@ -172,8 +175,14 @@ impl Forecast {
         let seconds = f64::from(steps) * by_power.min(by_rows) + drive_seconds;
         let is_in_memory = config.residence() == Residence::Memory;
         let drive_bytes = (tiers.pages[0] as f64 * growth).ceil() as u64 * tiers.frame_bytes;
-        let drive_bytes_most = store_bytes_most(config, tiers.pages[0] as f64 * growth);
         let state_bytes = last * row_bytes(config.sh_degree) as u64;
+        let commit_bytes_most = commit_bytes(config, state_bytes, seconds);
+        let versions = versions(is_in_memory, commit_bytes_most / state_bytes.max(1) as f64);
+        let pages_then = tiers.pages[0] as f64 * growth;
+        // The first commit of a run in memory sizes the segments; the import does with a spill directory.
+        let sized_by = if is_in_memory { pages_then.ceil() as u64 } else { tiers.pages[0] };
+        let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), sized_by);
+        let drive_bytes_most = store_bytes_most(config, pages_then, versions, layout);
         let mut forecast = Forecast {
             gaussians: [rows, last],
             reach,
@@ -186,7 +195,7 @@ impl Forecast {
             drive_bytes_most,
             ply_bytes: ply_bytes(config, last),
             bytes_written: 0.0,
-            commit_bytes_most: commit_bytes(config, state_bytes, seconds),
+            commit_bytes_most,
             seconds,
             drive_seconds,
         };
@@ -235,12 +244,19 @@ impl DriveUse {
     }
 }
 
-/// Most bytes of the files of a store with `pages` pages: the versions that are kept, a segment that is not full, and the map.
-fn store_bytes_most(config: &TrainConfig, pages: f64) -> u64 {
+/// Most bytes of the files of a store with `pages` pages: their versions, a segment that is not full, and the map.
+fn store_bytes_most(config: &TrainConfig, pages: f64, versions: u64, layout: SlotLayout) -> u64 {
     let pages = (pages * MORE_PAGES).ceil() as u64;
-    let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), pages);
-    let slots = VERSIONS * pages * layout.slot_bytes + layout.segment_bytes();
-    slots + MAP_BYTES + VERSIONS * pages * MAP_PAGE_BYTES
+    let slots = versions * pages * layout.slot_bytes + layout.segment_bytes();
+    let reserve = if config.residence() == Residence::Memory { 0 } else { reserve_bytes(layout.segment_bytes()) };
+    slots + reserve + MAP_BYTES + versions * pages * MAP_PAGE_BYTES
+}
+
+/// Versions of a page on the drive of a run that commits so many times: those of the last two commits, and that of a commit being
+/// written or, with a spill directory, of the steps since the last one.
+fn versions(is_in_memory: bool, commits: f64) -> u64 {
+    let commits = commits as u64;
+    if is_in_memory { commits.clamp(1, VERSIONS) } else { VERSIONS.min(commits + 1) }
 }
 
 /// Bytes of a PLY of `rows` Gaussians.
@@ -365,6 +381,12 @@ mod tests {
         // Nineteen rounds: after 600, 700, ... 2400 steps; nine of them after 1,500.
         let added = |done: u32| reach(&config(), 100_000, PIXELS, done, &[]).0 - 100_000;
         assert!((added(0) as f64 / 19.0 - added(1500) as f64 / 9.0).abs() < 1.0);
+    }
+
+    #[test]
+    fn each_commit_that_is_kept_holds_a_version_of_its_own() {
+        assert_eq!([0.0, 1.0, 2.0, 9.0].map(|commits| versions(true, commits)), [1, 1, 2, 3]);
+        assert_eq!([0.0, 1.0, 2.0, 9.0].map(|commits| versions(false, commits)), [1, 2, 3, 3]);
     }
 
     #[test]

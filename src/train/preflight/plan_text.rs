@@ -60,7 +60,10 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
         Some(_) if !plan.frames_are_named && forecast.holds_all_pages() => {
             String::from("frames of pages, one for every page")
         }
-        Some(frames) => format!("{frames} frames of pages"),
+        Some(frames) => match plan.frames {
+            Some(first) if first != frames => format!("{frames} frames of pages ({first} at the start)"),
+            _ => format!("{frames} frames of pages"),
+        },
     };
     let grows = forecast.gaussians[1] > forecast.gaussians[0];
     let at = if grows { format!(", with {} Gaussians", format_grouped(forecast.gaussians[1])) } else { String::new() };
@@ -149,12 +152,14 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     // A dry run keeps the pages in memory, whatever the run will use.
     let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
-        "drive   {} of pages{at}{now}{by} ({}), {} free\n        \
+        "drive   up to {} with the versions of the last commits{at}, {} free\n        \
+         one version is {} of pages{now}{by} ({})\n        \
          each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
+        format_bytes(forecast.drive_bytes_most),
+        plan.free_bytes.map_or(String::from("unknown"), format_bytes),
         format_bytes(forecast.drive_bytes),
         tiers.codec,
-        plan.free_bytes.map_or(String::from("unknown"), format_bytes),
         format_bytes(tiers.segment_bytes),
         format_bytes(reserve_bytes(tiers.segment_bytes)),
         format_bytes(forecast.bytes_written as u64),
