@@ -9,9 +9,9 @@
 
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
-use super::masks::{MaskIndex, MaskSource};
+use super::masks::{MaskIndex, MaskSource, Pattern, is_mask_name};
 use super::model::{Intrinsics, RawScene, RawView, Split};
-use super::photo::{Alpha, PhotoSource, intrinsics_at};
+use super::photo::{Alpha, PhotoSource, holds_zero_and_one, intrinsics_at};
 use super::photo_header::{PhotoHeader, read_header};
 use super::resize::{Size, divided_size, same_shape};
 use crate::base::error::{InputError, InputResult};
@@ -281,7 +281,7 @@ fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String
     let mut extra = Vec::new();
     for folder in folders {
         let Ok(entries) = std::fs::read_dir(folder) else { continue };
-        let photos = entries.flatten().map(|e| e.path()).filter(|path| is_photo_name(path));
+        let photos = entries.flatten().map(|e| e.path()).filter(|path| is_photo_name(path) && !is_mask_name(path));
         extra.extend(photos.filter(|path| !used.contains(path.as_path())));
     }
     if !extra.is_empty() {
@@ -350,14 +350,10 @@ fn check_photos(
              (--masks=false shows --background there)"
         ));
     }
-    let masked = photos.iter().filter(|p| p.mask.is_some()).count();
-    if masked == 0 && !index.is_empty() {
-        warnings.push("none of the files in the masks folder belongs to a photo: no mask is used".to_string());
-    } else if masked == 0 && options.invert_masks {
-        warnings.push("--invert-masks has no effect: there is no mask".to_string());
-    } else if masked > 0 && masked < photos.len() {
-        let (without, total) = (photos.len() - masked, photos.len());
-        warnings.push(format!("{without} of {total} photos have no mask: all of their pixels are used"));
+    let masks = || photos.iter().filter_map(|photo| photo.mask.as_ref());
+    warnings.extend(index.warnings(masks(), photos.len(), options.invert_masks));
+    if masks().next().is_some_and(holds_zero_and_one) {
+        warnings.push("the first mask holds 0 and 1 only: in such masks 1 counts as white".to_string());
     }
     Ok(photos)
 }
@@ -366,8 +362,9 @@ fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> Inpu
     let header = read_header(&view.image_path)?;
     let size = (header.width, header.height);
     check_shape(view, size)?;
-    let mask_path = view.mask_path.as_deref().filter(|_| options.masks).or_else(|| index.find(&view.name));
-    let mask = mask_path.map(|path| check_mask(path, size, options.invert_masks)).transpose()?;
+    let named = view.mask_path.as_deref().filter(|_| options.masks).map(|path| (path, Pattern::Named));
+    let mask = named.or_else(|| index.find(&view.name));
+    let mask = mask.map(|(path, pattern)| check_mask(path, size, options.invert_masks, pattern)).transpose()?;
     let stated = Intrinsics { lens: view.intrinsics.lens.simplified(), ..view.intrinsics };
     Ok(PhotoSource {
         image_path: view.image_path.clone(),
@@ -379,7 +376,7 @@ fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> Inpu
     })
 }
 
-fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource> {
+fn check_mask(path: &Path, photo: Size, invert: bool, pattern: Pattern) -> InputResult<MaskSource> {
     let header: PhotoHeader = read_header(path)?;
     if !same_shape((header.width, header.height), photo) {
         let problem = format!(
@@ -388,7 +385,7 @@ fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource>
         );
         return Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"));
     }
-    Ok(MaskSource { path: path.to_path_buf(), header, invert })
+    Ok(MaskSource { path: path.to_path_buf(), header, invert: invert != pattern.is_inverted(), pattern })
 }
 
 /// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the

@@ -161,8 +161,9 @@ fn undistort<const C: usize>(picture: &[u8], k: Intrinsics, target: Size, mut ta
 /// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = exclude.
 fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
     let mut keep = read_luma(&mask.path, &mask.header)?;
+    let whitest = if keep.iter().all(|value| *value <= 1) { 1 } else { 128 };
     for value in &mut keep {
-        let white = *value >= 128;
+        let white = *value >= whitest;
         *value = if white != mask.invert { 255 } else { 0 };
     }
     let size = (mask.header.width, mask.header.height);
@@ -171,6 +172,12 @@ fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> Inpu
         _ => undistort::<1>(&keep, intrinsics_at(intrinsics, size), target, |_| {}),
     };
     Ok(thresholded(share))
+}
+
+/// Whether a mask holds 0 and 1 instead of black and white; `false` where it cannot be decoded.
+pub fn holds_zero_and_one(mask: &MaskSource) -> bool {
+    read_luma(&mask.path, &mask.header)
+        .is_ok_and(|values| values.contains(&1) && values.iter().all(|value| *value <= 1))
 }
 
 /// Converts coverage of 0 to 255 to 0 or 255; half or more is kept.

@@ -96,7 +96,7 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
     let fixed =
         ["--threads", "2", "--steps", "4", "--device", "cpu", "--image-cache", "1MiB", "--max-gaussians", "2000"];
     let plain = [&fixed[..], &["--eval-every", "2", "--color-correct", "quadratic"]].concat();
-    let all = ["--robust-pixels", "--robust-views", "--refine-poses", "--appearance", "full", "--export", "sog"];
+    let all = ["--robust-pixels", "--robust-views", "--refine-poses", "--appearance", "full"];
     let all = [&plain[..], &all].concat();
     let run = folder.path().join("all");
     check(folder.path(), &scene, "all", &all);

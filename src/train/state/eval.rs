@@ -48,10 +48,10 @@ pub struct EvalRequest<'a> {
 }
 
 /// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
-/// metrics and do not count in the means. `None` if no view has metrics.
+/// metrics and do not count in the means, nor do views whose photo cannot be decoded, which are named in a warning. `None` if no view has metrics.
 ///
 /// # Errors
-/// A photo cannot be decoded, pages could not be pinned, the renderer failed, or a picture cannot be written.
+/// Pages could not be pinned, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
     (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
     renderer: &mut dyn Renderer,
@@ -66,7 +66,15 @@ pub fn evaluate(
     let (mut corrected, mut halves, mut figures) = (Vec::new(), Vec::new(), Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
-        let target = targets.get(view)?;
+        let target = match targets.get(view) {
+            Ok(target) => target,
+            // A damaged photo costs its own figures and no other's.
+            Err(error) => {
+                crate::tell!("warning: the held-out photo {} is not measured: {error}", dataset.views[view].name);
+                (request.progress)(i as u32 + 1);
+                continue;
+            }
+        };
         let camera = &dataset.views[view].camera;
         draw((&mut *scene, now, &mut *working), renderer, camera, options)?;
         let image = renderer.image()?;
@@ -100,6 +108,10 @@ pub fn evaluate(
         write_whole(&folder.join(name), serde_json::Value::from(figures).to_string().as_bytes())?;
     }
     if psnrs.is_empty() {
+        let count = request.views.len();
+        crate::tell!(
+            "warning: nothing is measured: none of the {count} held-out photos can be read and has a pixel outside its mask"
+        );
         return Ok(None);
     }
     let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
