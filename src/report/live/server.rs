@@ -46,7 +46,7 @@ const HEAD_BYTES: usize = 16 << 10;
 /// Most bytes of metrics in one answer.
 const METRICS_BYTES: u64 = 1 << 20;
 /// Most answers of metrics in memory. Other requests wait.
-const METRICS_MOST: usize = 4;
+const METRICS_MOST: usize = 8;
 /// Most pictures that are asked for, or in memory, at once. They are drawn one by one, so others wait as well without.
 const PICTURES_MOST: usize = 4;
 /// Header of an answer of metrics: the length of their file when it was read.
@@ -245,7 +245,7 @@ mod tests {
             let _ = stream.write_all(one.repeat(64).as_bytes());
             stream
         };
-        let unread: Vec<TcpStream> = (0..2 * CONNECTIONS_MOST).map(|_| asked("/metrics")).collect();
+        let unread: Vec<TcpStream> = (0..CONNECTIONS_MOST).map(|_| asked("/metrics")).collect();
         let mut answer = String::new();
         request(&live, "/status").read_to_string(&mut answer).unwrap();
         assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
