@@ -5,7 +5,7 @@
 //! `--disk-full-wait` the run stops. A run in memory waits as well, because it would lose all steps since its last commit if
 //! it ended; but its steps need no drive, so after the wait it goes on without commits where there is room for its results.
 //!
-//! Not here: the results after the last step ([`super::results_wait`]).
+//! Not here: the results after the last step (`results_wait`).
 //!
 //! Invariants: 1. waiting does not change the run; 2. the last commit always stays intact.
 
