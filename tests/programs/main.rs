@@ -18,6 +18,7 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod foreign_files;
 mod gpu_bytes;
 mod gpu_ends;
 mod gpu_events;

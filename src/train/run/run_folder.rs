@@ -163,12 +163,8 @@ pub(super) fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
-    let exported = export_beside(request, dataset, &mut trainer, &ply, &written);
-    if exported.is_err() {
-        crate::tell!(
-            "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
-        );
-    }
+    let exported = export_all(request, dataset, &mut trainer, &ply, &written);
+    let mut facts = exported.as_ref().map_or(Vec::new(), Clone::clone).into_iter();
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = stop.exit_code();
     let tested = looped.and_then(|()| match asked {
@@ -185,7 +181,8 @@ pub(super) fn train_into(
         // A run without its evaluation or its export is not finished: a resume makes them.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && exported.is_ok() && asked.is_none(),
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
-        export: exported.as_ref().ok().cloned().flatten(),
+        export: facts.next(),
+        more_exports: facts.collect(),
         costs,
         commits: tiers.checkpoint.as_ref().map(Checkpoint::report),
         ..summary_of(request, &trainer)
@@ -212,18 +209,35 @@ fn save_result(dataset: &Dataset, trainer: &mut Trainer, ply: &Path) -> Result<W
     Ok(written)
 }
 
-/// Writes the Gaussians of the PLY also in the format that was asked for, with their transform. `None` if only the PLY was.
-fn export_beside(
+/// Writes the Gaussians of the PLY also in the other formats that were asked for.
+fn export_all(
     request: &RunRequest,
     dataset: &Dataset,
     trainer: &mut Trainer,
     ply: &Path,
     written: &Written,
-) -> Result<Option<ExportFacts>, TrainError> {
-    let format = request.config.export;
-    let Some(other) = format.beside(ply) else { return Ok(None) };
-    let exported = trainer.export(dataset, &other, format)?;
-    format.write_transform(&other, &trainer.scene_meta(dataset), exported.frame)?;
+) -> Result<Vec<ExportFacts>, TrainError> {
+    let formats = request.config.export.formats().filter_map(|format| Some((format, format.beside(ply)?)));
+    let exported = formats.map(|(format, file)| export_beside(request, dataset, trainer, (format, &file), written));
+    let exported: Result<_, _> = exported.collect();
+    if exported.is_err() {
+        crate::tell!(
+            "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
+        );
+    }
+    exported
+}
+
+/// Writes the Gaussians of the PLY also in another format, with their transform.
+fn export_beside(
+    request: &RunRequest,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    (format, other): (ExportFormat, &Path),
+    written: &Written,
+) -> Result<ExportFacts, TrainError> {
+    let exported = trainer.export(dataset, other, format)?;
+    format.write_transform(other, &trainer.scene_meta(dataset), exported.frame)?;
     let left_out = written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
         crate::tell!(
@@ -234,14 +248,14 @@ fn export_beside(
     if let (Some(levels), false) = (exported.levels, request.quiet) {
         crate::tell!("{}: {levels}", other.display());
     }
-    Ok(Some(ExportFacts {
-        file: other.strip_prefix(&request.out).unwrap_or(&other).to_path_buf(),
+    Ok(ExportFacts {
+        file: other.strip_prefix(&request.out).unwrap_or(other).to_path_buf(),
         bytes: exported.bytes,
         gaussians: exported.rows,
         left_out,
         levels: exported.levels.map(|levels| levels.rows),
         always_shown: exported.levels.map_or(0, |levels| levels.always_shown),
-    }))
+    })
 }
 
 /// Evaluates the result, with pictures, and logs the evaluation.
@@ -315,6 +329,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
         export: None,
+        more_exports: Vec::new(),
         tiers: trainer.tier_traffic(),
         commits: None,
     }
