@@ -9,10 +9,11 @@ mod output;
 use clap::Parser;
 use device::{DeviceModel, DeviceRow};
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::text::read_text;
 use gsscale::base::units::format_bytes;
 use gsscale::config::choice::Chosen;
 use gsscale::config::command_line::parse_command_line;
-use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides};
 use gsscale::config::values::ByteSize;
 use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
@@ -322,7 +323,7 @@ fn not_planned(error: TrainError) -> InputError {
 }
 
 fn scene_of_run(config: &Path) -> InputResult<PathBuf> {
-    let text = std::fs::read_to_string(config).map_err(|e| InputError::io(config, "reading", &e))?;
+    let text = read_text(config, FILE_BYTES_MAX, "give the scene's folder instead")?;
     let scene =
         text.parse::<toml::Table>().ok().and_then(|t| t.get("resolved")?.get("scene")?.as_str().map(PathBuf::from));
     scene.ok_or_else(|| InputError::new(config, "it does not name its scene", "give the scene's folder instead"))

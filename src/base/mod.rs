@@ -16,6 +16,7 @@ pub mod rng;
 pub mod room;
 pub mod say;
 pub mod simd;
+pub mod text;
 pub mod trace;
 pub mod units;
 pub mod whole_file;

@@ -11,7 +11,7 @@ use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
-use crate::exchange::format::ExportFormat;
+use crate::exchange::format::Exports;
 use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
@@ -79,7 +79,7 @@ pub enum LogFormat {
 
 /// Every key whose value is a word, with the words that a user may write.
 pub fn choices() -> impl Iterator<Item = (&'static str, &'static [&'static str])> {
-    CHOICES.iter().chain(OPEN_CHOICES).copied()
+    CHOICES.iter().chain(OPEN_CHOICES).chain(&[(Exports::KEY, Exports::WORDS)]).copied()
 }
 
 /// Implements [`Choice`], reading and writing for enums whose values have one word each, and lists them. Values after
@@ -151,9 +151,34 @@ choices! {
     "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
-    "export": ExportFormat { Ply = "ply", Spz = "spz", Sog = "sog" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
 }
+
+/// A list of words: `spz,sog`.
+impl Choice for Exports {
+    const KEY: &'static str = "export";
+    const WORDS: &'static [&'static str] = &["ply", "spz", "sog"];
+
+    fn from_word(word: &str) -> Option<Exports> {
+        word.split(',').map(str::trim).try_fold(Exports::default(), |exports, format| match format {
+            "ply" => Some(exports),
+            "spz" => Some(Exports { spz: true, ..exports }),
+            "sog" => Some(Exports { sog: true, ..exports }),
+            _ => None,
+        })
+    }
+
+    fn word(&self) -> Cow<'static, str> {
+        Cow::Borrowed(match (self.spz, self.sog) {
+            (false, false) => "ply",
+            (true, false) => "spz",
+            (false, true) => "sog",
+            (true, true) => "spz,sog",
+        })
+    }
+}
+
+reading_and_writing!(Exports);
 
 /// Implements [`Choice`] for optional choices, with their word for `None`, and lists them.
 macro_rules! open_choices {
@@ -227,7 +252,18 @@ where
 }
 
 fn deserialize_choice<'de, T: Choice, D: Deserializer<'de>>(d: D) -> Result<T, D::Error> {
-    parse_choice(&String::deserialize(d)?).map_err(serde::de::Error::custom)
+    /// A word, or a list of words as TOML writes it.
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "expected a word")]
+    enum Words {
+        One(String),
+        List(Vec<String>),
+    }
+    let word = match Words::deserialize(d)? {
+        Words::One(word) => word,
+        Words::List(words) => words.join(","),
+    };
+    parse_choice(&word).map_err(serde::de::Error::custom)
 }
 
 /// Parses a flag whose value is a choice: help lists the words.
@@ -326,6 +362,11 @@ mod tests {
     fn every_word_is_written_as_it_is_read() {
         check_choices();
         check_open_choices();
+        check::<Exports>();
+        for list in ["\"sog, spz\"", "[\"spz\", \"sog\", \"ply\"]"] {
+            let config = TrainConfig::parse(&format!("export = {list}")).unwrap();
+            assert_eq!((config.export.word().as_ref(), config.export), ("spz,sog", Exports { spz: true, sog: true }));
+        }
         let problem = parse_choice::<Transfers>("x").unwrap_err();
         assert_eq!(problem, "unknown --transfers 'x': use overlap, ahead or demand");
         // An engine that only tests and dry runs open.

@@ -14,12 +14,13 @@ use super::values::{ByteSize, Rgb, Up};
 use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
+use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::checkpoint::interval::CommitEvery;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
-use crate::exchange::format::ExportFormat;
+use crate::exchange::format::Exports;
 use crate::exchange::meta::ExportFrame;
 use crate::gpu::DeviceChoice;
 use crate::optim::method::{Method, OptimizerPlace};
@@ -34,15 +35,13 @@ use crate::render::metrics::SsimVariant;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::fs::File;
-use std::io::Read;
 use std::path::Path;
 
 /// Tables of a config file that hold facts instead of settings.
 pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
 
 /// Longest config file, bytes; a file with every key has some 8 KB.
-const FILE_BYTES_MAX: u64 = 1 << 20;
+pub const FILE_BYTES_MAX: u64 = 1 << 20;
 macro_rules! config_keys {
     ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident $(before $before:literal)*; )+ })+) => {
         /// All keys of a run with their values.
@@ -246,8 +245,8 @@ config_keys! {
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
         /// Files of the result. A PLY is always written; spz adds a file of about a tenth of its bytes, sog a folder with levels of
-        /// detail, which web viewers load in parts. Values: ply, spz or sog
-        export: ExportFormat = ExportFormat::Ply => Free;
+        /// detail, which web viewers load in parts. Values: ply, spz, sog or several: spz,sog
+        export: Exports = Exports { spz: false, sog: false } => Free;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the exported files: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction
@@ -317,11 +316,11 @@ impl TrainConfig {
     /// # Errors
     /// As [`TrainConfig::read`].
     pub fn read_with_keys(path: &Path) -> InputResult<(TrainConfig, BTreeSet<String>)> {
-        let mut text = String::new();
-        let read = File::open(path).and_then(|file| file.take(FILE_BYTES_MAX + 1).read_to_string(&mut text));
-        read.map_err(|e| InputError::io(path, "reading the config", &e))?;
-        if text.len() as u64 > FILE_BYTES_MAX {
-            return Err(InputError::new(path, "the file is too large for a config", "give a TOML file of keys"));
+        let text = read_text(path, FILE_BYTES_MAX, "give a TOML file of keys")?;
+        let of_code_page = |(_, line): &(usize, &str)| has_raw_bytes(line.split('#').next().unwrap_or(""));
+        if let Some((at, line)) = text.lines().enumerate().find(of_code_page) {
+            let problem = format!("the text is not UTF-8: {}", shown(line.trim()));
+            return Err(InputError::new(path, problem, "save the file as UTF-8").at(format!("line {}", at + 1)));
         }
         TrainConfig::parse_with_keys(&text)
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))

@@ -7,10 +7,11 @@
 //! The values are GS-Scale's: from the dictionary `configs` at the end of its trainers, from its paper (arXiv
 //! 2509.15645) and from the behaviour of its code; comments in each file name the pitfalls.
 
-use super::file::{KEYS, TABLES, TrainConfig};
+use super::file::{FILE_BYTES_MAX, KEYS, TABLES, TrainConfig};
 use super::key::Key;
 use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::read_text;
 use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -140,8 +141,8 @@ impl PublishedRun {
             return PublishedRun::parse(name, text, name_or_file);
         }
         let names = BUILT_IN.map(|(name, _)| name).join(", ");
-        let text = std::fs::read_to_string(name_or_file).map_err(|e| {
-            let problem = format!("neither a published run nor a readable file: {e}");
+        let text = read_text(name_or_file, FILE_BYTES_MAX, "").map_err(|e| {
+            let problem = format!("neither a published run nor a readable file: {}", e.problem);
             InputError::new(name_or_file, problem, format!("name one of {names}, or a config file with [published]"))
         })?;
         let stem = name_or_file.file_stem().unwrap_or_default().to_string_lossy();

@@ -98,7 +98,7 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     }
 }
 
-/// Most segments and fill bytes before the pixels of a JPEG: each costs a read, and a photo with a large colour profile
+/// Most segments, fill bytes and pairs of stray bytes before the pixels of a JPEG: each costs a read, and a photo with a large colour profile
 /// and previews has some hundred.
 const MOST_SEGMENTS: u32 = 10_000;
 
@@ -213,7 +213,10 @@ impl HeaderReader<'_> {
                     }
                     at += 2 + length;
                 }
-                _ => return Err(self.damaged(at, "a JPEG marker is expected here")),
+                [0xff, _] => return Err(self.damaged(at, "a JPEG marker is expected here")),
+                // Stray bytes before a marker, which decoders skip.
+                [_, 0xff] => at += 1,
+                _ => at += 2,
             }
         }
         let Some(frame) = frame else {

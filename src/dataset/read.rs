@@ -1,11 +1,10 @@
 //! Chooses the reader for a path.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::head_of;
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::{colmap, mega_nerf, opensfm, photos_only, reality_capture, transforms};
-use std::fs::File;
-use std::io::Read;
+use crate::dataset::{colmap, mega_nerf, opensfm, photos_only, raw_names, reality_capture, transforms};
 use std::path::Path;
 
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
@@ -17,12 +16,17 @@ use std::path::Path;
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
-    Ok(RawScene { root: root.to_path_buf(), ..read_kind(path, facts.is_file(), options)? })
+    let mut scene = read_kind(path, facts.is_file(), options)?;
+    raw_names::make_readable(path, &mut scene)?;
+    Ok(RawScene { root: root.to_path_buf(), ..scene })
 }
 
 fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
     if is_file {
         let ends_with = |ending: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending));
+        if let Some(error) = file_of_results(path) {
+            return Err(error);
+        }
         return match () {
             () if ends_with("json") && is_a_list(path) => opensfm::read_opensfm(path, options),
             () if ends_with("json") => transforms::read_transforms(path, options),
@@ -60,6 +64,9 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     {
         return Err(InputError::io(path, "reading the scene", &e));
     }
+    if let Some(error) = folder_of_results(path) {
+        return Err(error);
+    }
     if let Some(error) = photos_only::error(path) {
         return Err(error);
     }
@@ -75,9 +82,44 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     ))
 }
 
+/// The error for Gaussians or points in the place of a scene.
+fn file_of_results(path: &Path) -> Option<InputError> {
+    let name = path.file_name()?.to_str()?.to_ascii_lowercase();
+    let is_tree = name == "lod-meta.json";
+    let is_rows = ["ply", "splat", "ksplat", "spz", "sog"].iter().any(|ending| name.ends_with(&format!(".{ending}")));
+    if !is_tree && !is_rows {
+        return None;
+    }
+    let file = path.display();
+    let remedy = match name.ends_with(".ply") {
+        true => {
+            format!("to measure it: gsscale-eval {file} SCENE; to start from it: gsscale-train SCENE --init-ply {file}")
+        }
+        false if is_tree => format!("to measure it: gsscale-eval {file} SCENE"),
+        false => {
+            "name the folder with photos and poses; to start from this file, convert it to a PLY for --init-ply, for \
+                  example with splat-transform"
+                .to_string()
+        }
+    };
+    Some(InputError::new(path, "a result, not a scene with photos and poses", remedy))
+}
+
+/// The error for the output folder of a run in the place of a scene.
+fn folder_of_results(path: &Path) -> Option<InputError> {
+    let has = |name: &str| path.join(name).is_file();
+    if !has("config.toml") || !["metrics.jsonl", "summary.json", "point_cloud.ply"].into_iter().any(has) {
+        return None;
+    }
+    let folder = path.display();
+    let remedy = format!(
+        "to continue the run: gsscale-train --resume {folder}; to measure its result: gsscale-eval {folder}; its config.toml names \
+         the scene that it trained on"
+    );
+    Some(InputError::new(path, "the output folder of a run, not a scene", remedy))
+}
+
 /// Whether a JSON file holds a list, as OpenSfM's does, and not an object.
 fn is_a_list(path: &Path) -> bool {
-    let mut head = Vec::new();
-    let read = File::open(path).and_then(|file| file.take(4096).read_to_end(&mut head));
-    read.is_ok() && head.iter().find(|byte| !byte.is_ascii_whitespace()) == Some(&b'[')
+    head_of(path, 4096).trim_start().starts_with('[')
 }

@@ -8,18 +8,21 @@
 //! the focal length for a picture of 36 mm, `px, py` the principal point from the centre in units of the longer side.
 //! `k1..k3` and `t1, t2` are OpenCV's k1..k3 and p1, p2; `k4`, of the eighth power, has no counterpart and is refused.
 //!
+//! Cells are separated by commas, semicolons or tabs, as the header says, and may be quoted. Numbers may have a decimal comma where
+//! commas do not separate. `z` stands for `alt`. A name may be a path on the computer of the export: its longest end that is a
+//! photo here counts.
+//!
 //! Invariants: 1. for any content of the file the result is a scene or an [`InputError`] that names file and line; 2. only a
 //! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
 
 use super::checks::{checked_intrinsics, sort_views};
 use super::left_out::LeftOut;
 use super::model::{Lens, RawScene, RawView, ReadOptions};
-use super::transforms::photos::{find_photo, read_size};
+use super::transforms::photos::{Photo, find_photo, read_size};
 use super::transforms::pose::make_pose;
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::{head_of, read_text};
 use glam::{DMat3, DVec3};
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// Largest file read, bytes; a photo takes about 300.
@@ -28,6 +31,8 @@ const MAX_BYTES: u64 = 128 << 20;
 const HEAD_BYTES: u64 = 4096;
 /// Columns that a line must have; the others are 0 where they are missing.
 const REQUIRED: [&str; 8] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f"];
+/// Characters that may separate cells.
+const SEPARATORS: [char; 3] = [',', ';', '\t'];
 /// The film to which `f` refers, millimetres.
 const FILM: f64 = 36.0;
 const EXPORT: &str = "export it again: Registration, 'Internal/External camera parameters'";
@@ -45,7 +50,7 @@ pub fn looks_like_reality_capture(folder: &Path) -> bool {
 pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let file = if path.is_file() { path.to_path_buf() } else { only_file(path)? };
     let folder = file.parent().unwrap_or(Path::new(""));
-    let text = read_text(&file)?;
+    let text = read_text(&file, MAX_BYTES, EXPORT)?;
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
     let header = lines.find_map(|(_, line)| Header::of(line));
     let header = header.ok_or_else(|| InputError::new(&file, "no line of column names '#name,x,y,alt,...'", EXPORT))?;
@@ -54,7 +59,8 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
     }
     let (mut scene, mut left_out) = (RawScene::default(), LeftOut::default());
     for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
-        let line = Line { file: &file, number: number + 1, header: &header, cells: line.split(',').collect() };
+        let line = Line { file: &file, number: number + 1, header: &header, cells: cells_of(line, header.separator) };
+        line.check_count()?;
         line.add_view(folder, options, &mut scene.views, &mut left_out)?;
     }
     left_out.report(&file, options, scene.views.len(), &mut scene.warnings)?;
@@ -65,11 +71,7 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
 
 /// The CSV files of a folder that have the header of this format.
 fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let has_header = |path: &PathBuf| {
-        let mut head = Vec::new();
-        let read = File::open(path).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head));
-        read.is_ok() && String::from_utf8_lossy(&head).lines().any(|line| Header::of(line).is_some())
-    };
+    let has_header = |path: &PathBuf| head_of(path, HEAD_BYTES).lines().any(|line| Header::of(line).is_some());
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let is_csv = |path: &PathBuf| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("csv")) && path.is_file();
     let mut files: Vec<PathBuf> = entries.filter(is_csv).filter(has_header).collect();
@@ -91,28 +93,44 @@ fn only_file(folder: &Path) -> InputResult<PathBuf> {
     }
 }
 
-fn read_text(file: &Path) -> InputResult<String> {
-    let mut bytes = Vec::new();
-    let opened = File::open(file).map_err(|e| InputError::io(file, "opening", &e))?;
-    opened.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|e| InputError::io(file, "reading", &e))?;
-    if bytes.len() as u64 > MAX_BYTES {
-        return Err(InputError::new(file, format!("the file is larger than {} MiB", MAX_BYTES >> 20), EXPORT));
+/// The cells of a line, without the quotes around them.
+fn cells_of(line: &str, separator: char) -> Vec<String> {
+    let (mut cells, mut cell, mut is_quoted) = (Vec::new(), String::new(), false);
+    let mut chars = line.chars().peekable();
+    while let Some(c) = chars.next() {
+        match c {
+            '"' if is_quoted && chars.next_if_eq(&'"').is_some() => cell.push('"'),
+            '"' if is_quoted || cell.trim().is_empty() => is_quoted = !is_quoted,
+            c if c == separator && !is_quoted => cells.push(std::mem::take(&mut cell)),
+            c => cell.push(c),
+        }
     }
-    String::from_utf8(bytes).map_err(|_| InputError::new(file, "the file is not UTF-8 text", EXPORT))
+    cells.push(cell);
+    cells.iter().map(|cell| cell.trim().to_string()).collect()
 }
 
 /// The names of the columns.
 struct Header {
     names: Vec<String>,
+    separator: char,
 }
 
 impl Header {
-    /// The header in this line, if it is one: it begins with the name and the place.
+    /// The header in this line, if it is one: it begins with the name and has the place. With `z` instead of `alt` it must have
+    /// an angle too, since lists of ground control points begin in the same way.
     fn of(line: &str) -> Option<Header> {
-        let names = line.trim_start_matches('\u{feff}').split(',');
-        let names: Vec<String> = names.map(|name| name.trim().trim_start_matches('#').to_ascii_lowercase()).collect();
-        let has = |name: &str| names.iter().any(|other| other == name);
-        (names.first().is_some_and(|name| name == "name") && has("x") && has("alt")).then_some(Header { names })
+        SEPARATORS.into_iter().find_map(|separator| {
+            let names = cells_of(line, separator);
+            let names = names.iter().map(|name| name.trim_matches(['#', ' ']).to_ascii_lowercase());
+            let mut names: Vec<String> = names.collect();
+            let place = |name: &str| names.iter().position(|other| other == name);
+            if let (Some(z), None, Some(_)) = (place("z"), place("alt"), place("heading")) {
+                names[z] = "alt".to_string();
+            }
+            let has = |name: &str| names.iter().any(|other| other == name);
+            let is_header = names.first().is_some_and(|name| name == "name") && has("x") && has("alt");
+            is_header.then_some(Header { names, separator })
+        })
     }
 
     fn place(&self, name: &str) -> Option<usize> {
@@ -125,7 +143,7 @@ struct Line<'a> {
     file: &'a Path,
     number: usize,
     header: &'a Header,
-    cells: Vec<&'a str>,
+    cells: Vec<String>,
 }
 
 impl Line<'_> {
@@ -133,11 +151,30 @@ impl Line<'_> {
         InputError::new(self.file, problem, remedy).at(format!("line {}", self.number))
     }
 
+    /// Refuses a line whose cells are not those of the header: numbers would stand in wrong columns. An empty cell at the end is
+    /// none.
+    fn check_count(&self) -> InputResult<()> {
+        let count = |cells: &[String]| cells.len() - usize::from(cells.last().is_some_and(String::is_empty));
+        let (cells, names) = (count(&self.cells), count(&self.header.names));
+        if cells == names || self.cells.len() == self.header.names.len() {
+            return Ok(());
+        }
+        let (problem, remedy) = (format!("the line has {cells} cells, the header names {names} columns"), EXPORT);
+        let is_comma = self.header.separator == ',' && cells > names;
+        let remedy = if is_comma {
+            "if the numbers have a decimal comma, export them with a point, or with ';' between the cells"
+        } else {
+            remedy
+        };
+        Err(self.error(problem, remedy))
+    }
+
     /// The number in a column, 0 if the header has no such column.
     fn number(&self, name: &str) -> InputResult<f64> {
         let Some(place) = self.header.place(name) else { return Ok(0.0) };
-        let cell = self.cells.get(place).map_or("", |cell| cell.trim());
-        cell.parse().map_err(|_| self.error(format!("{cell:?} in column '{name}' is not a number"), EXPORT))
+        let cell = self.cells.get(place).map_or("", String::as_str);
+        let number = if cell.contains('.') { cell.to_string() } else { cell.replacen(',', ".", 1) };
+        number.parse().map_err(|_| self.error(format!("{cell:?} in column '{name}' is not a number"), EXPORT))
     }
 
     fn numbers<const N: usize>(&self, names: [&str; N]) -> InputResult<[f64; N]> {
@@ -155,9 +192,9 @@ impl Line<'_> {
         views: &mut Vec<RawView>,
         left_out: &mut LeftOut,
     ) -> InputResult<()> {
-        let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
+        let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", String::as_str);
         let stays = "names must stay in the folder of the photos: export with plain file names";
-        let photo = find_photo(folder, options.images.as_deref().or(Some("images")), stated)
+        let photo = photo_of(folder, options.images.as_deref().or(Some("images")), stated)
             .map_err(|problem| self.error(problem, stays))?;
         let [k1, k2, k3, k4, t1, t2] = self.numbers(["k1", "k2", "k3", "k4", "t1", "t2"])?;
         if k4 != 0.0 {
@@ -190,6 +227,18 @@ impl Line<'_> {
         }
         Ok(())
     }
+}
+
+/// The photo that a name means, or a path on another computer: the longest end of it that is a photo here, inside the folder of
+/// the photos.
+fn photo_of(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
+    let is_path = stated.starts_with(['/', '\\']) || stated.get(1..2) == Some(":");
+    let ends = stated.match_indices(['/', '\\']).map(|(at, _)| &stated[at + 1..]);
+    let is_inside = |end: &&str| !end.is_empty() && end.split(['/', '\\']).next() != images;
+    let mut ends: Vec<&str> = if is_path { ends.filter(is_inside).collect() } else { Vec::new() };
+    let Some(name) = ends.pop() else { return find_photo(folder, images, stated) };
+    let longer = ends.iter().filter_map(|end| find_photo(folder, images, end).ok()).find(|photo| photo.exists);
+    longer.map_or_else(|| find_photo(folder, images, name), Ok)
 }
 
 /// Camera to world with the camera's axes right-up-back, from heading, pitch and roll in degrees.

@@ -24,6 +24,26 @@ pub enum ExportFormat {
     Sog,
 }
 
+/// What a run writes for viewers: always a PLY, and these beside it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Exports {
+    /// An SPZ.
+    pub spz: bool,
+    /// A folder of SOGs.
+    pub sog: bool,
+}
+
+impl Exports {
+    /// The formats, the PLY first.
+    pub fn formats(self) -> impl Iterator<Item = ExportFormat> {
+        ExportFormat::ALL.into_iter().filter(move |format| match format {
+            ExportFormat::Ply => true,
+            ExportFormat::Spz => self.spz,
+            ExportFormat::Sog => self.sog,
+        })
+    }
+}
+
 impl ExportFormat {
     /// All formats.
     pub const ALL: [ExportFormat; 3] = [ExportFormat::Ply, ExportFormat::Spz, ExportFormat::Sog];

@@ -7,6 +7,7 @@
 //! turned so that viewers show it upright ([`SceneMeta::upright`]).
 
 use crate::scene::rotation::Rotation;
+use std::path::PathBuf;
 
 /// Beyond this many scene radii an offset is not written into f32 positions: one unit in the last place of such an
 /// offset is more than 6e-5 radii, which is pixels in a photo.
@@ -64,6 +65,10 @@ pub struct SceneMeta {
     pub scene_radius: f64,
     /// When reading: whether training used an opacity compensation ("mip", "antialiased") that this renderer lacks.
     pub antialiased: bool,
+    /// When reading: whether the file itself states frame and axes.
+    pub is_stated: bool,
+    /// When reading: the file beside it from which frame and axes are, because the file does not state them.
+    pub transform: Option<PathBuf>,
     /// When reading: number of rows dropped because a value was not finite.
     pub dropped: u64,
     /// When reading: number of infinite opacities (logits of 0 and 1), which are read as logits of 1e-6 and 1 - 1e-6.
@@ -80,6 +85,8 @@ impl Default for SceneMeta {
             upright: None,
             scene_radius: 1.0,
             antialiased: false,
+            is_stated: false,
+            transform: None,
             dropped: 0,
             opacities_clamped: 0,
         }

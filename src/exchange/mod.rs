@@ -1,5 +1,6 @@
 //! Exchange with other programs: scenes in and out as PLY, out as SPZ and SOG, the levels of a SOG in, scalars for TensorBoard.
 
+pub mod foreign;
 pub mod format;
 pub mod frames;
 pub mod meta;

@@ -1,19 +1,91 @@
 //! The transform file of an export: maps its coordinates to those of the dataset and back, for programs that do
-//! not read the comments of a PLY.
-//!
-//! Not here: reading it. gsscale reads the comments.
+//! not read the comments of a PLY, and for a PLY that lost them because an editor saved it.
 //!
 //! Invariant: the matrices are those that [`super::frames`] applies.
 
 use super::meta::{ExportFrame, SceneMeta};
 use crate::base::error::{InputError, InputResult};
-use crate::base::whole_file::write_whole;
+use crate::base::text::read_text;
+use crate::base::whole_file::{folder_of, write_whole};
 use crate::scene::rotation::Rotation;
+use serde::Deserialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 
 /// Ending of the file beside a file: in place of `.ply`, and after any other ending. In an exported folder, its whole name.
 pub const TRANSFORM_ENDING: &str = "transform.json";
+
+/// Largest deviation of the transform from a rotation and a scale, over the scale.
+const TOLERANCE: f64 = 1e-9;
+/// Longest file read, bytes; one has some 700.
+const BYTES_MAX: u64 = 1 << 16;
+const REMEDY: &str =
+    "copy the file again, export the Gaussians again, or remove it if they are in the dataset's coordinates";
+
+/// The content of a transform file.
+#[derive(Debug, Deserialize)]
+pub struct Transform {
+    /// Name of the file of Gaussians.
+    #[serde(default)]
+    file: Option<String>,
+    up_in_dataset: Option<[f64; 3]>,
+    file_to_dataset: [[f64; 4]; 4],
+}
+
+impl Transform {
+    /// Frame and axes of Gaussians with this transform, which was read from `path`.
+    ///
+    /// # Errors
+    /// It is not what this program writes.
+    pub fn meta(&self, path: &Path) -> InputResult<SceneMeta> {
+        let matrix = self.file_to_dataset;
+        let upright = self.up_in_dataset.and_then(Rotation::upright);
+        let squares = matrix[..3].iter().flat_map(|row| &row[..3]).map(|x| x * x).sum::<f64>();
+        let scale = libm::sqrt(squares / 3.0);
+        let back = upright.unwrap_or(Rotation::IDENTITY).inverse().matrix();
+        let off = |i: usize, j: usize| (matrix[i][j] - scale * back[i][j]).abs() / scale;
+        let is_known = (0..9).all(|k| off(k / 3, k % 3) <= TOLERANCE);
+        let origin = [0, 1, 2].map(|i| matrix[i][3]);
+        if !is_known || !origin.iter().all(|x| x.is_finite()) {
+            let problem = "is no scale, offset and turn to the direction that points up";
+            return Err(InputError::new(path, problem, REMEDY).at("file_to_dataset"));
+        }
+        Ok(SceneMeta { origin, scale, frame: ExportFrame::Local, upright, scene_radius: scale, ..SceneMeta::default() })
+    }
+}
+
+/// Frame and axes of a PLY that does not state them, from the transform file beside it; `None` without one. An editor may have
+/// saved the PLY under another name: then the transform of the only other PLY in the folder counts.
+///
+/// # Errors
+/// The file cannot be read, or is not what this program writes.
+pub fn meta_beside(ply: &Path) -> InputResult<Option<SceneMeta>> {
+    let own = transform_path(ply);
+    let found = if own.is_file() { Some((own.clone(), read(&own)?)) } else { only_one_beside(ply) };
+    let Some((path, transform)) = found else { return Ok(None) };
+    let meta = transform.meta(&path)?;
+    // In the dataset's frame nothing but the axes differs.
+    let frame = if meta.origin == [0.0; 3] && (meta.scale - 1.0).abs() < TOLERANCE {
+        SceneMeta { scale: 1.0, scene_radius: 1.0, frame: ExportFrame::Dataset, ..meta }
+    } else {
+        meta
+    };
+    Ok(Some(SceneMeta { transform: Some(path), ..frame }))
+}
+
+fn only_one_beside(ply: &Path) -> Option<(PathBuf, Transform)> {
+    let entries = std::fs::read_dir(folder_of(ply)).ok()?.flatten().map(|entry| entry.path());
+    let is_transform =
+        |path: &PathBuf| path.to_str().is_some_and(|name| name.ends_with(&format!(".{TRANSFORM_ENDING}")));
+    let of_ply = |t: &Transform| t.file.as_ref().is_some_and(|name| name.to_ascii_lowercase().ends_with(".ply"));
+    let mut found = entries.filter(is_transform).filter_map(|path| read(&path).ok().filter(of_ply).map(|t| (path, t)));
+    found.next().filter(|_| found.next().is_none())
+}
+
+fn read(path: &Path) -> InputResult<Transform> {
+    let text = read_text(path, BYTES_MAX, REMEDY)?;
+    serde_json::from_str(&text).map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), REMEDY))
+}
 
 /// The file beside the Gaussians in `file`, which is no folder.
 pub fn transform_path(file: &Path) -> PathBuf {

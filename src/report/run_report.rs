@@ -44,7 +44,12 @@ pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, 
     page.heading("Training");
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
-    add_export(&mut page, &summary["export"]);
+    let more = summary["more_exports"].as_array().map_or(&[][..], Vec::as_slice);
+    let texts: Vec<String> = [&summary["export"]].into_iter().chain(more).filter_map(export_text).collect();
+    if !texts.is_empty() {
+        page.heading("For viewers");
+        texts.iter().for_each(|text| page.paragraph(text));
+    }
     let tiers = tier_charts(&metrics);
     if !tiers.is_empty() {
         page.heading("Memory and disk");
@@ -274,9 +279,9 @@ fn add_growth(page: &mut Page, summary: &Value) {
     page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
 }
 
-/// What lies in the file for viewers.
-fn add_export(page: &mut Page, export: &Value) {
-    let (Some(file), Some(bytes)) = (export["file"].as_str(), export["bytes"].as_u64()) else { return };
+/// What lies in a file for viewers.
+fn export_text(export: &Value) -> Option<String> {
+    let (file, bytes) = (export["file"].as_str()?, export["bytes"].as_u64()?);
     let count = |value: &Value| format_grouped(value.as_u64().unwrap_or(0));
     let levels: Vec<String> = export["levels"].as_array().map_or(&[][..], Vec::as_slice).iter().map(count).collect();
     let mut text = format!("{file}: {}, ", format_bytes(bytes));
@@ -292,8 +297,7 @@ fn add_export(page: &mut Page, export: &Value) {
             text += &format!(" {} {what}", count(&export[name]));
         }
     }
-    page.heading("For viewers");
-    page.paragraph(&text);
+    Some(text)
 }
 
 fn add_page_map(page: &mut Page, path: &Path) {

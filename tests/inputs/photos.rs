@@ -278,6 +278,34 @@ fn every_pixel_format_becomes_rgb8() {
     assert_eq!(target.mask, None);
 }
 
+/// Fill bytes and stray bytes before a marker of a JPEG are skipped, as other decoders do; nothing else of the header is.
+#[test]
+fn stray_bytes_between_the_segments_of_a_jpeg_are_skipped() {
+    let (folder, mut raw) = noise_scene(3);
+    let path = folder.path().join("images/p00.jpg");
+    noise_photo(64, 48, 9).save(&path).unwrap();
+    raw.views[0].image_path = path.clone();
+    let whole = std::fs::read(&path).unwrap();
+    let want = decode(&load(&raw).views[0].photo).unwrap().rgb;
+    // The places of the first segments.
+    let mut places = vec![2];
+    while let [0xff, code, high, low, ..] = whole[*places.last().unwrap()..] {
+        if code == 0xda {
+            break;
+        }
+        places.push(places.last().unwrap() + 2 + usize::from(u16::from_be_bytes([high, low])));
+    }
+    assert!(places.len() > 4, "{places:?}");
+    for &place in &places {
+        for stray in [&[0][..], &[0; 7], b"garbage", &[0xff], &[0xff; 3], &[1, 0xff, 0xff], &[0; 3000]] {
+            std::fs::write(&path, [&whole[..place], stray, &whole[place..]].concat()).unwrap();
+            assert!(decode(&load(&raw).views[0].photo).unwrap().rgb == want, "{stray:?} at {place}");
+        }
+        std::fs::write(&path, [&whole[..place], &[0; 30_000], &whole[place..]].concat()).unwrap();
+        assert!(refusal(&raw, &LoadOptions::default()).problem.contains("header does not end"));
+    }
+}
+
 /// At the edge of a cut-out object, colours are those of its opaque part, whatever lies hidden under the transparent one.
 #[test]
 fn alpha_is_a_mask_at_any_size_and_under_a_lens() {

@@ -5,7 +5,7 @@ use gsscale::base::error::InputError;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::exchange::frames::to_local;
 use gsscale::exchange::meta::{ExportFrame, SceneMeta};
-use gsscale::exchange::ply::{PlyContent, parse_ply, read_ply, write_gaussians};
+use gsscale::exchange::ply::{PlyContent, parse_ply, read_ply, stream_points, write_gaussians};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rotation::Rotation;
 use std::path::Path;
@@ -77,7 +77,7 @@ fn the_local_frame_round_trips_bit_for_bit() {
         assert_eq!(report.bytes, std::fs::metadata(&path).unwrap().len());
         let (back, back_meta) = gaussians(read_ply(&path).unwrap());
         assert_eq!(back, columns);
-        let same = SceneMeta { scene_radius: back_meta.scale, ..meta(ExportFrame::Local) };
+        let same = SceneMeta { scene_radius: back_meta.scale, is_stated: true, ..meta(ExportFrame::Local) };
         assert_eq!(back_meta, same);
         let mut local = back;
         assert_eq!(to_local(&mut local, &back_meta, back_meta.origin, back_meta.scale), 0);
@@ -354,6 +354,25 @@ fn coloured_points_are_read() {
     assert_eq!(points(parse(&byte_colors).unwrap()), (vec![[500_000.125, -2.0, 300.0]], vec![[0, 128, 255]], 0));
     let fractions = ascii_points(&format!("{position},float red,float green,float blue"), &["1 2 3 0 0.5 1"]);
     assert_eq!(points(parse(&fractions).unwrap()).1, [[0, 128, 255]]);
+    // Floating-point colours of 0 to 255, and fractions of which one exceeds 1 a little; streamed as well.
+    for (kind, rows, want) in [
+        ("float", ["1 2 3 0 128 255", "1 2 3 1 1 0.25"], [[0, 128, 255], [1, 1, 0]]),
+        ("double", ["1 2 3 0 32896 65535", "1 2 3 257 257 0"], [[0, 128, 255], [1, 1, 0]]),
+        ("float", ["1 2 3 0 0.5 1.01", "1 2 3 1 1 0.25"], [[0, 128, 255], [255, 255, 64]]),
+    ] {
+        let bytes = ascii_points(&format!("{position},{kind} red,{kind} green,{kind} blue"), &rows);
+        assert_eq!(points(parse(&bytes).unwrap()).1, want, "{kind}");
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("a.ply");
+        std::fs::write(&file, &bytes).unwrap();
+        let mut streamed = Vec::new();
+        let mut take = |_, color| {
+            streamed.push(color);
+            Ok(())
+        };
+        stream_points(&file, &mut take).unwrap();
+        assert_eq!(streamed, want, "{kind}");
+    }
     let wide = ascii_points(&format!("{position},ushort red,ushort green,ushort blue"), &["1 2 3 0 32896 65535"]);
     assert_eq!(points(parse(&wide).unwrap()).1, [[0, 128, 255]]);
     assert_eq!(points(parse(&ascii_points(position, &["1 2 3"])).unwrap()).1, [[128; 3]]);

@@ -18,6 +18,7 @@ mod exports;
 mod extremes;
 mod first_hour;
 mod forecast;
+mod foreign_files;
 #[cfg(unix)]
 mod full_memory_run;
 mod gpu_bytes;

@@ -9,6 +9,7 @@
 
 use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::text_of;
 use crate::dataset::model::TakePoint;
 use crate::dataset::paths::MAX_NAME_BYTES;
 use std::fs::File;
@@ -114,7 +115,7 @@ impl Source {
         if bytes.pop() != Some(0) {
             return Err(self.error(at, format!("an image name that does not end within {limit} bytes")));
         }
-        String::from_utf8(bytes).map_err(|_| self.error(at, "an image name that is not UTF-8"))
+        Ok(text_of(&bytes))
     }
 
     /// Adds a warning if bytes follow the last record.

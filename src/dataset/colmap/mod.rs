@@ -17,6 +17,7 @@ use crate::dataset::checks::{self, MAX_COORDINATE, listed, sort_views};
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::paths::safe_join;
+use crate::dataset::raw_names;
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -195,7 +196,7 @@ fn make_views(
     let mut left_out = Vec::new();
     for image in images {
         let place = format!("{unit} {}", image.position);
-        let (name, image_path) = safe_join(image_folder, &image.name).map_err(|problem| {
+        let (name, joined) = safe_join(image_folder, &image.name).map_err(|problem| {
             InputError::new(file, problem, "image names must be relative to the image folder and stay inside it")
                 .at(&place)
         })?;
@@ -203,6 +204,7 @@ fn make_views(
             InputError::new(file, format!("camera {} is not in the cameras file", image.camera_id), DAMAGED)
                 .at(format!("{place}, image '{name}'"))
         })?;
+        let image_path = raw_names::find(image_folder, &name).unwrap_or(joined);
         match make_pose(image.quat, image.translation) {
             Some(pose) => views.push(RawView { name, image_path, intrinsics, pose, mask_path: None, split: None }),
             None => left_out.push(name),

@@ -8,6 +8,7 @@
 
 use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::{TextReader, shown};
 use crate::dataset::model::TakePoint;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -20,7 +21,7 @@ const LINE_BYTES: usize = 8192;
 /// A text file with the read position.
 struct Lines {
     path: PathBuf,
-    reader: BufReader<File>,
+    reader: BufReader<TextReader<File>>,
     line: u64,
     buffer: Vec<u8>,
     /// Whether the kept part of the last line is incomplete.
@@ -35,7 +36,7 @@ impl Lines {
         if !file.metadata().is_ok_and(|m| m.is_file()) {
             return Err(InputError::new(path, "not a regular file", DAMAGED));
         }
-        let reader = BufReader::with_capacity(1 << 18, file);
+        let reader = BufReader::with_capacity(1 << 18, TextReader::new(file));
         Ok(Lines { path: path.to_path_buf(), reader, line: 0, buffer: Vec::new(), cut: false, stated: None })
     }
 
@@ -69,14 +70,13 @@ impl Lines {
             }
             Err(_) => return Err(self.error("text that is not UTF-8")),
         };
-        Ok(valid.trim_start_matches('\u{feff}').trim())
+        Ok(valid.trim())
     }
 
     /// Moves to the next line that is neither empty nor a comment.
     fn next_record(&mut self) -> InputResult<bool> {
         while self.advance()? {
             let start = self.buffer.trim_ascii_start();
-            let start = start.strip_prefix("\u{feff}".as_bytes()).unwrap_or(start);
             match start.first() {
                 None => {}
                 Some(b'#') => self.stated = self.stated.or_else(|| stated_count(start)),
@@ -122,7 +122,7 @@ impl<'a> Words<'a> {
 
     fn number<T: FromStr>(&mut self, what: &str) -> InputResult<T> {
         let word = self.next(what)?;
-        word.parse().map_err(|_| self.lines.error(format!("{what} is {word:?}, which is not a valid number")))
+        word.parse().map_err(|_| self.lines.error(format!("{what} is {:?}, which is not a valid number", shown(word))))
     }
 
     fn numbers<const N: usize>(&mut self, what: &str) -> InputResult<[f64; N]> {

@@ -7,6 +7,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::loose_json::{LooseJson, Number};
 use crate::dataset::model::PointCloud;
 use serde::Deserialize;
 use serde::de::{Deserializer, Error, IgnoredAny, MapAccess, Visitor};
@@ -50,9 +51,9 @@ pub(super) struct Camera {
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct Shot {
     /// Axis times angle in radians, world to camera.
-    pub rotation: [f64; 3],
+    pub rotation: [Number; 3],
     /// World to camera.
-    pub translation: [f64; 3],
+    pub translation: [Number; 3],
     /// Name of its camera.
     pub camera: String,
 }
@@ -60,6 +61,7 @@ pub(super) struct Shot {
 /// Photos whose poses are in one frame.
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct Reconstruction {
+    #[serde(deserialize_with = "cameras")]
     pub cameras: BTreeMap<String, Camera>,
     #[serde(deserialize_with = "shots")]
     pub shots: Vec<(String, Shot)>,
@@ -67,7 +69,7 @@ pub(super) struct Reconstruction {
     pub points: Points,
 }
 
-/// Points, without those that are too far away for a coordinate.
+/// Points, without those that are not finite or too far away for a coordinate.
 #[derive(Debug, Default)]
 pub(super) struct Points {
     pub cloud: PointCloud,
@@ -82,11 +84,12 @@ pub(super) fn load(path: &Path) -> InputResult<Vec<Reconstruction>> {
         let problem = format!("the file is larger than {} GiB", MAX_BYTES >> 30);
         return Err(InputError::new(path, problem, "export a COLMAP model, or split the project"));
     }
-    serde_json::from_reader(BufReader::with_capacity(1 << 20, file)).map_err(|e| {
+    serde_json::from_reader(BufReader::with_capacity(1 << 18, LooseJson::new(file))).map_err(|e| {
         if let Some(kind) = e.io_error_kind() {
             return InputError::io(path, "reading", &kind.into());
         }
-        let remedy = "it must be a reconstruction.json of OpenSfM or OpenDroneMap: copy it again";
+        let remedy =
+            "it must be a reconstruction.json of OpenSfM or OpenDroneMap: correct this place, or copy the file again";
         InputError::new(path, format!("cannot be read: {e}"), remedy).at(format!(
             "line {} column {}",
             e.line(),
@@ -117,6 +120,13 @@ impl<'de, V: Deserialize<'de>, F: FnMut(String, V)> Visitor<'de> for Entries<V, 
     }
 }
 
+fn cameras<'de, D: Deserializer<'de>>(source: D) -> Result<BTreeMap<String, Camera>, D::Error> {
+    let mut cameras = BTreeMap::new();
+    let take = |name, camera| _ = cameras.insert(name, camera);
+    source.deserialize_map(Entries { what: "camera", take, values: std::marker::PhantomData })?;
+    Ok(cameras)
+}
+
 fn shots<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<(String, Shot)>, D::Error> {
     let mut shots = Vec::new();
     let take = |name, shot| shots.push((name, shot));
@@ -127,20 +137,21 @@ fn shots<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<(String, Shot)>, D:
 fn points<'de, D: Deserializer<'de>>(source: D) -> Result<Points, D::Error> {
     #[derive(Deserialize)]
     struct Point {
-        coordinates: [f64; 3],
-        color: Option<[f64; 3]>,
+        coordinates: [Number; 3],
+        color: Option<[Number; 3]>,
         #[serde(rename = "observations")]
         _observations: Option<IgnoredAny>,
     }
     let mut points = Points::default();
     let take = |_, point: Point| {
-        if point.coordinates.iter().any(|x| x.abs() > MAX_COORDINATE) {
+        let position = point.coordinates.map(|x| x.0);
+        if !position.iter().all(|x| x.abs() <= MAX_COORDINATE) {
             points.dropped += 1;
             return;
         }
-        points.cloud.positions.push(point.coordinates);
+        points.cloud.positions.push(position);
         // Without a colour: grey.
-        points.cloud.colors.push(point.color.unwrap_or([128.0; 3]).map(|c| c.round() as u8));
+        points.cloud.colors.push(point.color.map_or([128; 3], |color| color.map(|c| c.0.round() as u8)));
     };
     source.deserialize_map(Entries { what: "point", take, values: std::marker::PhantomData })?;
     Ok(points)

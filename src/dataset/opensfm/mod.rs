@@ -88,7 +88,9 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
     sort_views(&file, &mut scene.views)?;
     if reconstruction.points.dropped > 0 {
         let dropped = reconstruction.points.dropped;
-        scene.warnings.push(format!("{}: {dropped} points are farther away than 1e15, dropped", file.display()));
+        scene
+            .warnings
+            .push(format!("{}: {dropped} points are not finite or farther away than 1e15, dropped", file.display()));
     }
     scene.points = reconstruction.points.cloud;
     Ok(scene)
@@ -143,10 +145,11 @@ fn intrinsics_of(camera: &Camera, size: (u64, u64)) -> Result<Intrinsics, (Strin
 
 /// The pose of a shot; `None` if it is impossible.
 fn pose_of(shot: &Shot) -> Option<Pose> {
-    let (axis, translation) = (DVec3::from_array(shot.rotation), DVec3::from_array(shot.translation));
-    if [axis, translation].iter().any(|v| v.abs().max_element() > MAX_COORDINATE) {
+    let [axis, translation] = [shot.rotation, shot.translation].map(|v| v.map(|x| x.0));
+    if !axis.iter().chain(&translation).all(|x| x.abs() <= MAX_COORDINATE) {
         return None;
     }
+    let (axis, translation) = (DVec3::from_array(axis), DVec3::from_array(translation));
     Some(Pose { rotation: rotation_of(axis), translation })
 }
 

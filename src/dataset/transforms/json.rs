@@ -9,6 +9,7 @@
 //! take a value per character.
 
 use crate::base::error::{InputError, InputResult};
+use crate::dataset::loose_json::{LooseJson, is_no_number};
 use crate::dataset::paths::clean_name;
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
@@ -76,8 +77,9 @@ pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
     let length = file.metadata().map_err(|e| InputError::io(path, "reading", &e))?.len();
     // Reserves room for the whole file and the check for its end, so that reading never reallocates.
     let mut bytes = Vec::with_capacity(length.min(MAX_BYTES) as usize + 64);
-    file.take(MAX_BYTES + 1).read_to_end(&mut bytes).map_err(|e| InputError::io(path, "reading", &e))?;
-    if bytes.len() as u64 > MAX_BYTES {
+    let mut limited = file.take(MAX_BYTES + 1);
+    LooseJson::new(&mut limited).read_to_end(&mut bytes).map_err(|e| InputError::io(path, "reading", &e))?;
+    if limited.limit() == 0 {
         let problem = format!("the file is larger than {} MiB", MAX_BYTES >> 20);
         return Err(InputError::new(path, problem, "split the scene into several, or use a COLMAP model"));
     }
@@ -96,7 +98,7 @@ pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
 }
 
 fn invalid(path: &Path, e: &serde_json::Error) -> InputError {
-    InputError::new(path, format!("not valid JSON: {e}"), "write the file again; NaN and Infinity are not JSON")
+    InputError::new(path, format!("not valid JSON: {e}"), "correct the file at this place, or write it again")
         .at(format!("line {} column {}", e.line(), e.column()))
 }
 
@@ -295,7 +297,10 @@ impl<'a> Node<'a> {
             None => Ok(None),
             Some(value) => match get(value) {
                 Some(found) => Ok(Some(found)),
-                None => Err(self.error(key, format!("not {kind}"), FIX_KEY)),
+                None => match value.as_str().filter(|word| is_no_number(word)) {
+                    Some(word) => Err(self.error(key, format!("{word} is not {kind}"), FIX_KEY)),
+                    None => Err(self.error(key, format!("not {kind}"), FIX_KEY)),
+                },
             },
         }
     }

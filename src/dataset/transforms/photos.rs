@@ -3,6 +3,7 @@
 use crate::base::error::InputResult;
 use crate::dataset::paths::clean_name;
 use crate::dataset::photo_header::read_header;
+use crate::dataset::raw_names;
 use std::path::{Path, PathBuf};
 
 /// Endings appended to the name in turn: Blender's exporter omits `.png`.
@@ -42,6 +43,10 @@ pub(in crate::dataset) fn find_photo(folder: &Path, images: Option<&str>, stated
                 return Ok(Photo { name: name + ending, path, exists: true });
             }
         }
+    }
+    let folders = [Some(folder.to_path_buf()), images.map(|images| folder.join(images))];
+    if let Some(path) = folders.iter().flatten().find_map(|folder| raw_names::find(folder, &name)) {
+        return Ok(Photo { name, path, exists: true });
     }
     let ending = if Path::new(&name).extension().is_some() { "" } else { ".png" };
     let path = with_ending(&places[0], ending);

@@ -3,6 +3,7 @@
 use super::json::{FIX_KEY, Node};
 use crate::base::error::InputResult;
 use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::loose_json::is_no_number;
 use crate::dataset::model::Pose;
 use glam::{DMat3, DVec3};
 use serde_json::Value;
@@ -14,7 +15,7 @@ const TOLERANCE: f64 = 1e-2;
 const MIN_SCALE: f64 = 1e-9;
 
 /// Reads the matrix of `transform_matrix`, or MatrixCity's `rot_mat`: 3 or 4 rows of 4 numbers, row-major; `null`,
-/// which some writers use for NaN, becomes NaN.
+/// which some writers use for NaN, becomes NaN, and so does a word such as Infinity.
 pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
     let key = if frame.get("transform_matrix").is_none() && frame.get("rot_mat").is_some() {
         "rot_mat"
@@ -32,6 +33,7 @@ pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
         for (to, value) in to.iter_mut().zip(row) {
             *to = match value {
                 Value::Null => f64::NAN,
+                Value::String(word) if is_no_number(word) => f64::NAN,
                 value => value.as_f64().ok_or_else(wrong)?,
             };
         }

@@ -11,8 +11,10 @@ use super::PlyContent;
 use super::header::{Element, Header, Kind, Scalar, parse_header, shorten};
 use super::rows::{Body, read_rows};
 use crate::base::error::{InputError, InputResult};
+use crate::exchange::foreign::foreign;
 use crate::exchange::frames::unit_quat;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::transform::meta_beside;
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::rotation::Rotation;
 use std::collections::TryReserveError;
@@ -23,7 +25,23 @@ use std::path::Path;
 /// Reads `path`. See [`parse_ply`].
 pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
     let (reader, total_bytes) = open(path)?;
-    parse_ply(reader, total_bytes, path)
+    let mut content = parse_ply(reader, total_bytes, path)?;
+    if let PlyContent::Gaussians { meta, .. } = &mut content {
+        look_beside(path, meta)?;
+    }
+    Ok(content)
+}
+
+/// Takes frame and axes of Gaussians that do not state them from the transform file beside `path`, if there is one.
+fn look_beside(path: &Path, meta: &mut SceneMeta) -> InputResult<()> {
+    if meta.is_stated {
+        return Ok(());
+    }
+    if let Some(beside) = meta_beside(path)? {
+        let SceneMeta { antialiased, dropped, opacities_clamped, .. } = *meta;
+        *meta = SceneMeta { antialiased, dropped, opacities_clamped, ..beside };
+    }
+    Ok(())
 }
 
 /// Whether `path` holds Gaussians; otherwise it holds points.
@@ -53,7 +71,23 @@ pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> Inp
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
     let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
-    stream_rows(&mut body, vertex, take)
+    let colors = Colors::of(path, vertex)?;
+    let full = match colors.full {
+        Some(full) => full,
+        // A pass that only finds the range of floating-point colours.
+        None => {
+            let mut most = 0.0;
+            let (mut reader, total_bytes) = open(path)?;
+            let header = parse_header(&mut reader, path)?;
+            let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
+            stream_rows(&mut body, vertex, &colors, &mut |_, color| {
+                most = color.into_iter().fold(most, f64::max);
+                Ok(())
+            })?;
+            full_of_floats(most)
+        }
+    };
+    stream_rows(&mut body, vertex, &colors, &mut |position, color| take(position, color.map(|c| color_byte(c, full))))
 }
 
 fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
@@ -61,6 +95,9 @@ fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
     let about = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening", &e))?;
     if !about.is_file() {
         return Err(InputError::new(path, "this is not a regular file", "give a PLY file"));
+    }
+    if let Some(error) = foreign(path) {
+        return Err(error);
     }
     let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
     let bytes = file.metadata().map_err(|e| InputError::io(path, "reading the length", &e))?.len();
@@ -70,8 +107,8 @@ fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
 /// Reads a PLY of `total_bytes` bytes: Gaussians if its vertices have `f_dc_0`, else coloured points.
 ///
 /// Accepts ascii and both binary formats, with properties in any order; other properties and elements, including lists,
-/// are skipped. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535) or fractions of 0 to 1. `path`
-/// only names the file in errors.
+/// are skipped. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535), or floating-point numbers in one of these
+/// ranges or from 0 to 1, whichever the largest of them says. `path` only names the file in errors.
 ///
 /// # Errors
 /// The file is cut short, states more rows than it holds, lacks a property, has a number of `f_rest` properties other
@@ -179,7 +216,9 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
     let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
-    stream_gaussian_rows(&mut body, &header, vertex, take)
+    let mut meta = stream_gaussian_rows(&mut body, &header, vertex, take)?;
+    look_beside(path, &mut meta)?;
+    Ok(meta)
 }
 
 /// Metadata in the header of a file of Gaussians, and its SH degree. `dropped` is still 0.
@@ -189,7 +228,9 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
 pub fn gaussians_header(path: &Path) -> InputResult<(SceneMeta, u8)> {
     let header = parse_header(&mut open(path)?.0, path)?;
     let (_, vertex) = vertex_of(&header, path)?;
-    Ok((meta_from_comments(path, &header.comments)?, sh_degree_of(path, vertex)?))
+    let mut meta = meta_from_comments(path, &header.comments)?;
+    look_beside(path, &mut meta)?;
+    Ok((meta, sh_degree_of(path, vertex)?))
 }
 
 fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &Element) -> InputResult<PlyContent> {
@@ -282,6 +323,7 @@ fn sh_degree_of(path: &Path, vertex: &Element) -> InputResult<u8> {
 fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<SceneMeta> {
     let mut meta = SceneMeta::default();
     let ours = comments.iter().any(|c| c.starts_with("Generated by gsscale"));
+    meta.is_stated = ours;
     for comment in comments {
         let bad = || {
             let problem = format!("the comment '{}' cannot be understood", shorten(comment));
@@ -320,58 +362,86 @@ fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<SceneMeta
 
 fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputResult<PlyContent> {
     let rows = vertex.count as usize;
-    let (mut positions, mut colors) = (Vec::new(), Vec::new());
+    let (mut positions, mut colors, mut floats) = (Vec::new(), Vec::new(), Vec::new());
+    let of_file = Colors::of(body.path, vertex)?;
+    let (bytes, numbers) = if of_file.full.is_some() { (rows, 0) } else { (0, rows) };
     positions.try_reserve_exact(rows).map_err(no_memory(body.path, vertex.count))?;
-    colors.try_reserve_exact(rows).map_err(no_memory(body.path, vertex.count))?;
-    let dropped = stream_rows(body, vertex, &mut |position, color| {
+    colors.try_reserve_exact(bytes).map_err(no_memory(body.path, vertex.count))?;
+    floats.try_reserve_exact(numbers).map_err(no_memory(body.path, vertex.count))?;
+    let dropped = stream_rows(body, vertex, &of_file, &mut |position, color| {
         positions.push(position);
-        colors.push(color);
+        match of_file.full {
+            Some(full) => colors.push(color.map(|c| color_byte(c, full))),
+            None => floats.push(color.map(|c| c as f32)),
+        }
         Ok(())
     })?;
+    let full = full_of_floats(floats.iter().flatten().fold(0.0, |most, &c| f64::from(c).max(most)));
+    colors.extend(floats.into_iter().map(|color| color.map(|c| color_byte(f64::from(c), full))));
     Ok(PlyContent::Points { positions, colors, dropped })
 }
 
-/// Streams the points of a body; returns the number dropped.
+/// The properties of colours.
+struct Colors {
+    slots: Vec<usize>,
+    /// The value of full brightness; `None` for floating-point numbers, whose range is not stated.
+    full: Option<f64>,
+}
+
+impl Colors {
+    fn of(path: &Path, vertex: &Element) -> InputResult<Colors> {
+        let known = [["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"], ["r", "g", "b"]];
+        let Some(names) = known.into_iter().find(|n| n.iter().all(|name| vertex.find(name).is_some())) else {
+            return Ok(Colors { slots: Vec::new(), full: Some(255.0) });
+        };
+        let found = names.iter().map(|name| scalar_at(path, vertex, name)).collect::<InputResult<Vec<_>>>()?;
+        let full = match found[0].1 {
+            kind if kind.is_float() => None,
+            kind if kind.size() == 2 => Some(65_535.0),
+            _ => Some(255.0),
+        };
+        Ok(Colors { slots: found.into_iter().map(|(slot, _)| slot).collect(), full })
+    }
+}
+
+/// Streams the points of a body with their colours as the file has them, mid grey of 255 without; returns the number dropped.
 fn stream_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     vertex: &Element,
-    take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>,
+    colors: &Colors,
+    take: &mut dyn FnMut([f64; 3], [f64; 3]) -> InputResult<()>,
 ) -> InputResult<u64> {
     let path = body.path;
     let mut slots = Vec::with_capacity(6);
     for name in ["x", "y", "z"] {
         slots.push(scalar_at(path, vertex, name)?.0);
     }
-    let color_names = [["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"], ["r", "g", "b"]];
-    let mut color_types = [Scalar::U8; 3];
-    if let Some(names) = color_names.into_iter().find(|n| n.iter().all(|name| vertex.find(name).is_some())) {
-        for (kind, name) in color_types.iter_mut().zip(names) {
-            let (slot, scalar) = scalar_at(path, vertex, name)?;
-            slots.push(slot);
-            *kind = scalar;
-        }
-    }
+    slots.extend(&colors.slots);
     let mut dropped = Dropped::default();
     read_rows(body, vertex, &slots, |row, raw| {
         if !raw.iter().all(|v| v.is_finite()) {
             dropped.add(row);
             return Ok(());
         }
-        let color = |c: usize| raw.get(3 + c).map_or(128, |&v| color_byte(v, color_types[c]));
+        // As f32, so that colours that wait for their range take little memory.
+        let color = |c: usize| raw.get(3 + c).map_or(128.0, |&v| f64::from(v as f32));
         take([raw[0], raw[1], raw[2]], [color(0), color(1), color(2)])
     })?;
     dropped.check(path, vertex.count)?;
     Ok(dropped.count)
 }
 
-/// Converts a finite colour value to a byte; the type determines its range.
-fn color_byte(value: f64, kind: Scalar) -> u8 {
-    let full = if kind.is_float() {
-        1.0
-    } else if kind.size() == 2 {
-        65_535.0
-    } else {
-        255.0
-    };
+/// The value of full brightness of floating-point colours of which this is the greatest. Fractions may exceed 1 a little; a file
+/// of bytes in which none exceeds 2 would be black.
+fn full_of_floats(most: f64) -> f64 {
+    match most {
+        ..=2.0 => 1.0,
+        ..=256.0 => 255.0,
+        _ => 65_535.0,
+    }
+}
+
+/// A finite colour as a byte.
+fn color_byte(value: f64, full: f64) -> u8 {
     ((value / full).clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }

@@ -10,17 +10,13 @@ use super::tree::Part;
 use crate::base::error::InputResult;
 use crate::base::room;
 use crate::base::whole_file::folder_of;
-use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::transform::TRANSFORM_ENDING;
+use crate::exchange::meta::SceneMeta;
+use crate::exchange::transform::{TRANSFORM_ENDING, Transform};
 use crate::scene::columns::{Column, Columns};
-use crate::scene::rotation::Rotation;
 use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
 use std::path::Path;
-
-/// Largest deviation of the transform from a rotation and a scale, over the scale.
-const TRANSFORM_TOLERANCE: f64 = 1e-9;
 
 #[derive(Deserialize)]
 struct TreeText {
@@ -50,12 +46,6 @@ struct PartText {
     file: usize,
     offset: usize,
     count: usize,
-}
-
-#[derive(Deserialize)]
-struct Transform {
-    up_in_dataset: Option<[f64; 3]>,
-    file_to_dataset: [[f64; 4]; 4],
 }
 
 /// A level: its number, the finest is 0, and its parts in the order of files.
@@ -170,23 +160,10 @@ fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>
 /// Reads the transform beside the `lod-meta.json` at `path`. A folder of gsscale has one.
 fn read_transform(path: &Path, is_ours: bool) -> InputResult<SceneMeta> {
     let path = folder_of(path).join(TRANSFORM_ENDING);
-    let Transform { up_in_dataset, file_to_dataset: matrix } = match read_json(&path) {
-        Err(e) if e.kind == Some(ErrorKind::NotFound) && !is_ours => return Ok(SceneMeta::default()),
-        read => read?,
-    };
-    let upright = up_in_dataset.and_then(Rotation::upright);
-    let squares = matrix[..3].iter().flat_map(|row| &row[..3]).map(|x| x * x).sum::<f64>();
-    let scale = libm::sqrt(squares / 3.0);
-    let back = upright.unwrap_or(Rotation::IDENTITY).inverse().matrix();
-    let off = |i: usize, j: usize| (matrix[i][j] - scale * back[i][j]).abs() / scale;
-    let is_known = (0..9).all(|k| off(k / 3, k % 3) <= TRANSFORM_TOLERANCE);
-    let origin = [0, 1, 2].map(|i| matrix[i][3]);
-    if !is_known || !origin.iter().all(|x| x.is_finite()) {
-        return Err(
-            malformed(&path, "is no scale, offset and turn to the direction that points up").at("file_to_dataset")
-        );
+    match read_json::<Transform>(&path) {
+        Err(e) if e.kind == Some(ErrorKind::NotFound) && !is_ours => Ok(SceneMeta::default()),
+        read => read?.meta(&path),
     }
-    Ok(SceneMeta { origin, scale, frame: ExportFrame::Local, upright, scene_radius: scale, ..SceneMeta::default() })
 }
 
 /// Appends a part of a file.

@@ -2,6 +2,7 @@
 //! machine, signals.
 
 pub mod dataset_print;
+pub(crate) mod fit;
 pub(crate) mod gaussian_pages;
 pub mod machine;
 pub(crate) mod places;

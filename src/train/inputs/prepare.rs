@@ -143,6 +143,11 @@ pub(crate) fn giants_warning(ply: &Path, giants: u64) -> Option<String> {
 /// Warnings about Gaussians read from `file`, of which `far` were dropped by the change of frame.
 pub fn file_warnings(file: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
     let mut warnings = Vec::new();
+    if let Some(transform) = &meta.transform {
+        let transform = transform.file_name().unwrap_or_default().display();
+        let file = file.display();
+        warnings.push(format!("{file}: it does not say its frame, which is taken from {transform} beside it"));
+    }
     if meta.dropped > 0 {
         warnings.push(format!("{}: {} Gaussians are not finite and are dropped", file.display(), meta.dropped));
     }

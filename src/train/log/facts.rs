@@ -4,8 +4,9 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
-use crate::config::file::TrainConfig;
+use crate::config::file::{FILE_BYTES_MAX, TrainConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -59,7 +60,7 @@ pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> I
 /// # Errors
 /// The file has no `[resolved]` table of a run.
 pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
-    let text = std::fs::read_to_string(path).map_err(|e| InputError::io(path, "reading the config", &e))?;
+    let text = read_text(path, FILE_BYTES_MAX, "name the output folder of a run")?;
     let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");
     let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
     let resolved = table.remove("resolved").ok_or_else(|| refuse("it has no table [resolved]".to_string()))?;

@@ -197,6 +197,9 @@ pub struct Summary {
     /// The file for viewers beside the PLY (`--export`), if it was asked for and written.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub export: Option<ExportFacts>,
+    /// Further files, if several formats were asked for.
+    #[serde(skip_serializing_if = "Vec::is_empty", default)]
+    pub more_exports: Vec<ExportFacts>,
     /// Traffic between the tiers, including import, evaluation and export.
     #[serde(flatten)]
     pub tiers: TierTraffic,

@@ -4,6 +4,7 @@ use super::device_memory;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::exchange::format::ExportFormat;
 use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
@@ -88,7 +89,8 @@ pub fn estimate(
     let pages = probe.pages as f64;
     let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + config.export.memory_bytes();
+    let of_export = config.export.formats().map(ExportFormat::memory_bytes).max().unwrap_or(0);
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + of_export;
     let base = base + trainer.photos.iter().map(|parameter| parameter.value_bytes(dataset)).sum::<u64>();
     let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;

@@ -47,7 +47,7 @@ pub(crate) fn check_drive_of_results(
         );
         return Err(InputError::new(out, problem, "free space on it, or choose another --out"));
     }
-    let results = last + last / 100 * export_percent(config.export);
+    let results = last + last / 100 * config.export.formats().map(export_percent).sum::<u64>();
     let (pages, beside) = match config.residence() {
         Residence::Memory => (forecast.drive_bytes_most, " and the checkpoint"),
         Residence::SpillDir(folder) if is_same_drive(&drive, &drive_of(folder)) => {

@@ -88,7 +88,7 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
         return Ok(outcome);
     }
     // What lies in the place of a result is refused here, and not after the last step.
-    out_folder::check_results(&request.out, config.export)?;
+    config.export.formats().try_for_each(|format| out_folder::check_results(&request.out, format))?;
     let folder = stored_folder(&request.out, &config);
     if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
         drop(lock);

@@ -201,12 +201,8 @@ fn write_results(
 ) -> Result<Summary, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let ply = Trainer::ply_path(out);
-    let exported = results.write(|results| export_beside(request, dataset, results.trainer, &ply, written));
-    if exported.is_err() {
-        crate::tell!(
-            "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
-        );
-    }
+    let exported = export_all(request, dataset, &mut results, &ply, written);
+    let mut facts = exported.as_ref().map_or(Vec::new(), Clone::clone).into_iter();
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let asked = results.stop.exit_code();
     let tested = looped.and_then(|()| match asked {
@@ -229,7 +225,8 @@ fn write_results(
         // A run without its evaluation or its export is not finished: a resume makes them.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && exported.is_ok() && asked.is_none(),
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
-        export: exported.as_ref().ok().cloned().flatten(),
+        export: facts.next(),
+        more_exports: facts.collect(),
         costs,
         commits: results.checkpoint.as_deref().map(Checkpoint::report),
         ..summary_of(request, trainer)
@@ -254,18 +251,37 @@ fn save_result(dataset: &Dataset, trainer: &mut Trainer, ply: &Path) -> Result<W
     Ok(written)
 }
 
-/// Writes the Gaussians of the PLY also in the format that was asked for, with their transform. `None` if only the PLY was.
+/// Writes the Gaussians of the PLY also in the other formats that were asked for.
+fn export_all(
+    request: &RunRequest,
+    dataset: &Dataset,
+    results: &mut Results<'_>,
+    ply: &Path,
+    written: &Written,
+) -> Result<Vec<ExportFacts>, TrainError> {
+    let formats = request.config.export.formats().filter_map(|format| Some((format, format.beside(ply)?)));
+    let exported = formats.map(|(format, file)| {
+        results.write(|results| export_beside(request, dataset, results.trainer, (format, &file), written))
+    });
+    let exported: Result<_, _> = exported.collect();
+    if exported.is_err() {
+        crate::tell!(
+            "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
+        );
+    }
+    exported
+}
+
+/// Writes the Gaussians of the PLY also in another format, with their transform.
 fn export_beside(
     request: &RunRequest,
     dataset: &Dataset,
     trainer: &mut Trainer,
-    ply: &Path,
+    (format, other): (ExportFormat, &Path),
     written: &Written,
-) -> Result<Option<ExportFacts>, TrainError> {
-    let format = request.config.export;
-    let Some(other) = format.beside(ply) else { return Ok(None) };
-    let exported = trainer.export(dataset, &other, format)?;
-    format.write_transform(&other, &trainer.scene_meta(dataset), exported.frame)?;
+) -> Result<ExportFacts, TrainError> {
+    let exported = trainer.export(dataset, other, format)?;
+    format.write_transform(other, &trainer.scene_meta(dataset), exported.frame)?;
     let left_out = written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
         crate::tell!(
@@ -276,14 +292,14 @@ fn export_beside(
     if let (Some(levels), false) = (exported.levels, request.quiet) {
         crate::tell!("{}: {levels}", other.display());
     }
-    Ok(Some(ExportFacts {
-        file: other.strip_prefix(&request.out).unwrap_or(&other).to_path_buf(),
+    Ok(ExportFacts {
+        file: other.strip_prefix(&request.out).unwrap_or(other).to_path_buf(),
         bytes: exported.bytes,
         gaussians: exported.rows,
         left_out,
         levels: exported.levels.map(|levels| levels.rows),
         always_shown: exported.levels.map_or(0, |levels| levels.always_shown),
-    }))
+    })
 }
 
 /// Evaluates the result, with pictures, and logs the evaluation.
@@ -361,6 +377,7 @@ fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
         costs: StepCosts::default(),
         growth: trainer.growth().to_vec(),
         export: None,
+        more_exports: Vec::new(),
         tiers: trainer.tier_traffic(),
         commits: None,
     }

@@ -29,6 +29,7 @@ use crate::train::error::TrainError;
 use crate::train::error::not_stored;
 use crate::train::inputs::dataset_print::view_print;
 use crate::train::inputs::dataset_print::{GaussiansPrint, points_print};
+use crate::train::inputs::fit::PositionSample;
 use crate::train::inputs::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead};
 use crate::train::inputs::places::folder_beside;
 use crate::train::inputs::prepare::file_warnings;
@@ -223,8 +224,16 @@ impl Start {
     ) -> Result<(Dataset, PagedScene), TrainError> {
         let mut scene = PagedScene::empty(pager, options);
         let folder = folder_beside(Path::new(&config.spill_dir));
-        let insert = &mut |id, state: SceneState| Ok(scene.insert_first_page(id, &state)?);
+        let mut sample = PositionSample::default();
+        let insert = &mut |id, state: SceneState| {
+            sample.add(&state.columns.means);
+            Ok(scene.insert_first_page(id, &state)?)
+        };
         let moved = self.for_each_page(options, &folder, host_mem, insert)?;
+        let source = if config.init_ply.is_empty() { "the points of the scene" } else { &config.init_ply };
+        if let Some(warning) = sample.warning(Path::new(source), &self.dataset.views) {
+            crate::tell!("warning: {warning}");
+        }
         if moved > 0 {
             crate::tell!(
                 "warning: {moved} log-scales of the first Gaussians are too small or large for this scene and are moved \

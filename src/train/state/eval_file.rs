@@ -19,6 +19,7 @@ use crate::render::lpips::{InputRange, Lpips};
 use crate::render::{RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
+use crate::train::inputs::fit::PositionSample;
 use crate::train::inputs::machine;
 use crate::train::inputs::prepare::file_warnings;
 use crate::train::log::progress::Count;
@@ -194,7 +195,9 @@ impl<'a> Evaluator<'a> {
     ) -> Result<Figures, TrainError> {
         let frame = &self.dataset.frame;
         let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
-        for warning in file_warnings(file, meta, far) {
+        let mut sample = PositionSample::default();
+        sample.add(&columns.means);
+        for warning in file_warnings(file, meta, far).into_iter().chain(sample.warning(file, &self.dataset.views)) {
             if self.printed.insert(warning.clone()) {
                 crate::tell!("warning: {warning}");
             }

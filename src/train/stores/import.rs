@@ -29,7 +29,9 @@ use crate::scene::partition::first_fill;
 use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
+use crate::train::inputs::fit::PositionSample;
 use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter};
+use crate::train::inputs::prepare::file_warnings;
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::step::pages::PageRules;
 use serde::Serialize;
@@ -87,7 +89,8 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
     let space = GaussianSpace { folder: beside, memory };
     let mut rows = GaussianWriter::new(&request.file, space);
-    let meta = read_rows(&request.file, &mut rows)?;
+    let (meta, radius) = read_rows(&request.file, &mut rows)?;
+    file_warnings(&request.file, &meta, 0).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let rows = rows.finish()?;
     let (count, sh_degree) = (rows.rows(), rows.sh_degree());
     let (config, options) = options_for(request, sh_degree, &meta)?;
@@ -106,7 +109,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         Some(error) => return Err(error),
         None => written?,
     }
-    let state = first_state(&config, &meta, count as u64, sh_degree)?;
+    let state = first_state(&config, (&meta, radius), count as u64, sh_degree)?;
     pages.store.commit(&state, format!("imported from {}", request.file.display()).as_bytes(), &[])?;
     let number = u64::from(pages.pages);
     pages.store.finish()?;
@@ -120,13 +123,15 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     })
 }
 
-/// Streams the Gaussians of `file` into `rows`, in the axes of their dataset.
-fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<SceneMeta> {
+/// Streams the Gaussians of `file` into `rows`, in the axes of their dataset. Returns the metadata, and the size of the scene in
+/// the units of the file, which no file states.
+fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMeta, f32)> {
     let (header, sh_degree) = gaussians_header(file)?;
     let none = || Columns::zeros(0, sh_degree);
-    let mut some = none();
+    let (mut some, mut sample) = (none(), PositionSample::default());
     let mut hand_on = |mut columns: Columns| {
         turn_back(&mut columns, &header);
+        sample.add(&columns.means);
         rows.push_all(&columns)
     };
     let meta = stream_gaussians(file, &mut |values| {
@@ -137,7 +142,7 @@ fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<SceneMet
         }
     })?;
     hand_on(some)?;
-    Ok(meta)
+    Ok((meta, sample.radius().unwrap_or(1.0)))
 }
 
 /// Encodes rows as pages and stores them.
@@ -193,14 +198,19 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &SceneMeta) -> Inpu
 }
 
 /// The run state before the first step.
-fn first_state(config: &TrainConfig, meta: &SceneMeta, rows: u64, sh_degree: u8) -> Result<Vec<u8>, TrainError> {
+fn first_state(
+    config: &TrainConfig,
+    (meta, scene_scale): (&SceneMeta, f32),
+    rows: u64,
+    sh_degree: u8,
+) -> Result<Vec<u8>, TrainError> {
     let (origin, scale) = match meta.frame {
         ExportFrame::Local => (meta.origin, meta.scale),
         ExportFrame::Dataset => ([0.0; 3], 1.0),
     };
     let fail = |e: String| CommitError::Contradiction(e);
     let text = toml::to_string(config).map_err(|e| fail(e.to_string()))?;
-    let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale: 1.0, origin, scale };
+    let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale, origin, scale };
     let simd = limits::simd_path(config).name().to_string();
     let origin = Origin { config: text, simd, sh_degree_start: sh_degree, dataset, run: RunIdentity::default() };
     let state = RunState::without_past(origin, "none".to_string(), rows);

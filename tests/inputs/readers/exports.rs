@@ -116,7 +116,7 @@ fn bad_lines_of_a_csv_are_refused_by_number() {
     let good = "a.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0";
     for (line, words) in [
         ("a.png,1,x,3,0,0,0,18,0,0,0,0,0,0,0,0", &["line 3", "\"x\" in column 'y'"][..]),
-        ("a.png,1,2", &["line 3", "column 'k1'"]),
+        ("a.png,1,2", &["line 3", "3 cells"]),
         ("a.png,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0", &["line 3", "focal length"]),
         ("a.png,1,2,3,0,0,0,18,0,0,0,0,0,0.5,0,0", &["line 3", "Brown3"]),
         ("../a.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["line 3", "climbs out"]),

@@ -2,6 +2,7 @@
 
 mod colmap_bad;
 mod colmap_good;
+mod encodings;
 mod exports;
 mod fuzz;
 mod layouts;
