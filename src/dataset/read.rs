@@ -17,7 +17,9 @@ use std::path::Path;
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
-    Ok(RawScene { root: root.to_path_buf(), ..read_kind(path, facts.is_file(), options)? })
+    let scene = read_kind(path, facts.is_file(), options)?;
+    let is_above = !scene.root.as_os_str().is_empty();
+    Ok(if is_above { scene } else { RawScene { root: root.to_path_buf(), ..scene } })
 }
 
 fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
@@ -59,6 +61,16 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
         .and_then(|found| if found.is_dir() { std::fs::read_dir(path).map(|_| ()) } else { Ok(()) })
     {
         return Err(InputError::io(path, "reading the scene", &e));
+    }
+    if let Some((above, images)) = photos_only::scene_above(path) {
+        let images = options.images.clone().or(Some(images));
+        let mut scene = read_scene(&above, &ReadOptions { images, ..options.clone() })?;
+        let (photos, above) = (path.display(), above.display());
+        scene.warnings.insert(
+            0,
+            format!("{photos} holds photos without poses: the scene is read from the folder above, {above}"),
+        );
+        return Ok(scene);
     }
     if let Some(error) = photos_only::error(path) {
         return Err(error);

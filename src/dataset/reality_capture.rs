@@ -14,7 +14,8 @@
 use super::checks::{checked_intrinsics, sort_views};
 use super::left_out::LeftOut;
 use super::model::{Lens, RawScene, RawView, ReadOptions};
-use super::transforms::photos::{find_photo, read_size};
+use super::photo_files::PhotoFiles;
+use super::transforms::photos::read_size;
 use super::transforms::pose::make_pose;
 use crate::base::error::{InputError, InputResult};
 use glam::{DMat3, DVec3};
@@ -53,11 +54,13 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
         return Err(InputError::new(&file, format!("there is no column '{missing}'"), EXPORT));
     }
     let (mut scene, mut left_out) = (RawScene::default(), LeftOut::default());
+    let photos = PhotoFiles::with_folders(folder, options.images.as_deref().or(Some("images")), options);
     for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
         let line = Line { file: &file, number: number + 1, header: &header, cells: line.split(',').collect() };
-        line.add_view(folder, options, &mut scene.views, &mut left_out)?;
+        line.add_view(&photos, &mut scene.views, &mut left_out)?;
     }
-    left_out.report(&file, options, scene.views.len(), &mut scene.warnings)?;
+    photos.finish(&mut scene.views, &mut scene.warnings);
+    left_out.report(&file, (options, &photos), scene.views.len(), &mut scene.warnings)?;
     sort_views(&file, &mut scene.views)?;
     scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
     Ok(scene)
@@ -148,17 +151,10 @@ impl Line<'_> {
         Ok(numbers)
     }
 
-    fn add_view(
-        &self,
-        folder: &Path,
-        options: &ReadOptions,
-        views: &mut Vec<RawView>,
-        left_out: &mut LeftOut,
-    ) -> InputResult<()> {
+    fn add_view(&self, photos: &PhotoFiles, views: &mut Vec<RawView>, left_out: &mut LeftOut) -> InputResult<()> {
         let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
         let stays = "names must stay in the folder of the photos: export with plain file names";
-        let photo = find_photo(folder, options.images.as_deref().or(Some("images")), stated)
-            .map_err(|problem| self.error(problem, stays))?;
+        let photo = photos.find(stated).map_err(|problem| self.error(problem, stays))?;
         let [k1, k2, k3, k4, t1, t2] = self.numbers(["k1", "k2", "k3", "k4", "t1", "t2"])?;
         if k4 != 0.0 {
             let remedy = "choose the distortion model Brown3 before the export, or export undistorted photos";
