@@ -241,7 +241,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
                 let corrected = t.color_corrected_text();
                 format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
             }
-            None if summary.finished => String::from("no photos held out"),
+            None if summary.finished => String::from("not measured: there is no held-out photo that counts"),
             None => String::from("not evaluated"),
         };
         gsscale::tell!(

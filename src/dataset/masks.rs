@@ -55,7 +55,7 @@ pub(super) struct FoundMask {
 #[derive(Debug, Default)]
 pub(super) struct MaskIndex {
     root: PathBuf,
-    /// Files of the folders of masks, by relative name.
+    /// Files of the folders that are called `masks`, by relative name.
     exact: BTreeMap<String, PathBuf>,
     in_folders: NameIndex,
     beside_photos: NameIndex,
@@ -70,6 +70,9 @@ impl MaskIndex {
         for place in [Some(root), beside, Some(image_folder)].into_iter().flatten() {
             for folder in mask_folders(place) {
                 index.in_folders.add(&folder, "", &|_| true);
+                if !folder.ends_with("masks") {
+                    continue;
+                }
                 for entry in index.in_folders.entries().filter(|entry| entry.is_readable()) {
                     let Ok(name) = entry.path.strip_prefix(&folder) else { continue };
                     let name = normalised(&name.to_string_lossy().replace('\\', "/"));
