@@ -241,7 +241,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
                 let corrected = t.color_corrected_text();
                 format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
             }
-            None if summary.finished => String::from("not measured: no held-out photo counts"),
+            None if summary.finished => String::from("not measured: there is no held-out photo that counts"),
             None => String::from("not evaluated"),
         };
         gsscale::tell!(
@@ -258,11 +258,10 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
             gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
-            gsscale::tell!(
-                "              (rates stay at their final values; a new run with more steps gives another result)"
-            );
             if !outcome.keeps_checkpoint {
-                gsscale::tell!("              (from the PLY, without Adam's moments; --keep-checkpoint keeps them)");
+                gsscale::tell!(
+                    "              (from the PLY, without Adam's moments; runs with --keep-checkpoint go on exactly)"
+                );
             }
         }
     }

@@ -2,6 +2,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::model::{Intrinsics, Lens, RawView};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Largest width or height accepted, pixels: the limit of JPEG.
@@ -44,18 +45,26 @@ pub(super) fn checked_intrinsics(
     Ok(Intrinsics { width: width as u32, height: height as u32, fx, fy, cx, cy, lens: lens.simplified() })
 }
 
-/// Sorts the views by name and refuses duplicate names.
+/// Sorts the views by name and refuses duplicate names and photos.
 pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> {
     views.sort_by(|a, b| a.name.cmp(&b.name));
-    match views.windows(2).find(|pair| pair[0].name == pair[1].name) {
-        None => Ok(()),
-        Some(pair) => Err(InputError::new(
-            file,
-            format!("two views have the name '{}'", pair[0].name),
-            "every photo may be listed once: remove one of the two entries",
-        )
-        .at(format!("image '{}'", pair[0].name))),
+    if let Some(pair) = views.windows(2).find(|pair| pair[0].name == pair[1].name) {
+        let problem = format!("two views have the name '{}'", pair[0].name);
+        return Err(InputError::new(file, problem, "every photo may be listed once: remove one of the two entries")
+            .at(format!("image '{}'", pair[0].name)));
     }
+    let mut by_photo = BTreeMap::new();
+    for view in views.iter() {
+        if let Some(other) = by_photo.insert(&view.image_path, &view.name) {
+            let problem = format!("the views '{other}' and '{}' have the same photo", view.name);
+            return Err(InputError::new(
+                &view.image_path,
+                problem,
+                "name the folder with a photo for each view with --images",
+            ));
+        }
+    }
+    Ok(())
 }
 
 /// The warning about views that a reader leaves out.

@@ -2,6 +2,7 @@
 
 use super::checks::{left_out, listed};
 use super::model::ReadOptions;
+use super::photo_files::PhotoFiles;
 use crate::base::error::{InputError, InputResult};
 use std::path::Path;
 
@@ -22,12 +23,13 @@ impl LeftOut {
     pub fn report(
         &self,
         file: &Path,
-        options: &ReadOptions,
+        (options, photos): (&ReadOptions, &PhotoFiles),
         kept: usize,
         warnings: &mut Vec<String>,
     ) -> InputResult<()> {
         if !self.missing.is_empty() && !options.allow_missing {
-            let problem = format!("{} photo(s) are missing: {}", self.missing.len(), listed(&self.missing));
+            let near = photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
+            let problem = format!("{} photo(s) are missing: {}{near}", self.missing.len(), listed(&self.missing));
             let remedy =
                 "put them into images/, name their folder with --images, or leave them out with --allow-missing";
             return Err(InputError::new(file, problem, remedy));

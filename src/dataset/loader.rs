@@ -1,7 +1,7 @@
 //! Turns a [`RawScene`] into a checked [`Dataset`]: checks every photo's header and end, scales intrinsics to training
 //! size, removes offset and scale, and assigns each view to a set.
 //!
-//! Not here: reading models (the readers) and pixels ([`super::photo`], [`super::target_cache`]).
+//! Not here: reading models (the readers), checking the files of photos ([`super::photo_checks`]) and pixels ([`super::photo`], [`super::target_cache`]).
 //!
 //! Invariants: 1. every view of a dataset has a photo whose header and end marker exist and whose shape matches its
 //! camera; 2. frame, scene scale and split depend on the views registered in the model, so dropping a photo with
@@ -9,11 +9,11 @@
 
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
-use super::masks::{MaskIndex, MaskSource, Pattern, is_mask_name};
-use super::model::{Intrinsics, RawScene, RawView, Split};
-use super::photo::{Alpha, PhotoSource, holds_zero_and_one, intrinsics_at};
-use super::photo_header::{PhotoHeader, read_header};
-use super::resize::{Size, divided_size, same_shape};
+use super::model::{RawScene, RawView, Split};
+use super::name_index::is_photo;
+use super::photo::{PhotoSource, intrinsics_at};
+use super::photo_checks::check_photos;
+use super::photo_files::PhotoFiles;
 use crate::base::error::{InputError, InputResult};
 use crate::scene::camera::Camera;
 use glam::DVec3;
@@ -183,9 +183,9 @@ fn load_views(
         warnings
             .push(format!("{count} cameras are far from all others and do not count for the scene's size: {names}"));
     }
-    warn_about_extra_photos(&posed, &mut warnings);
-    let present = drop_missing(posed, options, &image_folder, &mut warnings)?;
+    let present = drop_missing(posed, options, (&root, &image_folder), &mut warnings)?;
     let photos = check_photos(&present, options, (&root, &image_folder), &mut warnings)?;
+    warn_about_extra_photos(&photos, &mut warnings);
     let view = |((raw, split), photo): ((RawView, Split), PhotoSource)| {
         let camera = camera_of(&raw, &photo, &frame, options);
         View { name: raw.name, split, camera, photo }
@@ -274,14 +274,15 @@ fn drop_unusable_poses(
     good
 }
 
-/// Warns about photos in the views' folders that no view uses.
-fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String>) {
-    let used: BTreeSet<&Path> = views.iter().map(|(view, _)| view.image_path.as_path()).collect();
+/// Warns about pictures in the photos' folders that no view uses.
+fn warn_about_extra_photos(photos: &[PhotoSource], warnings: &mut Vec<String>) {
+    let mut used: BTreeSet<&Path> = photos.iter().map(|photo| photo.image_path.as_path()).collect();
     let folders: BTreeSet<&Path> = used.iter().filter_map(|path| path.parent()).collect();
+    used.extend(photos.iter().filter_map(|photo| Some(photo.mask.as_ref()?.path.as_path())));
     let mut extra = Vec::new();
     for folder in folders {
         let Ok(entries) = std::fs::read_dir(folder) else { continue };
-        let photos = entries.flatten().map(|e| e.path()).filter(|path| is_photo_name(path) && !is_mask_name(path));
+        let photos = entries.flatten().map(|e| e.path()).filter(|path| is_photo(path));
         extra.extend(photos.filter(|path| !used.contains(path.as_path())));
     }
     if !extra.is_empty() {
@@ -292,15 +293,10 @@ fn warn_about_extra_photos(views: &[(RawView, Split)], warnings: &mut Vec<String
     }
 }
 
-fn is_photo_name(path: &Path) -> bool {
-    let extension = path.extension().map(|e| e.to_string_lossy().to_ascii_lowercase());
-    extension.is_some_and(|e| ["jpg", "jpeg", "png"].contains(&e.as_str()))
-}
-
 fn drop_missing(
     views: Vec<(RawView, Split)>,
     options: &LoadOptions,
-    image_folder: &Path,
+    (root, image_folder): (&Path, &Path),
     warnings: &mut Vec<String>,
 ) -> InputResult<Vec<(RawView, Split)>> {
     let exists: Vec<bool> = views.par_iter().map(|(view, _)| view.image_path.is_file()).collect();
@@ -310,8 +306,12 @@ fn drop_missing(
     if missing.is_empty() {
         return Ok(present);
     }
-    let names = list_names(missing.iter().map(|((view, _), _)| view.name.as_str()));
-    let problem = format!("{} of {total} photos are missing: {names}", missing.len());
+    let names: Vec<&str> = missing.iter().map(|((view, _), _)| view.name.as_str()).collect();
+    let mut problem = format!("{} of {total} photos are missing: {}", missing.len(), list_names(names.iter().copied()));
+    if !options.allow_missing || present.is_empty() {
+        let photos = PhotoFiles::in_folders(root, vec![image_folder.to_path_buf()], true);
+        problem.push_str(&photos.near_misses(&names));
+    }
     if !options.allow_missing {
         let remedy = "copy them there, give the right folder with --images, or train without them with --allow-missing";
         return Err(InputError::new(image_folder, problem, remedy));
@@ -321,101 +321,6 @@ fn drop_missing(
     }
     warnings.push(problem);
     Ok(present)
-}
-
-/// Checks headers, shapes and masks of all views, in parallel; returns the first error in view order.
-fn check_photos(
-    views: &[(RawView, Split)],
-    options: &LoadOptions,
-    (root, image_folder): (&Path, &Path),
-    warnings: &mut Vec<String>,
-) -> InputResult<Vec<PhotoSource>> {
-    let index = if options.masks { MaskIndex::scan(root, image_folder) } else { MaskIndex::default() };
-    let checked: Vec<InputResult<PhotoSource>> =
-        views.par_iter().map(|(view, _)| check_photo(view, &index, options)).collect();
-    let bad = checked.iter().filter(|c| c.is_err()).count();
-    let mut photos = Vec::with_capacity(checked.len());
-    for photo in checked {
-        photos.push(photo.map_err(|mut error| {
-            if bad > 1 {
-                error.problem.push_str(&format!(" ({} other photos or masks cannot be used either)", bad - 1));
-            }
-            error
-        })?);
-    }
-    let transparent = photos.iter().filter(|p| p.is_masked_by_alpha()).count();
-    if transparent > 0 {
-        warnings.push(format!(
-            "{transparent} photos have an alpha channel: pixels that are less than half opaque do not count, as under a mask \
-             (--masks=false shows --background there)"
-        ));
-    }
-    let masks = || photos.iter().filter_map(|photo| photo.mask.as_ref());
-    warnings.extend(index.warnings(masks(), photos.len(), options.invert_masks));
-    if masks().next().is_some_and(holds_zero_and_one) {
-        warnings.push("the first mask holds 0 and 1 only: in such masks 1 counts as white".to_string());
-    }
-    Ok(photos)
-}
-
-fn check_photo(view: &RawView, index: &MaskIndex, options: &LoadOptions) -> InputResult<PhotoSource> {
-    let header = read_header(&view.image_path)?;
-    let size = (header.width, header.height);
-    check_shape(view, size)?;
-    let named = view.mask_path.as_deref().filter(|_| options.masks).map(|path| (path, Pattern::Named));
-    let mask = named.or_else(|| index.find(&view.name));
-    let mask = mask.map(|(path, pattern)| check_mask(path, size, options.invert_masks, pattern)).transpose()?;
-    let stated = Intrinsics { lens: view.intrinsics.lens.simplified(), ..view.intrinsics };
-    Ok(PhotoSource {
-        image_path: view.image_path.clone(),
-        header,
-        intrinsics: intrinsics_at(&stated, size),
-        target: target_size(size, options),
-        mask,
-        alpha: if options.masks { Alpha::Mask } else { Alpha::Over(options.background) },
-    })
-}
-
-fn check_mask(path: &Path, photo: Size, invert: bool, pattern: Pattern) -> InputResult<MaskSource> {
-    let header: PhotoHeader = read_header(path)?;
-    if !same_shape((header.width, header.height), photo) {
-        let problem = format!(
-            "the mask is {} x {}, its photo {} x {}: their shapes differ",
-            header.width, header.height, photo.0, photo.1
-        );
-        return Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"));
-    }
-    Ok(MaskSource { path: path.to_path_buf(), header, invert: invert != pattern.is_inverted(), pattern })
-}
-
-/// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the
-/// photo's scaled to that limit instead (one rounding, from the full size).
-fn target_size(photo: Size, options: &LoadOptions) -> Size {
-    let size = divided_size(photo, options.data_factor);
-    let longest = photo.0.max(photo.1);
-    match options.max_resolution {
-        Some(limit) if size.0.max(size.1) > limit => divided_size(photo, f64::from(longest) / f64::from(limit)),
-        _ => size,
-    }
-}
-
-fn check_shape(view: &RawView, size: Size) -> InputResult<()> {
-    let stated = (view.intrinsics.width, view.intrinsics.height);
-    if stated.0 > 0 && stated.1 > 0 && same_shape(size, stated) {
-        return Ok(());
-    }
-    let problem = format!(
-        "the photo is {} x {}, its camera {} x {}: a photo of this shape cannot belong to this camera",
-        size.0, size.1, stated.0, stated.1
-    );
-    let turned = stated.0 > 0 && stated.1 > 0 && same_shape((size.1, size.0), stated);
-    let remedy = if turned {
-        "the photo is turned by 90 degrees against its camera, as viewers do when they apply EXIF orientation: \
-         use the photos that the model was made from, stored the same way up"
-    } else {
-        "use the photos that the model was made from (other sizes are fine, cropped photos are not)"
-    };
-    Err(InputError::new(&view.image_path, problem, remedy).at(format!("view {}", view.name)))
 }
 
 fn camera_of(view: &RawView, photo: &PhotoSource, frame: &Frame, options: &LoadOptions) -> Camera {
@@ -472,21 +377,4 @@ fn list_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
         text.push_str(&format!(", and {} more", total - NAMES_LISTED));
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn targets_round_once_from_the_full_size() {
-        let with = |factor: f64, limit: Option<u32>| {
-            target_size((4608, 3456), &LoadOptions { data_factor: factor, max_resolution: limit, ..Default::default() })
-        };
-        assert_eq!(with(1.0, None), (4608, 3456));
-        assert_eq!(with(3.4175, None), (1348, 1011));
-        assert_eq!(with(1.0, Some(1600)), (1600, 1200));
-        assert_eq!(with(4.0, Some(1600)), (1152, 864));
-        assert_eq!(with(2.0, Some(1000)), (1000, 750));
-    }
 }

@@ -1,85 +1,36 @@
 //! Masks: finds the mask of each photo. [`super::photo`] decodes the pixels to keep.
 //!
-//! A mask is a picture of the photo's shape: white (128 and above; 1 in a file of zeros and ones) is kept, black is excluded
-//! from loss and metrics. A transparent mask pixel counts as black. Masks are in `masks/` or `mask/` in the scene, beside or
-//! inside the image folder, under one of the names of [`Pattern`]; those with "mask" in the name may lie beside the photos.
-//! Names are compared case-insensitively where only one file matches.
+//! A mask is a picture of the photo's shape: white (128 and above) is kept, black is excluded from loss and metrics. A
+//! transparent mask pixel counts as black. Masks are in `masks/` beside (or inside) the image folder, under the photo's
+//! relative name: the same name, the name with `.png` appended, or with another picture extension.
 //!
-//! Invariants: 1. each folder is listed once; links are followed, since they belong to the user, but no folder is entered
-//! twice; 2. a mask's size may differ from the photo's, its shape may not; 3. files that look like masks and are not used are
-//! named in a warning.
+//! Other programs write masks under other names, also beside the photos, and in folders of other names: what fits one photo and
+//! nothing else is used, and the form of the name is said ([`FORMS`]).
+//!
+//! Invariants: 1. a folder is listed once; links in it are followed, as for photos; 2. a mask's size may differ from the
+//! photo's, its shape may not; 3. nothing is listed outside of the scene, except through links in it; 4. a picture is the mask of
+//! one photo at most, unless it has the plain name for several.
 
+use super::name_index::{Entry, Found, NameIndex, folded, split_ending, split_folder};
 use super::photo_header::PhotoHeader;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
-/// Pictures that are not read.
-const OTHER_EXTENSIONS: [&str; 6] = ["tif", "tiff", "bmp", "webp", "gif", "npy"];
-const DEEPEST: usize = 16;
-
-/// How a mask is named after its photo.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pattern {
-    /// `X.jpg` or, with another picture extension, `X.png`.
-    Same,
-    /// `X.jpg.png`: COLMAP, Nerfstudio.
-    Appended,
-    /// `X.jpg.mask.png`.
-    AppendedMask,
-    /// `X.mask.png`: Agisoft.
-    DotMask,
-    /// `X_mask.jpg`, `X-mask.png`: OpenDroneMap.
-    UnderscoreMask,
-    /// `dynamic_mask_X.png`: instant-ngp. White is what moves, and is left out.
-    DynamicMask,
-    /// The dataset names the file.
-    Named,
-}
-
-impl Pattern {
-    /// In the order of preference.
-    const ALL: [Pattern; 6] = [
-        Pattern::Same,
-        Pattern::Appended,
-        Pattern::AppendedMask,
-        Pattern::DotMask,
-        Pattern::UnderscoreMask,
-        Pattern::DynamicMask,
-    ];
-
-    /// Names of the mask of the photo `base`, with stem `stem`, in lower case.
-    fn names(self, base: &str, stem: &str) -> Vec<String> {
-        let with_extensions = |stem: String| EXTENSIONS.map(|e| format!("{stem}.{e}")).to_vec();
-        match self {
-            Pattern::Same => [vec![base.to_string()], with_extensions(stem.to_string())].concat(),
-            Pattern::Appended => vec![format!("{base}.png")],
-            Pattern::AppendedMask => with_extensions(format!("{base}.mask")),
-            Pattern::DotMask => with_extensions(format!("{stem}.mask")),
-            Pattern::UnderscoreMask => {
-                [with_extensions(format!("{stem}_mask")), with_extensions(format!("{stem}-mask"))].concat()
-            }
-            Pattern::DynamicMask => with_extensions(format!("dynamic_mask_{stem}")),
-            Pattern::Named => Vec::new(),
-        }
-    }
-
-    /// An example, where the name deserves a word.
-    fn example(self) -> Option<&'static str> {
-        match self {
-            Pattern::Same | Pattern::Appended | Pattern::Named => None,
-            Pattern::AppendedMask => Some("X.jpg.mask.png"),
-            Pattern::DotMask => Some("X.mask.png"),
-            Pattern::UnderscoreMask => Some("X_mask.png"),
-            Pattern::DynamicMask => Some("dynamic_mask_X.png, where white is left out"),
-        }
-    }
-
-    /// Whether white is left out.
-    pub fn is_inverted(self) -> bool {
-        self == Pattern::DynamicMask
-    }
-}
+/// Folders of masks, folded.
+const FOLDERS: [&str; 5] = ["masks", "mask", "_mask", "_masks", ".mask"];
+/// What stands before and after the photo's name, with or without its ending, and whether white is left out: RealityScan's,
+/// Metashape's, OpenMVG's and OpenDroneMap's, instant-ngp's. The first is for folders of masks alone.
+const FORMS: [(&str, &str, bool); 6] = [
+    ("", "", false),
+    ("", ".mask", false),
+    ("", "_mask", false),
+    ("", "-mask", false),
+    ("mask_", "", false),
+    ("dynamic_mask_", "", true),
+];
+/// Files that a message shows.
+const SHOWN: usize = 3;
 
 /// The mask of a photo.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,217 +41,293 @@ pub struct MaskSource {
     pub header: PhotoHeader,
     /// Whether black is kept instead of white.
     pub invert: bool,
-    /// How it is named.
-    pub pattern: Pattern,
 }
 
-/// Files of one name in lower case: the name as it is, and the path.
-type SameName = Vec<(String, PathBuf)>;
+/// A mask that belongs to a photo.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct FoundMask {
+    pub path: PathBuf,
+    /// Whether the form of its name says that white is left out.
+    pub inverted: bool,
+}
 
-/// Mask files by relative name in lower case.
-#[derive(Debug, Clone, Default)]
-pub struct MaskIndex {
-    in_folders: BTreeMap<String, SameName>,
-    beside_photos: BTreeMap<String, SameName>,
-    /// Pictures in the folders of masks that are of no readable kind.
-    unreadable: Vec<PathBuf>,
+/// Mask files by name.
+#[derive(Debug, Default)]
+pub(super) struct MaskIndex {
+    root: PathBuf,
+    /// Files of the folders that are called `masks`, by relative name.
+    exact: BTreeMap<String, PathBuf>,
+    in_folders: NameIndex,
+    beside_photos: NameIndex,
 }
 
 impl MaskIndex {
-    /// Lists the folders of masks in the scene's folder, beside the image folder if that is deeper, and inside the image
-    /// folder, and files beside the photos whose names hold "mask"; the first match wins. Searches nothing outside the
-    /// scene; missing folders count as empty.
+    /// Lists the folders of masks in the scene's folder, beside the image folder if that is deeper, and inside the image folder;
+    /// the first match wins. Missing folders count as empty.
     pub fn scan(root: &Path, image_folder: &Path) -> Self {
-        let mut index = MaskIndex::default();
-        let mut entered = BTreeSet::new();
-        let above = image_folder.parent().filter(|p| p.starts_with(root));
-        for folder in [Some(root), above, Some(image_folder)].into_iter().flatten() {
-            for name in ["masks", "mask", "Masks", "Mask"] {
-                index.add_folder(&folder.join(name), "", 0, &mut entered);
+        let mut index = MaskIndex { root: root.to_path_buf(), ..MaskIndex::default() };
+        let beside = image_folder.parent().filter(|parent| parent.starts_with(root));
+        for place in [Some(root), beside, Some(image_folder)].into_iter().flatten() {
+            for folder in mask_folders(place) {
+                index.in_folders.add(&folder, "", &|_| true);
+                if !folder.ends_with("masks") {
+                    continue;
+                }
+                for entry in index.in_folders.entries().filter(|entry| entry.is_readable()) {
+                    let Ok(name) = entry.path.strip_prefix(&folder) else { continue };
+                    let name = normalised(&name.to_string_lossy().replace('\\', "/"));
+                    index.exact.entry(name).or_insert_with(|| entry.path.clone());
+                }
             }
         }
-        index.add_beside_photos(image_folder, "", 0, &mut entered);
+        let is_flat = image_folder == root;
+        index.beside_photos.add(image_folder, "", &|name| match split_ending(name).1 {
+            Some(_) => name.contains("mask"),
+            None => !is_flat && !FOLDERS.contains(&name),
+        });
         index
     }
 
-    /// The mask of the photo with this `/`-separated relative name, and how it is named. A leading `images/` of the name is
-    /// optional in the mask folder.
-    pub fn find(&self, name: &str) -> Option<(&Path, Pattern)> {
-        let short = name.strip_prefix("images/");
-        [Some(name), short].into_iter().flatten().find_map(|name| self.find_exact(name))
+    /// Whether there are no folders of masks with files in them.
+    pub fn is_empty(&self) -> bool {
+        self.in_folders.is_empty()
     }
 
-    fn find_exact(&self, name: &str) -> Option<(&Path, Pattern)> {
-        let (folder, base) = name.rsplit_once('/').map_or(("", name), |(folder, base)| (folder, base));
-        let stem = base.rsplit_once('.').map_or(base, |(stem, _)| stem);
-        Pattern::ALL.into_iter().find_map(|pattern| {
-            let names = pattern.names(base, stem);
-            let names = names.into_iter().map(|mask| if folder.is_empty() { mask } else { format!("{folder}/{mask}") });
-            let places = [Some(&self.in_folders), Some(&self.beside_photos).filter(|_| pattern.example().is_some())];
-            let mut found = names.flat_map(|mask| places.map(|files| only(files?.get(&mask.to_lowercase())?, &mask)));
-            found.find_map(|path| path).map(|path| (path.as_path(), pattern))
+    /// The masks of photos, given by their `/`-separated names and their files; says which form of name was used, if not the
+    /// plain one, and which files are not used.
+    pub fn assign(&self, photos: &[(&str, &Path)], warnings: &mut Vec<String>) -> Vec<Option<FoundMask>> {
+        let exact = |path: &Path| FoundMask { path: path.to_path_buf(), inverted: false };
+        let mut masks: Vec<Option<FoundMask>> =
+            photos.iter().map(|(name, _)| self.find_plain(name).map(exact)).collect();
+        let mut used: BTreeSet<&Path> = photos.iter().map(|(_, path)| *path).collect();
+        let plain: BTreeSet<PathBuf> = masks.iter().flatten().map(|mask| mask.path.clone()).collect();
+        used.extend(plain.iter().map(PathBuf::as_path));
+        let mut near: Vec<(usize, FoundMask, String)> = Vec::new();
+        let mut unclear = Vec::new();
+        for (i, (name, path)) in photos.iter().enumerate().filter(|(i, _)| masks[*i].is_none()) {
+            let mut found = self.find_forms(name, path);
+            found.retain(|mask, _| !used.contains(mask.path.as_path()));
+            match found.len() {
+                0 => {}
+                1 => near.extend(found.into_iter().map(|(mask, form)| (i, mask, form))),
+                _ => unclear.push(format!("'{name}' may have {}", self.shown(found.keys().map(|mask| &*mask.path)))),
+            }
+        }
+        let mut uses: BTreeMap<PathBuf, usize> = BTreeMap::new();
+        near.iter().for_each(|(_, mask, _)| *uses.entry(mask.path.clone()).or_default() += 1);
+        let mut forms: BTreeMap<String, usize> = BTreeMap::new();
+        for (i, mask, form) in near {
+            if uses[&mask.path] > 1 {
+                unclear.push(format!(
+                    "{} may belong to '{}' and others",
+                    self.shown([&*mask.path].into_iter()),
+                    photos[i].0
+                ));
+                continue;
+            }
+            *forms.entry(form).or_default() += 1;
+            masks[i] = Some(mask);
+        }
+        warnings.extend(forms.into_iter().map(|(form, count)| format!("masks: {count} of the form {form}")));
+        if !unclear.is_empty() {
+            let (count, some) = (unclear.len(), unclear[..SHOWN.min(unclear.len())].join("; "));
+            warnings.push(format!("{count} photos have no mask, because it is not clear which: {some}"));
+        }
+        self.warn_of_unused(&masks, warnings);
+        masks
+    }
+
+    /// The mask with the plain name. A leading `images/` of the photo's name is optional in the folder of masks.
+    fn find_plain(&self, name: &str) -> Option<&Path> {
+        let short = name.strip_prefix("images/");
+        [Some(name), short].into_iter().flatten().find_map(|name| {
+            let stem = match name.rsplit_once('.') {
+                Some((stem, extension)) if !extension.contains('/') => stem,
+                _ => name,
+            };
+            let same = std::iter::once(normalised(name));
+            let appended = std::iter::once(format!("{name}.png"));
+            let others = EXTENSIONS.iter().map(|e| format!("{stem}.{e}"));
+            same.chain(appended).chain(others).find_map(|key| self.exact.get(&key)).map(PathBuf::as_path)
         })
     }
 
-    /// What the user should know of the masks of `total` photos: conventions of other tools that were recognised, and files that
-    /// are no photo's mask.
-    pub fn warnings<'a>(&self, masks: impl Iterator<Item = &'a MaskSource>, total: usize, invert: bool) -> Vec<String> {
-        let masks: Vec<&MaskSource> = masks.collect();
-        let mut warnings = Vec::new();
-        for pattern in Pattern::ALL {
-            let count = masks.iter().filter(|mask| mask.pattern == pattern).count();
-            if let Some(example) = pattern.example().filter(|_| count > 0) {
-                warnings.push(format!("masks of {count} photos are used, named like {example}"));
+    /// Masks whose names have one of the forms, for the photo's name in the model or that of its file, with the form.
+    fn find_forms(&self, name: &str, photo: &Path) -> BTreeMap<FoundMask, String> {
+        let mut found = BTreeMap::new();
+        let name = folded(name);
+        let (folder, base) = split_folder(&name);
+        let file = folded(&photo.file_name().unwrap_or_default().to_string_lossy());
+        for base in [base, &file] {
+            let stem = split_ending(base).0;
+            for (before, after, inverted) in FORMS {
+                let is_marked = !(before.is_empty() && after.is_empty());
+                for own in [stem, base] {
+                    let key = format!("{before}{own}{after}");
+                    let indexes = [Some(&self.in_folders), is_marked.then_some(&self.beside_photos)];
+                    for entry in indexes.into_iter().flatten().flat_map(|index| match index.find_stem(folder, &key) {
+                        Found::Nothing => Vec::new(),
+                        Found::One(entry) => vec![entry],
+                        Found::Several(entries) => entries,
+                    }) {
+                        let form = form(
+                            entry,
+                            before,
+                            &base[if own == stem { base.len() } else { stem.len() }..],
+                            after,
+                            inverted,
+                        );
+                        found.entry(FoundMask { path: entry.path.clone(), inverted }).or_insert(form);
+                    }
+                }
             }
         }
-        let first = self.in_folders.values().flatten().map(|(_, path)| path).chain(&self.unreadable).next();
-        match first {
-            Some(file) if masks.is_empty() && self.unreadable.is_empty() => warnings.push(format!(
-                "none of the files in the masks folder belongs to a photo: no mask is used; the mask of X.jpg is called X.jpg.png or \
-                 X.png, not {}",
-                file.file_name().unwrap_or_default().display()
-            )),
-            _ if masks.is_empty() && invert => {
-                warnings.push("--invert-masks has no effect: there is no mask".to_string());
-            }
-            _ if !masks.is_empty() && masks.len() < total => {
-                warnings.push(format!("{} of {total} photos have no mask: all of their pixels are used", total - masks.len()));
-            }
-            _ => {}
+        found
+    }
+
+    fn warn_of_unused(&self, masks: &[Option<FoundMask>], warnings: &mut Vec<String>) {
+        let used: BTreeSet<&Path> = masks.iter().flatten().map(|mask| mask.path.as_path()).collect();
+        let unused = |entry: &&Entry| !used.contains(entry.path.as_path());
+        let all: Vec<&Entry> = self.in_folders.entries().chain(self.beside_photos.entries()).filter(unused).collect();
+        let (unread, others): (Vec<&Entry>, Vec<&Entry>) = all.into_iter().partition(|entry| !entry.is_readable());
+        if !unread.is_empty() {
+            let (count, some) = (unread.len(), self.shown(unread.iter().map(|entry| &*entry.path)));
+            warnings
+                .push(format!("{count} masks are neither PNG nor JPEG and are not used: {some}; convert them to PNG"));
         }
-        if let Some(file) = self.unreadable.first() {
+        let links: Vec<&Path> =
+            [&self.in_folders, &self.beside_photos].into_iter().flat_map(|i| &i.dangling).map(|p| &**p).collect();
+        if !links.is_empty() {
+            let (count, some) = (links.len(), self.shown(links.into_iter()));
             warnings.push(format!(
-                "{} masks are not used, because they are neither PNG nor JPEG: {}; convert them, for example with `mogrify -format png`",
-                self.unreadable.len(),
-                file.display()
+                "{count} masks are links whose target is not on this machine, and are not used: {some}; fetch it first (git annex \
+                 get, dvc pull)"
             ));
         }
-        warnings
+        if !others.is_empty() && !used.is_empty() && masks.contains(&None) {
+            let (count, some) = (others.len(), self.shown(others.iter().map(|entry| &*entry.path)));
+            warnings.push(format!("{count} masks belong to no photo: {some}"));
+        }
     }
 
-    fn add_folder(&mut self, folder: &Path, prefix: &str, depth: usize, entered: &mut BTreeSet<PathBuf>) {
-        for_each_entry(folder, entered, &mut |entered, path, name, is_folder| {
-            let relative = format!("{prefix}{name}");
-            let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-            if is_folder {
-                if depth < DEEPEST {
-                    self.add_folder(&path, &format!("{relative}/"), depth + 1, entered);
-                }
-            } else if OTHER_EXTENSIONS.contains(&extension.as_str()) {
-                self.unreadable.push(path);
-            } else {
-                add(&mut self.in_folders, relative, path);
-            }
-        });
-    }
-
-    fn add_beside_photos(&mut self, folder: &Path, prefix: &str, depth: usize, entered: &mut BTreeSet<PathBuf>) {
-        for_each_entry(folder, entered, &mut |entered, path, name, is_folder| {
-            let relative = format!("{prefix}{name}");
-            if is_folder {
-                if depth < DEEPEST {
-                    self.add_beside_photos(&path, &format!("{relative}/"), depth + 1, entered);
-                }
-            } else if is_mask_name(&path) {
-                add(&mut self.beside_photos, relative, path);
-            }
-        });
+    /// The first of these files, by their names in the scene.
+    fn shown<'a>(&self, paths: impl Iterator<Item = &'a Path>) -> String {
+        let names: Vec<String> =
+            paths.take(SHOWN).map(|path| path.strip_prefix(&self.root).unwrap_or(path).display().to_string()).collect();
+        names.join(", ")
     }
 }
 
-/// Whether a file beside photos is named like a mask.
-pub fn is_mask_name(path: &Path) -> bool {
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy().to_lowercase();
-    stem.ends_with(".mask") || stem.ends_with("_mask") || stem.ends_with("-mask") || stem.starts_with("dynamic_mask_")
+/// The folders of masks in a folder; `masks` itself first.
+fn mask_folders(place: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(place).into_iter().flatten().flatten().map(|entry| entry.path());
+    let rank = |path: &Path| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        FOLDERS.iter().position(|folder| *folder == folded(&name)).map(|rank| (name != "masks", rank, name))
+    };
+    let mut found: Vec<(_, PathBuf)> = entries.filter_map(|path| Some((rank(&path)?, path))).collect();
+    found.sort();
+    found.into_iter().map(|(_, path)| path).filter(|path| path.is_dir()).collect()
 }
 
-/// The one file of a name, or the one that is spelled like it but for the case of its extension.
-fn only<'f>(found: &'f SameName, mask: &str) -> Option<&'f PathBuf> {
-    let with_low_extension = |name: &str| match name.rsplit_once('.') {
+/// The form of a mask's name, in words.
+fn form(entry: &Entry, before: &str, ending: &str, after: &str, inverted: bool) -> String {
+    let own = entry.path.extension().unwrap_or_default().to_string_lossy();
+    let form = format!("{before}X{ending}{after}.{own}");
+    let how = match (before, after, inverted) {
+        (_, _, true) => ", in which white is left out",
+        ("", "", _) => ", in other case, form of accents or folder",
+        _ => "",
+    };
+    form + how
+}
+
+/// The name with its last extension in lower case.
+fn normalised(name: &str) -> String {
+    match name.rsplit_once('.') {
         Some((stem, extension)) => format!("{stem}.{}", extension.to_ascii_lowercase()),
         None => name.to_string(),
-    };
-    let is_same = |(name, _): &&(String, PathBuf)| with_low_extension(name) == with_low_extension(mask);
-    let spelled = found.iter().find(is_same);
-    spelled.or(found.first().filter(|_| found.len() == 1)).map(|(_, path)| path)
-}
-
-fn add(files: &mut BTreeMap<String, SameName>, name: String, path: PathBuf) {
-    let same = files.entry(name.to_lowercase()).or_default();
-    // The same name in a later folder.
-    if same.iter().all(|(known, _)| *known != name) {
-        same.push((name, path));
-    }
-}
-
-/// Takes a set of entered folders, an entry's path, its name, and whether it is a folder.
-type TakeEntry<'t> = dyn FnMut(&mut BTreeSet<PathBuf>, PathBuf, String, bool) + 't;
-
-/// Calls `take` for each file and folder in `folder`, in the order of names, links followed. A folder that was entered before, or cannot
-/// be read, counts as empty.
-fn for_each_entry(folder: &Path, entered: &mut BTreeSet<PathBuf>, take: &mut TakeEntry<'_>) {
-    let Ok(entries) = std::fs::read_dir(folder) else { return };
-    if !std::fs::canonicalize(folder).is_ok_and(|folder| entered.insert(folder)) {
-        return;
-    }
-    let mut paths: Vec<PathBuf> = entries.flatten().map(|entry| entry.path()).collect();
-    paths.sort();
-    for path in paths {
-        let (Ok(facts), Some(name)) = (std::fs::metadata(&path), path.file_name().and_then(|name| name.to_str()))
-        else {
-            continue;
-        };
-        if facts.is_dir() || facts.is_file() {
-            let name = name.to_string();
-            take(entered, path, name, facts.is_dir());
-        }
     }
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
-    fn index(names: &[&str], beside: &[&str]) -> MaskIndex {
-        let mut index = MaskIndex::default();
-        names.iter().for_each(|n| add(&mut index.in_folders, n.to_string(), PathBuf::from(n)));
-        beside.iter().for_each(|n| add(&mut index.beside_photos, n.to_string(), PathBuf::from(n)));
-        index
+    /// The masks of photos in `images/`, in a scene with these files.
+    fn found(files: &[&str], photos: &[&str]) -> (Vec<Option<String>>, String) {
+        let root = tempfile::tempdir().unwrap();
+        std::fs::create_dir(root.path().join("images")).unwrap();
+        for file in files {
+            let path = root.path().join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, []).unwrap();
+        }
+        let images = root.path().join("images");
+        let paths: Vec<PathBuf> = photos.iter().map(|name| images.join(name)).collect();
+        let named: Vec<(&str, &Path)> = photos.iter().copied().zip(paths.iter().map(PathBuf::as_path)).collect();
+        let mut warnings = Vec::new();
+        let masks = MaskIndex::scan(root.path(), &images).assign(&named, &mut warnings);
+        let mark = |mask: FoundMask| {
+            let path = mask.path.strip_prefix(root.path()).unwrap().to_str().unwrap().to_string();
+            if mask.inverted { format!("not {path}") } else { path }
+        };
+        (masks.into_iter().map(|mask| mask.map(mark)).collect(), warnings.join("\n"))
     }
 
     #[test]
-    fn masks_are_found_under_every_usual_name() {
-        let masks = index(
-            &[
-                "a.PNG",
-                "b.JPG.png",
-                "c.jpg",
-                "left/d.png",
-                "E.png",
-                "f.jpg.mask.png",
-                "g.mask.png",
-                "h_mask.png",
-                "i.png",
-                "I.png",
-            ],
-            &["k_mask.JPG", "sub/dynamic_mask_l.png", "m.png"],
+    fn plain_names_need_no_word() {
+        for (file, photo) in [
+            ("masks/a.PNG", "a.JPG"),
+            ("masks/b.JPG.png", "b.JPG"),
+            ("masks/c.jpg", "c.JPG"),
+            ("masks/left/d.png", "left/d.jpeg"),
+            ("masks/left/d.png", "images/left/d.jpeg"),
+            ("images/masks/e.png", "e.jpg"),
+        ] {
+            assert_eq!(found(&[file], &[photo]), (vec![Some(file.to_string())], String::new()), "{file}");
+        }
+    }
+
+    #[test]
+    fn forms_of_other_programs_are_used_and_said() {
+        for (file, photo, form) in [
+            ("masks/a.jpg.mask.png", "a.jpg", "X.jpg.mask.png"),
+            ("masks/a.mask.png", "a.jpg", "X.mask.png"),
+            ("masks/A_mask.png", "a.jpg", "X_mask.png"),
+            ("mask/a.png", "cam/a.jpg", "X.png"),
+            ("Masks/a.png", "A.JPG", "X.png"),
+            ("masks/ete\u{301}.png", "et\u{e9}.jpg", "X.png"),
+            ("images/a_mask.JPG", "a.JPG", "X_mask.JPG"),
+            ("images/a.JPG.mask.png", "a.JPG", "X.jpg.mask.png"),
+            ("images/dynamic_mask_a.png", "images/a.jpg", "dynamic_mask_X.png, in which white is left out"),
+            ("masks/images/a.png", "a.jpg", "X.png"),
+        ] {
+            let (masks, said) = found(&[file], &[photo]);
+            let expected = if file.contains("dynamic") { format!("not {file}") } else { file.to_string() };
+            assert_eq!(masks, [Some(expected)], "{file}: {said}");
+            assert!(said.contains(&format!("masks: 1 of the form {form}")), "{file}: {said}");
+        }
+    }
+
+    #[test]
+    fn what_is_unclear_or_cannot_be_read_is_not_used_and_named() {
+        for (files, photos, words) in [
+            (&["masks/a_mask.png", "masks/a.mask.png"][..], &["a.jpg"][..], "a.mask.png, masks/a_mask.png"),
+            (&["mask/a.png"], &["left/a.jpg", "right/a.jpg"], "may belong to 'left/a.jpg'"),
+            (&["masks/a.tif"], &["a.jpg"], "1 masks are neither PNG nor JPEG and are not used: masks/a.tif"),
+            (&["masks/A.bmp"], &["a.jpg"], "masks/A.bmp"),
+            (&["images/other.png", "images/a.png"], &["a.jpg"], ""),
+            (&["masks/v1.2/noext.png"], &["v1.3/noext"], ""),
+        ] {
+            let (masks, said) = found(files, photos);
+            assert!(masks.iter().all(Option::is_none) && said.contains(words), "{files:?}: {masks:?} {said}");
+        }
+        let (masks, said) = found(&["masks/a.png", "masks/c.png"], &["a.jpg", "b.jpg"]);
+        assert!(
+            masks[0].is_some() && masks[1].is_none() && said.contains("1 masks belong to no photo: masks/c.png"),
+            "{said}"
         );
-        let found = |name: &str| masks.find(name).map(|(path, pattern)| (path.to_string_lossy().into_owned(), pattern));
-        let is = |file: &str, pattern: Pattern| Some((file.to_string(), pattern));
-        assert_eq!(found("a.JPG"), is("a.PNG", Pattern::Same));
-        assert_eq!(found("b.JPG"), is("b.JPG.png", Pattern::Appended));
-        assert_eq!(found("c.JPG"), is("c.jpg", Pattern::Same));
-        assert_eq!(found("left/d.jpeg"), is("left/d.png", Pattern::Same));
-        assert_eq!(found("images/left/d.jpeg"), is("left/d.png", Pattern::Same));
-        assert_eq!(found("d.jpeg"), None);
-        assert_eq!(found("e.jpg"), is("E.png", Pattern::Same), "the only one but for its case");
-        assert_eq!((found("i.jpg"), found("I.jpg")), (is("i.png", Pattern::Same), is("I.png", Pattern::Same)));
-        assert_eq!(found("f.jpg"), is("f.jpg.mask.png", Pattern::AppendedMask));
-        assert_eq!(found("g.jpg"), is("g.mask.png", Pattern::DotMask));
-        assert_eq!(found("h.jpg"), is("h_mask.png", Pattern::UnderscoreMask));
-        assert_eq!(found("k.JPG"), is("k_mask.JPG", Pattern::UnderscoreMask));
-        assert_eq!(found("sub/l.jpg"), is("sub/dynamic_mask_l.png", Pattern::DynamicMask));
-        assert_eq!(found("m.jpg"), None, "a photo beside a photo is no mask");
-        assert_eq!(found("v1.2/noext"), None);
     }
 }

@@ -1,49 +1,77 @@
-//! Converts names from files to paths that stay inside a folder. Nothing here accesses the disk.
+//! Converts names from files to names that stay inside a folder. Nothing here accesses the disk.
 //!
-//! Invariants: 1. an accepted name is relative and has no `..` component, drive letter or control character, and at
+//! A name that lies outside of its folder (absolute, on another drive, climbing) is told apart and keeps its components: models
+//! are moved between machines, and the end of such a name may lie inside (`photo_files`).
+//!
+//! Invariants: 1. a name that is returned is relative and has no `..` component, drive letter or control character, and at
 //! most [`MAX_NAME_BYTES`] bytes; 2. both `/` and `\` separate components, on every platform, so that a name means the
 //! same file everywhere. Links inside the folder belong to the user and are followed.
-
-use std::path::{Path, PathBuf};
 
 /// Longest name accepted, bytes: the usual limit of a path.
 pub const MAX_NAME_BYTES: usize = 4096;
 
-/// The name with `/` between its components and without `.` and empty ones, or the reason for refusal.
-pub fn clean_name(name: &str) -> Result<String, String> {
-    if name.len() > MAX_NAME_BYTES {
-        return Err(format!("a name of {} bytes is longer than {MAX_NAME_BYTES}", name.len()));
-    }
-    // {:?} keeps control characters of a hostile name out of the terminal.
-    if name.chars().any(char::is_control) {
-        return Err(format!("the name {name:?} holds control characters"));
-    }
-    if name.starts_with(['/', '\\']) {
-        return Err(format!("the name {name:?} is an absolute path"));
-    }
-    let mut parts = Vec::new();
-    for part in name.split(['/', '\\']) {
-        let bytes = part.as_bytes();
-        match part {
-            "" | "." => {}
-            ".." => return Err(format!("the name {name:?} climbs out of its folder with '..'")),
-            _ if bytes.len() >= 2 && bytes[0].is_ascii_alphabetic() && bytes[1] == b':' => {
-                return Err(format!("the name {name:?} holds a drive letter"));
-            }
-            _ => parts.push(part),
-        }
-    }
-    if parts.is_empty() {
-        return Err(format!("the name {name:?} is not a file name"));
-    }
-    Ok(parts.join("/"))
+/// A name from a file.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StatedName {
+    /// Its components with `/` between them: relative, without root, drive letter, `.` and `..`.
+    pub name: String,
+    /// Why the stated name lies outside of its folder, if it does; `name` then is the part of it that may be looked for inside.
+    pub outside: Option<String>,
 }
 
-/// `folder` joined with a name from a file: the cleaned name and the path, or the reason for refusal.
-pub fn safe_join(folder: &Path, name: &str) -> Result<(String, PathBuf), String> {
-    let name = clean_name(name)?;
-    let path = folder.join(&name);
-    Ok((name, path))
+impl StatedName {
+    /// The name, then its ends with one component less each. Only the name itself if it lies inside of its folder.
+    pub fn tails(&self) -> impl Iterator<Item = &str> {
+        let starts = self.name.match_indices('/').map(|(at, _)| at + 1).filter(|_| self.outside.is_some());
+        std::iter::once(0).chain(starts).map(|at| &self.name[at..])
+    }
+}
+
+/// Reads a name that is relative to the folder `base` (itself relative, possibly empty), or the reason for refusal.
+pub fn read_name(base: &str, stated: &str) -> Result<StatedName, String> {
+    if stated.len() > MAX_NAME_BYTES {
+        return Err(format!("a name of {} bytes is longer than {MAX_NAME_BYTES}", stated.len()));
+    }
+    // {:?} keeps control characters of a hostile name out of the terminal.
+    if stated.chars().any(char::is_control) {
+        return Err(format!("the name {stated:?} holds control characters"));
+    }
+    let mut parts: Vec<&str> = base.split(['/', '\\']).filter(|part| !part.is_empty()).collect();
+    let mut outside = None;
+    if stated.starts_with(['/', '\\']) {
+        parts.clear();
+        outside = Some(format!("the name {stated:?} is an absolute path"));
+    }
+    let mut last = "";
+    for part in stated.split(['/', '\\']) {
+        last = part;
+        let mut part = part;
+        while let [letter, b':', ..] = part.as_bytes()
+            && letter.is_ascii_alphabetic()
+        {
+            part = &part[2..];
+            parts.clear();
+            outside.get_or_insert_with(|| format!("the name {stated:?} holds a drive letter"));
+        }
+        match part {
+            "" | "." => {}
+            ".." if parts.pop().is_none() => {
+                outside.get_or_insert_with(|| format!("the name {stated:?} climbs out of its folder with '..'"));
+            }
+            ".." => {}
+            part => parts.push(part),
+        }
+    }
+    if parts.is_empty() || matches!(last, "." | "..") {
+        return Err(format!("the name {stated:?} is not a file name"));
+    }
+    Ok(StatedName { name: parts.join("/"), outside })
+}
+
+/// The name with `/` between its components and without `.`, `..` and empty ones, or the reason for refusal.
+pub fn clean_name(stated: &str) -> Result<String, String> {
+    let StatedName { name, outside } = read_name("", stated)?;
+    outside.map_or(Ok(name), Err)
 }
 
 #[cfg(test)]
@@ -60,10 +88,30 @@ mod tests {
             ("..a/b..png", "..a/b..png"),
             ("straße/é.png", "straße/é.png"),
             ("12:30.jpg", "12:30.jpg"),
+            ("sparse/../images/a.jpg", "images/a.jpg"),
         ] {
             assert_eq!(clean_name(given).as_deref(), Ok(clean));
         }
-        let (name, path) = safe_join(Path::new("scene"), "./x/y.png").unwrap_or_default();
-        assert_eq!((name.as_str(), path.as_path()), ("x/y.png", Path::new("scene/x/y.png")));
+    }
+
+    #[test]
+    fn names_outside_give_their_ends_and_never_leave() {
+        let tails = |base: &str, stated: &str| {
+            let read = read_name(base, stated).unwrap_or_else(|e| panic!("{e}"));
+            assert!(read.outside.is_some(), "{stated}");
+            read.tails().map(String::from).collect::<Vec<_>>()
+        };
+        assert_eq!(tails("", "/p/images/a.jpg"), ["p/images/a.jpg", "images/a.jpg", "a.jpg"]);
+        assert_eq!(tails("", "C:\\p\\a.jpg"), ["p/a.jpg", "a.jpg"]);
+        assert_eq!(tails("x", "../../p/../a.jpg"), ["a.jpg"]);
+        assert_eq!(tails("x", "D:a.jpg"), ["a.jpg"]);
+        assert_eq!(tails("", "\\\\host\\share\\a.jpg"), ["host/share/a.jpg", "share/a.jpg", "a.jpg"]);
+        assert_eq!(
+            read_name("pose/all", "../../train/a.png").map(|n| (n.name, n.outside)),
+            Ok(("train/a.png".into(), None))
+        );
+        for bad in ["", ".", "..", "/", "a/..", "C:", "a\n", &"a".repeat(MAX_NAME_BYTES + 1)] {
+            assert!(read_name("", bad).is_err(), "{bad:?}");
+        }
     }
 }

@@ -160,10 +160,9 @@ fn undistort<const C: usize>(picture: &[u8], k: Intrinsics, target: Size, mut ta
 
 /// Decodes a mask for a photo with these full-size intrinsics: one byte per target pixel, 255 = keep, 0 = exclude.
 fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> InputResult<Vec<u8>> {
-    let mut keep = read_luma(&mask.path, &mask.header)?;
-    let whitest = if keep.iter().all(|value| *value <= 1) { 1 } else { 128 };
+    let (mut keep, _) = read_luma(&mask.path, &mask.header)?;
     for value in &mut keep {
-        let white = *value >= whitest;
+        let white = *value >= 128;
         *value = if white != mask.invert { 255 } else { 0 };
     }
     let size = (mask.header.width, mask.header.height);
@@ -172,12 +171,6 @@ fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> Inpu
         _ => undistort::<1>(&keep, intrinsics_at(intrinsics, size), target, |_| {}),
     };
     Ok(thresholded(share))
-}
-
-/// Whether a mask holds 0 and 1 instead of black and white; `false` where it cannot be decoded.
-pub fn holds_zero_and_one(mask: &MaskSource) -> bool {
-    read_luma(&mask.path, &mask.header)
-        .is_ok_and(|values| values.contains(&1) && values.iter().all(|value| *value <= 1))
 }
 
 /// Converts coverage of 0 to 255 to 0 or 255; half or more is kept.
@@ -219,14 +212,31 @@ fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<C
     }
 }
 
-/// Decodes a picture to 8-bit gray over black.
-fn read_luma(path: &Path, header: &PhotoHeader) -> InputResult<Vec<u8>> {
+/// Decodes a mask to 8-bit gray over black. A PNG of 0 and 1 is read as one of 0 and 255, which any program writes that
+/// saves labels; a JPEG has such values from black alone.
+fn read_luma(path: &Path, header: &PhotoHeader) -> InputResult<(Vec<u8>, bool)> {
     let picture = read_picture(path, header)?;
-    if !picture.color().has_alpha() {
-        return Ok(picture.into_luma8().into_raw());
+    let is_png = header.format == PhotoFormat::Png;
+    let mut gray = match &picture {
+        DynamicImage::ImageLuma16(deep) if is_png && deep.iter().max() == Some(&1) => {
+            deep.iter().map(|&value| value as u8).collect()
+        }
+        picture if picture.color().has_alpha() => {
+            let gray = picture.to_luma_alpha8();
+            gray.as_raw().as_chunks::<2>().0.iter().map(|&[l, a]| over_black(l, a)).collect()
+        }
+        _ => picture.into_luma8().into_raw(),
+    };
+    let is_0_and_1 = is_png && gray.iter().max() == Some(&1);
+    if is_0_and_1 {
+        gray.iter_mut().for_each(|value| *value *= 255);
     }
-    let gray = picture.into_luma_alpha8();
-    Ok(gray.as_raw().as_chunks::<2>().0.iter().map(|&[l, a]| over_black(l, a)).collect())
+    Ok((gray, is_0_and_1))
+}
+
+/// Whether a mask holds 1 where others hold 255.
+pub(super) fn holds_0_and_1(mask: &MaskSource) -> InputResult<bool> {
+    Ok(read_luma(&mask.path, &mask.header)?.1)
 }
 
 fn over_black(value: u8, alpha: u8) -> u8 {

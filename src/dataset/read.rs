@@ -18,7 +18,8 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
     let mut scene = read_kind(path, facts.is_file(), options)?;
     raw_names::make_readable(path, &mut scene)?;
-    Ok(RawScene { root: root.to_path_buf(), ..scene })
+    let is_above = !scene.root.as_os_str().is_empty();
+    Ok(if is_above { scene } else { RawScene { root: root.to_path_buf(), ..scene } })
 }
 
 fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
@@ -66,6 +67,16 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     }
     if let Some(error) = folder_of_results(path) {
         return Err(error);
+    }
+    if let Some((above, images)) = photos_only::scene_above(path) {
+        let images = options.images.clone().or(Some(images));
+        let mut scene = read_scene(&above, &ReadOptions { images, ..options.clone() })?;
+        let (photos, above) = (path.display(), above.display());
+        scene.warnings.insert(
+            0,
+            format!("{photos} holds photos without poses: the scene is read from the folder above, {above}"),
+        );
+        return Ok(scene);
     }
     if let Some(error) = photos_only::error(path) {
         return Err(error);

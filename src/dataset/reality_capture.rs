@@ -18,7 +18,8 @@
 use super::checks::{checked_intrinsics, sort_views};
 use super::left_out::LeftOut;
 use super::model::{Lens, RawScene, RawView, ReadOptions};
-use super::transforms::photos::{Photo, find_photo, read_size};
+use super::photo_files::PhotoFiles;
+use super::transforms::photos::read_size;
 use super::transforms::pose::make_pose;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::{head_of, read_text};
@@ -58,12 +59,14 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
         return Err(InputError::new(&file, format!("there is no column '{missing}'"), EXPORT));
     }
     let (mut scene, mut left_out) = (RawScene::default(), LeftOut::default());
+    let photos = PhotoFiles::with_folders(folder, options.images.as_deref().or(Some("images")), options);
     for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
         let line = Line { file: &file, number: number + 1, header: &header, cells: cells_of(line, header.separator) };
         line.check_count()?;
-        line.add_view(folder, options, &mut scene.views, &mut left_out)?;
+        line.add_view(&photos, &mut scene.views, &mut left_out)?;
     }
-    left_out.report(&file, options, scene.views.len(), &mut scene.warnings)?;
+    photos.finish(&mut scene.views, &mut scene.warnings);
+    left_out.report(&file, (options, &photos), scene.views.len(), &mut scene.warnings)?;
     sort_views(&file, &mut scene.views)?;
     scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
     Ok(scene)
@@ -185,17 +188,10 @@ impl Line<'_> {
         Ok(numbers)
     }
 
-    fn add_view(
-        &self,
-        folder: &Path,
-        options: &ReadOptions,
-        views: &mut Vec<RawView>,
-        left_out: &mut LeftOut,
-    ) -> InputResult<()> {
-        let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", String::as_str);
+    fn add_view(&self, photos: &PhotoFiles, views: &mut Vec<RawView>, left_out: &mut LeftOut) -> InputResult<()> {
+        let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
         let stays = "names must stay in the folder of the photos: export with plain file names";
-        let photo = photo_of(folder, options.images.as_deref().or(Some("images")), stated)
-            .map_err(|problem| self.error(problem, stays))?;
+        let photo = photos.find(stated).map_err(|problem| self.error(problem, stays))?;
         let [k1, k2, k3, k4, t1, t2] = self.numbers(["k1", "k2", "k3", "k4", "t1", "t2"])?;
         if k4 != 0.0 {
             let remedy = "choose the distortion model Brown3 before the export, or export undistorted photos";
@@ -227,18 +223,6 @@ impl Line<'_> {
         }
         Ok(())
     }
-}
-
-/// The photo that a name means, or a path on another computer: the longest end of it that is a photo here, inside the folder of
-/// the photos.
-fn photo_of(folder: &Path, images: Option<&str>, stated: &str) -> Result<Photo, String> {
-    let is_path = stated.starts_with(['/', '\\']) || stated.get(1..2) == Some(":");
-    let ends = stated.match_indices(['/', '\\']).map(|(at, _)| &stated[at + 1..]);
-    let is_inside = |end: &&str| !end.is_empty() && end.split(['/', '\\']).next() != images;
-    let mut ends: Vec<&str> = if is_path { ends.filter(is_inside).collect() } else { Vec::new() };
-    let Some(name) = ends.pop() else { return find_photo(folder, images, stated) };
-    let longer = ends.iter().filter_map(|end| find_photo(folder, images, end).ok()).find(|photo| photo.exists);
-    longer.map_or_else(|| find_photo(folder, images, name), Ok)
 }
 
 /// Camera to world with the camera's axes right-up-back, from heading, pitch and roll in degrees.

@@ -1,7 +1,7 @@
 //! Command lines and scenes that are wrong or unusual, through the real binaries. A bad scene ends with a message that
 //! names the file, the place and the remedy, with a non-zero exit code, and without an output folder.
 
-use crate::support::scenes::{TextModel, city, stderr, summary, text, train};
+use crate::support::scenes::{TextModel, city, eval, stderr, summary, text, train};
 use gsscale::config::choice::choices;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
@@ -437,11 +437,32 @@ fn a_held_out_photo_that_cannot_be_decoded_loses_no_run() {
     bytes[45] ^= 0xff;
     std::fs::write(&path, bytes).unwrap();
     let out = folder.path().join("out");
-    let output = train(&[text(&scene), "--out", text(&out), "--steps", "12", "-q"]);
-    assert_eq!(output.status.code(), Some(1));
-    assert!(stderr(&output).contains(&model.views[0].name), "{}", stderr(&output));
-    assert!(out.join("point_cloud.ply").is_file());
-    assert_eq!(summary(&out)["steps"], 12);
+    let said = trains(&folder, &scene, &["--eval-every", "6"]);
+    let named = format!("the held-out photo '{}' cannot be read and is not compared", model.views[0].name);
+    assert_eq!(said.matches(&named).count(), 2, "{said}");
+    assert_eq!((summary(&out)["test"]["views"].clone(), summary(&out)["finished"].clone()), (1.into(), true.into()));
+    let output = eval(&[text(&out.join("point_cloud.ply"))]);
+    assert!(output.status.success() && stderr(&output).contains(&named), "{}", stderr(&output));
+    assert!(String::from_utf8_lossy(&output.stdout).contains("\"views\": 1"));
+}
+
+#[test]
+fn held_out_photos_that_are_all_masked_are_said_before_the_first_step() {
+    let (folder, scene, model) = small();
+    let masks = scene.join("masks");
+    std::fs::create_dir(&masks).unwrap();
+    for i in [0, 8] {
+        image::GrayImage::new(96, 64).save(masks.join(format!("{}.png", model.views[i].name))).unwrap();
+    }
+    let out = folder.path().join("out");
+    let output = train(&[text(&scene), "--out", text(&out), "--steps", "12"]);
+    let said = stderr(&output);
+    let warned = said.find("none of the 2 held-out photos can be compared").expect(&said);
+    assert!(
+        warned < said.find("done:").expect(&said) && said.contains("there is no held-out photo that counts"),
+        "{said}"
+    );
+    assert!(output.status.success() && summary(&out)["test"].is_null(), "{said}");
 }
 
 #[test]

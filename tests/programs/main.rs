@@ -33,6 +33,7 @@ mod growing;
 mod growth;
 mod mcmc;
 mod memory;
+mod near_names;
 mod optimizers;
 mod outgrown;
 mod outliers;

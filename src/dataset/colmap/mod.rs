@@ -16,8 +16,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{self, MAX_COORDINATE, listed, sort_views};
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
-use crate::dataset::paths::safe_join;
-use crate::dataset::raw_names;
+use crate::dataset::photo_files::PhotoFiles;
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,6 +25,7 @@ use std::path::{Path, PathBuf};
 pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or .txt) in sparse/*, sparse, colmap/sparse/*, colmap/sparse and the folder itself";
 /// Remedy for a file that COLMAP cannot have written.
 const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
+const STAY_INSIDE: &str = "image names must be relative to the image folder and stay inside it";
 /// A quaternion with a smaller largest component has no direction.
 const MIN_QUAT: f64 = 1e-6;
 
@@ -74,7 +74,7 @@ pub fn looks_like_colmap(scene: &Path) -> bool {
 }
 
 /// Reads the COLMAP model of a scene folder. Views are sorted by name; `image_path` is `scene/<images>/<name>`.
-/// Non-finite points are dropped and counted. If there is no image folder but `train` and `val` with photos, these are
+/// Non-finite points are dropped and counted. If there is no image folder, other places are
 /// searched ([`parts`]).
 ///
 /// # Errors
@@ -84,19 +84,12 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     if !looks_like_colmap(scene) {
         return Err(no_model(scene));
     }
-    let image_folder = scene.join(options.images.as_deref().unwrap_or("images"));
-    let apart = if image_folder.is_dir() { Vec::new() } else { parts::photo_folders(scene) };
-    if !image_folder.is_dir() && apart.is_empty() {
-        return Err(InputError::new(
-            &image_folder,
-            "the image folder does not exist",
-            "name the folder of the photos, relative to the scene, with --images",
-        ));
-    }
-    let photos = apart.first().unwrap_or(&image_folder);
-    let Model { mut views, points, points_path, warnings } = read_model(scene, photos, Some(options.points_later))?;
-    parts::find_photos(&mut views, &apart)?;
-    Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
+    let mut said = Vec::new();
+    let folders = parts::image_folders(scene, options, &mut said)?;
+    let model = read_model((scene, options), folders, Some(options.points_later))?;
+    let Model { views, points, points_path, warnings } = model;
+    said.extend(warnings);
+    Ok(RawScene { views, points, points_path, warnings: said, ..RawScene::default() })
 }
 
 /// Content of a model.
@@ -107,9 +100,13 @@ struct Model {
     warnings: Vec<String>,
 }
 
-/// Reads the model of a folder whose photos are in `image_folder`. `points_later`: whether the caller reads the points
+/// Reads the model of a folder whose photos are in `image_folders`. `points_later`: whether the caller reads the points
 /// later; `None` leaves them out.
-fn read_model(folder: &Path, image_folder: &Path, points_later: Option<bool>) -> InputResult<Model> {
+fn read_model(
+    (folder, options): (&Path, &ReadOptions),
+    image_folders: Vec<PathBuf>,
+    points_later: Option<bool>,
+) -> InputResult<Model> {
     let mut warnings = Vec::new();
     let model = choose_model(folder, &mut warnings)?;
     let cameras_path = model.file("cameras");
@@ -120,7 +117,12 @@ fn read_model(folder: &Path, image_folder: &Path, points_later: Option<bool>) ->
         (text::read_cameras(&cameras_path, &mut warnings)?, text::read_images(&images_path, &mut warnings)?)
     };
     let unit = if model.is_binary { "byte" } else { "line" };
-    let views = make_views(&images_path, unit, image_folder, &cameras, images, &mut warnings)?;
+    let photos = PhotoFiles::in_folders(folder, image_folders.clone(), options.allow_missing);
+    let mut views = make_views((&images_path, unit), &photos, &cameras, images, &mut warnings)?;
+    parts::find_photos(&mut views, &image_folders)?;
+    photos.complete(&mut views);
+    photos.finish(&mut views, &mut warnings);
+    sort_views(&images_path, &mut views)?;
     let (points, points_path) = match points_later {
         None => (PointCloud::default(), None),
         Some(later) => read_points(&model, later, &mut warnings)?,
@@ -182,9 +184,8 @@ fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFo
 }
 
 fn make_views(
-    file: &Path,
-    unit: &str,
-    image_folder: &Path,
+    (file, unit): (&Path, &str),
+    photos: &PhotoFiles,
     cameras: &Cameras,
     images: Vec<ImageRecord>,
     warnings: &mut Vec<String>,
@@ -196,15 +197,12 @@ fn make_views(
     let mut left_out = Vec::new();
     for image in images {
         let place = format!("{unit} {}", image.position);
-        let (name, joined) = safe_join(image_folder, &image.name).map_err(|problem| {
-            InputError::new(file, problem, "image names must be relative to the image folder and stay inside it")
-                .at(&place)
-        })?;
+        let (name, image_path) =
+            photos.place(&image.name).map_err(|problem| InputError::new(file, problem, STAY_INSIDE).at(&place))?;
         let intrinsics = *cameras.get(&image.camera_id).ok_or_else(|| {
             InputError::new(file, format!("camera {} is not in the cameras file", image.camera_id), DAMAGED)
                 .at(format!("{place}, image '{name}'"))
         })?;
-        let image_path = raw_names::find(image_folder, &name).unwrap_or(joined);
         match make_pose(image.quat, image.translation) {
             Some(pose) => views.push(RawView { name, image_path, intrinsics, pose, mask_path: None, split: None }),
             None => left_out.push(name),
@@ -217,7 +215,6 @@ fn make_views(
     if !left_out.is_empty() {
         warnings.push(checks::left_out(file, &left_out, "their pose is not finite or not a rotation"));
     }
-    sort_views(file, &mut views)?;
     Ok(views)
 }
 

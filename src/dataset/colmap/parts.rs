@@ -15,6 +15,7 @@ use super::{Model, read_model};
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::sort_views;
 use crate::dataset::model::{RawScene, RawView, ReadOptions, Split};
+use crate::dataset::name_index::{folded, photos_in};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -29,7 +30,7 @@ pub(in crate::dataset) fn photo_folder(part: &Path) -> Option<PathBuf> {
 }
 
 /// The existing photo folders of both parts.
-pub(super) fn photo_folders(scene: &Path) -> Vec<PathBuf> {
+fn photo_folders(scene: &Path) -> Vec<PathBuf> {
     ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect()
 }
 
@@ -56,9 +57,9 @@ pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> 
     let mut names = BTreeSet::new();
     let mut shared = false;
     for (folder, split) in folders.iter().zip([Split::Train, Split::Test]) {
-        let photos = photos_of(folder, options)?;
+        let photos = vec![photos_of(folder, options)?];
         let points = (split == Split::Train).then_some(options.points_later);
-        let Model { views, points, points_path, warnings } = read_model(folder, &photos, points)?;
+        let Model { views, points, points_path, warnings } = read_model((folder, options), photos, points)?;
         all.warnings.extend(warnings);
         if split == Split::Train {
             (all.points, all.points_path) = (points, points_path);
@@ -86,12 +87,52 @@ fn photos_of(part: &Path, options: &ReadOptions) -> InputResult<PathBuf> {
     })
 }
 
+/// The folders of the photos of one model: the named one or `images`; otherwise those of the parts, a folder in the scene with
+/// another usual name, or the scene itself.
+pub(super) fn image_folders(
+    scene: &Path,
+    options: &ReadOptions,
+    warnings: &mut Vec<String>,
+) -> InputResult<Vec<PathBuf>> {
+    let stated = scene.join(options.images.as_deref().unwrap_or("images"));
+    if stated.is_dir() {
+        return Ok(vec![stated]);
+    }
+    let apart = photo_folders(scene);
+    if !apart.is_empty() {
+        return Ok(apart);
+    }
+    let entries = std::fs::read_dir(scene).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut folders: Vec<PathBuf> = entries.filter(|path| path.is_dir() && photos_in(path) > 0).collect();
+    folders.sort();
+    let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let same = |path: &&PathBuf| folded(&name(path)) == folded(&name(&stated));
+    let other = match options.images {
+        Some(_) => folders.iter().find(same).cloned(),
+        None => folders.iter().find(same).cloned().or_else(|| photo_folder(scene)),
+    };
+    let flat = || (options.images.is_none() && photos_in(scene) > 0).then(|| scene.to_path_buf());
+    if let Some(found) = other.or_else(flat) {
+        warnings.push(format!("{} does not exist: the photos are read from {}", stated.display(), found.display()));
+        return Ok(vec![found]);
+    }
+    let found = folders.iter().map(|path| name(path)).collect::<Vec<_>>().join(", ");
+    let problem = match folders.is_empty() {
+        true => String::from("the image folder does not exist"),
+        false => format!("the image folder does not exist; these hold pictures: {found}"),
+    };
+    Err(InputError::new(&stated, problem, "name the folder of the photos, relative to the scene, with --images"))
+}
+
 /// For one model of all photos without a common folder: finds each view's photo in one of `folders`.
 pub(super) fn find_photos(views: &mut [RawView], folders: &[PathBuf]) -> InputResult<()> {
+    if folders.len() < 2 {
+        return Ok(());
+    }
     for view in views {
         let found: Vec<PathBuf> = folders.iter().map(|f| f.join(&view.name)).filter(|path| path.is_file()).collect();
         match &found[..] {
-            // The loader reports missing photos.
+            // Looked for under near names, then reported by the loader.
             [] => {}
             [path] => view.image_path.clone_from(path),
             _ => {

@@ -18,7 +18,8 @@ use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{MAX_COORDINATE, checked_intrinsics, sort_views};
 use crate::dataset::left_out::LeftOut;
 use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, RawView, ReadOptions};
-use crate::dataset::transforms::photos::{find_photo, read_size};
+use crate::dataset::photo_files::PhotoFiles;
+use crate::dataset::transforms::photos::read_size;
 use glam::{DMat3, DVec3};
 use json::{Camera, Reconstruction, Shot};
 use std::path::{Path, PathBuf};
@@ -54,12 +55,13 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
     let project = if folder.ends_with(FOLDER_OF_ODM) { folder.parent().unwrap_or(Path::new("")) } else { folder };
     let mut scene = RawScene::default();
     let reconstruction = largest(&file, json::load(&file)?, &mut scene.warnings)?;
+    let photos = PhotoFiles::with_folders(project, options.images.as_deref().or(Some("images")), options);
     let mut left_out = LeftOut::default();
     for (name, shot) in &reconstruction.shots {
         let stays = |problem: String| InputError::new(&file, problem, EXPORT_AGAIN).at(format!("shot {name:?}"));
         let camera = reconstruction.cameras.get(&shot.camera);
         let camera = camera.ok_or_else(|| stays(format!("its camera {:?} is not in the file", shot.camera)))?;
-        let photo = find_photo(project, options.images.as_deref().or(Some("images")), name).map_err(stays)?;
+        let photo = photos.find(name).map_err(stays)?;
         let size = match (camera.width, camera.height) {
             (0.0, 0.0) if photo.exists => read_size(&photo.path)?,
             (0.0, 0.0) => {
@@ -84,7 +86,8 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
             }),
         }
     }
-    left_out.report(&file, options, scene.views.len(), &mut scene.warnings)?;
+    photos.finish(&mut scene.views, &mut scene.warnings);
+    left_out.report(&file, (options, &photos), scene.views.len(), &mut scene.warnings)?;
     sort_views(&file, &mut scene.views)?;
     if reconstruction.points.dropped > 0 {
         let dropped = reconstruction.points.dropped;

@@ -10,7 +10,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::loose_json::{LooseJson, is_no_number};
-use crate::dataset::paths::clean_name;
+use crate::dataset::paths::read_name;
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;
@@ -246,8 +246,8 @@ fn read_names<'de, A: SeqAccess<'de>>(of: &mut A) -> Result<Names, A::Error> {
         let Some(name) = name.as_str() else {
             return Ok(Names::Bad("not a list of strings".to_string(), FIX_KEY));
         };
-        match clean_name(name) {
-            Ok(name) => names.insert(name),
+        match read_name("", name) {
+            Ok(read) => names.insert(read.name),
             Err(problem) => return Ok(Names::Bad(problem, STAY_INSIDE)),
         };
     }

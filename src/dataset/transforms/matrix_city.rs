@@ -12,10 +12,12 @@
 //!
 //! Invariant: paths may contain `..`, as those files do, but never leave the scene's folder.
 
-use super::{Reading, json, photos};
+use super::{Reading, json};
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::sort_views;
 use crate::dataset::model::{RawScene, ReadOptions, Split};
+use crate::dataset::paths::read_name;
+use crate::dataset::photo_files::{Photo, PhotoFiles};
 use std::path::{Path, PathBuf};
 
 /// Photo folders inside a block's folder: as in the archive, or as unpacked by other scripts.
@@ -61,12 +63,15 @@ pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<Raw
         }
         files.extend(of_set.into_iter().map(|file| (file, split)));
     }
-    let mut reading = Reading::new(options);
+    let mut reading = Reading::new(folder, options);
+    // Names are relative to the scene, and the image folder lies inside those of the blocks.
+    reading.photos = PhotoFiles::with_folders(folder, None, options);
     reading.root = Some(folder.to_path_buf());
     let mut scene = RawScene::default();
     for (file, split) in &files {
         reading.add_file(file, &json::load(file)?, Some(*split), &mut scene)?;
     }
+    reading.photos.finish(&mut reading.views, &mut scene.warnings);
     reading.report(&files[0].0, &mut scene.warnings)?;
     scene.views = reading.views;
     scene.points_path = CLOUDS.iter().map(|name| folder.join(name)).find(|path| path.is_file());
@@ -74,42 +79,17 @@ pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<Raw
     Ok(scene)
 }
 
-/// The photo at `stated`, relative to `folder`, a folder inside `root`; its name is relative to `root`.
-pub(super) fn find_photo(
-    root: &Path,
-    folder: &Path,
-    images: Option<&str>,
-    stated: &str,
-) -> Result<photos::Photo, String> {
-    let base = folder.strip_prefix(root).unwrap_or(Path::new(""));
-    let name = resolved(&base.to_string_lossy(), stated)?;
-    let (block, file) = name.rsplit_once('/').unwrap_or(("", &name));
-    let block = root.join(block);
-    let own = block.file_name().map(|n| n.to_string_lossy().into_owned());
-    let inside = match images {
-        Some(images) => vec![images],
-        None => INSIDE_BLOCK.into_iter().chain(own.as_deref()).collect(),
-    };
-    let places = std::iter::once(block.join(file)).chain(inside.into_iter().map(|sub| block.join(sub).join(file)));
-    let found = places.into_iter().find(|path| path.is_file());
-    let exists = found.is_some();
-    Ok(photos::Photo { path: found.unwrap_or_else(|| root.join(&name)), name, exists })
-}
-
-/// `stated` relative to `base`, both with `/`, without `..`; refused if it leaves the folder that `base` is relative
-/// to.
-fn resolved(base: &str, stated: &str) -> Result<String, String> {
-    let climbs = || format!("the name {stated:?} climbs out of the scene's folder with '..'");
-    let mut parts: Vec<&str> = base.split(['/', '\\']).filter(|p| !p.is_empty()).collect();
-    let mut rest = stated;
-    while let Some(up) = rest.strip_prefix("../").or_else(|| rest.strip_prefix("./")) {
-        if rest.starts_with("..") {
-            parts.pop().ok_or_else(climbs)?;
-        }
-        rest = up;
-    }
-    // Further `..`, and everything else that names must not contain, is refused as elsewhere.
-    let rest = crate::dataset::paths::clean_name(rest)?;
-    parts.push(&rest);
-    Ok(parts.join("/"))
+/// The photo at `stated`, relative to the folder `base` of the scene; its name is relative to the scene.
+pub(super) fn find_photo(photos: &PhotoFiles, base: &str, images: Option<&str>, stated: &str) -> Result<Photo, String> {
+    photos.find_at(stated, read_name(base, stated)?, "", &|place| {
+        let block = place.parent().unwrap_or(place);
+        let (file, own) = (place.file_name()?, block.file_name().map(|name| name.to_string_lossy()));
+        let inside = match images {
+            Some(images) => vec![images],
+            None => INSIDE_BLOCK.into_iter().chain(own.as_deref()).collect(),
+        };
+        let mut places =
+            std::iter::once(place.to_path_buf()).chain(inside.into_iter().map(|sub| block.join(sub).join(file)));
+        places.find(|path| path.is_file()).map(|path| (path, String::new()))
+    })
 }

@@ -26,7 +26,8 @@ pub(in crate::dataset) mod pose;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::checks::{left_out, listed, sort_views};
 use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
-use crate::dataset::paths::{clean_name, safe_join};
+use crate::dataset::paths::read_name;
+use crate::dataset::photo_files::{PhotoFiles, file_inside};
 use intrinsics::Levels;
 use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
@@ -46,13 +47,14 @@ pub fn looks_like_transforms(folder: &Path) -> bool {
 /// No JSON, broken JSON, keys of the wrong kind, unsupported cameras, names that leave the folder or occur twice, no
 /// view left, missing photos whose size is needed.
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let mut reading = Reading::new(options);
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
     let files = choose_files(path, &mut scene.warnings)?;
+    let mut reading = Reading::new(files[0].0.parent().unwrap_or(Path::new("")), options);
     for (file, split) in &files {
         reading.add_file(file, &json::load(file)?, *split, &mut scene)?;
     }
     let file = &files[0].0;
+    reading.photos.finish(&mut reading.views, &mut scene.warnings);
     reading.report(file, &mut scene.warnings)?;
     scene.views = reading.views;
     sort_views(file, &mut scene.views)?;
@@ -85,6 +87,7 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
 /// State of the reader.
 struct Reading<'a> {
     options: &'a ReadOptions,
+    photos: PhotoFiles,
     views: Vec<RawView>,
     bad_poses: Vec<String>,
     missing: Vec<String>,
@@ -95,9 +98,11 @@ struct Reading<'a> {
 }
 
 impl<'a> Reading<'a> {
-    fn new(options: &'a ReadOptions) -> Reading<'a> {
+    /// Photos are looked for in `folder`.
+    fn new(folder: &Path, options: &'a ReadOptions) -> Reading<'a> {
         let (views, bad_poses, missing, unlisted) = Default::default();
-        Reading { options, views, bad_poses, missing, unlisted, root: None }
+        let photos = PhotoFiles::with_folders(folder, options.images.as_deref(), options);
+        Reading { options, photos, views, bad_poses, missing, unlisted, root: None }
     }
 
     fn add_file(
@@ -132,7 +137,7 @@ impl<'a> Reading<'a> {
         let refused = |problem: String| frame.error(key, problem, STAY_INSIDE);
         let split = match prescribed {
             None => split,
-            Some(lists) => match lists.split_of(&clean_name(&stated).map_err(refused)?) {
+            Some(lists) => match lists.split_of(&read_name("", &stated).map_err(refused)?.name) {
                 None => {
                     self.unlisted.push(stated.into_owned());
                     return Ok(());
@@ -140,11 +145,13 @@ impl<'a> Reading<'a> {
                 found => found,
             },
         };
-        let images = self.options.images.as_deref();
         let mut matrix = pose::read_matrix(frame)?;
         let photo = match &self.root {
-            None => photos::find_photo(folder, images, &stated),
-            Some(root) => matrix_city::find_photo(root, folder, images, &stated),
+            None => self.photos.find(&stated),
+            Some(root) => {
+                let base = folder.strip_prefix(root).unwrap_or(Path::new("")).to_string_lossy();
+                matrix_city::find_photo(&self.photos, &base, self.options.images.as_deref(), &stated)
+            }
         };
         let photo = photo.map_err(refused)?;
         if self.root.is_some() {
@@ -165,7 +172,7 @@ impl<'a> Reading<'a> {
         let intrinsics = levels.intrinsics(size)?;
         let mask_path = match frame.text("mask_path")? {
             None => None,
-            Some(mask) => Some(safe_join(folder, mask).map_err(|p| frame.error("mask_path", p, STAY_INSIDE))?.1),
+            Some(mask) => Some(file_inside(folder, mask).map_err(|p| frame.error("mask_path", p, STAY_INSIDE))?.1),
         };
         self.views.push(RawView { name: photo.name, image_path: photo.path, intrinsics, pose, mask_path, split });
         Ok(())
@@ -174,7 +181,8 @@ impl<'a> Reading<'a> {
     /// Warns about dropped views; fails if a photo's size was needed or no view remains.
     fn report(&self, file: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
         if !self.missing.is_empty() && !self.options.allow_missing {
-            let problem = format!("{} photo(s) are missing: {}", self.missing.len(), listed(&self.missing));
+            let near = self.photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
+            let problem = format!("{} photo(s) are missing: {}{near}", self.missing.len(), listed(&self.missing));
             let remedy = "put them there, name their folder with --images, or leave them out with --allow-missing";
             return Err(InputError::new(file, problem, remedy).at("file_path"));
         }
@@ -245,7 +253,7 @@ impl<'j> Prescribed<'j> {
 /// The PLY that the file names, if it exists.
 fn points_path(top: &Node<'_>, folder: &Path, warnings: &mut Vec<String>) -> InputResult<Option<PathBuf>> {
     let Some(stated) = top.text("ply_file_path")? else { return Ok(None) };
-    let (name, path) = safe_join(folder, stated).map_err(|p| top.error("ply_file_path", p, STAY_INSIDE))?;
+    let (name, path) = file_inside(folder, stated).map_err(|p| top.error("ply_file_path", p, STAY_INSIDE))?;
     if path.is_file() {
         return Ok(Some(path));
     }

@@ -39,6 +39,7 @@ use crate::train::log::progress::{Count, Progress};
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::start::tiers::Tiers;
+use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -145,6 +146,7 @@ pub(super) fn train_into(
         }
     }
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    warn_of_held_out(dataset, &targets);
     let live = request.live.clone().map(|live| {
         live.set_metrics(out.join(METRICS_FILE));
         LivePage::new(live)

@@ -48,7 +48,8 @@ pub struct EvalRequest<'a> {
 }
 
 /// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
-/// metrics and do not count in the means, nor do views whose photo cannot be decoded, which are named in a warning. `None` if no view has metrics.
+/// metrics and do not count in the means. Nor do photos that cannot be decoded, which a warning names: a photo must not cost the
+/// figures of all others. `None` if no view has metrics, with a warning.
 ///
 /// # Errors
 /// Pages could not be pinned, the renderer failed, or a picture cannot be written.
@@ -68,9 +69,9 @@ pub fn evaluate(
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = match targets.get(view) {
             Ok(target) => target,
-            // A damaged photo costs its own figures and no other's.
             Err(error) => {
-                crate::tell!("warning: the held-out photo {} is not measured: {error}", dataset.views[view].name);
+                let name = &dataset.views[view].name;
+                crate::tell!("warning: the held-out photo '{name}' cannot be read and is not compared: {error}");
                 (request.progress)(i as u32 + 1);
                 continue;
             }
@@ -108,10 +109,7 @@ pub fn evaluate(
         write_whole(&folder.join(name), serde_json::Value::from(figures).to_string().as_bytes())?;
     }
     if psnrs.is_empty() {
-        let count = request.views.len();
-        crate::tell!(
-            "warning: nothing is measured: none of the {count} held-out photos can be read and has a pixel outside its mask"
-        );
+        crate::tell!("warning: {}", none_counts(request.views.len()));
         return Ok(None);
     }
     let ssim = if ssims.is_empty() { 0.0 } else { mean(&ssims) };
@@ -123,6 +121,30 @@ pub fn evaluate(
     });
     let views = psnrs.len() as u32;
     Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, color_corrected, half_fitted }))
+}
+
+/// Warns, before a run spends its time, if no held-out photo will have figures. Decodes photos up to the first that has.
+pub fn warn_of_held_out(dataset: &Dataset, targets: &TargetCache) {
+    let views = dataset.test_views();
+    let mut first_error = None;
+    for &view in &views {
+        match targets.get(view) {
+            Ok(target) if target.counts() => return,
+            Ok(_) => {}
+            Err(error) => _ = first_error.get_or_insert(error),
+        }
+    }
+    if !views.is_empty() {
+        let why = first_error.map_or(String::new(), |error| format!(" ({error})"));
+        crate::tell!("warning: {}{why}", none_counts(views.len()));
+    }
+}
+
+fn none_counts(views: usize) -> String {
+    format!(
+        "none of the {views} held-out photos can be compared, so there will be no figures: masks leave out all of their pixels, or \
+         they cannot be read; hold out others with --test-every, or correct the masks (see --invert-masks)"
+    )
 }
 
 /// PSNR of the right half of a picture, `[3][height][width]`: as it is, and under the correction that brings the left half

@@ -5,7 +5,7 @@ use crate::allocation::peak_of;
 use crate::exif::{Settings, with_exif};
 use crate::scene_folder::scratch;
 use gsscale::dataset::exif::brightness;
-use gsscale::dataset::masks::{MaskSource, Pattern};
+use gsscale::dataset::masks::MaskSource;
 use gsscale::dataset::model::{Intrinsics, Lens};
 use gsscale::dataset::photo::{Alpha, PhotoSource, decode};
 use gsscale::dataset::photo_header::{PhotoHeader, read_header};
@@ -115,7 +115,7 @@ pub fn decoded(bytes: &[u8]) -> [(&'static str, u64, u64); 2] {
         let intrinsics = Intrinsics { width, height, fx: 50.0, fy: 50.0, cx: 1.0, cy: 1.0, lens: Lens::Pinhole };
         PhotoSource { image_path, header, intrinsics, target: (16, 12), mask, alpha: Alpha::Mask }
     };
-    let mask = Some(MaskSource { path: path.clone(), header, invert: false, pattern: Pattern::Same });
+    let mask = Some(MaskSource { path: path.clone(), header, invert: false });
     [("a photo", source(path.clone(), header, None)), ("a mask", source(small, of_small, mask))].map(
         |(what, source)| {
             let peak = peak_of(|| assert!(decode(&source).is_ok()));

@@ -3,7 +3,7 @@
 use super::{split_mode, with_mode};
 use crate::Target;
 use crate::scene_folder::{read_and_check, scratch, stays_in};
-use gsscale::dataset::paths::{MAX_NAME_BYTES, clean_name, safe_join};
+use gsscale::dataset::paths::{MAX_NAME_BYTES, clean_name, read_name};
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -197,10 +197,14 @@ pub fn image_names() -> Target {
 fn run_name(input: &[u8]) {
     let name = String::from_utf8_lossy(input);
     let folder = Path::new("/data/scene");
-    if let Ok((clean, path)) = safe_join(folder, &name) {
-        assert!(stays_in(folder, &path), "{path:?}");
-        assert!(clean.len() <= MAX_NAME_BYTES && !clean.contains('\\') && !clean.chars().any(char::is_control));
-        assert_eq!(clean_name(&clean), Ok(clean));
+    for base in ["", "pose/all"] {
+        let Ok(read) = read_name(base, &name) else { continue };
+        for tail in read.tails() {
+            assert!(stays_in(folder, &folder.join(tail)), "{tail:?}");
+            assert!(tail.len() <= MAX_NAME_BYTES + base.len() + 1 && !tail.contains('\\'));
+            assert!(!tail.chars().any(char::is_control));
+            assert_eq!(clean_name(tail).as_deref(), Ok(tail));
+        }
     }
     read_and_check(scene_of(&binary_files(input), "bin").path());
     read_and_check(scene_of(&text_files(input), "txt").path());

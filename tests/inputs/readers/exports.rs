@@ -119,7 +119,7 @@ fn bad_lines_of_a_csv_are_refused_by_number() {
         ("a.png,1,2", &["line 3", "3 cells"]),
         ("a.png,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0", &["line 3", "focal length"]),
         ("a.png,1,2,3,0,0,0,18,0,0,0,0,0,0.5,0,0", &["line 3", "Brown3"]),
-        ("../a.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["line 3", "climbs out"]),
+        ("../c.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["line 3", "climbs out"]),
         ("b.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["1 photo(s) are missing", "'b.png'"]),
         (good, &["two views"]),
     ] {
