@@ -43,7 +43,8 @@ fn models_whose_names_nearly_match_train_as_if_they_matched() {
     let (folder, scene, model) = small();
     let (expected, said) = run(folder.path(), &scene, &[]);
     assert!(!said.contains("other names"), "{said}");
-    let rename: [(&str, &dyn Fn(&str) -> String); 12] = [
+    type Rename<'a> = &'a dyn Fn(&str) -> String;
+    let rename: [(&str, Rename); 12] = [
         ("another case", &|name| name.replace(".jpg", ".JPG")),
         ("another ending", &|name| name.replace(".jpg", ".ARW")),
         ("no ending", &|name| name.replace(".jpg", "")),

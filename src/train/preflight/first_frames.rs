@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::train::memory::budget::{FRAMES_LEAST, frames_and_batch};
-use crate::train::memory::estimate::{MemoryEstimate, obtainable_bytes};
+use crate::train::memory::estimate::{MemoryEstimate, list_bytes, obtainable_bytes};
 use crate::train::memory::staging::with_staging;
 use crate::train::step::working_set::WorkingSet;
 
@@ -72,6 +72,13 @@ fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
     bytes + bytes / 50 + memory.base / 16
 }
 
+/// What lists of intersections may take more in a run with `bytes`, which were measured in a run with `budget`: lists fill their share of
+/// the budget where a view needs longer ones. An eighth of what is added goes to lists again.
+fn more_lists(bytes: u64, budget: u64) -> u64 {
+    let more = list_bytes(bytes).saturating_sub(list_bytes(budget));
+    more + more / 7
+}
+
 /// Margin for a view slightly larger than the rendered ones: its vectors grow by an eighth.
 fn view_spare(memory: &MemoryEstimate) -> u64 {
     (memory.view - memory.view_pixels) / 8
@@ -108,12 +115,13 @@ pub(super) fn frames_of_budget(
             format_bytes(beside),
             format_bytes(of_a_page)
         );
-        let floor = with_staging(beside - memory.staging + of_a_page, memory.staging, budget);
+        let floor = with_margin(with_staging(beside - memory.staging + of_a_page, memory.staging, budget), memory);
+        let whole = least_memory(need, memory, host_mem);
         let remedy = format!(
             "give at least {} ({} keeps each view in one batch), or lower --image-cache, --prefetch-bytes, --page-rows, \
              --sh-degree or the size of the photos",
-            format_bytes_up(with_margin(floor, memory)),
-            format_bytes_up(least_memory(need, memory, host_mem))
+            format_bytes_up(floor + more_lists(floor, budget)),
+            format_bytes_up(whole + more_lists(whole, budget))
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };
