@@ -13,6 +13,7 @@ pub mod frame;
 pub mod import;
 pub mod layout;
 mod left_out;
+pub mod load_options;
 pub mod loader;
 pub mod lookalike;
 mod loose_json;

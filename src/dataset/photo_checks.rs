@@ -2,7 +2,7 @@
 //!
 //! Not here: which views there are ([`super::loader`]), where masks are found ([`super::masks`]), pixels ([`super::photo`]).
 
-use super::loader::LoadOptions;
+use super::load_options::LoadOptions;
 use super::masks::{FoundMask, MaskIndex, MaskSource};
 use super::model::{Intrinsics, RawView, Split};
 use super::photo::{Alpha, PhotoSource, holds_0_and_1, intrinsics_at};

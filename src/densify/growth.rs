@@ -192,6 +192,11 @@ impl GrowthRule {
         })
     }
 
+    /// The steps of the first and of the last check.
+    pub fn check_steps(&self) -> [u32; 2] {
+        [CHECKS[0], CHECKS[CHECKS.len() - 1]].map(|[share, _]| (share * f64::from(self.unit)) as u32)
+    }
+
     /// Whether a check may still come after this step or a later one.
     pub fn is_open(&self, step: u32, refine_every: u32) -> bool {
         let [last, _] = CHECKS[CHECKS.len() - 1];

@@ -208,6 +208,7 @@ impl World {
             stop: &stop,
             checkpoint: Some(&mut checkpoint),
             live: None,
+            costs: Default::default(),
         };
         if let Err(error) = trainer.run(&dataset, &targets, &mut outputs) {
             self.after_failure(out, &mut trainer, &dataset, &checkpoint, &error);

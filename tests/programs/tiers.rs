@@ -216,7 +216,7 @@ fn the_codec_follows_from_the_moments() {
 /// The codec that a run announces at its start.
 fn codec_of(output: &std::process::Output) -> String {
     let said = told(output);
-    let line = said.lines().find(|line| line.starts_with("drive ")).expect(&said);
+    let line = said.lines().find(|line| line.contains("one version is ")).expect(&said);
     line.split(['(', ')']).nth(1).expect(line).to_string()
 }
 

@@ -36,8 +36,19 @@ pub fn json_of_forecast(forecast: &Forecast) -> Value {
         "memory_bytes": forecast.memory_at_end().total(), "memory_bytes_at_start": forecast.memory[0].total(),
         "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_most": forecast.drive_bytes_most,
         "ply_bytes": forecast.ply_bytes, "bytes_written": forecast.bytes_written,
+        "if_growth_does_not_pay": forecast.if_kept.as_ref().map(|kept| json_of_forecast(kept)),
         "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds, "drive_seconds": forecast.drive_seconds,
     })
+}
+
+/// The same of a run whose growth will not pay.
+fn text_of_kept(kept: &Forecast) -> String {
+    format!(
+        "  if growth does not pay: memory about {}, drive {}, time about {}\n",
+        format_bytes(kept.memory_at_end().total()),
+        format_bytes(kept.drive_bytes_most),
+        format_seconds(kept.seconds)
+    )
 }
 
 /// The lines about the run; the table below them is about comparisons.
@@ -58,13 +69,14 @@ fn text_of_forecast(scene: &Scene) -> String {
     };
     format!(
         "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \
-         drive   {drive}, PLY {}; commits write {} at most\n  time    about {}\n",
+         drive   {drive}, PLY {}; commits write {} at most\n  time    about {}\n{}",
         format_grouped(forecast.gaussians[1]),
         if matches!(forecast.reach, Reach::Guess | Reach::Decided) { " (a guess)" } else { "" },
         format_bytes(forecast.memory_at_end().total()),
         format_bytes(forecast.ply_bytes),
         format_bytes(forecast.commit_bytes_most as u64),
         format_seconds(forecast.seconds),
+        forecast.if_kept.as_deref().map_or(String::new(), text_of_kept),
     )
 }
 

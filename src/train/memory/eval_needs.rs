@@ -14,8 +14,8 @@ use std::path::Path;
 
 /// Bytes of a renderer for a Gaussian in view: splat, sort and intersections with tiles.
 const RENDERER_ROW_BYTES: u64 = 320;
-/// Bytes of a renderer and of SSIM for a pixel: picture, coverage, and bands of windows.
-const PIXEL_BYTES: u64 = 24;
+/// Bytes of a renderer for a pixel: colour and coverage of the picture, and colour, transmittance and last splat of its tile.
+const PIXEL_BYTES: u64 = 36;
 
 /// Refuses an evaluation of these Gaussians on the held-out photos of a scene that may take more than the memory of the program.
 ///

@@ -106,8 +106,8 @@ pub(crate) struct StepUse {
 /// Scene, frames and times of a run whose traffic is simulated.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SimulatedRun {
-    /// Frames, possibly more than pages.
-    pub frames: usize,
+    /// Frames, possibly more than pages, with the Gaussians of now and with those of the end.
+    pub frames: [usize; 2],
     /// Gaussians at the end over those of now.
     pub growth: f64,
     /// Seconds of a step that waits for nothing, with the Gaussians of now and with those of the end.
@@ -116,8 +116,8 @@ pub(crate) struct SimulatedRun {
     pub drive: DriveRate,
 }
 
-/// What the steps of a run do with its drive. Simulates a few epochs with the current pages. At the end the same number of frames holds a
-/// smaller share of the pages, and a view needs more pages.
+/// What the steps of a run do with its drive. Simulates a few epochs with the current pages. At the end the frames hold a smaller share of
+/// the pages, and a view that needs as large a share as now goes in batches where it needs more than the frames.
 pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Trainer, run: &SimulatedRun) -> DriveUse {
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
@@ -142,8 +142,8 @@ pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Train
     };
     // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
     let growth = run.growth.max(1.0);
-    let then = ((run.frames as f64 / growth) as usize).max(views.most().min(run.frames)).min(index.len());
-    let frames = run.frames.min(index.len()).max(1);
+    let [frames, then] =
+        [run.frames[0] as f64, run.frames[1] as f64 / growth].map(|n| (n as usize).clamp(1, index.len().max(1)));
     let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
     let [step_seconds, step_seconds_then] = run.step_seconds;
     let now = of_step(frames, 1.0, step_seconds);

@@ -16,6 +16,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::residence::Residence;
 use crate::densify::growth::GrowthCheck;
+use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::state::row_bytes;
@@ -32,9 +33,9 @@ const ROUND_POWER: f64 = 0.4;
 /// Most Gaussians that a round adds, as a share of the existing ones: the share that the first rounds of a scene with few
 /// points add.
 const ADDED_MOST: f64 = 0.6;
-/// The number of Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.3 on sheffield_cross, 8 on cities,
+/// Most Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.3 on sheffield_cross, 8 on cities,
 /// see "A count that the program decides" in `benches/RESULTS.md`.
-const DECIDED: f64 = 4.0;
+const DECIDED_MOST: f64 = 8.0;
 /// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power of
 /// their number.
 pub const STEP_GROWTH: f64 = 0.54;
@@ -63,7 +64,7 @@ pub enum Reach {
     Guess,
     /// The number at the start: the run has too few photos to decide another one.
     Kept,
-    /// A guess: the run decides the count as it trains ([`crate::densify::growth`]).
+    /// The most that is likely: the run decides the count as it trains ([`crate::densify::growth`]).
     Decided,
 }
 
@@ -85,7 +86,7 @@ pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32, chec
     let guess = guess(rows, rounds, every).min(pixels.max(rows));
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess, Reach::Guess),
-        (Some(_), None) => (guess.min((DECIDED * rows as f64) as u64), Reach::Decided),
+        (Some(_), None) => (guess.min((DECIDED_MOST * rows as f64) as u64), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
 }
@@ -110,6 +111,8 @@ pub struct Forecast {
     pub gaussians: [u64; 2],
     /// How the last number is known.
     pub reach: Reach,
+    /// The forecast of the same run without growth, if the run will decide how far it grows.
+    pub if_kept: Option<Box<Forecast>>,
     /// Steps to do.
     pub steps: u32,
     /// Memory now, at the cap on Gaussians, and at the number that will be reached.
@@ -168,16 +171,17 @@ impl Forecast {
         let steps = config.steps.saturating_sub(steps_done);
         let step_seconds = view_seconds * STEP_OVER_RENDERING;
         let more = ROW_SECONDS * visible_share * (last - rows) as f64 / rayon::current_num_threads() as f64;
-        let by_rows = step_seconds + more * (mean_over_steps(config, steps_done, 2.0, 1.0) - 1.0);
-        let by_power = step_seconds * mean_over_steps(config, steps_done, growth, STEP_GROWTH);
-        let waits_and_writes = drive.mean_of_steps(config, steps_done, growth);
+        let growing = GrowingSteps::new(config, steps_done, growth);
+        let by_rows = step_seconds + more * (growing.mean(2.0, 1.0) - 1.0);
+        let by_power = step_seconds * growing.mean(growth, STEP_GROWTH);
+        let waits_and_writes = drive.mean_of_steps(&growing, growth);
         let drive_seconds = f64::from(steps) * waits_and_writes.waits;
         let seconds = f64::from(steps) * by_power.min(by_rows) + drive_seconds;
         let is_in_memory = config.residence() == Residence::Memory;
         let drive_bytes = (tiers.pages[0] as f64 * growth).ceil() as u64 * tiers.frame_bytes;
         let state_bytes = last * row_bytes(config.sh_degree) as u64;
-        let commit_bytes_most = commit_bytes(config, state_bytes, seconds);
-        let versions = versions(is_in_memory, commit_bytes_most / state_bytes.max(1) as f64);
+        let (commits, commit_bytes_most) = commits(config, state_bytes, seconds);
+        let versions = versions(is_in_memory, commits);
         let pages_then = tiers.pages[0] as f64 * growth;
         // The first commit of a run in memory sizes the segments; the import does with a spill directory.
         let sized_by = if is_in_memory { pages_then.ceil() as u64 } else { tiers.pages[0] };
@@ -186,6 +190,7 @@ impl Forecast {
         let mut forecast = Forecast {
             gaussians: [rows, last],
             reach,
+            if_kept: None,
             steps,
             memory,
             frames_at_end: tiers.frames,
@@ -214,11 +219,7 @@ impl Forecast {
         let [_, grown @ ..] = &mut self.memory;
         let [start, last] = self.gaussians;
         for (memory, rows) in grown.iter_mut().zip([rows_at_most(config, start), last]) {
-            let growth = rows as f64 / start.max(1) as f64;
-            let pages = (self.tiers.largest_view.pages as f64 * growth).ceil() as u64;
-            let need = LargestNeed { frame_bytes: self.tiers.frame_bytes, pages };
-            let frames = obey(config, &need, budget, memory);
-            self.frames_at_end = self.tiers.frames.map(|now| if rows > start { frames.min(now) } else { now });
+            self.frames_at_end = frames_then(config, &self.tiers, [start, rows], memory, budget);
         }
     }
 
@@ -233,10 +234,31 @@ impl Forecast {
     }
 }
 
+/// Frames of a scene that has grown from the first to the second number of Gaussians within a budget, whose `memory` is made to obey
+/// that budget. `None` for a run in memory.
+pub(crate) fn frames_then(
+    config: &TrainConfig,
+    tiers: &TierPlan,
+    [start, rows]: [u64; 2],
+    memory: &mut MemoryEstimate,
+    budget: u64,
+) -> Option<u64> {
+    let growth = rows as f64 / start.max(1) as f64;
+    let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
+    let need = LargestNeed { frame_bytes: tiers.frame_bytes, pages };
+    let frames = obey(config, &need, budget, memory);
+    tiers.frames.map(|now| if rows > start { frames.min(now) } else { now })
+}
+
 impl DriveUse {
+    /// That of a run whose scene stays as it is.
+    pub(crate) fn without_growth(self) -> DriveUse {
+        DriveUse { of_step: [self.of_step[0]; 2], ..self }
+    }
+
     /// The mean over the steps to do: from a step of now to one with the Gaussians of the end, as their number grows.
-    fn mean_of_steps(&self, config: &TrainConfig, steps_done: u32, growth: f64) -> StepUse {
-        let ramp = mean_over_steps(config, steps_done, growth, 1.0);
+    fn mean_of_steps(&self, growing: &GrowingSteps, growth: f64) -> StepUse {
+        let ramp = growing.mean(growth, 1.0);
         let share = if growth > 1.0 { (ramp - 1.0) / (growth - 1.0) } else { 0.0 };
         let [now, at_end] = self.of_step;
         let mean = |now: f64, at_end: f64| now + share * (at_end - now);
@@ -252,11 +274,15 @@ fn store_bytes_most(config: &TrainConfig, pages: f64, versions: u64, layout: Slo
     slots + reserve + MAP_BYTES + versions * pages * MAP_PAGE_BYTES
 }
 
-/// Versions of a page on the drive of a run that commits so many times: those of the last two commits, and that of a commit being
-/// written or, with a spill directory, of the steps since the last one.
-fn versions(is_in_memory: bool, commits: f64) -> u64 {
-    let commits = commits as u64;
-    if is_in_memory { commits.clamp(1, VERSIONS) } else { VERSIONS.min(commits + 1) }
+/// Most versions of a page on the drive of a run that commits so many times before its end: those of the last two commits, and that of
+/// a commit being written or, with a spill directory, of the steps since the last one. The first pages of a spill directory are a
+/// commit, and so is the end of every run that has committed.
+fn versions(is_in_memory: bool, commits: u64) -> u64 {
+    match (is_in_memory, commits) {
+        (true, 0) => 1,
+        (true, _) => VERSIONS.min(commits + 1),
+        (false, _) => VERSIONS.min(commits + 2),
+    }
 }
 
 /// Bytes of a PLY of `rows` Gaussians.
@@ -264,34 +290,62 @@ pub(super) fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
     rows * (PLY_ROW_BYTES + 12 * (u64::from(config.sh_degree) + 1).pow(2))
 }
 
-/// Mean over the steps to do of (Gaussians / Gaussians now) to a power, if their number grows evenly between the first round
-/// and the last.
-fn mean_over_steps(config: &TrainConfig, done: u32, growth: f64, power: f64) -> f64 {
-    let steps = f64::from(config.steps.saturating_sub(done).max(1));
-    let last = f64::from(config.refine_stop.min(config.steps).max(done) - done);
-    let first = f64::from(config.refine_start.max(done) - done).min(last);
-    // The mean of x^power for x from 1 to growth.
-    let ramp = match growth - 1.0 {
-        more if more.abs() < 1e-9 => 1.0,
-        more => (growth.powf(power + 1.0) - 1.0) / ((power + 1.0) * more),
-    };
-    (first + (last - first) * ramp + (steps - last).max(0.0) * growth.powf(power)) / steps
+/// The steps to do, by what the number of Gaussians does meanwhile.
+struct GrowingSteps {
+    /// Steps before it grows.
+    before: f64,
+    /// Steps in which it grows, evenly.
+    growing: f64,
+    /// Steps after that.
+    after: f64,
 }
 
-/// Most bytes that the commits of a run of `seconds` write.
-fn commit_bytes(config: &TrainConfig, state_bytes: u64, seconds: f64) -> f64 {
+impl GrowingSteps {
+    /// Those of a scene that becomes so many times as large. A round of the long-axis strategy doubles the scene as long as there is room,
+    /// so that growth to a cap ends early; a run that decides its count grows with its checks.
+    fn new(config: &TrainConfig, done: u32, growth: f64) -> GrowingSteps {
+        let end = config.refine_stop.min(config.steps);
+        let [first, last] = match limits::growth_rule(config) {
+            Some(rule) => rule.check_steps().map(|step| step.min(end)),
+            None if config.strategy == StrategyName::LongAxis => {
+                let rounds = growth.max(1.0).log2().ceil() as u32;
+                [config.refine_start, end.min(config.refine_start + config.refine_every * rounds)]
+            }
+            None => [config.refine_start, end],
+        };
+        let last = last.max(done) - done;
+        let first = (first.max(done) - done).min(last);
+        let after = config.steps.saturating_sub(done).saturating_sub(last);
+        GrowingSteps { before: first.into(), growing: (last - first).into(), after: after.into() }
+    }
+
+    /// Mean over the steps of (Gaussians / Gaussians now) to a power, if their number becomes `growth` times as large.
+    fn mean(&self, growth: f64, power: f64) -> f64 {
+        let GrowingSteps { before, growing, after } = *self;
+        // The mean of x^power for x from 1 to growth.
+        let ramp = match growth - 1.0 {
+            more if more.abs() < 1e-9 => 1.0,
+            more => (growth.powf(power + 1.0) - 1.0) / ((power + 1.0) * more),
+        };
+        (before + growing * ramp + after * growth.powf(power)) / (before + growing + after).max(1.0)
+    }
+}
+
+/// Periodic commits of a run of `seconds`, and the most bytes that commits write.
+fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
     let (every, limit) = match (config.residence(), config.commit_every) {
-        (Residence::Frames, _) => return 0.0,
+        (Residence::Frames, _) => return (0, 0.0),
         (_, CommitEvery::Seconds(every)) => (every, f64::INFINITY),
         (Residence::Memory, CommitEvery::Auto) => (SHORTEST_SECONDS, bytes_per_hour(Some(state_bytes))),
         (Residence::SpillDir(_), CommitEvery::Auto) => (SHORTEST_SECONDS, bytes_per_hour(None)),
     };
     if every <= 0.0 {
-        return 0.0;
+        return (0, 0.0);
     }
     // Each commit writes every page at most. The limit of an hour does not hold back the first commit.
     let state = state_bytes as f64;
-    (state * (seconds / every).ceil()).min((limit * seconds / 3600.0).max(state))
+    let commits = (seconds / every).min((limit * seconds / 3600.0 / state.max(1.0)).max(1.0));
+    (commits as u64, state * commits.ceil())
 }
 
 #[cfg(test)]
@@ -299,7 +353,6 @@ mod tests {
     use super::*;
     use crate::base::units::GIB;
     use crate::config::schedule::Lengths;
-    use crate::densify::strategy::StrategyName;
 
     /// Pixels of photos that limit no guess.
     const PIXELS: u64 = 1 << 40;
@@ -331,7 +384,7 @@ mod tests {
     #[test]
     fn a_run_that_decides_its_count_forecasts_a_small_one_until_it_has_decided() {
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
-        assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (165_284, Reach::Decided));
+        assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (330_568, Reach::Decided));
         assert_eq!(reach(&decides, 41_321, 50_000, 0, &[]), (50_000, Reach::Decided), "no more than pixels");
         let check = GrowthCheck {
             step: 1001,
@@ -385,26 +438,35 @@ mod tests {
 
     #[test]
     fn each_commit_that_is_kept_holds_a_version_of_its_own() {
-        assert_eq!([0.0, 1.0, 2.0, 9.0].map(|commits| versions(true, commits)), [1, 1, 2, 3]);
-        assert_eq!([0.0, 1.0, 2.0, 9.0].map(|commits| versions(false, commits)), [1, 2, 3, 3]);
+        assert_eq!([0, 1, 2, 9].map(|commits| versions(true, commits)), [1, 2, 3, 3]);
+        assert_eq!([0, 1, 2, 9].map(|commits| versions(false, commits)), [2, 3, 3, 3]);
     }
 
     #[test]
     fn means_over_steps_follow_the_growth() {
-        let of = |growth, power| mean_over_steps(&config(), 0, growth, power);
+        let of = |growth, power| GrowingSteps::new(&config(), 0, growth).mean(growth, power);
         assert_eq!(of(1.0, 0.5), 1.0);
         // 500 steps at 1, 2,000 from 1 to 3, 500 at 3; roundings.
         assert!((of(3.0, 1.0) - (500.0 + 2000.0 * 2.0 + 500.0 * 3.0) / 3000.0).abs() < 1e-12);
-        assert!((mean_over_steps(&config(), 2600, 3.0, 1.0) - 3.0).abs() < 1e-12);
+        let of_later = GrowingSteps::new(&config(), 2600, 3.0);
+        assert!((of_later.mean(3.0, 1.0) - 3.0).abs() < 1e-12);
+        // Two rounds of doublings make room for a cap of three times the scene; checks decide between 1,000 and 1,600 steps.
+        let steps_of = |config: &TrainConfig| {
+            let GrowingSteps { before, growing, after } = GrowingSteps::new(config, 0, 3.0);
+            [before, growing, after]
+        };
+        let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
+        assert_eq!(steps_of(&TrainConfig { max_gaussians: 9, ..decides.clone() }), [500.0, 200.0, 2300.0]);
+        assert_eq!(steps_of(&decides), [1000.0, 600.0, 1400.0]);
     }
 
     #[test]
     fn commits_are_bounded_by_the_size_of_the_result() {
         let hour = 3600.0;
-        assert!(commit_bytes(&config(), GIB, hour) <= 24.0 * GIB as f64);
+        assert!(commits(&config(), GIB, hour).1 <= 24.0 * GIB as f64);
         let every = TrainConfig { commit_every: CommitEvery::Seconds(600.0), ..config() };
-        assert_eq!(commit_bytes(&every, GIB, hour), 6.0 * GIB as f64);
+        assert_eq!(commits(&every, GIB, hour), (6, 6.0 * GIB as f64));
         let never = TrainConfig { commit_every: CommitEvery::Seconds(0.0), ..config() };
-        assert_eq!(commit_bytes(&never, GIB, hour), 0.0);
+        assert_eq!(commits(&never, GIB, hour), (0, 0.0));
     }
 }

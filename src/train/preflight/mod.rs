@@ -9,6 +9,7 @@ mod first_frames;
 pub mod first_look;
 mod fitting;
 pub mod forecast;
+pub(crate) mod growth_costs;
 pub mod plan;
 pub(crate) mod plan_text;
 pub mod probe;

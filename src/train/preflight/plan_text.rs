@@ -34,7 +34,7 @@ pub fn growth(forecast: &Forecast) -> String {
         }
         Reach::Decided => {
             format!(
-                ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"
+                ", growing as far as held-out training photos say that it pays, at most to about {last} (a guess; see --quality)"
             )
         }
     }
@@ -67,8 +67,11 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
     };
     let grows = forecast.gaussians[1] > forecast.gaussians[0];
     let at = if grows { format!(", with {} Gaussians", format_grouped(forecast.gaussians[1])) } else { String::new() };
-    let start = format!(" ({} at the start)", format_bytes(forecast.memory[0].total()));
-    let start = if grows { start.as_str() } else { "" };
+    let start = match &forecast.if_kept {
+        _ if !grows => String::new(),
+        Some(kept) => or_kept(format_bytes(kept.memory_at_end().total())),
+        None => format!(" ({} at the start)", format_bytes(forecast.memory[0].total())),
+    };
     text.push_str(&format!("memory  about {} at the peak{at}{start}\n", format_bytes(memory.total())));
     if let (None, Some(limit)) = (plan.frames, forecast.host_mem.filter(|limit| *limit < memory.total())) {
         text.push_str(&format!(
@@ -86,12 +89,18 @@ pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
     text.push_str(&part("program and tables", memory.base + memory.copies));
     text.push_str(&drive(forecast, tiers, &at));
     text.push_str(&format!(
-        "time    about {} for {} steps{at}, without evaluation{}\n",
+        "time    about {} for {} steps{at}{}, without evaluation{}\n",
         format_seconds(forecast.seconds),
         format_grouped(forecast.steps.into()),
+        forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_seconds(kept.seconds))),
         waits(forecast)
     ));
     text
+}
+
+/// What a run takes whose growth will not pay, as the end of a sentence.
+fn or_kept(what: String) -> String {
+    format!(" ({what} if growth does not pay)")
 }
 
 /// The part of the time that is spent on the drive, if it is worth a word.
@@ -136,13 +145,14 @@ fn break_of(line: &str) -> Option<usize> {
 /// The lines about drives.
 fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     let (plan, commits) = (&forecast.tiers, forecast.commit_bytes_most);
+    let kept = forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_bytes(kept.drive_bytes_most)));
     let commits = match commits > 0.0 {
         true => format!("commits write {} at most", format_bytes(commits as u64)),
         false => String::from("no periodic commits"),
     };
     if !tiers.spills() {
         let [checkpoint, ply] = [forecast.drive_bytes_most, forecast.ply_bytes].map(format_bytes);
-        return format!("drive   checkpoint {checkpoint} at most, PLY {ply}{at}; {commits}\n");
+        return format!("drive   checkpoint {checkpoint} at most{kept}, PLY {ply}{at}; {commits}\n");
     }
     let now = if at.is_empty() {
         String::new()
@@ -152,7 +162,7 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     // A dry run keeps the pages in memory, whatever the run will use.
     let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
-        "drive   up to {} with the versions of the last commits{at}, {} free\n        \
+        "drive   up to {} with the versions of the last commits{at}{kept}, {} free\n        \
          one version is {} of pages{now}{by} ({})\n        \
          each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",

@@ -31,7 +31,10 @@ use crate::train::memory::estimate::list_bytes;
 use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
 use crate::train::preflight::device_memory;
 use crate::train::preflight::drive_space::{DriveUse, SimulatedRun, check_first_drive, drive_use};
-use crate::train::preflight::forecast::{Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, reach};
+use crate::train::preflight::forecast::{
+    Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, frames_then, reach,
+};
+use crate::train::preflight::growth_costs::GrowthCosts;
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
@@ -241,11 +244,12 @@ fn plan(
     let growth = last as f64 / rows.max(1) as f64;
     let step_seconds = times.seconds * STEP_OVER_RENDERING;
     let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
-    let simulated = |frames| SimulatedRun { frames, growth, step_seconds, drive: drive_rate };
-    let drive = match plan.frames {
-        Some(frames) => drive_use(config, dataset, trainer, &simulated(frames as usize)),
-        None => DriveUse::default(),
-    };
+    let drive = plan.frames.map_or(DriveUse::default(), |now| {
+        let budget = host_mem.filter(|_| config.frames == 0);
+        let then = budget.and_then(|budget| frames_then(config, &plan, [rows, last], &mut memory[2].clone(), budget));
+        let frames = [now, then.unwrap_or(now)].map(|frames| frames as usize);
+        drive_use(config, dataset, trainer, &SimulatedRun { frames, growth, step_seconds, drive: drive_rate })
+    });
     let measured = Measured {
         rows,
         reach: (last, known),
@@ -254,7 +258,14 @@ fn plan(
         visible_share: times.visible_share,
         drive,
     };
-    Ok(Forecast::new(config, memory, plan, &measured, host_mem))
+    let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
+    if !(known == Reach::Decided && trainer.growth().is_empty()) {
+        return Ok(forecast);
+    }
+    let [first, most, _] = memory;
+    let kept = Measured { reach: (rows, known), drive: measured.drive.without_growth(), ..measured };
+    let if_kept = Forecast::new(config, [first, most, first], plan, &kept, host_mem);
+    Ok(Forecast { if_kept: Some(Box::new(if_kept)), ..forecast })
 }
 
 /// Plans a run, prints the plan, and trains to the end.
@@ -295,7 +306,7 @@ pub(super) fn plan_and_train(
         }
         out_folder::make(&request.out, request.existing)?;
     }
-    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun);
+    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun, GrowthCosts::new(&forecast));
     if tiers.can_resume() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);

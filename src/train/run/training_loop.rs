@@ -14,6 +14,7 @@ use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{Progress, Shown};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::preflight::growth_costs::GrowthCosts;
 use crate::train::run::live::LivePage;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;
@@ -34,6 +35,8 @@ pub struct LoopOutputs<'a> {
     pub checkpoint: Option<&'a mut Checkpoint>,
     /// The page that shows the run while it trains, if the user asked for it.
     pub live: Option<LivePage>,
+    /// What the run takes by its count.
+    pub costs: GrowthCosts,
 }
 
 impl Trainer {
@@ -137,7 +140,7 @@ impl Trainer {
         targets: &TargetCache,
         outputs: &mut LoopOutputs<'_>,
     ) -> Result<bool, TrainError> {
-        let checks = self.growth().len();
+        let (checks, allowed) = (self.growth().len(), self.state.growth.allowed());
         loop {
             match self.log_due_events(dataset, targets) {
                 Ok(()) => break,
@@ -149,7 +152,8 @@ impl Trainer {
             }
         }
         if let Some(check) = self.growth().get(checks) {
-            outputs.progress.say(&check.to_string());
+            let costs = if check.allowed == allowed { String::new() } else { outputs.costs.text(check.allowed) };
+            outputs.progress.say(&format!("{check}{costs}"));
         }
         Ok(true)
     }
