@@ -18,7 +18,6 @@ use crate::config::residence::Residence;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
-use crate::scene::page_layout::capacity_bytes;
 use crate::scene::state::row_bytes;
 use crate::train::commits::reserve::reserve_bytes;
 use crate::train::memory::estimate::{MemoryEstimate, rows_at_most};
@@ -43,7 +42,7 @@ pub const STEP_GROWTH: f64 = 0.54;
 /// Gaussians: 150,000 of them at 790x594 take a step of 48 ms on two cores, 422,000 at 395x297 one of some 120 ms on one.
 const ROW_SECONDS: f64 = 0.4e-6;
 /// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache.
-pub(crate) const STEP_OVER_RENDERING: f64 = 1.35;
+pub(crate) const STEP_OVER_RENDERING: f64 = 1.45;
 /// Most pages of a grown scene, over the pages that its Gaussians would take at the fill of the first pages: .96 in sheffield_cross_395 and
 /// .99 in seneca (`gsscale-ckpt ls` after `--max-resolution 200 --steps 40 --keep-checkpoint`).
 const MORE_PAGES: f64 = 1.1;
@@ -181,12 +180,15 @@ impl Forecast {
         let drive_bytes = (tiers.pages[0] as f64 * growth).ceil() as u64 * tiers.frame_bytes;
         let state_bytes = last * row_bytes(config.sh_degree) as u64;
         let (commits, commit_bytes_most) = commits(config, state_bytes, seconds);
-        let versions = versions(is_in_memory, commits);
         let pages_then = tiers.pages[0] as f64 * growth;
-        // The first commit of a run in memory sizes the segments; the import does with a spill directory.
-        let sized_by = if is_in_memory { pages_then.ceil() as u64 } else { tiers.pages[0] };
-        let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), sized_by);
-        let drive_bytes_most = store_bytes_most(config, pages_then, versions, layout);
+        // The first commit of a run in memory chooses the segments.
+        let segment_bytes = match tiers.segment_bytes {
+            0 => SlotLayout::new(tiers.frame_bytes as usize, pages_then.ceil() as u64).segment_bytes(),
+            bytes => bytes,
+        };
+        let [of_first, of_last] = versions(is_in_memory, commits);
+        let slots = of_first * tiers.pages[0] + of_last * (pages_then * MORE_PAGES).ceil() as u64;
+        let drive_bytes_most = store_bytes_most(slots, tiers.frame_bytes, segment_bytes, is_in_memory);
         let mut forecast = Forecast {
             gaussians: [rows, last],
             reach,
@@ -266,22 +268,22 @@ impl DriveUse {
     }
 }
 
-/// Most bytes of the files of a store with `pages` pages: their versions, a segment that is not full, and the map.
-fn store_bytes_most(config: &TrainConfig, pages: f64, versions: u64, layout: SlotLayout) -> u64 {
-    let pages = (pages * MORE_PAGES).ceil() as u64;
-    let slots = versions * pages * layout.slot_bytes + layout.segment_bytes();
-    let reserve = if config.residence() == Residence::Memory { 0 } else { reserve_bytes(layout.segment_bytes()) };
-    slots + reserve + MAP_BYTES + versions * pages * MAP_PAGE_BYTES
+/// Most bytes of the files of a store with that many slots in use: whole segments, one that is begun, the map and, with a spill
+/// directory, the reserve.
+fn store_bytes_most(slots: u64, slot_bytes: u64, segment_bytes: u64, is_in_memory: bool) -> u64 {
+    let segments = (slots * slot_bytes).div_ceil(segment_bytes.max(1)) + 1;
+    let reserve = if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
+    segments * segment_bytes + reserve + MAP_BYTES + slots * MAP_PAGE_BYTES
 }
 
-/// Most versions of a page on the drive of a run that commits so many times before its end: those of the last two commits, and that of
-/// a commit being written or, with a spill directory, of the steps since the last one. The first pages of a spill directory are a
-/// commit, and so is the end of every run that has committed.
-fn versions(is_in_memory: bool, commits: u64) -> u64 {
+/// Most versions of the first pages and of the last ones on the drive of a run that commits so many times before its end: those of the last
+/// two commits, and that of a commit being written or, with a spill directory, of the steps since the last one. The import to a spill
+/// directory is its first commit, and the end of a run that has committed is one as well.
+fn versions(is_in_memory: bool, commits: u64) -> [u64; 2] {
     match (is_in_memory, commits) {
-        (true, 0) => 1,
-        (true, _) => VERSIONS.min(commits + 1),
-        (false, _) => VERSIONS.min(commits + 2),
+        (true, 0) => [0, 1],
+        (false, 0 | 1) => [1, commits + 1],
+        _ => [0, VERSIONS.min(commits + 1)],
     }
 }
 
@@ -438,8 +440,8 @@ mod tests {
 
     #[test]
     fn each_commit_that_is_kept_holds_a_version_of_its_own() {
-        assert_eq!([0, 1, 2, 9].map(|commits| versions(true, commits)), [1, 2, 3, 3]);
-        assert_eq!([0, 1, 2, 9].map(|commits| versions(false, commits)), [2, 3, 3, 3]);
+        assert_eq!([0, 1, 2, 9].map(|commits| versions(true, commits)), [[0, 1], [0, 2], [0, 3], [0, 3]]);
+        assert_eq!([0, 1, 2, 9].map(|commits| versions(false, commits)), [[1, 1], [1, 2], [0, 3], [0, 3]]);
     }
 
     #[test]

@@ -43,6 +43,8 @@ pub struct TierPlan {
     pub pages: [u64; 2],
     /// Bytes of a frame and of a slot on the drive.
     pub frame_bytes: u64,
+    /// Bytes of a segment file of the spill directory; 0 for a run in memory.
+    pub(super) segment_bytes: u64,
     /// Frames, possibly more than pages; `None` for a run in memory, which has one frame per page.
     pub frames: Option<u64>,
     /// The user set the number of frames.
@@ -70,6 +72,7 @@ pub fn plan_tiers(
     let mut plan = TierPlan {
         pages: pages_now_and_most(config, trainer),
         frame_bytes: trainer.scene.pager.frame_bytes() as u64,
+        segment_bytes: tiers.segment_bytes,
         frames: None,
         frames_are_named: config.frames > 0,
         free_bytes: tiers.free_bytes()?,
