@@ -69,9 +69,9 @@ impl ExportFormat {
         }
     }
 
-    /// Most memory of the format's sink beside its input rows, bytes; a few MiB count as none.
-    pub fn memory_bytes(self) -> u64 {
-        if self == ExportFormat::Sog { memory_bytes() } else { 0 }
+    /// Most memory of the format's sink for `rows` rows beside its input, bytes; a few MiB count as none.
+    pub fn memory_bytes(self, rows: u64) -> u64 {
+        if self == ExportFormat::Sog { memory_bytes(rows) } else { 0 }
     }
 
     /// The export that a run writes beside its PLY; `None` for the PLY itself.

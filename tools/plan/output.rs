@@ -65,7 +65,7 @@ fn text_of_forecast(scene: &Scene) -> String {
             format_bytes(forecast.drive_bytes),
             format_bytes(forecast.bytes_written as u64)
         ),
-        None => format!("checkpoint {} at most", format_bytes(forecast.drive_bytes_most)),
+        None => format!("checkpoint about {}", format_bytes(forecast.drive_bytes_most)),
     };
     format!(
         "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \

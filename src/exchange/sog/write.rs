@@ -44,14 +44,15 @@ const BOX_SIGMAS: f64 = 2.0;
 /// Folder of the giants.
 const GIANTS_FOLDER: &str = "env";
 
-/// Most memory of a writer beside its input rows, bytes.
-pub fn memory_bytes() -> u64 {
-    let group_leaves = GROUP_ROWS / LEAF_ROWS;
+/// Most memory of a writer of `rows` rows beside its input, bytes.
+pub fn memory_bytes(rows: u64) -> u64 {
+    let most = |bound: usize| bound.min(usize::try_from(rows).unwrap_or(usize::MAX));
+    let group_leaves = most(GROUP_ROWS).div_ceil(LEAF_ROWS);
     let coarser = GROUP_ROWS / 2 + (LEVELS - 1) * (FULL_ROWS + LEAF_ROWS);
     // Two copies of the SH coefficients of a file, pictures, codebooks.
-    let encoding = GROUP_ROWS * 500;
+    let encoding = most(GROUP_ROWS) * 500;
     let merging = rayon::current_num_threads().min(group_leaves) * LEAF_ROWS * MERGE_ROW_BYTES;
-    let rows = GROUP_ROWS + coarser + GIANTS_MAX;
+    let rows = most(GROUP_ROWS) + most(coarser) + most(GIANTS_MAX);
     (rows * size_of::<ExportRow>() + encoding.max(merging) + (4 << 20)) as u64
 }
 

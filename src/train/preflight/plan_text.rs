@@ -152,7 +152,7 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     };
     if !tiers.spills() {
         let [checkpoint, ply] = [forecast.drive_bytes_most, forecast.ply_bytes].map(format_bytes);
-        return format!("drive   checkpoint {checkpoint} at most{kept}, PLY {ply}{at}; {commits}\n");
+        return format!("drive   checkpoint about {checkpoint}{kept}, PLY {ply}{at}; {commits}\n");
     }
     let now = if at.is_empty() {
         String::new()

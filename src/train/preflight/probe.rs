@@ -4,7 +4,6 @@ use super::device_memory;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::format::ExportFormat;
 use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
@@ -89,8 +88,7 @@ pub fn estimate(
     let pages = probe.pages as f64;
     let is_growing = config.strategy.grows();
     let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
-    let of_export = config.export.formats().map(ExportFormat::memory_bytes).max().unwrap_or(0);
-    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver + of_export;
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
     let base = base + trainer.photos.iter().map(|parameter| parameter.value_bytes(dataset)).sum::<u64>();
     let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
@@ -107,7 +105,7 @@ pub fn estimate(
             targets,
             index: (pages * growth) as u64 * INDEX_BYTES,
             copies,
-            base,
+            base: base + config.export.formats().map(|format| format.memory_bytes(rows_then)).max().unwrap_or(0),
             device: device.map(|view| view.grown(growth)),
         }
     });

@@ -98,7 +98,8 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
     let (_, options) = options_of(&place.folder, &state)?;
-    let mut scene = scene_at(&store, generation, &state, &options, (request.host_mem, 1), format.memory_bytes())?;
+    let mut scene =
+        scene_at(&store, generation, &state, &options, (request.host_mem, 1), format.memory_bytes(state.rows_bound))?;
     let mut choice = Choice::new(&state, request);
     let pages = choice.pages(&scene);
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
