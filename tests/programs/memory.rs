@@ -1,5 +1,6 @@
 //! The memory that `--dry-run` announces against the peak memory of the run that follows.
 
+use crate::support::lpips::lpips_weights;
 #[cfg(target_os = "linux")]
 use crate::support::memory_group::MemoryGroup;
 use crate::support::scenes::{city, classic, eval, stderr, summary, text, told, train};
@@ -110,10 +111,15 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
         std::fs::remove_dir_all(&spill).ok();
     }
     // The evaluation of a file on the same photos.
-    let arguments = [text(&run), text(&scene), "--image-cache", "1MiB", "--color-correct", "quadratic", "--host-mem"];
-    let least = least(&eval(&[&arguments[..], &["100MiB"]].concat()));
-    let host_mem = format!("{least}MiB");
-    let pictures = folder.path().join("pictures");
-    let arguments = [&arguments[..], &[&host_mem, "--renders", text(&pictures)]].concat();
-    succeeds_within(least, env!("CARGO_BIN_EXE_gsscale-eval"), &arguments);
+    let weights = lpips_weights(folder.path());
+    let lpips = ["--lpips", text(&weights), "--appearance", "full"];
+    let arguments = [text(&run), text(&scene), "--image-cache", "1MiB", "--color-correct", "quadratic"];
+    for arguments in [arguments.to_vec(), [&arguments[..], &lpips].concat()] {
+        let arguments = [&arguments[..], &["--host-mem"]].concat();
+        let least = least(&eval(&[&arguments[..], &["100MiB"]].concat()));
+        let host_mem = format!("{least}MiB");
+        let pictures = folder.path().join("pictures");
+        let arguments = [&arguments[..], &[&host_mem, "--renders", text(&pictures)]].concat();
+        succeeds_within(least, env!("CARGO_BIN_EXE_gsscale-eval"), &arguments);
+    }
 }
