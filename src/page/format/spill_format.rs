@@ -20,8 +20,6 @@ const KIND: u8 = 1;
 
 /// Target size of a segment, bytes; segments of small scenes are smaller.
 const SEGMENT_BYTES: u64 = 256 << 20;
-/// Least number of segments of a scene: a segment is taken as a whole, and the drive should hold little that no page needs.
-pub const SEGMENTS_LEAST: u64 = 4;
 /// Largest slot, bytes: the length of a payload is a 32-bit number.
 const SLOT_BYTES_MAX: u64 = HEADER_BYTES as u64 + (1 << 32);
 /// Target number of segments of a scene: each costs a file descriptor.
@@ -54,10 +52,10 @@ pub struct SlotLayout {
 
 impl SlotLayout {
     /// Slots for payloads of at most `capacity_bytes`, in segments that suit a scene of about `pages` pages: about 256
-    /// MiB, a quarter of a smaller scene, more where a scene would need too many files.
+    /// MiB, less for a smaller scene, more where a scene would need too many files.
     pub fn new(capacity_bytes: usize, pages: u64) -> SlotLayout {
         let slot_bytes = transfer_bytes(capacity_bytes) as u64;
-        let usual = (SEGMENT_BYTES / slot_bytes).min(pages.div_ceil(SEGMENTS_LEAST));
+        let usual = (SEGMENT_BYTES / slot_bytes).min(pages);
         let slots = usual.max(pages / SEGMENTS).clamp(1, u64::from(u32::MAX));
         SlotLayout { slot_bytes, slots_per_segment: slots as u32 }
     }
@@ -218,7 +216,7 @@ mod tests {
     fn segments_fit_the_scene() {
         let capacity = 745_472;
         let small = SlotLayout::new(capacity, 10);
-        assert_eq!((small.slots_per_segment, small.slot_bytes), (3, 4096 + 745_472));
+        assert_eq!((small.slots_per_segment, small.slot_bytes), (10, 4096 + 745_472));
         let usual = SlotLayout::new(capacity, 20_000);
         assert!(usual.segment_bytes() <= 256 << 20 && usual.segment_bytes() > 255 << 20);
         let huge = SlotLayout::new(capacity, 1_000_000);

@@ -43,9 +43,6 @@ pub const STEP_GROWTH: f64 = 0.54;
 const ROW_SECONDS: f64 = 0.4e-6;
 /// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache.
 pub(crate) const STEP_OVER_RENDERING: f64 = 1.45;
-/// Pages of a grown scene, over the pages that its Gaussians would take at the fill of the first pages: 1.15 in sheffield_cross_395 after
-/// `--steps 900 --max-gaussians 120000`, .99 in seneca after `--max-resolution 200 --steps 40`.
-const MORE_PAGES: f64 = 1.07;
 /// Bytes of a store's map and its other small files without pages, and bytes of the map for each version of a page, with a margin.
 const MAP_BYTES: u64 = 2 << 20;
 const MAP_PAGE_BYTES: u64 = 1024;
@@ -187,7 +184,7 @@ impl Forecast {
             bytes => bytes,
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
-        let slots = of_first * tiers.pages[0] + of_last * (pages_then * MORE_PAGES).ceil() as u64;
+        let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
         let drive_bytes_most = store_bytes_most(slots, tiers.frame_bytes, segment_bytes, is_in_memory);
         let mut forecast = Forecast {
             gaussians: [rows, last],
@@ -268,12 +265,13 @@ impl DriveUse {
     }
 }
 
-/// Bytes of the files of a store with that many slots in use: whole segments, one of which is begun, the map and, with a spill directory,
-/// the reserve.
+/// Bytes of the files of a store with that many slots in use: whole segments and the map. With a spill directory also the reserve, and half
+/// a segment for slots that wait for a commit, for which runs took none to one. In memory also a segment for the pages that
+/// the scene gains after its first commit, which chooses the segments.
 fn store_bytes_most(slots: u64, slot_bytes: u64, segment_bytes: u64, is_in_memory: bool) -> u64 {
     let full = (slots * slot_bytes).next_multiple_of(segment_bytes.max(1));
-    let reserve = if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
-    full + segment_bytes + reserve + MAP_BYTES + slots * MAP_PAGE_BYTES
+    let beside = if is_in_memory { segment_bytes } else { segment_bytes / 2 + reserve_bytes(segment_bytes) };
+    full + beside + MAP_BYTES + slots * MAP_PAGE_BYTES
 }
 
 /// Most versions of the first pages and of the last ones on the drive of a run that commits so many times before its end: those of the last
