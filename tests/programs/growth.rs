@@ -42,6 +42,8 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
         let grows = check["is_trial"] == true || of(check, "lost") > of(check, "pays_from");
         assert_eq!((line.contains("up to"), line.contains("on trial")), (grows, check["is_trial"] == true), "{line}");
     }
+    // The check that changes the count says what the run takes from then on.
+    assert!(said.contains("\n  which takes about ") && said.contains(" of the drive\n"), "{said}");
     let may_follow = |pair: &[Value]| of(&pair[0], "allowed") <= of(&pair[1], "allowed") || pair[0]["is_trial"] == true;
     assert!(checks.windows(2).all(may_follow), "{growth}");
     let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();

@@ -37,17 +37,17 @@ impl GrowthCosts {
         least.map_or(GrowthCosts::default(), |least| GrowthCosts { ends: [costs(least), costs(forecast)] })
     }
 
-    /// What the run takes with `gaussians`, as the end of a sentence; empty if that is unknown. Rows make up memory and drive, so both are
-    /// interpolated in their number.
-    pub(crate) fn text(&self, gaussians: u64) -> String {
+    /// What the run takes with `gaussians`, as a line; `None` if that is unknown. Rows make up memory and drive, so both are interpolated in
+    /// their number.
+    pub(crate) fn text(&self, gaussians: u64) -> Option<String> {
         let [least, most] = self.ends;
         if most.gaussians <= least.gaussians {
-            return String::new();
+            return None;
         }
         let share = (gaussians as f64 - least.gaussians as f64) / (most.gaussians - least.gaussians) as f64;
         let between = |least: u64, most: u64| (least as f64 + share * (most as f64 - least as f64)) as u64;
         let [memory, drive] = [between(least.memory, most.memory), between(least.drive, most.drive)].map(format_bytes);
-        format!("; that takes about {memory} of memory and {drive} of the drive at most")
+        Some(format!("  which takes about {memory} of memory and {drive} of the drive"))
     }
 }
 
@@ -57,12 +57,13 @@ mod tests {
 
     #[test]
     fn costs_grow_with_the_rows() {
-        assert_eq!(GrowthCosts::default().text(1000), "");
+        assert_eq!(GrowthCosts::default().text(1000), None);
         let least = Costs { gaussians: 1000, memory: 100 << 20, drive: 10 << 20 };
         let most = Costs { gaussians: 8000, memory: 800 << 20, drive: 80 << 20 };
         let costs = GrowthCosts { ends: [least, most] };
-        assert_eq!(costs.text(4000), "; that takes about 400 MiB of memory and 40.0 MiB of the drive at most");
+        let text = |gaussians| costs.text(gaussians).unwrap_or_default();
+        assert_eq!(text(4000), "  which takes about 400 MiB of memory and 40.0 MiB of the drive");
         // Also beyond what was foreseen.
-        assert!(costs.text(16_000).contains("1.56 GiB") && costs.text(1000).contains("100 MiB"));
+        assert!(text(16_000).contains("1.6 GiB") && text(1000).contains("100 MiB"));
     }
 }

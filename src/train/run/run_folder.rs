@@ -171,7 +171,7 @@ pub(super) fn train_into(
         has_ply: false,
     };
     let ply = Trainer::ply_path(out);
-    let saved = results.write(|results| save_result(dataset, results.trainer, &ply));
+    let saved = save_result(dataset, &mut results, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
     let (looped, written) = match (looped, saved) {
         (Err(error), Err(other)) => {
@@ -180,7 +180,6 @@ pub(super) fn train_into(
         }
         (looped, saved) => (looped, saved?),
     };
-    results.has_ply = true;
     warn_of_ply(config, &written, &ply);
     let summary = write_results(request, dataset, &targets, results, (looped, &written, step_costs))?;
     tiers.is_done = summary.finished;
@@ -250,9 +249,13 @@ fn write_results(
 }
 
 /// Writes the Gaussians at the current step as a PLY, and its transform to the dataset's coordinates.
-fn save_result(dataset: &Dataset, trainer: &mut Trainer, ply: &Path) -> Result<Written, TrainError> {
-    let written = trainer.save(dataset, ply)?;
-    ExportFormat::Ply.write_transform(ply, &trainer.scene_meta(dataset), written.frame)?;
+fn save_result(dataset: &Dataset, results: &mut Results<'_>, ply: &Path) -> Result<Written, TrainError> {
+    let written = results.write(|results| results.trainer.save(dataset, ply))?;
+    results.has_ply = true;
+    results.write(|results| {
+        let meta = results.trainer.scene_meta(dataset);
+        Ok(ExportFormat::Ply.write_transform(ply, &meta, written.frame)?)
+    })?;
     Ok(written)
 }
 

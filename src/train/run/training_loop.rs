@@ -152,8 +152,9 @@ impl Trainer {
             }
         }
         if let Some(check) = self.growth().get(checks) {
-            let costs = if check.allowed == allowed { String::new() } else { outputs.costs.text(check.allowed) };
-            outputs.progress.say(&format!("{check}{costs}"));
+            outputs.progress.say(&check.to_string());
+            let costs = outputs.costs.text(check.allowed).filter(|_| check.allowed != allowed);
+            costs.iter().for_each(|line| outputs.progress.say(line));
         }
         Ok(true)
     }

@@ -192,7 +192,7 @@ fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
     let said = failed(&["export", text(&out), "--out", "lod-meta.json"]);
     assert!(said.contains("city/lod-meta.json"), "{said}");
     let said =
-        failed(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json")), "--host-mem", "90MiB"]);
+        failed(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json")), "--host-mem", "25MiB"]);
     assert!(said.contains("give at least"), "the writer's memory counts: {said}");
     // A PLY beside the folder has a transform of its own.
     let beside = bench.path(sog).with_extension("ply");
