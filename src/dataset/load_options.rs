@@ -1,6 +1,6 @@
 //! What the user asks of the photos, the split and the frame of a dataset.
 //!
-//! Not here: applying it ([`super::loader`], [`super::photo_checks`]).
+//! Not here: applying it ([`super::loader`], `photo_checks`).
 
 use crate::base::error::{InputError, InputResult};
 use std::path::PathBuf;
@@ -24,7 +24,7 @@ pub struct LoadOptions {
     pub invert_masks: bool,
     /// Drop views without a photo instead of failing.
     pub allow_missing: bool,
-    /// Near plane in robust scene sizes, the local unit (see [`Extent::frame`]): gsplat uses 0.01 in a scene normalised
+    /// Near plane in robust scene sizes, the local unit (see [`super::frame::Extent::frame`]): gsplat uses 0.01 in a scene normalised
     /// to a median camera distance of 1.
     pub near_plane: f64,
     /// Folder that the views' names are relative to; `None`: derived from the first view's name and path.

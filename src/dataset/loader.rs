@@ -1,7 +1,7 @@
 //! Turns a [`RawScene`] into a checked [`Dataset`]: checks every photo's header and end, scales intrinsics to training
 //! size, removes offset and scale, and assigns each view to a set.
 //!
-//! Not here: reading models (the readers), checking the files of photos ([`super::photo_checks`]) and pixels ([`super::photo`], [`super::target_cache`]).
+//! Not here: reading models (the readers), checking the files of photos (`photo_checks`) and pixels ([`super::photo`], [`super::target_cache`]).
 //!
 //! Invariants: 1. every view of a dataset has a photo whose header and end marker exist and whose shape matches its
 //! camera; 2. frame, scene scale and split depend on the views registered in the model, so dropping a photo with

@@ -5,7 +5,7 @@
 //! relative name: the same name, the name with `.png` appended, or with another picture extension.
 //!
 //! Other programs write masks under other names, also beside the photos, and in folders of other names: what fits one photo and
-//! nothing else is used, and the form of the name is said ([`FORMS`]).
+//! nothing else is used, and the form of the name is said (`FORMS`).
 //!
 //! Invariants: 1. a folder is listed once; links in it are followed, as for photos; 2. a mask's size may differ from the
 //! photo's, its shape may not; 3. nothing is listed outside of the scene, except through links in it; 4. a picture is the mask of

@@ -2,7 +2,7 @@
 //! reads the file row by row, shrinks both halves to the means of areas, and computes a difference map.
 //!
 //! Invariants: 1. sizes are checked before decoding, and the decoder receives the pixel chunks only; 2. memory holds some
-//! rows of the file, and pictures of at most [`WIDTH_MAX`] columns.
+//! rows of the file, and pictures of at most `WIDTH_MAX` columns.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_pixels::{PNG_BUFFERS, PixelChunks};
