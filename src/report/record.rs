@@ -76,7 +76,7 @@ pub struct RunRecord {
     pub host_bytes_peak: u64,
     /// Peak device memory, bytes.
     pub device_bytes_peak: u64,
-    /// Bytes of the segment files.
+    /// Bytes of the files of the pages.
     pub drive_bytes_peak: u64,
     /// Digest of the PLY: equal digests mean equal bits.
     pub ply: String,

@@ -13,8 +13,11 @@ const MIB: u64 = 1 << 20;
 /// Enough for everything.
 const ROOM: u64 = 400 * MIB;
 
-const FLAGS: &str = "--steps 100 --page-rows 32 --refine-start 1000 --max-gaussians 9000 --view-order groups:4 --test-every 8 --device cpu \
-    --log-every 2 --quiet --threads 1 --export spz --log tensorboard";
+const FLAGS: &str = "--steps 100 --page-rows 32 --max-gaussians 9000 --view-order groups:4 --test-every 8 --device cpu \
+    --quiet --threads 1 --export spz --log tensorboard";
+
+/// Flags that a test may give otherwise.
+const USUAL: [[&str; 2]; 2] = [["--log-every", "2"], ["--refine-start", "1000"]];
 
 struct Bench {
     folder: TempDir,
@@ -45,13 +48,14 @@ impl Bench {
         let mut args = vec![text(&self.scene), "--out", text(out)];
         args.extend(FLAGS.split_whitespace());
         args.extend(classic(&args));
+        args.extend(USUAL.iter().filter(|[flag, _]| !more.contains(flag)).flatten());
         [&args[..], more].concat().iter().map(ToString::to_string).collect()
     }
 
     /// The PLY and the files of a run with room.
-    fn alone(&self) -> (Vec<u8>, Vec<PathBuf>) {
+    fn alone(&self, more: &[&str]) -> (Vec<u8>, Vec<PathBuf>) {
         let out = self.folder.path().join("alone");
-        let args = self.args(&out, &["--commit-every", "0"]);
+        let args = self.args(&out, &[&["--commit-every", "0"], more].concat());
         let output = train(&args.iter().map(String::as_str).collect::<Vec<_>>());
         assert!(output.status.success(), "{}", stderr(&output));
         (std::fs::read(out.join("point_cloud.ply")).unwrap(), files(&out))
@@ -70,10 +74,10 @@ impl Bench {
         wait_until("a commit", || metrics().lines().filter_map(commits).any(|commits| commits >= least));
     }
 
-    /// Takes all space of the drive but `left` bytes.
+    /// Takes all space of the drive but `left` bytes, into the file of an earlier call if there is one.
     fn fill(&self, left: u64) -> PathBuf {
         let path = self.drive.0.join("other");
-        let mut other = std::fs::File::create(&path).unwrap();
+        let mut other = std::fs::File::options().create(true).append(true).open(&path).unwrap();
         while other.write_all(&[0; 1 << 16]).is_ok() {}
         while other.write_all(&[0; 4096]).is_ok() {}
         let taken = other.metadata().unwrap().len();
@@ -129,10 +133,10 @@ fn wait_until(what: &str, is_so: impl Fn() -> bool) {
 #[test]
 fn commits_of_a_run_in_memory_wait_for_space() {
     let Some(bench) = Bench::new() else { return };
-    let (want, all) = bench.alone();
+    let (want, all) = bench.alone(&[]);
+    // Room for a PLY, without which no run begins, and not for a commit.
+    let other = bench.fill(want.len() as u64 + 100_000);
     let mut run = bench.begin(&["--commit-every", "0.02", "--disk-full-wait", "300"]);
-    wait_until("a first line of metrics", || bench.out().join("metrics.jsonl").is_file());
-    let other = bench.fill(0);
     assert!(run.wait_for("paused:"), "{}", run.said);
     std::thread::sleep(Duration::from_millis(200));
     assert!(run.child.try_wait().unwrap().is_none(), "it waits");
@@ -147,45 +151,38 @@ fn commits_of_a_run_in_memory_wait_for_space() {
     assert_eq!(files(&bench.out()), all);
 }
 
-/// The drive is full when the last step is done, and there is room for the PLY, then for more, and in the end for all results. Each result
-/// that finds no space waits, and in the end all are there.
+/// The drive has room for the PLY of the first Gaussians, so that the run begins, and not for that of the grown scene. Then there is room for
+/// the PLY and a tenth of it, which is less than the file for viewers takes while it is written: that file waits, and the run says
+/// that the PLY is whole.
 #[test]
 fn each_result_of_a_run_in_memory_waits_for_space() {
     let Some(bench) = Bench::new() else { return };
-    let (want, all) = bench.alone();
+    // Lines of metrics wait too, so only the last step has one.
+    let grows = ["--refine-start", "20", "--refine-every", "20", "--log-every", "1000"];
+    let (want, all) = bench.alone(&grows);
     let ply = want.len() as u64;
-    let run = bench.begin(&["--commit-every", "0", "--disk-full-wait", "300"]);
-    wait_until("a first line of metrics", || bench.out().join("metrics.jsonl").is_file());
-    let path = bench.fill(0);
-    let mut run = run;
+    let first = 8_000 * 248;
+    assert!(ply > first + 200_000, "the scene hardly grew: {ply} bytes");
+    let path = bench.fill(first + 100_000);
+    let mut run = bench.begin(&[&grows[..], &["--commit-every", "0", "--disk-full-wait", "300"]].concat());
     assert!(run.wait_for("paused:"), "{}", run.said);
-    // In small portions, so that every kind of result meets a full drive.
-    let mut left = std::fs::metadata(&path).unwrap().len();
-    let mut given = 0;
-    while run.child.try_wait().unwrap().is_none() {
-        assert!(given < 200, "{}", run.said);
-        let portion = if given == 0 { ply + 8192 } else { 131_072 };
-        left = left.saturating_sub(portion);
-        std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(left).unwrap();
-        given += 1;
-        std::thread::sleep(Duration::from_millis(if given == 1 { 1500 } else { 700 }));
-    }
+    assert!(!bench.out().join("point_cloud.ply").exists(), "{}", run.said);
+    bench.fill(ply + ply / 10);
+    assert!(run.wait_for("point_cloud.ply is whole and can be copied"), "{}", run.said);
+    assert!(std::fs::read(bench.out().join("point_cloud.ply")).unwrap() == want, "it is whole");
+    std::fs::remove_file(path).unwrap();
     let (code, said) = run.end();
     assert_eq!(code, Some(0), "{said}");
-    // Which results meet the full drive is a matter of time; each that comes after the PLY says that the PLY is whole.
-    let pauses: Vec<&str> = said.split("paused: ").skip(1).collect();
-    assert!(!pauses.is_empty(), "no result met a full drive: {said}");
-    let is_after_ply = |pause: &&str| pause.contains("The results wait") && !pause.contains("point_cloud.ply: writing");
-    let says_so = |pause: &str| pause.contains("point_cloud.ply is whole and can be copied");
-    assert!(pauses.into_iter().filter(is_after_ply).all(says_so), "{said}");
-    assert!(std::fs::read(bench.out().join("point_cloud.ply")).unwrap() == want, "waiting changed the scene");
+    assert!(said.matches("paused:").count() >= 2, "{said}");
     assert_eq!((files(&bench.out()), summary(&bench.out())["finished"] == true), (all, true));
 }
 
 #[test]
 fn a_drive_that_stays_full_ends_a_run_in_memory_with_its_last_commit() {
     let Some(bench) = Bench::new() else { return };
-    let (want, all) = bench.alone();
+    let (want, all) = bench.alone(&[]);
+    // The run is not over before the little that is left then is taken.
+    bench.fill(ROOM / 10);
     let run = bench.begin(&["--commit-every", "0.02", "--disk-full-wait", "0.3"]);
     bench.wait_for_commits(1);
     bench.fill(0);
@@ -208,7 +205,7 @@ fn a_drive_that_stays_full_ends_a_run_in_memory_with_its_last_commit() {
 #[test]
 fn what_a_commit_holds_can_be_saved_on_another_drive() {
     let Some(bench) = Bench::new() else { return };
-    let (want, all) = bench.alone();
+    let (want, all) = bench.alone(&[]);
     let out = bench.out();
     // Some commits of all pages, so that later ones take their slots.
     let (code, said) = bench.begin(&["--commit-every", "0", "--keep-checkpoint"]).end();

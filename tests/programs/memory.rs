@@ -98,8 +98,9 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
     let fixed = ["--threads", "2", "--steps", "5", "--device", "cpu", "--image-cache", "1MiB"];
     let decides = "--strategy long-axis --refine-start 1 --refine-every 1 --refine-stop 5 --appearance full";
     let decides = [&fixed[..], &decides.split(' ').collect::<Vec<_>>()].concat();
-    let all = "--max-gaussians 2000 --color-correct quadratic --robust-pixels --robust-views --refine-poses --appearance full";
-    let all = [&fixed[..], &all.split(' ').collect::<Vec<_>>()].concat();
+    let all = "--max-gaussians 2000 --color-correct quadratic --robust-pixels --robust-views --refine-poses --appearance full \
+               --export spz,sog --eval-every 3";
+    let all = [&fixed[..], &all.split_whitespace().collect::<Vec<_>>()].concat();
     let run = folder.path().join("all");
     check(folder.path(), &scene, "all", &all);
     for flags in [all, decides] {

@@ -196,7 +196,7 @@ fn a_run_does_what_was_planned() {
 /// Bytes that a run announces to write.
 fn told_to_be_written(said: &str) -> f64 {
     let line = said.lines().find(|line| line.contains(" to write without commits")).unwrap();
-    let text = line.split("about ").nth(1).and_then(|rest| rest.split(" to write without commits").next());
+    let text = line.split(" to write without commits").next().and_then(|rest| rest.rsplit("about ").next());
     let (number, unit) = text.and_then(|text| text.split_once(' ')).expect(line);
     let power = ["B", "KiB", "MiB", "GiB", "TiB"].iter().position(|u| *u == unit).expect(line);
     number.parse::<f64>().expect(line) * 1024f64.powi(power as i32)

@@ -179,6 +179,8 @@ fn bytes_follow_pages_and_everything_that_leaves_is_written() {
     let options = ReplayOptions { frames: pages.most() - 1, plan_bytes: 1 << 28, ..options };
     let cut = replay(&pages, &vec![1 << 20; 256], &order, &options).unwrap();
     assert!(cut.is_exact && cut.totals().0 > read);
+    let (read, written) = cut.totals();
+    assert!(read - written > (options.frames as u64) << 20, "pages that are only rendered are evicted without a write");
     for (step, traffic) in cut.steps.iter().enumerate() {
         let pages = pages.of(order.clone().view_at(step as u32));
         assert_eq!(

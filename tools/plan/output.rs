@@ -34,7 +34,7 @@ pub fn json_of_forecast(forecast: &Forecast) -> Value {
     json!({
         "gaussians": forecast.gaussians, "gaussians_known_by": format!("{:?}", forecast.reach).to_lowercase(),
         "memory_bytes": forecast.memory_at_end().total(), "memory_bytes_at_start": forecast.memory[0].total(),
-        "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_most": forecast.drive_bytes_most,
+        "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_peak": forecast.drive_bytes_peak,
         "ply_bytes": forecast.ply_bytes, "bytes_written": forecast.bytes_written,
         "if_growth_does_not_pay": forecast.if_kept.as_ref().map(|kept| json_of_forecast(kept)),
         "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds, "drive_seconds": forecast.drive_seconds,
@@ -46,7 +46,7 @@ fn text_of_kept(kept: &Forecast) -> String {
     format!(
         "  if growth does not pay: memory about {}, drive {}, time about {}\n",
         format_bytes(kept.memory_at_end().total()),
-        format_bytes(kept.drive_bytes_most),
+        format_bytes(kept.drive_bytes_peak),
         format_seconds(kept.seconds)
     )
 }
@@ -60,12 +60,12 @@ fn text_of_forecast(scene: &Scene) -> String {
     };
     let drive = match forecast.tiers.frames {
         Some(_) => format!(
-            "up to {} ({} of pages and their versions of the last commits), about {} to write without commits",
-            format_bytes(forecast.drive_bytes_most),
+            "about {} ({} of pages and their versions of the last commits), about {} to write without commits",
+            format_bytes(forecast.drive_bytes_peak),
             format_bytes(forecast.drive_bytes),
             format_bytes(forecast.bytes_written as u64)
         ),
-        None => format!("checkpoint about {}", format_bytes(forecast.drive_bytes_most)),
+        None => format!("checkpoint about {}", format_bytes(forecast.drive_bytes_peak)),
     };
     format!(
         "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \

@@ -12,7 +12,7 @@
 //! completed transfers.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
-//! page moves, whole pages only; every evicted page was changed and is written, unless its share says otherwise.
+//! page moves, whole pages only; an evicted page is written if a batch on the way back, or the only batch of a step, had it since it was read.
 
 use crate::base::ids::PageNo;
 use crate::paging::frames::evict::EvictPolicy;
@@ -21,7 +21,7 @@ use crate::paging::plan::cache_model::{CacheModel, STEPS_AHEAD, StepChange, TooF
 use crate::paging::plan::steps::Plan;
 use crate::schedule::order::ViewOrder;
 use crate::schedule::visibility::ViewPages;
-use std::collections::VecDeque;
+use std::collections::{HashSet, VecDeque};
 use std::ops::Range;
 
 /// Steps of the window whose heaviest place is reported.
@@ -58,7 +58,7 @@ pub struct StepTraffic {
     pub bytes_first: u64,
     /// Number of pages that are needed before the first eviction.
     pub pages_first: u32,
-    /// Bytes of the pages that were evicted for the step.
+    /// Bytes of the changed pages that were evicted for the step.
     pub bytes_written: u64,
     /// Frames that become free at the begin of this step: their pages are evicted for this step or one of the next
     /// [`STEPS_AHEAD`].
@@ -99,6 +99,7 @@ pub fn replay(
     let mut steps = vec![StepTraffic::default(); options.steps as usize];
     let mut frames_left = options.frames;
     let mut frames_freed = vec![0; options.steps as usize];
+    let mut changed: HashSet<PageNo> = HashSet::new();
     let mut batch = 0;
     while coming.extend(&mut plan, batch) {
         let step = coming.step_of(batch);
@@ -118,7 +119,12 @@ pub fn replay(
         traffic.bytes_read += bytes(&change.admit);
         traffic.bytes_first += bytes(&change.admit[..first]);
         traffic.pages_first += first as u32;
-        traffic.bytes_written += bytes(&change.evict);
+        for page in &change.evict {
+            traffic.bytes_written += if changed.remove(page) { bytes(&[*page]) } else { 0 };
+        }
+        if coming.updates(batch) {
+            changed.extend(pages);
+        }
         plan.pop();
         batch += 1;
     }
@@ -131,10 +137,12 @@ struct Coming<'a> {
     views: &'a ViewPages,
     order: ViewOrder,
     options: &'a ReplayOptions,
-    /// The step of each batch that is planned, from the batch `first` on.
-    step_from_batch: Vec<u32>,
+    /// The step of each batch that is planned, and whether the batch updates its pages.
+    batches: Vec<(u32, bool)>,
     /// Batches of the step that is planned now and are not planned yet.
     waiting: VecDeque<Vec<PageNo>>,
+    /// Batches among them before the one that is pinned once: from there on the step updates.
+    forwards: usize,
     next_step: u32,
     /// Whether every next use was known whenever a page left.
     is_exact: bool,
@@ -142,18 +150,23 @@ struct Coming<'a> {
 
 impl<'a> Coming<'a> {
     fn new(views: &'a ViewPages, order: &ViewOrder, options: &'a ReplayOptions) -> Coming<'a> {
-        let (step_from_batch, waiting) = (Vec::new(), VecDeque::new());
-        Coming { views, order: order.clone(), options, step_from_batch, waiting, next_step: 0, is_exact: true }
+        let (batches, waiting) = (Vec::new(), VecDeque::new());
+        Coming { views, order: order.clone(), options, batches, waiting, forwards: 0, next_step: 0, is_exact: true }
     }
 
     fn step_of(&self, batch: u32) -> u32 {
-        self.step_from_batch[batch as usize]
+        self.batches[batch as usize].0
+    }
+
+    /// Whether the batch changes its pages: a step in several batches reads the first ones to render alone.
+    fn updates(&self, batch: u32) -> bool {
+        self.batches[batch as usize].1
     }
 
     /// Plans the next two epochs after `batch`, as far as they fit: each page is needed in every epoch, so its next use
     /// lies less than two epochs ahead. `false` when no batch is left.
     fn extend(&mut self, plan: &mut Plan, batch: u32) -> bool {
-        let now = self.step_from_batch.get(batch as usize).copied().unwrap_or(self.next_step);
+        let now = self.batches.get(batch as usize).map_or(self.next_step, |&(step, _)| step);
         // The run ends; what would come after it is not needed by anyone.
         let reach = self.options.steps.min(now.saturating_add(2 * self.views.views() as u32));
         loop {
@@ -163,10 +176,13 @@ impl<'a> Coming<'a> {
                     break;
                 }
                 self.waiting.pop_front();
-                self.step_from_batch.push(self.next_step - 1);
+                self.batches.push((self.next_step - 1, self.forwards == 0));
+                self.forwards = self.forwards.saturating_sub(1);
             } else if self.next_step < reach {
                 let pages = self.views.of(self.order.view_at(self.next_step));
                 self.waiting.extend(walk(pages, self.options.frames).map(<[PageNo]>::to_vec));
+                // There and back, with one batch at the turn.
+                self.forwards = self.waiting.len() / 2;
                 self.next_step += 1;
             } else {
                 break;

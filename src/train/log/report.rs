@@ -155,8 +155,26 @@ pub struct StepCosts {
     pub train_stall_seconds: f64,
     /// Peak bytes allocated on the device; 0 on the CPU.
     pub device_bytes_peak: u64,
-    /// Bytes of the segment files on the drive, which never shrink; 0 without a spill directory.
+    /// Bytes of the files of the pages on the drive, which hardly ever shrink; 0 without a checkpoint.
     pub drive_bytes_peak: u64,
+    /// What the run said at its start.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub forecast: Option<Foreseen>,
+}
+
+/// What a process foresaw before its first step. Every figure stands beside what came of it in the same summary.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Foreseen {
+    /// Gaussians at the end.
+    pub gaussians: u64,
+    /// Seconds of the steps that were to be done.
+    pub train_seconds: f64,
+    /// Peak memory of the process, bytes.
+    pub host_bytes_peak: u64,
+    /// Bytes of the files of the pages on the drive.
+    pub drive_bytes_peak: u64,
+    /// Bytes that import and steps write to the drive, without commits.
+    pub bytes_written: f64,
 }
 
 /// Content of summary.json.

@@ -10,9 +10,13 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::page::folder::drive_rate::DriveRate;
 use crate::page::folder::file_system::free_bytes;
+use crate::page::format::slot_header::transfer_bytes;
 use crate::paging::pager::PagerConfig;
 use crate::paging::simulation::replay::{DriveModel, Replay, ReplayOptions, replay};
+use crate::scene::page_layout::PageLayout;
+use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
+use crate::scene::state::row_bytes;
 use crate::schedule::visibility::ViewPages;
 use crate::train::inputs::places::drive_of;
 use crate::train::memory::largest_view::train_cameras;
@@ -122,7 +126,10 @@ pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Train
     let cameras = train_cameras(dataset);
     let index = trainer.scene.pager.index();
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
-    let page_bytes = vec![trainer.scene.pager.frame_bytes() as u32; index.len()];
+    let sh_degree = config.sh_degree;
+    let bands = share_of_bands(trainer, config);
+    let payload = |page: &PageMeta| bands * PageLayout { rows: page.rows as usize, sh_degree }.bytes() as f64;
+    let page_bytes: Vec<u32> = index.iter().map(|page| transfer_bytes(payload(page) as usize) as u32).collect();
     let views = ViewPages::new(index, &cameras);
     let play = |frames: usize, reads_ahead: bool| -> Replay {
         let options = ReplayOptions { frames, policy: config.evict, reads_ahead, steps, plan_bytes: PLAN_BYTES as u64 };
@@ -152,4 +159,13 @@ pub(crate) fn drive_use(config: &TrainConfig, dataset: &Dataset, trainer: &Train
         false => now,
     };
     DriveUse { import, of_step: [now, at_end] }
+}
+
+/// Bytes of a Gaussian on the drive over those with all colour bands, mean over the steps to do: pages hold the bands that the run has
+/// reached.
+fn share_of_bands(trainer: &Trainer, config: &TrainConfig) -> f64 {
+    let steps = trainer.steps_done()..config.steps;
+    let bytes = |step: u32| row_bytes(trainer.options.sh_degree_at(step)) as f64;
+    let sum: f64 = steps.clone().map(bytes).sum();
+    if steps.is_empty() { 1.0 } else { sum / (steps.len() as f64 * row_bytes(config.sh_degree) as f64) }
 }

@@ -20,6 +20,7 @@ use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::state::row_bytes;
 use crate::train::commits::reserve::reserve_bytes;
+use crate::train::log::report::Foreseen;
 use crate::train::memory::estimate::{MemoryEstimate, rows_at_most};
 
 /// Gaussians that a round of densification adds without a cap, if rounds are [`ROUND_STEPS`] apart. Neither the size of the photos nor the
@@ -41,7 +42,8 @@ pub const STEP_GROWTH: f64 = 0.54;
 /// Seconds that a core takes for another Gaussian in view. Limits that power for scenes that begin with few and large
 /// Gaussians: 150,000 of them at 790x594 take a step of 48 ms on two cores, 422,000 at 395x297 one of some 120 ms on one.
 const ROW_SECONDS: f64 = 0.4e-6;
-/// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache.
+/// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache. Runs of four photo
+/// scenes and a city took 1.3 to 1.7, see "Forecasts" in `benches/RESULTS.md`.
 pub(crate) const STEP_OVER_RENDERING: f64 = 1.45;
 /// Bytes of a store's map and its other small files without pages, and bytes of the map for each version of a page, with a margin.
 const MAP_BYTES: u64 = 2 << 20;
@@ -60,7 +62,7 @@ pub enum Reach {
     Guess,
     /// The number at the start: the run has too few photos to decide another one.
     Kept,
-    /// The most that is likely: the run decides the count as it trains ([`crate::densify::growth`]).
+    /// The most that usual runs decide as they train ([`crate::densify::growth`]).
     Decided,
 }
 
@@ -121,9 +123,9 @@ pub struct Forecast {
     pub host_mem: Option<u64>,
     /// Bytes of one version of all pages on the drive, at the end.
     pub drive_bytes: u64,
-    /// Peak bytes on the drive, all files counted: the pages with their versions of the commits that are kept, or the checkpoint of a
-    /// run in memory.
-    pub drive_bytes_most: u64,
+    /// Expected peak bytes on the drive, all files counted: the pages with their versions of the commits that are kept, or the checkpoint
+    /// of a run in memory.
+    pub drive_bytes_peak: u64,
     /// Bytes of the PLY.
     pub ply_bytes: u64,
     /// Bytes that import and steps write to the drive; 0 for a run in memory.
@@ -151,6 +153,8 @@ pub(crate) struct Measured {
     pub visible_share: f64,
     /// What steps do with the drive.
     pub drive: DriveUse,
+    /// Frames with the Gaussians of the end; `None` for a run in memory.
+    pub frames_at_end: Option<u64>,
 }
 
 impl Forecast {
@@ -162,7 +166,8 @@ impl Forecast {
         measured: &Measured,
         host_mem: Option<u64>,
     ) -> Forecast {
-        let Measured { rows, reach: (last, reach), steps_done, view_seconds, visible_share, drive } = *measured;
+        let Measured { rows, reach: (last, reach), steps_done, view_seconds, visible_share, drive, frames_at_end } =
+            *measured;
         let growth = last as f64 / rows.max(1) as f64;
         let steps = config.steps.saturating_sub(steps_done);
         let step_seconds = view_seconds * STEP_OVER_RENDERING;
@@ -185,18 +190,18 @@ impl Forecast {
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
         let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
-        let drive_bytes_most = store_bytes_most(slots, tiers.frame_bytes, segment_bytes, is_in_memory);
+        let drive_bytes_peak = store_bytes_peak(slots, tiers.frame_bytes, segment_bytes, is_in_memory);
         let mut forecast = Forecast {
             gaussians: [rows, last],
             reach,
             if_kept: None,
             steps,
             memory,
-            frames_at_end: tiers.frames,
+            frames_at_end,
             tiers,
             host_mem,
             drive_bytes,
-            drive_bytes_most,
+            drive_bytes_peak,
             ply_bytes: ply_bytes(config, last),
             bytes_written: 0.0,
             commit_bytes_most,
@@ -205,26 +210,24 @@ impl Forecast {
         };
         if !is_in_memory {
             forecast.bytes_written = drive.import + waits_and_writes.written * f64::from(steps);
-            if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
-                forecast.limit_memory(config, budget);
-            }
         }
         forecast
-    }
-
-    /// Makes the memory of the grown scene obey the budget, and counts the frames that are left then.
-    fn limit_memory(&mut self, config: &TrainConfig, budget: u64) {
-        // The plan has chosen the frames of the start.
-        let [_, grown @ ..] = &mut self.memory;
-        let [start, last] = self.gaussians;
-        for (memory, rows) in grown.iter_mut().zip([rows_at_most(config, start), last]) {
-            self.frames_at_end = frames_then(config, &self.tiers, [start, rows], memory, budget);
-        }
     }
 
     /// Whether every page has a frame at the end.
     pub(super) fn holds_all_pages(&self) -> bool {
         self.frames_at_end.is_some_and(|frames| frames.saturating_mul(self.tiers.frame_bytes) >= self.drive_bytes)
+    }
+
+    /// The figures that the summary keeps.
+    pub(crate) fn facts(&self) -> Foreseen {
+        Foreseen {
+            gaussians: self.gaussians[1],
+            train_seconds: self.seconds,
+            host_bytes_peak: self.memory_at_end().total(),
+            drive_bytes_peak: self.drive_bytes_peak,
+            bytes_written: self.bytes_written,
+        }
     }
 
     /// Memory at the number of Gaussians that will be reached.
@@ -233,20 +236,25 @@ impl Forecast {
     }
 }
 
-/// Frames of a scene that has grown from the first to the second number of Gaussians within a budget, whose `memory` is made to obey
-/// that budget. `None` for a run in memory.
-pub(crate) fn frames_then(
+/// Makes the memory of a scene that grows to `last` Gaussians obey the budget of the run: `memory` is that of `rows` Gaussians, of the cap, and
+/// of `last`. Returns the frames that are left at the end; `None` for a run in memory.
+pub(crate) fn limit_memory(
     config: &TrainConfig,
     tiers: &TierPlan,
-    [start, rows]: [u64; 2],
-    memory: &mut MemoryEstimate,
-    budget: u64,
+    host_mem: Option<u64>,
+    [rows, last]: [u64; 2],
+    memory: &mut [MemoryEstimate; 3],
 ) -> Option<u64> {
-    let growth = rows as f64 / start.max(1) as f64;
-    let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
-    let need = LargestNeed { frame_bytes: tiers.frame_bytes, pages };
-    let frames = obey(config, &need, budget, memory);
-    tiers.frames.map(|now| if rows > start { frames.min(now) } else { now })
+    let mut frames_at_end = tiers.frames;
+    let Some((budget, now)) = host_mem.filter(|_| config.frames == 0).zip(tiers.frames) else { return frames_at_end };
+    // The plan has chosen the frames of the start.
+    for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
+        let growth = rows_then as f64 / rows.max(1) as f64;
+        let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
+        let frames = obey(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
+        frames_at_end = Some(if rows_then > rows { frames.min(now) } else { now });
+    }
+    frames_at_end
 }
 
 impl DriveUse {
@@ -268,7 +276,7 @@ impl DriveUse {
 /// Bytes of the files of a store with that many slots in use: whole segments and the map. With a spill directory also the reserve, and half
 /// a segment for slots that wait for a commit, for which runs took none to one. In memory also a segment for the pages that
 /// the scene gains after its first commit, which chooses the segments.
-fn store_bytes_most(slots: u64, slot_bytes: u64, segment_bytes: u64, is_in_memory: bool) -> u64 {
+fn store_bytes_peak(slots: u64, slot_bytes: u64, segment_bytes: u64, is_in_memory: bool) -> u64 {
     let full = (slots * slot_bytes).next_multiple_of(segment_bytes.max(1));
     let beside = if is_in_memory { segment_bytes } else { segment_bytes / 2 + reserve_bytes(segment_bytes) };
     full + beside + MAP_BYTES + slots * MAP_PAGE_BYTES
@@ -382,7 +390,7 @@ mod tests {
     }
 
     #[test]
-    fn a_run_that_decides_its_count_forecasts_a_small_one_until_it_has_decided() {
+    fn a_run_that_decides_its_count_forecasts_the_most_until_it_has_decided() {
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
         assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (330_568, Reach::Decided));
         assert_eq!(reach(&decides, 41_321, 50_000, 0, &[]), (50_000, Reach::Decided), "no more than pixels");

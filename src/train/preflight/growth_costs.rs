@@ -31,7 +31,7 @@ impl GrowthCosts {
         let costs = |forecast: &Forecast| Costs {
             gaussians: forecast.gaussians[1],
             memory: forecast.memory_at_end().total(),
-            drive: forecast.drive_bytes_most,
+            drive: forecast.drive_bytes_peak,
         };
         let least = forecast.if_kept.as_deref();
         least.map_or(GrowthCosts::default(), |least| GrowthCosts { ends: [costs(least), costs(forecast)] })

@@ -34,7 +34,7 @@ pub fn growth(forecast: &Forecast) -> String {
         }
         Reach::Decided => {
             format!(
-                ", growing as far as held-out training photos say that it pays, at most to about {last} (a guess; see --quality)"
+                ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"
             )
         }
     }
@@ -145,13 +145,13 @@ fn break_of(line: &str) -> Option<usize> {
 /// The lines about drives.
 fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     let (plan, commits) = (&forecast.tiers, forecast.commit_bytes_most);
-    let kept = forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_bytes(kept.drive_bytes_most)));
+    let kept = forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_bytes(kept.drive_bytes_peak)));
     let commits = match commits > 0.0 {
         true => format!("commits write {} at most", format_bytes(commits as u64)),
         false => String::from("no periodic commits"),
     };
     if !tiers.spills() {
-        let [checkpoint, ply] = [forecast.drive_bytes_most, forecast.ply_bytes].map(format_bytes);
+        let [checkpoint, ply] = [forecast.drive_bytes_peak, forecast.ply_bytes].map(format_bytes);
         return format!("drive   checkpoint about {checkpoint}{kept}, PLY {ply}{at}; {commits}\n");
     }
     let now = if at.is_empty() {
@@ -162,11 +162,11 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
     // A dry run keeps the pages in memory, whatever the run will use.
     let by = if tiers.engine == "memory" { String::new() } else { format!(" by {}", tiers.engine) };
     format!(
-        "drive   up to {} with the versions of the last commits{at}{kept}, {} free\n        \
+        "drive   about {} with the versions of the last commits{at}{kept}, {} free\n        \
          one version is {} of pages{now}{by} ({})\n        \
          each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
          about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
-        format_bytes(forecast.drive_bytes_most),
+        format_bytes(forecast.drive_bytes_peak),
         plan.free_bytes.map_or(String::from("unknown"), format_bytes),
         format_bytes(forecast.drive_bytes),
         tiers.codec,

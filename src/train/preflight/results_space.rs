@@ -49,9 +49,9 @@ pub(crate) fn check_drive_of_results(
     }
     let results = last + last / 100 * config.export.formats().map(export_percent).sum::<u64>();
     let (pages, beside) = match config.residence() {
-        Residence::Memory => (forecast.drive_bytes_most, " and the checkpoint"),
+        Residence::Memory => (forecast.drive_bytes_peak, " and the checkpoint"),
         Residence::SpillDir(folder) if is_same_drive(&drive, &drive_of(folder)) => {
-            (forecast.drive_bytes_most, " and the pages, which lie on the same drive,")
+            (forecast.drive_bytes_peak, " and the pages, which lie on the same drive,")
         }
         _ => (0, ""),
     };

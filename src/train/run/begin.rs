@@ -32,9 +32,8 @@ use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
 use crate::train::preflight::device_memory;
 use crate::train::preflight::drive_space::{DriveUse, SimulatedRun, check_first_drive, drive_use};
 use crate::train::preflight::forecast::{
-    Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, frames_then, reach,
+    Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, limit_memory, reach,
 };
-use crate::train::preflight::growth_costs::GrowthCosts;
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
 use crate::train::preflight::probe::{Probe, estimate};
@@ -244,10 +243,9 @@ fn plan(
     let growth = last as f64 / rows.max(1) as f64;
     let step_seconds = times.seconds * STEP_OVER_RENDERING;
     let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
-    let drive = plan.frames.map_or(DriveUse::default(), |now| {
-        let budget = host_mem.filter(|_| config.frames == 0);
-        let then = budget.and_then(|budget| frames_then(config, &plan, [rows, last], &mut memory[2].clone(), budget));
-        let frames = [now, then.unwrap_or(now)].map(|frames| frames as usize);
+    let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
+    let drive = plan.frames.zip(frames_at_end).map_or(DriveUse::default(), |(now, then)| {
+        let frames = [now, then].map(|frames| frames as usize);
         drive_use(config, dataset, trainer, &SimulatedRun { frames, growth, step_seconds, drive: drive_rate })
     });
     let measured = Measured {
@@ -257,13 +255,15 @@ fn plan(
         view_seconds: times.seconds,
         visible_share: times.visible_share,
         drive,
+        frames_at_end,
     };
     let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
     if !(known == Reach::Decided && trainer.growth().is_empty()) {
         return Ok(forecast);
     }
     let [first, most, _] = memory;
-    let kept = Measured { reach: (rows, known), drive: measured.drive.without_growth(), ..measured };
+    let drive = measured.drive.without_growth();
+    let kept = Measured { reach: (rows, known), drive, frames_at_end: plan.frames, ..measured };
     let if_kept = Forecast::new(config, [first, most, first], plan, &kept, host_mem);
     Ok(Forecast { if_kept: Some(Box::new(if_kept)), ..forecast })
 }
@@ -306,7 +306,7 @@ pub(super) fn plan_and_train(
         }
         out_folder::make(&request.out, request.existing)?;
     }
-    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun, GrowthCosts::new(&forecast));
+    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun, &forecast);
     if tiers.can_resume() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);

@@ -29,6 +29,7 @@ impl Meter {
             train_stall_seconds: stats.stall_seconds - self.stall,
             device_bytes_peak: trainer.renderer.traffic().device_bytes_peak,
             drive_bytes_peak: tiers.drive_bytes(),
+            forecast: None,
         }
     }
 }

@@ -38,6 +38,7 @@ use crate::train::log::facts::{Resolved, write_config};
 use crate::train::log::progress::{Count, Progress};
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::preflight::forecast::Forecast;
 use crate::train::preflight::growth_costs::GrowthCosts;
 use crate::train::start::tiers::Tiers;
 use crate::train::state::eval::warn_of_held_out;
@@ -133,7 +134,7 @@ pub(super) fn train_into(
     mut trainer: Trainer,
     (stop, tiers): (&StopFlag, &mut Tiers),
     begun: Begun,
-    costs: GrowthCosts,
+    forecast: &Forecast,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
@@ -156,10 +157,12 @@ pub(super) fn train_into(
     let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     metrics.start_clock(trainer.train_seconds());
+    let costs = GrowthCosts::new(forecast);
     let mut outputs =
         LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint, live, costs };
     let looped = trainer.run(dataset, &targets, &mut outputs);
-    let step_costs = meter.stop(&trainer, &*tiers, metrics.cpu_seconds());
+    let step_costs =
+        StepCosts { forecast: Some(forecast.facts()), ..meter.stop(&trainer, &*tiers, metrics.cpu_seconds()) };
     let mut results = Results {
         trainer: &mut trainer,
         metrics: &mut metrics,

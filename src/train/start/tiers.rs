@@ -220,12 +220,12 @@ impl Tiers {
         (self.spill.is_some() || self.planned_on.is_some()) && !self.is_in_memory
     }
 
-    /// Bytes of the segment files; 0 without a drive or if they cannot be listed.
+    /// Bytes of the files of the pages; 0 without a drive or if they cannot be listed.
     pub fn drive_bytes(&self) -> u64 {
-        let of =
-            |spill: &SpillDir| spill.segments().map_or(0, |s| s.len() as u64 * spill.format().layout.segment_bytes());
         let made = self.checkpoint.as_ref().and_then(Checkpoint::spill);
-        self.spill.as_ref().or(made).map_or(0, of)
+        let Some(spill) = self.spill.as_ref().or(made) else { return 0 };
+        let files = std::fs::read_dir(spill.folder()).into_iter().flatten().flatten();
+        files.filter_map(|file| file.metadata().ok()).map(|about| about.len()).sum()
     }
 
     /// Bytes that pages may take on the drive: free bytes plus bytes of existing segments (of the import or a resumed
