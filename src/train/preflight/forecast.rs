@@ -44,7 +44,7 @@ pub const STEP_GROWTH: f64 = 0.54;
 const ROW_SECONDS: f64 = 0.4e-6;
 /// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache. Runs of four photo
 /// scenes and a city took 1.3 to 1.7, see "Forecasts" in `benches/RESULTS.md`.
-pub(crate) const STEP_OVER_RENDERING: f64 = 1.45;
+pub(crate) const STEP_OVER_RENDERING: f64 = 1.35;
 /// Bytes of a store's map and its other small files without pages, and bytes of the map for each version of a page, with a margin.
 const MAP_BYTES: u64 = 2 << 20;
 const MAP_PAGE_BYTES: u64 = 1024;
@@ -190,7 +190,14 @@ impl Forecast {
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
         let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
-        let drive_bytes_peak = store_bytes_peak(slots, tiers.frame_bytes, segment_bytes, is_in_memory);
+        // Pages that a scene gains after its first commit may take a segment.
+
+        let beside = match is_in_memory {
+            true if commits <= 1 => 0,
+            true => segment_bytes,
+            false => segment_bytes / 2 + reserve_bytes(segment_bytes),
+        };
+        let drive_bytes_peak = beside + store_bytes_peak(slots, tiers.frame_bytes, segment_bytes);
         let mut forecast = Forecast {
             gaussians: [rows, last],
             reach,
@@ -273,13 +280,11 @@ impl DriveUse {
     }
 }
 
-/// Bytes of the files of a store with that many slots in use: whole segments and the map. With a spill directory also the reserve, and half
-/// a segment for slots that wait for a commit, for which runs took none to one. In memory also a segment for the pages that
-/// the scene gains after its first commit, which chooses the segments.
-fn store_bytes_peak(slots: u64, slot_bytes: u64, segment_bytes: u64, is_in_memory: bool) -> u64 {
-    let full = (slots * slot_bytes).next_multiple_of(segment_bytes.max(1));
-    let beside = if is_in_memory { segment_bytes } else { segment_bytes / 2 + reserve_bytes(segment_bytes) };
-    full + beside + MAP_BYTES + slots * MAP_PAGE_BYTES
+/// Bytes of the files of a store with that many slots in use: whole segments and the map. Beside them a spill directory holds the reserve,
+/// and half a segment for slots that wait for a commit, for which runs took none to one. A run in memory may need a segment for
+/// the pages that the scene gains after its first commit, which chooses the segments.
+fn store_bytes_peak(slots: u64, slot_bytes: u64, segment_bytes: u64) -> u64 {
+    (slots * slot_bytes).next_multiple_of(segment_bytes.max(1)) + MAP_BYTES + slots * MAP_PAGE_BYTES
 }
 
 /// Most versions of the first pages and of the last ones on the drive of a run that commits so many times before its end: those of the last
@@ -339,17 +344,23 @@ impl GrowingSteps {
     }
 }
 
+/// Seconds of training before the first commit of a run; `None` if it makes none.
+fn first_commit_seconds(config: &TrainConfig) -> Option<f64> {
+    let every = match config.commit_every {
+        CommitEvery::Seconds(every) => every,
+        CommitEvery::Auto => SHORTEST_SECONDS,
+    };
+    (every > 0.0 && config.residence() != Residence::Frames).then_some(every)
+}
+
 /// Periodic commits of a run of `seconds`, and the most bytes that commits write.
 fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
-    let (every, limit) = match (config.residence(), config.commit_every) {
-        (Residence::Frames, _) => return (0, 0.0),
-        (_, CommitEvery::Seconds(every)) => (every, f64::INFINITY),
-        (Residence::Memory, CommitEvery::Auto) => (SHORTEST_SECONDS, bytes_per_hour(Some(state_bytes))),
-        (Residence::SpillDir(_), CommitEvery::Auto) => (SHORTEST_SECONDS, bytes_per_hour(None)),
+    let Some(every) = first_commit_seconds(config) else { return (0, 0.0) };
+    let limit = match (config.residence(), config.commit_every) {
+        (_, CommitEvery::Seconds(_)) => f64::INFINITY,
+        (Residence::Memory, CommitEvery::Auto) => bytes_per_hour(Some(state_bytes)),
+        (_, CommitEvery::Auto) => bytes_per_hour(None),
     };
-    if every <= 0.0 {
-        return (0, 0.0);
-    }
     // Each commit writes every page at most. The limit of an hour does not hold back the first commit.
     let state = state_bytes as f64;
     let commits = (seconds / every).min((limit * seconds / 3600.0 / state.max(1.0)).max(1.0));
