@@ -190,13 +190,11 @@ impl Forecast {
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
         let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
-        // Pages that a scene gains after its first commit may take a segment.
-
-        let beside = match is_in_memory {
-            true if commits <= 1 => 0,
-            true => segment_bytes,
-            false => segment_bytes / 2 + reserve_bytes(segment_bytes),
-        };
+        // Slots that wait for a commit, and those of pages that the scene gains after its first commit, take another segment where there
+        // is time for them.
+        let is_short = first_commit_seconds(config).is_some_and(|first| seconds < 2.0 * first);
+        let more = if is_short { 0 } else { segment_bytes };
+        let beside = more + if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
         let drive_bytes_peak = beside + store_bytes_peak(slots, tiers.frame_bytes, segment_bytes);
         let mut forecast = Forecast {
             gaussians: [rows, last],
@@ -280,9 +278,7 @@ impl DriveUse {
     }
 }
 
-/// Bytes of the files of a store with that many slots in use: whole segments and the map. Beside them a spill directory holds the reserve,
-/// and half a segment for slots that wait for a commit, for which runs took none to one. A run in memory may need a segment for
-/// the pages that the scene gains after its first commit, which chooses the segments.
+/// Bytes of the files of a store with that many slots in use: whole segments and the map.
 fn store_bytes_peak(slots: u64, slot_bytes: u64, segment_bytes: u64) -> u64 {
     (slots * slot_bytes).next_multiple_of(segment_bytes.max(1)) + MAP_BYTES + slots * MAP_PAGE_BYTES
 }
