@@ -192,7 +192,7 @@ impl Forecast {
         let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
         // Slots that wait for a commit, and those of pages that the scene gains after its first commit, take another segment where there
         // is time for them.
-        let is_short = first_commit_seconds(config).is_some_and(|first| seconds < 2.0 * first);
+        let is_short = first_commit_seconds(config).is_none_or(|first| seconds < 2.0 * first);
         let more = if is_short { 0 } else { segment_bytes };
         let beside = more + if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
         let drive_bytes_peak = beside + store_bytes_peak(slots, tiers.frame_bytes, segment_bytes);
