@@ -523,9 +523,9 @@ fn a_hidden_key_works_as_a_flag_and_in_a_file() {
     let (folder, scene, _) = small();
     let file = folder.path().join("hidden.toml");
     std::fs::write(&file, "page-rows = 64\n").unwrap();
-    trains(&folder, &scene, &["--config", text(&file), "--adam-eps", "1e-14"]);
+    trains(&folder, &scene, &["--config", text(&file), "--evict", "lru"]);
     let config = std::fs::read_to_string(folder.path().join("out/config.toml")).unwrap();
-    assert!(config.contains("page-rows = 64\n") && config.contains("adam-eps = 1e-14\n"), "{config}");
+    assert!(config.contains("page-rows = 64\n") && config.contains("evict = \"lru\"\n"), "{config}");
 }
 
 /// `gsscale-plan ... | head` exits with success, whatever remains unprinted.
