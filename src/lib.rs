@@ -54,9 +54,8 @@
 //!
 //! **A config key**
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
-//!    ([`config::key::Class`]).
-//!    `before` behind the class gives the value that means "as before the key existed", if there is one. Otherwise a run of an older
-//!    program resumes only with `--accept-changes`.
+//!    ([`config::key::Class`]). `hidden` behind the class keeps it out of help: it is for work on the program, and `configs/README.md`
+//!    names it. `common` also shows it in `-h` ([`config::key::Shown`]).
 //! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
 //! 3. `config/limits.rs`: puts the value into the options of the module that uses it. No module but `train` sees the config.
 //! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
@@ -84,8 +83,7 @@
 //!    for the same bits on any number of threads. `save` gives `Encoded::of(&())`. The test of `train/step/comparison.rs` has
 //!    a small example. `first` returns `None` where the weight is 0, so that nothing changes.
 //! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs` (with `before "0.0"` behind its class, so that runs of older programs resume), `photo_options`
-//!    in `config/limits.rs`, `config/check.rs` for its range. `CHANGELOG.md` names it.
+//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `config/check.rs` for its range. `CHANGELOG.md` names it.
 //! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
 //!    shaders. A run with such a kind records no steps ahead on a device: recorded steps compute the built-in
 //!    loss alone.
@@ -97,8 +95,7 @@
 //!    forecast, `summary.json` and the report follow. `photos/appearance.rs` acts on pictures, `photos/poses.rs` on
 //!    cameras, `photos/masked_blocks.rs` on photos.
 //! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. With `before "off"` behind its class, runs of older
-//!    programs resume. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
+//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
@@ -111,7 +108,7 @@
 //!
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
-//!    `VERSION` and what the version before lacks, and in `check` which values are impossible. A value by photo is a
+//!    `VERSION`, and in `check` which values are impossible. A value by photo is a
 //!    parameter of photos instead.
 //! 2. `train/state/trainer.rs`: uses `self.state`. Commits and resumes need no change.
 //! 3. `tests/fuzz/targets/map.rs`: the sample state. Only a new format of slots needs a new fixture (`tests/programs/ckpt/fixture.rs`).

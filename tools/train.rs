@@ -23,6 +23,16 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+/// Help with the examples before the flags.
+const HELP: &str = "{about-with-newline}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
+
+const FIRST_EXAMPLES: &str = "\
+Examples:
+  gsscale-train --demo                              train on a generated city, pictures in runs/demo
+  gsscale-train scans/village --out runs/village    a COLMAP scene: images/ and sparse/0/
+  gsscale-train scans/village --dry-run             print the settings and the memory needed
+  gsscale-train --resume runs/village               resume a stopped or interrupted run";
+
 const EXAMPLES: &str = "\
 Examples:
   gsscale-train --demo                              generate a city, train on it, write pictures to runs/demo
@@ -39,51 +49,58 @@ report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, con
 
 /// Trains a 3D Gaussian Splatting scene from photos with known poses.
 #[derive(Parser)]
-#[command(name = "gsscale-train", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-train", version, help_template = HELP)]
+#[command(before_help = FIRST_EXAMPLES, before_long_help = EXAMPLES)]
 struct Args {
-    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, an OpenDroneMap project, RealityScan's CSV, or
-    /// Mega-NeRF's layout
+    /// Scene: a COLMAP folder (images/, sparse/), or one of the other layouts that --help names
+    ///
+    /// These are one with transforms.json, an OpenDroneMap project, RealityScan's CSV, and Mega-NeRF's layout
     #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
     scene: Option<PathBuf>,
-    /// Output folder [default: runs/NAME, with the name of the scene; runs/NAME-2 and so on if that is taken]
+    /// Output folder [default: runs/NAME, with the name of the scene]
+    ///
+    /// If that is taken, runs/NAME-2 and so on
     #[arg(long, short)]
     out: Option<PathBuf>,
     /// Config file; flags override it
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     config: Option<PathBuf>,
     /// Generate a small city in the folder `scene` inside --out and train on it
-    #[arg(long, conflicts_with = "scene")]
+    #[arg(long, conflicts_with = "scene", hide_short_help = true)]
     demo: bool,
-    /// Resume the run in this output folder, which was stopped, interrupted, or kept its checkpoint, with its config
-    /// and scene. These may be given anew: memory, frames, threads, I/O, device and logging; more --steps; the scene or
+    /// Resume the run in this output folder, with its config and scene
+    ///
+    /// The run was stopped, interrupted, or kept its checkpoint. These may be given anew: memory, frames, threads, I/O, device and logging; more --steps; the scene or
     /// --init-ply if they moved
     #[arg(long, value_name = "OUT", conflicts_with_all = ["out", "config", "demo", "overwrite"])]
     resume: Option<PathBuf>,
     /// With --resume: continue although the dataset changed, or with other values of keys that change numbers
-    #[arg(long, requires = "resume")]
+    #[arg(long, requires = "resume", hide_short_help = true)]
     accept_changes: bool,
-    /// Print what the run will need (with --resume: what it will do), then stop; nothing is written
+    /// Print what the run will need, then stop
+    ///
+    /// With --resume: what it will do. Nothing is written
     #[arg(long)]
     dry_run: bool,
     /// Print the GPUs available to --device, best first, then stop
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     list_devices: bool,
     /// Replace the results of an earlier run in --out
-    #[arg(long)]
+    #[arg(long, hide_short_help = true)]
     overwrite: bool,
     /// Print only warnings and errors
-    #[arg(long, short)]
+    #[arg(long, short, hide_short_help = true)]
     quiet: bool,
     /// If the GPU is lost, go on from the last commit in this process, up to N times
-    #[arg(long, value_name = "N", default_value_t = 3)]
+    #[arg(long, value_name = "N", default_value_t = 3, hide_short_help = true)]
     restarts: u32,
     /// Write a trace of the host's work in every step (uploads, submissions, waits, read-backs, pages, events) to this file.
     /// Perfetto (ui.perfetto.dev) and chrome://tracing open it
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", hide_short_help = true)]
     trace: Option<PathBuf>,
     /// Serve a live page of the run, with its curves and a picture from a camera that you move. ADDRESS is a port of this
     /// machine (8080), or an address with a port (0.0.0.0:8080 lets the network see the page)
-    #[arg(long, value_name = "ADDRESS", value_parser = parse_address)]
+    #[arg(long, value_name = "ADDRESS", value_parser = parse_address, hide_short_help = true)]
     serve: Option<SocketAddr>,
     #[command(flatten)]
     keys: TrainOverrides,

@@ -6,10 +6,9 @@
 //!
 //! Layout: [`VERSION`] as u32, then the values in the order of `encode` and `decode`, as
 //! [`crate::page::format::encoding`] writes them. A new value is a field of [`TrainerState`], a place at the end of `encode` and
-//! `decode`, a new version, and a line in `older_states`. A new kind of values of photos changes nothing here: these are encoded
-//! by [`crate::photos`], each kind under its name.
+//! `decode`, and a new version. A new kind of values of photos changes nothing here: these are encoded by [`crate::photos`], each
+//! kind under its name.
 
-use super::older_states::{GrowthOf8, OlderEnd, OlderGrowth, missing_values};
 use crate::base::identity::RunId;
 use crate::densify::growth::GrowthState;
 use crate::page::format::encoding::{self, EncodingError};
@@ -17,7 +16,6 @@ use crate::paging::stats::PagerStats;
 use crate::photos;
 use crate::photos::saved::{SavedValues, ValuesError};
 use crate::scene::events::{Event, EventKind, EventLog};
-use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
@@ -108,9 +106,6 @@ pub struct TrainerState {
     pub growth: GrowthState,
 }
 
-/// The end of the layout.
-type End = (GrowthState, SavedValues);
-
 /// The state of a run between two steps, without its pages.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RunState {
@@ -194,14 +189,10 @@ impl RunState {
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
-        let state = match version {
-            VERSION => RunState::decode(body, Ok::<End, _>)?,
-            8 => RunState::decode(body, OlderEnd::<GrowthOf8>::today)?,
-            older => {
-                let missing = missing_values(older)?.ok_or(RunStateError::Version(version))?;
-                RunState::decode(&[body, &missing].concat(), OlderEnd::<OlderGrowth>::today)?
-            }
-        };
+        if version != VERSION {
+            return Err(RunStateError::Version(version));
+        }
+        let state = RunState::decode(body)?;
         state.check()?;
         Ok(state)
     }
@@ -222,19 +213,15 @@ impl RunState {
         ))
     }
 
-    /// The counterpart of [`RunState::encode`]. `today` turns the end of the layout, as a version has it, into that of today.
-    fn decode<E: DeserializeOwned>(
-        bytes: &[u8],
-        today: impl Fn(E) -> Result<End, EncodingError>,
-    ) -> Result<RunState, EncodingError> {
+    /// The counterpart of [`RunState::encode`].
+    fn decode(bytes: &[u8]) -> Result<RunState, EncodingError> {
         let (
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
             (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
             (metrics_bytes, test, traffic, run),
-            end,
+            (growth, photos),
         ) = encoding::from_bytes(bytes)?;
-        let (growth, photos) = today(end)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
         let trainer =
             TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, growth };
@@ -289,8 +276,7 @@ impl RunState {
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
-pub(super) mod tests {
-    use super::super::older_states::OLDEST;
+mod tests {
     use super::*;
     use crate::appearance::state::AppearanceState;
     use crate::base::rng::mix64;
@@ -320,43 +306,32 @@ pub(super) mod tests {
         poses
     }
 
-    /// The end of the sample in version 8, with the checks of growth of today.
-    pub(in crate::checkpoint) fn end_of_8() -> OlderEnd<GrowthState> {
-        OlderEnd {
-            appearance: AppearanceState::new(&[0, 1, 0]),
-            outliers: vec![ViewState::default(); 3],
-            growth: GrowthState {
-                first: 7,
-                checks: vec![
-                    GrowthCheck {
-                        step: 5,
-                        gaussians: 7,
-                        psnr: 20.0,
-                        trained_psnr: 20.0,
-                        lost: 0.5,
-                        pays_from: 0.25,
-                        is_trial: false,
-                        allowed: 10,
-                    },
-                    GrowthCheck {
-                        step: 8,
-                        gaussians: 10,
-                        psnr: 21.0,
-                        trained_psnr: 21.0,
-                        lost: -0.5,
-                        pays_from: 0.5,
-                        is_trial: false,
-                        allowed: 10,
-                    },
-                ],
-            },
-            blocks: looked_at(),
-            first_exposures: 2,
-            poses: moved(),
-        }
+    fn growth() -> GrowthState {
+        let check = |step, gaussians, psnr, lost, pays_from| GrowthCheck {
+            step,
+            gaussians,
+            psnr,
+            trained_psnr: psnr,
+            lost,
+            pays_from,
+            is_trial: false,
+            allowed: 10,
+        };
+        GrowthState { first: 7, checks: vec![check(5, 7, 20.0, 0.5, 0.25), check(8, 10, 21.0, -0.5, 0.5)] }
     }
 
-    pub(in crate::checkpoint) fn sample() -> RunState {
+    /// Values of every kind.
+    fn photos_of_three() -> SavedValues {
+        let values = [
+            ("appearance", Encoded::of(&(AppearanceState::new(&[0, 1, 0]), 2u32))),
+            ("outliers", Encoded::of(&vec![ViewState::default(); 3])),
+            ("blocks", Encoded::of(&looked_at())),
+            ("poses", Encoded::of(&moved())),
+        ];
+        values.map(|(name, values)| (name.to_string(), values.unwrap())).into()
+    }
+
+    fn sample() -> RunState {
         let thresholds =
             RoundThresholds { grow_grad2d: f32::INFINITY, split_scale: 0.5, prune_opacity: -0.0, prune_scale: 2.0 };
         let events = [
@@ -364,7 +339,7 @@ pub(super) mod tests {
             Event { step: 4, kind: EventKind::Densify(thresholds) },
             Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
         ];
-        let (growth, photos) = end_of_8().today().unwrap();
+        let (growth, photos) = (growth(), photos_of_three());
         RunState {
             origin: Origin {
                 config: "steps = 20\n".to_string(),
@@ -414,7 +389,7 @@ pub(super) mod tests {
     fn states_come_back_and_other_versions_do_not() {
         let mut bytes = sample().to_bytes().unwrap();
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
-        for other in [OLDEST - 1, VERSION + 1] {
+        for other in [0, VERSION - 1, VERSION + 1] {
             bytes[..4].copy_from_slice(&other.to_le_bytes());
             assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
         }

@@ -137,11 +137,7 @@ impl TrainConfig {
         self.check_adam_eps()
     }
 
-    /// Checks Adam's epsilon; separate for the config of a checkpoint.
-    ///
-    /// # Errors
-    /// The epsilon is out of range.
-    pub fn check_adam_eps(&self) -> InputResult<()> {
+    fn check_adam_eps(&self) -> InputResult<()> {
         if (EPS_MIN..=1.0).contains(&self.adam_eps) {
             return Ok(());
         }

@@ -8,7 +8,7 @@
 //! `[resolved]` table and the tables of [`super::published`] hold facts and are ignored when read.
 
 use super::choice::{Chosen, Device, LogFormat};
-use super::key::{Class, Key};
+use super::key::{Class, Key, Shown};
 use super::schedule::Schedule;
 use super::values::{ByteSize, Rgb, Up};
 use crate::appearance::AppearanceMode;
@@ -39,11 +39,27 @@ use std::path::Path;
 
 /// Tables of a config file that hold facts instead of settings.
 pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
+/// A key that configs may still have: it never had an effect.
+const WITHOUT_EFFECT: &str = "deterministic";
 
 /// Longest config file, bytes; a file with every key has some 8 KB.
 pub const FILE_BYTES_MAX: u64 = 1 << 20;
+
+/// The word behind a key's class as a [`Shown`].
+macro_rules! shown {
+    () => {
+        Shown::InGroup
+    };
+    (common) => {
+        Shown::First
+    };
+    (hidden) => {
+        Shown::Nowhere
+    };
+}
+
 macro_rules! config_keys {
-    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident $(before $before:literal)*; )+ })+) => {
+    ($($heading:literal { $( $(#[doc = $doc:literal])+ $([$($arg:tt)+])? $name:ident: $ty:ty = $default:expr => $class:ident $($shown:ident)?; )+ })+) => {
         /// All keys of a run with their values.
         #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default, rename_all = "kebab-case")]
@@ -73,7 +89,7 @@ macro_rules! config_keys {
 
         /// Every key, in order.
         pub const KEYS: &[Key] = &[$($(
-            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class, before: &[$($before),*] },
+            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class, shown: shown!($($shown)?) },
         )+)+];
     };
 }
@@ -85,11 +101,11 @@ config_keys! {
         /// Reduce photos by this factor (may be fractional: 3.4175)
         data_factor: f64 = 1.0 => Numbers;
         /// Longest side of a photo in pixels after --data-factor; 0 = no limit
-        max_resolution: u32 = 0 => Numbers;
+        max_resolution: u32 = 0 => Numbers common;
         /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
         test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
-        test_after: i64 = -1 => Numbers;
+        test_after: i64 = -1 => Numbers hidden;
         /// Use masks found in masks/ (white = keep), and the alpha of photos as a mask (opaque = keep). Without, transparent
         /// pixels show --background
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
@@ -100,7 +116,7 @@ config_keys! {
         /// Memory for decoded photos
         image_cache: ByteSize = ByteSize(1 << 30) => Free;
         /// Near plane, relative to the size of the scene
-        near_plane: f64 = 0.01 => Numbers;
+        near_plane: f64 = 0.01 => Numbers hidden;
         /// Start from this PLY (Gaussians if it has f_dc_0, else coloured points), or from the last generation of this
         /// store folder (see gsscale-ckpt import), which may exceed memory. Empty = the dataset's points
         init_ply: String = String::new() => Derived;
@@ -109,10 +125,10 @@ config_keys! {
     }
     "Training" {
         /// Total number of steps; --resume can raise it (see --keep-checkpoint)
-        [value_parser = parse_count32] steps: u32 = 30_000 => Length;
+        [value_parser = parse_count32] steps: u32 = 30_000 => Length common;
         /// Steps over which learning rates decay; they are constant afterwards. 0 = --steps, and with --strategy long-axis and
         /// --schedule run-length at most 150 for each training photo. A resumed run keeps its first value
-        [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived;
+        [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived hidden;
         /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
         /// also of --scales-lr, --quats-lr, --shn-lr and --others-lr-final, where they are not given: run-length (by --steps;
         /// the classic values from 30,000 steps on, except that others-lr-final is 0.1) or classic (their defaults below). A
@@ -123,48 +139,48 @@ config_keys! {
         /// Highest degree of spherical harmonics (SH), 0 to 3
         sh_degree: u8 = 3 => Layout;
         /// Raise the SH degree every N steps; 0 = full degree from the start
-        sh_every: u32 = 1000 => Numbers;
+        sh_every: u32 = 1000 => Numbers hidden;
         /// SH degree of the first step
-        sh_start: u8 = 0 => Numbers;
+        sh_start: u8 = 0 => Numbers hidden;
         /// Order of the photos: auto, shuffle, groups:N (N spatial groups, shuffled within) or tour (a path through
         /// all). auto is shuffle if the scene fits in memory or reads are few, else groups
         view_order: Chosen<Order> = Chosen(None) => Numbers;
         /// Capacity of a page, Gaussians. Fixed for a run, because it changes the rounding
-        page_rows: u32 = 1024 => Layout;
+        page_rows: u32 = 1024 => Layout hidden;
         /// Weight of 1 - SSIM in the loss; the rest is L1
         ssim_lambda: f64 = 0.2 => Numbers;
         /// Pixels of the SSIM in the loss: valid (windows inside the image) or same (zero padded)
-        ssim_padding: SsimPadding = SsimPadding::Valid => Numbers;
+        ssim_padding: SsimPadding = SsimPadding::Valid => Numbers hidden;
         /// Learning rate of positions, times the scene scale
         means_lr: f64 = 1.6e-4 => Numbers;
         /// Learning rate of positions at the last step, as a fraction of --means-lr
-        means_lr_final: f64 = 0.01 => Numbers;
+        means_lr_final: f64 = 0.01 => Numbers hidden;
         /// Learning rate of log-scales
-        scales_lr: f64 = 5e-3 => Numbers;
+        scales_lr: f64 = 5e-3 => Numbers hidden;
         /// Learning rate of quaternions
-        quats_lr: f64 = 1e-3 => Numbers;
+        quats_lr: f64 = 1e-3 => Numbers hidden;
         /// Learning rate of logit opacities
-        opacities_lr: f64 = 5e-2 => Numbers;
+        opacities_lr: f64 = 5e-2 => Numbers hidden;
         /// Learning rate of the constant SH band
-        sh0_lr: f64 = 2.5e-3 => Numbers;
+        sh0_lr: f64 = 2.5e-3 => Numbers hidden;
         /// Learning rate of the higher SH bands
-        shn_lr: f64 = 2.5e-3 / 20.0 => Numbers;
+        shn_lr: f64 = 2.5e-3 / 20.0 => Numbers hidden;
         /// Learning rates of everything but positions at the last step, as a fraction: they fall over the last tenth of the
         /// run. 1 = they are constant
-        others_lr_final: f64 = 1.0 => Numbers before "1.0";
+        others_lr_final: f64 = 1.0 => Numbers hidden;
         /// Adam's epsilon, 1e-16 to 1: below 1e-16 it is lost in the f32 rounding of second moments
-        adam_eps: f64 = 1e-15 => Numbers;
+        adam_eps: f64 = 1e-15 => Numbers hidden;
         /// Which Gaussians Adam updates: deferred (all; those without a gradient when next visible), dense (all at
         /// every step: slow, for comparison), or sparse (only those with a gradient: not exact)
-        optimizer: Method = Method::Deferred => Numbers;
+        optimizer: Method = Method::Deferred => Numbers hidden;
         /// Where the optimizer runs: host, or device (on the GPU that renders, in pages that stay there while --device-mem
         /// has room; with --optimizer deferred, --moments f32 and --growth-score gradient). The two round differently.
         /// auto is host, until device is faster on measured GPUs. A resumed run keeps its place
-        optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers before "auto" before "host";
+        optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers;
         /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk)
         moments: Moments = Moments::F32 => Numbers;
         /// Initial opacity
-        init_opacity: f64 = 0.1 => Numbers;
+        init_opacity: f64 = 0.1 => Numbers hidden;
         /// Initial size, times the distance to the three nearest neighbours
         init_scale: f64 = 1.0 => Numbers;
         /// For few or random first points: --growth-score mixed, --recycle 0.05, --init-scale 2 and 6.7 times the --means-lr of
@@ -172,25 +188,25 @@ config_keys! {
         /// run keeps its values
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] poor_points: bool = false => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
-        max_alpha: f64 = 0.99 => Numbers;
+        max_alpha: f64 = 0.99 => Numbers hidden;
         /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo) or full (also eight
         /// numbers for its colours, and the vignetting of each camera). For photos whose exposure or colours change. Exposures
         /// start from the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
-        appearance: AppearanceMode = AppearanceMode::Off => Numbers before "off";
+        appearance: AppearanceMode = AppearanceMode::Off => Numbers;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
         /// The log and the report name such views with and without this key
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers before "false";
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
         /// side of a masked block is a 64th of the photo's longer side. Pixels beside a masked block that have its colour are
         /// masked too. At most a quarter of the blocks of a photo is masked, from a tenth of the run on (step 500 at the
         /// latest). Masks of your own work better: see --masks
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers before "false";
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
         /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
         /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. poses.json has the
         /// refined ones. Not with --optimizer-on device
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers before "false";
+        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
     }
@@ -202,15 +218,15 @@ config_keys! {
         strategy: StrategyName = StrategyName::LongAxis => Numbers;
         /// With --strategy long-axis, grow first the Gaussians with the largest screen-space gradient (gradient), with the
         /// largest squared error in the pixels that they cover (error), or with the largest geometric mean of both (mixed)
-        growth_score: GrowthScore = GrowthScore::Gradient => Numbers;
+        growth_score: GrowthScore = GrowthScore::Gradient => Numbers hidden;
         /// With --strategy long-axis, the share of the Gaussians seen that a round at the cap removes; 0 = none
-        recycle: f64 = 0.02 => Numbers;
-        /// With --strategy long-axis and no --max-gaussians: draft (few Gaussians), normal or archive (many). The run holds out
+        recycle: f64 = 0.02 => Numbers hidden;
+        /// draft (few Gaussians), normal or archive (many); with --strategy long-axis and no --max-gaussians. The run holds out
         /// some training photos during its first half (at most 1,700 steps). The scene grows as long as more Gaussians bring
         /// these photos enough decibels
-        quality: Quality = Quality::Normal => Numbers before "normal";
+        quality: Quality = Quality::Normal => Numbers common;
         /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)
-        [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers;
+        [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers common;
         /// Step after which densification rounds begin
         refine_start: u32 = 500 => Numbers;
         /// Step at which densification rounds and opacity resets end
@@ -220,15 +236,15 @@ config_keys! {
         refine_every: u32 = 100 => Numbers;
         /// Steps between opacity resets (to twice --prune-opa); 0 = never. No reset comes in the last steps of the planned run
         /// (a third of this number, at most 1,000), because opacities need steps to recover
-        reset_every: u32 = 3000 => Numbers;
+        reset_every: u32 = 3000 => Numbers hidden;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
-        grow_grad2d: f64 = 2e-4 => Numbers;
+        grow_grad2d: f64 = 2e-4 => Numbers hidden;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
-        grow_scale3d: f64 = 0.01 => Numbers;
+        grow_scale3d: f64 = 0.01 => Numbers hidden;
         /// Remove Gaussians with a lower opacity; 0 = none, and no opacity resets. With --strategy mcmc, relocate them
-        prune_opa: f64 = 0.005 => Numbers;
+        prune_opa: f64 = 0.005 => Numbers hidden;
         /// Remove Gaussians larger than this (times the scene scale), after the first --reset-every steps
-        prune_scale3d: f64 = 0.1 => Numbers;
+        prune_scale3d: f64 = 0.1 => Numbers hidden;
     }
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
@@ -240,13 +256,13 @@ config_keys! {
         /// Log of metrics: json (metrics.jsonl), or tensorboard (event files as well)
         log: LogFormat = LogFormat::Json => Free;
         /// SSIM to report: same (zero padded, as the 3DGS code), valid or reflect
-        ssim_variant: SsimVariant = SsimVariant::Same => Reported;
+        ssim_variant: SsimVariant = SsimVariant::Same => Reported hidden;
         /// Also report colour-corrected PSNR: affine (per channel, as gsplat), quadratic (as Zip-NeRF and nerfstudio)
         /// or off. It is not comparable with PSNR
         [alias = "colour-correct"] color_correct: Chosen<ColorCorrect> = Chosen(None) => Free;
-        /// Files of the result. A PLY is always written; spz adds a file of about a tenth of its bytes, sog a folder with levels of
-        /// detail, which web viewers load in parts. Values: ply, spz, sog or several: spz,sog
-        export: Exports = Exports { spz: false, sog: false } => Free;
+        /// Files of the result: ply, spz, sog or several (spz,sog). A PLY is always written; spz adds a file of about a tenth of its
+        /// bytes, sog a folder with levels of detail, which web viewers load in parts
+        export: Exports = Exports { spz: false, sog: false } => Free common;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the exported files: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction
@@ -257,18 +273,18 @@ config_keys! {
     }
     "Memory and disk" {
         /// Memory limit of the run; 0 = 70 % of the memory available on this machine or in its control group
-        host_mem: ByteSize = ByteSize(0) => Free;
+        host_mem: ByteSize = ByteSize(0) => Free common;
         /// Folder on a fast drive for pages that do not fit in memory; it is also the checkpoint of the run. Empty =
         /// all pages stay in memory, and the checkpoint is the folder `checkpoint` inside --out
-        spill_dir: String = String::new() => Lasting;
+        spill_dir: String = String::new() => Lasting common;
         /// Keep the checkpoint at the end of the run, for more steps later or for gsscale-ckpt. Otherwise it is kept
         /// only if the run stops early
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
         /// Most pages in memory; 0 = as many as --host-mem allows
-        frames: u32 = 0 => Free;
+        frames: u32 = 0 => Free hidden;
         /// I/O engine for pages: auto, uring, mmap or pread. Never changes results. mmap reads through memory maps: if another
         /// program makes a page file shorter during a read, the system ends the run (SIGBUS), and --resume continues it
-        io: IoEngine = IoEngine::Auto => Free;
+        io: IoEngine = IoEngine::Auto => Free hidden;
         /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
         /// raw; gsscale-iotune advises zstd for slow drives). Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
@@ -278,25 +294,23 @@ config_keys! {
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
         /// without commits if its results have room
-        disk_full_wait: f64 = 600.0 => Free;
+        disk_full_wait: f64 = 600.0 => Free hidden;
         /// Which page to evict: belady (farthest next use) or lru. Never changes results
-        evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free;
+        evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free hidden;
         /// When pages move: overlap (during steps), ahead (prefetched between steps, which wait) or demand (when a step
         /// needs them). The last two are for comparison. Never changes results
-        transfers: Transfers = Transfers::Overlap => Free;
+        transfers: Transfers = Transfers::Overlap => Free hidden;
         /// Most bytes of prefetched pages; 0 = an eighth of the frames
-        prefetch_bytes: ByteSize = ByteSize(0) => Free;
+        prefetch_bytes: ByteSize = ByteSize(0) => Free hidden;
     }
     "Machine" {
         /// Worker threads; 0 = one per core. Never changes results
         threads: u32 = 0 => Free;
         /// Instruction path: auto, avx512, avx2 or baseline. Each path always gives the same bits
-        simd: Chosen<SimdPath> = Chosen(None) => Instructions;
-        /// Renderer: auto (a hardware GPU if there is one, else the CPU), gpu (a software adapter as well), cpu, or a
-        /// part of a name from --list-devices
-        device: Device = Device::Gpu(DeviceChoice::Auto) => Free;
-        /// Repeated runs give the same bits on the same device. Always on; there is no faster mode
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] deterministic: bool = true => Free;
+        simd: Chosen<SimdPath> = Chosen(None) => Instructions hidden;
+        /// Renderer: auto (a hardware GPU, else the CPU), gpu (also a software adapter), cpu, or part of a name from
+        /// --list-devices
+        device: Device = Device::Gpu(DeviceChoice::Auto) => Free common;
         /// Memory limit on the device; 0 = all of its memory
         device_mem: ByteSize = ByteSize(0) => Free;
     }
@@ -340,7 +354,7 @@ impl TrainConfig {
     /// As [`TrainConfig::parse`].
     pub fn parse_with_keys(text: &str) -> Result<(TrainConfig, BTreeSet<String>), String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
-        for name in TABLES {
+        for name in TABLES.into_iter().chain([WITHOUT_EFFECT]) {
             table.remove(name);
         }
         let given = table.keys().map(|key| key.replace('-', "_")).collect();
@@ -354,7 +368,9 @@ mod tests {
 
     #[test]
     fn files_override_defaults_and_unknown_keys_are_refused() {
-        let config = TrainConfig::parse("steps = 7\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n");
+        let config = TrainConfig::parse(
+            "steps = 7\ndeterministic = true\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n",
+        );
         let config = config.unwrap_or_default();
         assert_eq!((config.steps, config.image_cache), (7, ByteSize(64 << 20)));
         let error = TrainConfig::parse("stepz = 7").err().unwrap_or_default();

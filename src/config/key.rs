@@ -1,4 +1,4 @@
-//! A key's heading in help, its meaning, its class (the effect of a change), and what it was before it existed.
+//! A key's heading in help, its meaning, its class (the effect of a change), and where help shows it.
 
 /// A key of the config.
 #[derive(Debug, Clone, Copy)]
@@ -11,9 +11,8 @@ pub struct Key {
     pub meaning: &'static str,
     /// The effect of a change.
     pub class: Class,
-    /// For a newer key, the values under which a run behaves as before the key existed. Without one, the key counts as changed when
-    /// a run of an older program resumes.
-    pub before: &'static [&'static str],
+    /// Where help shows it.
+    pub shown: Shown,
 }
 
 impl Key {
@@ -21,6 +20,17 @@ impl Key {
     pub fn name(&self) -> String {
         self.field.replace('_', "-")
     }
+}
+
+/// Where help shows a key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shown {
+    /// In `-h` and in `--help`: most runs give it.
+    First,
+    /// In `--help`.
+    InGroup,
+    /// In configs/README.md and configs/default.toml alone: it is for work on the program, and for comparisons.
+    Nowhere,
 }
 
 /// The effect of a changed key on a resumed run, and on the comparison with a published run.

@@ -18,7 +18,6 @@ pub struct PagerStats {
     /// Pages read from the store.
     pub pages_read: u64,
     /// Pages written to the store.
-    #[serde(default)]
     pub pages_written: u64,
     /// Pages that steps needed.
     pub pages_needed: u64,
@@ -38,20 +37,16 @@ pub struct PagerStats {
     #[serde(rename = "pages_pinned_max")]
     pub pinned_max: usize,
     /// Misses that were not even on their way.
-    #[serde(rename = "page_absent", default)]
+    #[serde(rename = "page_absent")]
     pub absent: u64,
     /// Pages that evaluation, export and a look at the views before the first step needed.
-    #[serde(default)]
     pub other_pages_needed: u64,
     /// Bytes read for those pages.
-    #[serde(default)]
     pub other_bytes_read: u64,
     /// Seconds that evaluation, export, such a look and the import waited for the store.
-    #[serde(default)]
     pub other_stall_seconds: f64,
     /// Bytes that a cache of this size which knows the future would have read for the steps
     /// ([`super::plan::bound::FewestReads`]); to compare with `bytes_read` less `other_bytes_read`.
-    #[serde(default)]
     pub belady_bytes_read: u64,
 }
 
@@ -98,7 +93,7 @@ mod tests {
     use crate::base::ids::PageNo;
     use crate::page::format::encoding;
 
-    /// What older programs wrote must be read back: bytes in the state of a run, names in the files of metrics.
+    /// Other files hold them: bytes in the state of a run, names in the files of metrics.
     #[test]
     fn the_order_of_the_bytes_and_the_names_stay() {
         let stats = PagerStats {

@@ -2,7 +2,7 @@
 
 use gsscale::config::command_line::default_file;
 use gsscale::config::file::{KEYS, TrainConfig};
-use gsscale::config::key::Key;
+use gsscale::config::key::{Key, Shown};
 use std::path::PathBuf;
 
 fn configs() -> PathBuf {
@@ -25,6 +25,16 @@ fn default_file_is_the_default() {
     assert_eq!(TrainConfig::read(&path).unwrap(), TrainConfig::default());
     for name in KEYS.iter().map(Key::name) {
         assert!(written.contains(&format!("\n{name} = ")), "{name} is not in default.toml");
+    }
+}
+
+#[test]
+fn keys_that_help_does_not_show_are_in_the_readme() {
+    let readme = std::fs::read_to_string(configs().join("README.md")).unwrap();
+    let section = readme.split("\n## ").find(|section| section.starts_with("Keys that help")).unwrap();
+    for key in KEYS {
+        let is_listed = section.contains(&format!("`{}`", key.name()));
+        assert_eq!(is_listed, key.shown == Shown::Nowhere, "{}", key.name());
     }
 }
 

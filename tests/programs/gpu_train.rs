@@ -71,14 +71,12 @@ fn a_gpu_trains_as_the_cpu_does() {
     for line in metrics(&on_cpu) {
         assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
     }
-    // The same command gives the same file, with --deterministic (the default) and without.
+    // The same command gives the same file.
     let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
     for (name, device, first) in [("again", "gpu", &on_gpu), ("again on the CPU", "cpu", &on_cpu)] {
-        for switch in ["--deterministic", "--deterministic=false"] {
-            let again = folder.path().join(format!("{name} {switch}"));
-            run(&scene, &again, &["--device", device, switch]);
-            assert!(ply(first) == ply(&again), "two runs of the same command differ: {name} {switch}");
-        }
+        let again = folder.path().join(name);
+        run(&scene, &again, &["--device", device]);
+        assert!(ply(first) == ply(&again), "two runs of the same command differ: {name}");
     }
     // The PLY alone gives the run's metrics, on the device that its config names.
     let report = eval(&[text(&on_gpu), text(&scene)]);

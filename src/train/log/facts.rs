@@ -16,7 +16,6 @@ pub struct Resolved {
     /// Version of the program.
     pub version: String,
     /// Identity of the run; its commits hold it too.
-    #[serde(default)]
     pub run: RunId,
     /// The scene.
     pub scene: PathBuf,
@@ -39,7 +38,6 @@ pub struct Resolved {
     /// Scene scale, dataset units.
     pub scene_scale: f64,
     /// The run made the folder of its spill directory, and so removes it at its end.
-    #[serde(default)]
     pub made_spill_dir: bool,
 }
 

@@ -241,7 +241,6 @@ pub struct ExportFacts {
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub levels: Option<[u64; LEVELS_MAX]>,
     /// Giants among them, which viewers show beside any level.
-    #[serde(default)]
     pub always_shown: u64,
 }
 

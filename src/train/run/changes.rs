@@ -39,15 +39,6 @@ pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
 }
 
-/// Refuses to resume from pages trained with too small an epsilon: their bounds do not hold, and a new epsilon does not
-/// repair them. Checks the config of the commit, since the config in the run's folder may have changed.
-fn check_eps_of_commit(file: &Path, then: &TrainConfig) -> InputResult<()> {
-    let Err(error) = then.check_adam_eps() else { return Ok(()) };
-    let problem = format!("the last commit was trained with an invalid --adam-eps: {}", error.problem);
-    let remedy = "start a new run from its Gaussians: gsscale-ckpt export, then --init-ply with that file";
-    Err(InputError::new(file, problem, remedy))
-}
-
 /// Differences, one line each.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct Changes {
@@ -74,14 +65,9 @@ impl Changes {
         let (there, here) = (table(&then)?, table(config)?);
         let mut changes = Changes::default();
         for (name, now) in &here {
-            let Some(&Key { class, before, .. }) = KEYS.iter().find(|key| key.name() == *name) else { continue };
-            // A key unknown to the older commit counts as a difference, so that the user sees its default.
-            // It counts as known if the programs of that time can only have done one thing.
-            let was_done = |value: &toml::Value| {
-                let value = value.as_str().map_or_else(|| value.to_string(), String::from);
-                before.contains(&value.as_str())
-            };
-            let then = there.get(name).filter(|value| written.contains_key(name) || was_done(value));
+            let Some(&Key { class, .. }) = KEYS.iter().find(|key| key.name() == *name) else { continue };
+            // A key that the commit lacks counts as a difference, so that the user sees its default.
+            let then = there.get(name).filter(|_| written.contains_key(name));
             if class.is_derived() || then == Some(now) {
                 continue;
             }
@@ -93,7 +79,6 @@ impl Changes {
             let then = then.map_or_else(|| "absent".to_string(), toml::Value::to_string);
             lines.push(format!("{name} was {then} and is {now}"));
         }
-        check_eps_of_commit(file, &then)?;
         let [was, is] = [&then, config].map(limits::schedule_steps);
         if was != is {
             changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
@@ -148,7 +133,6 @@ impl Changes {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::appearance::AppearanceMode;
     use crate::checkpoint::run_state::{Origin, RunIdentity};
 
     #[test]
@@ -171,9 +155,9 @@ mod tests {
         }
     }
 
-    /// A run that began before a key existed goes on as it was, and only so.
+    /// Another program may have written the commit.
     #[test]
-    fn a_run_without_the_key_of_appearance_was_off() {
+    fn a_key_that_the_commit_lacks_is_a_difference() {
         let config = TrainConfig::default();
         let text = toml::to_string(&config).unwrap();
         let without: String =
@@ -190,10 +174,9 @@ mod tests {
         let simd = limits::simd_path(&config).name().to_string();
         let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
         let state = RunState::without_past(origin, "cpu".to_string(), 1);
-        let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
-        assert_eq!(changes(&config), Changes::default());
-        let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
-        assert_eq!(on.numbers, ["appearance was \"off\" and is \"full\""]);
+        let changes = Changes::of_config(Path::new("config.toml"), &state, &config).unwrap();
+        assert_eq!(changes.numbers, ["appearance was absent and is \"off\""]);
+        assert!(changes.free.is_empty() && changes.fixed.is_empty());
     }
 
     #[test]

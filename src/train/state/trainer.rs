@@ -383,7 +383,7 @@ impl Trainer {
     /// As [`Trainer::check_growth`].
     pub(crate) fn log_due_events(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let Some(step) = self.state.step.checked_sub(1) else { return Ok(()) };
-        // A failed attempt of the coming step, or an older program, has logged them already.
+        // A failed attempt of the coming step has logged them already.
         if self.events().events().last().is_some_and(|last| last.step >= step) {
             return Ok(());
         }

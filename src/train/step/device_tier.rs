@@ -43,7 +43,6 @@ pub struct SlotTraffic {
     /// Payloads copied to the device.
     pub loads: u64,
     /// Those copied while the device computed the step before.
-    #[serde(default)]
     pub loads_ahead: u64,
     /// Their bytes.
     pub bytes_loaded: u64,
@@ -54,14 +53,11 @@ pub struct SlotTraffic {
     /// Pages of batches that were on the device already.
     pub hits: u64,
     /// Pages whose statistics the device cleared after a round, in place of a drain, an edit and a load.
-    #[serde(default)]
     pub cleared: u64,
     /// Slots.
-    #[serde(default)]
     pub slots: u64,
     /// The fewest bytes that any order of eviction could have copied to that many slots so far ([`FewestReads`]); to compare
     /// with `bytes_loaded`. Pages that events changed on the host are copied again in any order.
-    #[serde(default)]
     pub bytes_loaded_fewest: u64,
 }
 

@@ -2,10 +2,8 @@
 
 use super::{StorePlace, run_state_of};
 use crate::page::tool::reading::Access;
-use crate::report::run_files::METRICS_FILE;
 use crate::train::error::TrainError;
 use serde::Serialize;
-use std::path::Path;
 
 /// A kept generation.
 #[derive(Debug, Clone, Serialize)]
@@ -18,7 +16,7 @@ pub struct GenerationLine {
     pub is_latest: bool,
     /// Steps done.
     pub step: u32,
-    /// Held-out PSNR of the last evaluation before it, dB; `None` if unknown.
+    /// Held-out PSNR of the last evaluation before it, dB; `None` without one.
     pub psnr: Option<f64>,
     /// Gaussians in its pages. Pages that no view has needed since the last events have not applied them.
     pub gaussians: u64,
@@ -51,18 +49,15 @@ pub struct Listed {
 /// The store cannot be opened, or another version of the program wrote a run state.
 pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let store = place.open(Access::Map)?;
-    let tests = place.run.as_deref().map(tests_of).unwrap_or_default();
     let mut generations = Vec::new();
     for used in store.disk_use()? {
         let state = run_state_of(&store, used.generation)?;
-        let in_metrics = || tests.iter().rfind(|(step, _)| *step < state.trainer.step).map(|(_, psnr)| *psnr);
-        let psnr = state.trainer.test.map(|test| test.psnr).or_else(in_metrics);
         generations.push(GenerationLine {
             generation: used.generation,
             names: used.names,
             is_latest: used.generation == store.generations().latest(),
             step: state.trainer.step,
-            psnr,
+            psnr: state.trainer.test.map(|test| test.psnr),
             gaussians: state.rows,
             gaussians_at_most: state.rows_bound,
             pages: used.pages,
@@ -73,15 +68,4 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let segment_bytes = store.segments()?.iter().map(|(_, bytes)| bytes).sum();
     let used_by = store.used_by().map(str::to_string);
     Ok(Listed { store: place.folder.clone(), used_by, segment_bytes, generations })
-}
-
-/// Steps and PSNRs of the evaluations in a run's metrics.jsonl, in order. Invalid lines are skipped, since a crash cuts
-/// the file short.
-fn tests_of(run: &Path) -> Vec<(u32, f64)> {
-    let text = std::fs::read_to_string(run.join(METRICS_FILE)).unwrap_or_default();
-    let test = |line: &str| {
-        let line: serde_json::Value = serde_json::from_str(line).ok()?;
-        Some((u32::try_from(line["step"].as_u64()?).ok()?, line["test"]["psnr"].as_f64()?))
-    };
-    text.lines().filter_map(test).collect()
 }

@@ -30,6 +30,7 @@ use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::stores::opened::Stored;
+use crate::train::stores::run_state_of;
 use std::path::Path;
 
 /// Refuses the checkpoint of another run.
@@ -119,9 +120,7 @@ pub(crate) fn read_own(folder: &Path, claim: Claim<'_>) -> Result<Option<RunStat
 /// The store has no commit or cannot be opened.
 pub(crate) fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
     let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
-    let bytes = store.run_state(store.find(None)?)?;
-    let wrong = |problem: String| InputError::new(folder, problem, "use the program that made it");
-    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()))?)
+    run_state_of(&store, store.find(None)?)
 }
 
 /// Removes the checkpoint that `run` left in its output folder, for a run that starts over there.
