@@ -200,7 +200,7 @@ mod tests {
         };
         let names = ["base", "slow", "unlucky", "fine", "dull", "paged", "mixed", "idle"].map(str::to_string);
         // The spread of the base is 0.2 dB and .02; seed 1 has 26.0 dB and .80, seed 2 has 26.2 and .82.
-        use Verdict::{Reference, Costs, NoEffect, SameBits, Unknown, WithinSpread};
+        use Verdict::{Costs, NoEffect, Reference, SameBits, Unknown, WithinSpread};
         let want = [Reference, Costs, Costs, WithinSpread, Costs, SameBits, Costs, NoEffect];
         assert_eq!(verdicts(&runs), names.clone().into_iter().zip(want).collect::<Vec<_>>());
         // With one seed of the base, only equal bits give a verdict.

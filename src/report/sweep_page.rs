@@ -6,7 +6,7 @@ use super::bars::Bars;
 use super::chart::{Chart, Mark};
 use super::figures::Figure;
 use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
-use super::html::{Cell, Page};
+use super::html::{Cell, Column, Page};
 use super::record::RunRecord;
 use serde::Deserialize;
 
@@ -55,13 +55,16 @@ pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) 
     }
     page.heading("All figures");
     let (names, rows) = cells(view, &settings);
-    let columns: Vec<Box<dyn Fn(&Vec<String>) -> Cell>> = (0..names.len())
-        .map(|i| -> Box<dyn Fn(&Vec<String>) -> Cell> {
-            let is_text = i == 0 || i + 1 == names.len();
-            Box::new(move |row| if is_text { Cell::text(&row[i]) } else { Cell::Number(row[i].clone()) })
-        })
-        .collect();
-    let columns: Vec<_> = names.iter().zip(&columns).map(|(name, cell)| (name.as_str(), cell.as_ref())).collect();
+    let last = names.len() - 1;
+    let cell = |i: usize| {
+        move |row: &Vec<String>| match i {
+            _ if i == 0 || i == last => Cell::text(&row[i]),
+            _ => Cell::Number(row[i].clone()),
+        }
+    };
+    let cells: Vec<_> = (0..names.len()).map(cell).collect();
+    let columns: Vec<Column<'_, Vec<String>>> =
+        names.iter().zip(&cells).map(|(name, cell)| (name.as_str(), cell as &dyn Fn(&Vec<String>) -> Cell)).collect();
     page.table(&rows, &columns);
     page.finish()
 }
@@ -253,7 +256,17 @@ mod tests {
     fn run(name: &str, seed: u64, psnr: f64, ply: &str) -> RunRecord {
         let (name, bits, ply) = (name.to_string(), "host".to_string(), ply.to_string());
         let key = format!("{name} {seed}");
-        RunRecord { key, name, bits, ply, seed, psnr: Some(psnr), ssim: Some(0.5), seconds: psnr, ..RunRecord::default() }
+        RunRecord {
+            key,
+            name,
+            bits,
+            ply,
+            seed,
+            psnr: Some(psnr),
+            ssim: Some(0.5),
+            seconds: psnr,
+            ..RunRecord::default()
+        }
     }
 
     #[test]

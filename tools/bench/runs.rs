@@ -329,12 +329,7 @@ impl Sweep {
         let path = beside(program)?;
         let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
         let mut command = Command::new(&path);
-        command
-            .args(arguments)
-            .envs(environment)
-            .stdin(Stdio::from(held))
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped());
+        command.args(arguments).envs(environment).stdin(Stdio::from(held)).stdout(Stdio::null()).stderr(Stdio::piped());
         if program == "gsscale-train" {
             command.arg("--quiet");
         }
