@@ -87,14 +87,8 @@ fn main() -> ExitCode {
 /// The checked config of a measurement; starts the worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
     let config = TrainConfig::of_new_run(file, keys)?;
-    start_threads(&config)?;
-    Ok(config)
-}
-
-/// Checks a config and starts the worker threads.
-fn start_threads(config: &TrainConfig) -> Result<(), TrainError> {
     config.check()?;
-    if !simd_path(config).is_supported() {
+    if !simd_path(&config).is_supported() {
         let problem = format!("this machine cannot run {}", config.simd.word());
         return Err(InputError::new("--simd", problem, "use --simd auto").into());
     }
@@ -102,5 +96,5 @@ fn start_threads(config: &TrainConfig) -> Result<(), TrainError> {
         // Fails only if the pool already exists; main has not started one.
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
-    Ok(())
+    Ok(config)
 }

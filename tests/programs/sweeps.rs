@@ -84,7 +84,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let words: Vec<&str> =
         table.lines().filter_map(|line| line.strip_prefix("| ")?.split_whitespace().next()).collect();
     assert_eq!(words, ["run", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
-    assert!(table.contains(&format!("| {:.2} |", number(memory, "psnr"))) && !table.contains("DIFFER"));
+    assert!(table.contains(&format!(" {:.2} |", number(memory, "psnr"))) && !table.contains("DIFFER"));
     let results = own.join("results.jsonl");
     assert_eq!(parse(&std::fs::read_to_string(&results).unwrap()), records);
     // A machine that was three times as slow during one rung: a third of its 90 seconds at the pace of the others.
@@ -94,8 +94,8 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     (slow["pace"]["seconds"], slow["seconds"]) = (6.0.into(), 90.0.into());
     std::fs::write(&results, paced.iter().map(|rung| format!("{rung}\n")).collect::<String>()).unwrap();
     let (converted, measured) = (said(&bench(&plain)), said(&bench(&with_pace("0"))));
-    assert!(converted.contains("| 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
-    assert!(measured.contains("| 90.0 |") && measured.contains("times as measured"), "{measured}");
+    assert!(converted.contains(" 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
+    assert!(measured.contains(" 90.0 |") && measured.contains("times as measured"), "{measured}");
 }
 
 /// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
@@ -241,7 +241,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
         &list.replace("reference = \"plain\"", "reference = \"other\"").replace(", RUN", ""),
         "no run of the list",
     );
-    refuses_list(&list.replace("psnr", "beauty"), "beauty");
+    refuses_list(&list.replace("psnr", "beauty").replace(", RUN", ""), "beauty");
     refuses_list(&with("{ name = \"plain\" }"), "two runs plain");
     refuses_list(&with("{ name = \"a\", environment = { PATH = \"/\" } }"), "PATH");
     refuses_list(&with("{ name = \"a\", set = { stepz = 3 } }"), "stepz");

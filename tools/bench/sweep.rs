@@ -99,9 +99,10 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         return Err(InputError::new("--share", "the value must be 0 or more, and below 100", remedy).into());
     }
     let given = TrainConfig::given(args.config.as_deref(), &args.keys)?;
-    super::start_threads(&super::settle(args.config.as_deref(), &args.keys)?)?;
+    super::settle(args.config.as_deref(), &args.keys)?;
     let mut plans: Vec<(Place, Plan)> = Vec::new();
     for scene in &args.scenes {
+        std::fs::metadata(scene).map_err(|e| InputError::io(scene, "reading the scene", &e))?;
         let name = scene.file_name().unwrap_or(scene.as_os_str());
         let place = Place { scene: scene.clone(), out: args.out.join(name), spill: args.spill.clone() };
         if plans.iter().any(|(other, _)| other.out == place.out) {
