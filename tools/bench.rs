@@ -5,24 +5,18 @@
 mod compare;
 #[path = "bench/facts.rs"]
 mod facts;
-#[path = "bench/knobs.rs"]
-mod knobs;
-#[path = "bench/ladder.rs"]
-mod ladder;
-#[path = "bench/pareto.rs"]
-mod pareto;
+#[path = "bench/list.rs"]
+mod list;
 #[path = "bench/published.rs"]
 mod published;
 #[path = "bench/published_table.rs"]
 mod published_table;
 #[path = "bench/run.rs"]
 mod run;
-#[path = "bench/stability.rs"]
-mod stability;
+#[path = "bench/runs.rs"]
+mod runs;
 #[path = "bench/sweep.rs"]
 mod sweep;
-#[path = "bench/table.rs"]
-mod table;
 
 use clap::Parser;
 use gsscale::base::error::InputError;
@@ -44,10 +38,9 @@ Measures training.
   gsscale-bench SCENE                  trains a scene (the same as run SCENE)
   gsscale-bench run NAME --data DIR    trains a published scene; prints our figures beside the published figures
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
-  gsscale-bench pareto SCENE --out DIR shows the cost and savings of each setting
-  gsscale-bench ladder SCENE --out DIR shows the gain of each idea of out-of-core training
-  gsscale-bench stability SCENE --out DIR
-                                       shows what faults of photos, poses and points cost, and what remedies win back
+  gsscale-bench sweep LIST SCENE... --out DIR
+                                       trains the runs of a list and compares them: pareto, ladder, ladder-gpu, stability,
+                                       or a file
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
 Published scenes:";
@@ -70,12 +63,8 @@ fn main() -> ExitCode {
     let done = if named("help") || named("--help") || named("-h") {
         gsscale::say!("{HELP} {}", BUILT_IN.map(|(name, _)| name).join(", "));
         Ok(())
-    } else if named("ladder") {
-        ladder::start(&parse_arguments(&arguments), &mut print)
-    } else if named("pareto") {
-        pareto::start(&parse_arguments(&arguments), &mut print)
-    } else if named("stability") {
-        stability::start(&parse_arguments(&arguments), &mut print)
+    } else if named("sweep") {
+        sweep::start(&parse_arguments(&arguments), &mut print)
     } else if named("compare") {
         compare::start(&compare::Args::parse_from(&arguments))
     } else if named("run") && published::is_meant(&arguments) {

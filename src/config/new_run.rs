@@ -50,17 +50,49 @@ impl TrainConfig {
     /// # Errors
     /// The file cannot be read.
     pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
+        let (mut config, given) = TrainConfig::with_given(file, keys)?;
+        config.set_open_keys(&given);
+        Ok(config)
+    }
+
+    /// As [`TrainConfig::of_new_run`], of the given keys.
+    ///
+    /// # Errors
+    /// A key or a word is unknown.
+    pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
+        let given = keys.keys().map(|key| key.replace('-', "_")).collect();
+        let mut config: TrainConfig = keys.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+        config.set_open_keys(&given);
+        Ok(config)
+    }
+
+    /// The keys that a config file and flags give.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub fn given(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<toml::Table> {
+        let (config, given) = TrainConfig::with_given(file, keys)?;
+        let all = toml::Table::try_from(&config).unwrap_or_default();
+        Ok(all.into_iter().filter(|(key, _)| given.contains(&key.replace('-', "_"))).collect())
+    }
+
+    /// The keys of a config file and flags over the defaults, and the names of their fields.
+    fn with_given(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<(TrainConfig, BTreeSet<String>)> {
         let (mut config, mut given) = match file {
             Some(path) => TrainConfig::read_with_keys(path)?,
             None => (TrainConfig::default(), BTreeSet::new()),
         };
         given.extend(keys.given().into_iter().map(str::to_string));
         keys.clone().apply(&mut config);
-        config.follow_length(&given);
-        if config.poor_points {
-            config.suit_poor_points(|field| !given.contains(field));
+        Ok((config, given))
+    }
+
+    /// Sets the keys that the length of the run and `poor-points` decide, but for those in `given` (names of fields).
+    fn set_open_keys(&mut self, given: &BTreeSet<String>) {
+        self.follow_length(given);
+        if self.poor_points {
+            self.suit_poor_points(|field| !given.contains(field));
         }
-        Ok(config)
     }
 
     /// Sets the fields of `poor-points` that are open. The values were chosen by the PSNR of held-out photos of two scenes with a tenth

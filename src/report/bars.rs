@@ -6,15 +6,15 @@ use super::chart::{AXIS, COLORS, Canvas, draw_svg, text};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-const WIDTH: u32 = 560;
+const WIDTH: u32 = 1040;
 /// Height of a bar with the gap below it.
-const BAR: i32 = 30;
+const BAR: i32 = 26;
 /// Height of the title.
 const TITLE: i32 = 40;
-/// Width of the names, about twelve characters.
-const NAMES: i32 = 110;
+/// Width of the names.
+const NAMES: i32 = 320;
 /// Width of the value beside the longest bar.
-const VALUES: i32 = 90;
+const VALUES: i32 = 250;
 
 /// Named values, one bar each.
 #[derive(Debug, Clone)]

@@ -21,7 +21,7 @@ const LEGEND_TOP: u32 = 40;
 const LEGEND_ROW: u32 = 20;
 /// Longest name in the legend, characters.
 const NAME_MAX: usize = 24;
-/// Colours of series, as many as a sweep needs for the base, eleven knobs and the front.
+/// Colours of series, as many as a sweep needs for the reference, eleven groups and the front.
 pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
@@ -61,8 +61,6 @@ pub enum Mark {
     Faint,
     /// A dot at every point.
     Dots,
-    /// A ring at every point.
-    Rings,
     /// A line with dots.
     LineAndDots,
 }
@@ -102,10 +100,6 @@ pub struct Chart {
     pub labels: Vec<(f64, f64, String)>,
     /// Vertical ranges: (x, lowest y, highest y).
     pub ranges: Vec<(f64, f64, f64)>,
-    /// Horizontal ranges: (y, lowest x, highest x).
-    pub ranges_x: Vec<(f64, f64, f64)>,
-    /// A dashed horizontal line and its text.
-    pub rule: Option<(f64, String)>,
     /// Whether the chart takes the whole width of the page, with the legend at the right.
     pub is_wide: bool,
     /// Whether the y axis starts at zero.
@@ -175,7 +169,6 @@ impl Chart {
             let (y, color) = ((LEGEND_TOP + LEGEND_ROW * row as u32) as i32, color(series.color));
             match series.mark {
                 Mark::Line | Mark::Faint => root.draw(&PathElement::new([(0, y), (12, y)], color.stroke_width(2))),
-                Mark::Rings => root.draw(&Circle::new((6, y), 4, color.stroke_width(2))),
                 Mark::Dots | Mark::LineAndDots => root.draw(&Circle::new((6, y), 4, color.filled())),
             }
             .map_err(text)?;
@@ -207,14 +200,6 @@ impl Chart {
         let (of_x, of_y) = (|v: &f64| tick(*v, x1 - x0), |v: &f64| tick(*v, y1 - y0));
         mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
-        if let Some((y, meaning)) = &self.rule {
-            let line = DashedLineSeries::new([(x0, *y), (x1, *y)], 5, 4, AXIS.mix(0.7).stroke_width(1));
-            chart.draw_series(line).map_err(text)?;
-            let (x, y) = chart.backend_coord(&(x1, *y));
-            let style = TextStyle::from(("sans-serif", LABEL_SIZE)).color(&AXIS).pos(Pos::new(HPos::Right, VPos::Top));
-            let (dx, dy) = root.get_base_pixel();
-            root.draw(&Text::new(meaning.clone(), (x - dx, y - dy + 3), style)).map_err(text)?;
-        }
         chart.draw_series(self.bars().map(|ends| PathElement::new(ends, AXIS.mix(0.6)))).map_err(text)?;
         for series in &self.series {
             draw_series(&mut chart, series, !self.is_wide)?;
@@ -270,11 +255,10 @@ impl Chart {
         Ok(())
     }
 
-    /// Both ends of each vertical and horizontal range; ranges that are not finite are dropped.
+    /// Both ends of each range; ranges that are not finite are dropped.
     fn bars(&self) -> impl Iterator<Item = [(f64, f64); 2]> {
-        let vertical = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
-        let horizontal = self.ranges_x.iter().map(|&(y, low, high)| [(low, y), (high, y)]);
-        vertical.chain(horizontal).filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
+        let all = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
+        all.filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
     }
 
     /// Ranges of the axes, with a margin; never empty.
@@ -286,8 +270,7 @@ impl Chart {
         };
         let ends = || self.bars().flatten();
         let x = range(&mut points().map(|p| p.0).chain(ends().map(|p| p.0)));
-        let ys = points().map(|p| p.1).chain(ends().map(|p| p.1)).chain(self.rule.iter().map(|r| r.0));
-        let mut y = range(&mut ys.filter(|y| y.is_finite()));
+        let mut y = range(&mut points().map(|p| p.1).chain(ends().map(|p| p.1)));
         if self.from_zero {
             y[0] = y[0].min(0.0);
         }
@@ -357,11 +340,10 @@ fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Re
     }
     // A line through one point has no length.
     if !series.mark.is_line() || series.points.len() == 1 {
-        let style = if series.mark == Mark::Rings { color.stroke_width(2) } else { color.filled() };
-        let dots = series.points.iter().map(|&p| Circle::new(p, if series.mark == Mark::Rings { 4 } else { 3 }, style));
+        let dots = series.points.iter().map(|&p| Circle::new(p, 3, color.filled()));
         let drawn = chart.draw_series(dots).map_err(text)?;
         if is_named && !series.mark.is_line() && series.mark != Mark::LineAndDots {
-            drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, style));
+            drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, color.filled()));
         }
     }
     Ok(())
@@ -398,7 +380,7 @@ mod tests {
 
     #[test]
     fn colours_differ_also_when_they_begin_again() {
-        // A sweep needs colours for the base, eleven knobs and the front.
+        // A sweep needs colours for the reference, eleven groups and the front.
         assert!(COLORS.len() > 12);
         let all: Vec<RGBColor> = (0..COLORS.len() * SHADES.len()).map(color).collect();
         assert_eq!(all[..COLORS.len()], COLORS);
@@ -440,22 +422,20 @@ mod tests {
         let bars = |chart: &Chart| chart.svg().matches("opacity=\"0.6\" stroke=\"#616161\"").count();
         let mut with = chart.clone();
         with.ranges = vec![(1.0, -3.0, 4.0), (f64::NAN, 0.0, 1.0), (1.0, 0.0, f64::INFINITY)];
-        with.ranges_x = vec![(2.0, -5.0, 9.0), (2.0, f64::NAN, 1.0), (f64::INFINITY, 0.0, 1.0)];
-        assert_eq!([bars(&chart), bars(&with)], [0, 2], "{}", with.svg());
-        let ([x0, x1], [y0, y1]) = with.ranges();
-        assert!(x0 <= -5.0 && (9.0..12.0).contains(&x1) && y0 <= -3.0 && (4.0..6.0).contains(&y1));
+        assert_eq!([bars(&chart), bars(&with)], [0, 1], "{}", with.svg());
+        let (_, [y0, y1]) = with.ranges();
+        assert!(y0 <= -3.0 && (4.0..6.0).contains(&y1));
     }
 
     #[test]
     fn labels_lie_over_nothing_and_wide_charts_have_their_legend_beside_them() {
         let dots = vec![(0.0, 0.0), (1.0, 1.0), (1.001, 1.0), (1.002, 1.0)];
-        let mut chart = Chart::new("a", "b", "c").with("knob", dots.clone(), Mark::Rings).wide();
+        let mut chart = Chart::new("a", "b", "c").with("knob", dots.clone(), Mark::Dots).wide();
         chart.labels = (0..20).map(|i| (1.001, 1.0, format!("label{i}"))).collect();
-        chart.rule = Some((0.5, "limit".to_string()));
         chart.ranges = vec![(0.0, -5.0, 5.0)];
         let svg = chart.svg();
         assert!(svg.contains("label0") && !svg.contains("label19"), "there is no room for twenty");
-        assert!(svg.contains("limit") && svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
+        assert!(svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
         assert!(chart.ranges().1[0] <= -5.0);
     }
 

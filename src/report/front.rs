@@ -1,7 +1,7 @@
-//! Judges the settings of a sweep: mean and spread over seeds, Pareto front, loss of accuracy against the base.
+//! Judges the settings of a sweep: mean and spread over seeds, Pareto front, loss of accuracy against the reference.
 //!
 //! Invariants: 1. a point is on the front unless another point is at least as good in both values and better in one;
-//! 2. without a known spread of the base, only settings with the same bits as the base count as free.
+//! 2. without a known spread of the reference, only settings with the same bits as the reference count as free.
 
 use super::record::RunRecord;
 
@@ -31,20 +31,20 @@ impl Spread {
     }
 }
 
-/// Accuracy of a setting against the base.
+/// Accuracy of a setting against the reference.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// The setting is the base.
-    Base,
-    /// The same bits and the same traffic as the base for every common seed: the setting changed nothing here.
+    /// The setting is the reference.
+    Reference,
+    /// The same bits and the same traffic as the reference for every common seed: the setting changed nothing here.
     NoEffect,
-    /// The same bits as the base for every common seed.
+    /// The same bits as the reference for every common seed.
     SameBits,
-    /// PSNR and SSIM are at least the base's means over the common seeds, minus the base's spread over all its seeds.
+    /// PSNR and SSIM are at least the reference's means over the common seeds, minus the reference's spread over all its seeds.
     WithinSpread,
     /// PSNR or SSIM is lower than that.
     Costs,
-    /// The base has only one seed, or base and setting have no common seed.
+    /// The reference has only one seed, or reference and setting have no common seed.
     Unknown,
 }
 
@@ -52,7 +52,7 @@ impl Verdict {
     /// The verdict for people; empty where it is not known.
     pub fn words(self) -> &'static str {
         match self {
-            Verdict::Base => "the base",
+            Verdict::Reference => "the reference",
             Verdict::NoEffect => "changed nothing here",
             Verdict::SameBits => "the same bits",
             Verdict::WithinSpread => "no cost beyond the spread",
@@ -60,83 +60,66 @@ impl Verdict {
             Verdict::Unknown => "",
         }
     }
-
-    /// Whether the setting loses no accuracy beyond the spread.
-    pub fn is_free(self) -> bool {
-        matches!(self, Verdict::Base | Verdict::NoEffect | Verdict::SameBits | Verdict::WithinSpread)
-    }
 }
 
 /// A setting with the runs of all its seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
-    /// The changed knob.
-    pub knob: String,
-    /// Name of the setting.
-    pub label: String,
+    /// Group and name, `group/name`.
+    pub name: String,
     /// The successful runs.
     pub runs: Vec<RunRecord>,
-    /// PSNR, dB.
-    pub psnr: Option<Spread>,
-    /// SSIM.
-    pub ssim: Option<Spread>,
-    /// Accuracy against the base.
+    /// Why a run of it failed.
+    pub problem: Option<String>,
+    /// Accuracy against the reference.
     pub verdict: Verdict,
 }
 
 impl Setting {
-    /// Mean of a value over the seeds that have it.
-    pub fn mean(&self, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<f64> {
-        Spread::of(self.runs.iter().filter_map(of)).map(|s| s.mean)
+    /// A value over the seeds that have it.
+    pub fn spread(&self, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<Spread> {
+        Spread::of(self.runs.iter().filter_map(of))
     }
 }
 
-/// Groups the successful runs by setting, base first, and judges each setting against the base.
-pub fn settings(records: &[RunRecord]) -> Vec<Setting> {
+/// Groups the runs by setting, in their order, and judges each setting against the reference.
+pub fn settings(records: &[RunRecord], reference: &str) -> Vec<Setting> {
     let mut settings: Vec<Setting> = Vec::new();
-    for record in records.iter().filter(|r| r.problem.is_none()) {
-        let same = |s: &&mut Setting| s.knob == record.knob && s.label == record.label;
-        match settings.iter_mut().find(same) {
-            Some(setting) => setting.runs.push(record.clone()),
-            None => settings.push(Setting {
-                knob: record.knob.clone(),
-                label: record.label.clone(),
-                runs: vec![record.clone()],
-                psnr: None,
-                ssim: None,
-                verdict: Verdict::Unknown,
-            }),
+    for record in records {
+        let at = settings.iter().position(|s| s.name == record.name).unwrap_or_else(|| {
+            let (name, runs) = (record.name.clone(), Vec::new());
+            settings.push(Setting { name, runs, problem: None, verdict: Verdict::Unknown });
+            settings.len() - 1
+        });
+        match &record.problem {
+            None => settings[at].runs.push(record.clone()),
+            Some(problem) => settings[at].problem = Some(problem.clone()),
         }
     }
-    for setting in &mut settings {
-        setting.psnr = Spread::of(setting.runs.iter().filter_map(|r| r.psnr));
-        setting.ssim = Spread::of(setting.runs.iter().filter_map(|r| r.ssim));
-    }
-    settings.sort_by_key(|s| s.knob != "base");
-    if let Some(base) = settings.first().filter(|s| s.knob == "base").cloned() {
-        settings.iter_mut().for_each(|s| s.verdict = judge(s, &base));
+    if let Some(reference) = settings.iter().find(|s| s.name == reference && !s.runs.is_empty()).cloned() {
+        settings.iter_mut().for_each(|s| s.verdict = judge(s, &reference));
     }
     settings
 }
 
-fn judge(setting: &Setting, base: &Setting) -> Verdict {
-    if setting.knob == "base" {
-        return Verdict::Base;
+fn judge(setting: &Setting, reference: &Setting) -> Verdict {
+    if setting.name == reference.name {
+        return Verdict::Reference;
     }
-    let of_seed = |run: &RunRecord| base.runs.iter().find(|b| b.seed == run.seed);
+    let of_seed = |run: &RunRecord| reference.runs.iter().find(|b| b.seed == run.seed);
     let pairs: Vec<_> = setting.runs.iter().filter_map(|run| Some((run, of_seed(run)?))).collect();
-    if !pairs.is_empty() && pairs.iter().all(|(run, base)| !run.ply.is_empty() && run.ply == base.ply) {
+    if !pairs.is_empty() && pairs.iter().all(|(run, own)| !run.ply.is_empty() && run.ply == own.ply) {
         // Times always differ a little; these figures differ where a setting of memory or drive does something.
         let traffic = |r: &RunRecord| (r.bytes_read, r.bytes_written, r.frames, r.pages, r.steps);
-        let is_idle = pairs.iter().all(|(run, base)| traffic(run) == traffic(base));
+        let is_idle = pairs.iter().all(|(run, own)| traffic(run) == traffic(own));
         return if is_idle { Verdict::NoEffect } else { Verdict::SameBits };
     }
-    if base.runs.len() < 2 || against(setting, base, |r| r.psnr).is_none() {
+    if reference.runs.len() < 2 || against(setting, reference, |r| r.psnr).is_none() {
         return Verdict::Unknown;
     }
     let holds = |of: fn(&RunRecord) -> Option<f64>| {
-        let width = Spread::of(base.runs.iter().filter_map(of)).map(|s| s.width());
-        against(setting, base, of).zip(width).is_some_and(|(difference, width)| difference >= -width)
+        let width = reference.spread(of).map(|s| s.width());
+        against(setting, reference, of).zip(width).is_some_and(|(difference, width)| difference.mean >= -width)
     };
     match holds(|r| r.psnr) && holds(|r| r.ssim) {
         true => Verdict::WithinSpread,
@@ -144,11 +127,10 @@ fn judge(setting: &Setting, base: &Setting) -> Verdict {
     }
 }
 
-/// Mean difference to the base over common seeds. Pairing by seed cancels the luck of a seed. `None` without a common
-/// seed.
-pub fn against(setting: &Setting, base: &Setting, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<f64> {
-    let of_base = |seed: u64| base.runs.iter().find(|b| b.seed == seed).and_then(&of);
-    Spread::of(setting.runs.iter().filter_map(|run| Some(of(run)? - of_base(run.seed)?))).map(|s| s.mean)
+/// Difference to the reference over common seeds. Pairing by seed cancels the luck of a seed. `None` without a common seed.
+pub fn against(setting: &Setting, reference: &Setting, of: impl Fn(&RunRecord) -> Option<f64>) -> Option<Spread> {
+    let of_reference = |seed: u64| reference.runs.iter().find(|b| b.seed == seed).and_then(&of);
+    setting.spread(|run| Some(of(run)? - of_reference(run.seed)?))
 }
 
 /// The Pareto front: indices of the points (cost, value) that no other point beats, by ascending cost. Lower cost and
@@ -191,9 +173,9 @@ mod tests {
         }
     }
 
-    fn run(knob: &str, seed: u64, psnr: f64, ssim: f64, ply: &str) -> RunRecord {
+    fn run(name: &str, seed: u64, psnr: f64, ssim: f64, ply: &str) -> RunRecord {
         let (psnr, ssim) = (Some(psnr), Some(ssim));
-        RunRecord { knob: knob.into(), label: knob.into(), seed, psnr, ssim, ply: ply.into(), ..RunRecord::default() }
+        RunRecord { name: name.into(), seed, psnr, ssim, ply: ply.into(), ..RunRecord::default() }
     }
 
     #[test]
@@ -214,18 +196,18 @@ mod tests {
         ];
         runs.push(RunRecord { problem: Some("died".into()), ..run("base", 3, 1.0, 0.1, "") });
         let verdicts = |runs: &[RunRecord]| -> Vec<(String, Verdict)> {
-            settings(runs).into_iter().map(|s| (s.knob, s.verdict)).collect()
+            settings(runs, "base").into_iter().map(|s| (s.name, s.verdict)).collect()
         };
         let names = ["base", "slow", "unlucky", "fine", "dull", "paged", "mixed", "idle"].map(str::to_string);
         // The spread of the base is 0.2 dB and .02; seed 1 has 26.0 dB and .80, seed 2 has 26.2 and .82.
-        use Verdict::{Base, Costs, NoEffect, SameBits, Unknown, WithinSpread};
-        let want = [Base, Costs, Costs, WithinSpread, Costs, SameBits, Costs, NoEffect];
+        use Verdict::{Costs, NoEffect, Reference, SameBits, Unknown, WithinSpread};
+        let want = [Reference, Costs, Costs, WithinSpread, Costs, SameBits, Costs, NoEffect];
         assert_eq!(verdicts(&runs), names.clone().into_iter().zip(want).collect::<Vec<_>>());
         // With one seed of the base, only equal bits give a verdict.
         runs.remove(3);
-        let want = [Base, Unknown, Unknown, Unknown, Unknown, SameBits, NoEffect, NoEffect];
+        let want = [Reference, Unknown, Unknown, Unknown, Unknown, SameBits, NoEffect, NoEffect];
         assert_eq!(verdicts(&runs), names.into_iter().zip(want).collect::<Vec<_>>());
-        let paged = &settings(&runs)[5];
-        assert_eq!(paged.psnr.map(|s| (s.low, s.high)), Some((26.0, 26.2)));
+        let paged = &settings(&runs, "base")[5];
+        assert_eq!(paged.spread(|r| r.psnr).map(|s| (s.low, s.high)), Some((26.0, 26.2)));
     }
 }

@@ -6,10 +6,9 @@
 pub mod bars;
 pub mod chart;
 pub mod compare_report;
-pub mod dots;
+pub mod figures;
 pub mod front;
 pub mod html;
-pub mod ladder_page;
 pub mod levels_page;
 pub mod live;
 mod numbers;
@@ -20,5 +19,4 @@ pub mod record;
 pub mod results_log;
 pub mod run_files;
 pub mod run_report;
-pub mod stability_page;
 pub mod sweep_page;

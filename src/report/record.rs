@@ -17,7 +17,7 @@ pub struct Pace {
     pub cpu_seconds: Option<f64>,
 }
 
-/// A run of a ladder or of a sweep.
+/// A run of a sweep.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunRecord {
@@ -25,10 +25,11 @@ pub struct RunRecord {
     pub key: String,
     /// The scene.
     pub scene: String,
-    /// The changed knob: `base`, the name of a knob, or `together`.
-    pub knob: String,
-    /// Name of the setting, such as `groups:9`.
-    pub label: String,
+    /// Group and name in the list of the sweep, such as `order/groups:9`.
+    pub name: String,
+    /// Runs of one class and seed must end with the same bits; empty = this is not known. Of the list, not of the run.
+    #[serde(skip)]
+    pub bits: String,
     /// Config keys that differ from the base, with their values.
     pub settings: BTreeMap<String, String>,
     /// Seed.
@@ -91,6 +92,11 @@ pub struct RunRecord {
 }
 
 impl RunRecord {
+    /// The group in the list of the sweep.
+    pub fn group(&self) -> &str {
+        self.name.split('/').next().unwrap_or_default()
+    }
+
     /// Bytes read and written.
     pub fn bytes_moved(&self) -> u64 {
         self.bytes_read.saturating_add(self.bytes_written)

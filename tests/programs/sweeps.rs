@@ -1,4 +1,4 @@
-//! `gsscale-bench` commands that train runs in child processes: ladder, sweep and compare.
+//! `gsscale-bench sweep`, which trains runs in child processes, and `gsscale-bench compare` of its runs.
 
 use crate::support::bench::{bench, large_city, lines, number, parse};
 use crate::support::browser::in_a_browser;
@@ -7,7 +7,7 @@ use crate::support::scenes::{stderr, text};
 use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
@@ -29,67 +29,73 @@ fn check_page(page: &Path, parts: &[&str], scratch: &Path) {
     in_a_browser(page, scratch);
 }
 
+/// Arguments of a sweep on a scene with small pages.
+fn sweep<'a>(list: &'a str, scene: &'a Path, out: &'a Path, more: &[&'a str]) -> Vec<&'a str> {
+    let common = ["--page-rows", "16", "--strategy", "none", "--pace-steps", "0"];
+    [&["sweep", list, text(scene), "--out", text(out)][..], &common, more].concat()
+}
+
+/// The record of a run.
+fn of<'a>(records: &'a [Value], name: &str, seed: u64) -> &'a Value {
+    let found = records.iter().find(|r| r["name"] == name && r["seed"] == seed);
+    found.unwrap_or_else(|| panic!("{name} {seed} in {records:?}"))
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
 #[test]
 fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let folder = TempDir::new().unwrap();
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
-    let sizes = ["--steps", "60", "--page-rows", "16", "--strategy", "none", "--share", "70", "--seed", "3"];
-    let command = [&["ladder", text(&scene), "--out", text(&out)][..], &sizes].concat();
-    let plain = [&command[..], &["--pace-steps", "20"]].concat();
-    let args = [&plain[..], &["--json"]].concat();
-    let rungs = lines(&args);
-    let labels: Vec<&str> = rungs.iter().map(|r| r["label"].as_str().unwrap()).collect();
-    assert_eq!(labels, ["naive", "deferred", "planned", "overlap", "memory"]);
-    let [naive, deferred, planned, overlap, memory] = &rungs[..] else { panic!("{rungs:?}") };
+    let command = sweep("ladder", &scene, &out, &["--steps", "60", "--share", "70", "--seeds", "3"]);
+    let at = command.iter().position(|arg| *arg == "--pace-steps").unwrap() + 1;
+    let with_pace = |steps: &'static str| {
+        let mut command = command.clone();
+        command[at] = steps;
+        command
+    };
+    let plain = with_pace("20");
+    let records = lines(&[&plain[..], &["--json"]].concat());
+    let [naive, deferred, planned, overlap, memory] =
+        ["naive", "deferred", "planned", "overlap", "memory"].map(|name| of(&records, name, 3));
     for rung in [deferred, planned, overlap] {
-        assert_eq!(rung["ply"], memory["ply"], "{} is not exact", rung["label"]);
+        assert_eq!(rung["ply"], memory["ply"], "{} is not exact", rung["name"]);
     }
     assert_ne!(naive["ply"], memory["ply"], "dense updates round more often");
     // 60 steps amplify roundings of 1e-7 to a few thousandths of a decibel at most.
     assert!((number(naive, "psnr") - number(memory, "psnr")).abs() < 0.05);
     // A cache smaller than the scene keeps nothing if every step visits all pages in the same order.
-    let pages = number(naive, "pages");
-    let frames = number(naive, "frames");
+    let (pages, frames) = (number(naive, "pages"), number(naive, "frames"));
     assert!(frames < pages && number(deferred, "frames") == frames);
     assert!(number(naive, "bytes_read") > 60.0 * (pages - frames) * 16.0 * 200.0);
     assert!(number(naive, "bytes_read") > 2.0 * number(deferred, "bytes_read"));
     assert!(number(planned, "bytes_read") < number(deferred, "bytes_read"), "Belady reads less than LRU");
     assert!(number(memory, "bytes_read") == 0.0 && number(overlap, "drive_bytes_peak") > 0.0);
-    assert!(rungs.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
-    assert!(rungs.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each rung");
-    check_page(&out.join("ladder.html"), &["the same, byte for byte"], folder.path());
-    assert!(names(&out.join("spill")).is_empty(), "scratch is removed");
-    // Finished runs are not repeated.
-    assert_eq!(lines(&args), rungs);
-    // Without --json, the end is a table of them.
-    let table = String::from_utf8(bench(&plain).stdout).unwrap();
-    let words: Vec<&str> = table.lines().filter_map(|line| line.split_whitespace().next()).collect();
-    assert_eq!(words, ["rung", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
-    assert!(table.contains(&format!("{:.2}", number(memory, "psnr"))), "{table}");
-    let results = out.join("ladder.jsonl");
-    assert_eq!(parse(&std::fs::read_to_string(&results).unwrap()), rungs);
-    // A machine that was three times as slow during the last rung: a third of its 90 seconds at the pace of the others.
-    let mut paced = rungs.clone();
+    assert!(records.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
+    assert!(records.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each rung");
+    let own = out.join(scene.file_name().unwrap());
+    check_page(&own.join("sweep.html"), &["the same, byte for byte", "seconds waiting"], folder.path());
+    assert!(names(&own.join("spill")).is_empty(), "scratch is removed");
+    // Finished runs are not repeated. Without --json, the end is a table of them, in the order of the list.
+    let table = said(&bench(&plain));
+    let words: Vec<&str> =
+        table.lines().filter_map(|line| line.strip_prefix("| ")?.split_whitespace().next()).collect();
+    assert_eq!(words, ["run", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
+    assert!(table.contains(&format!(" {:.2} |", number(memory, "psnr"))) && !table.contains("DIFFER"));
+    let results = own.join("results.jsonl");
+    assert_eq!(parse(&std::fs::read_to_string(&results).unwrap()), records);
+    // A machine that was three times as slow during one rung: a third of its 90 seconds at the pace of the others.
+    let mut paced = records.clone();
     paced.iter_mut().for_each(|rung| rung["pace"]["seconds"] = 2.0.into());
-    (paced[4]["pace"]["seconds"], paced[4]["seconds"]) = (6.0.into(), 90.0.into());
-    let text_of = |rungs: &[Value]| rungs.iter().map(|rung| format!("{rung}\n")).collect::<String>();
-    std::fs::write(&results, text_of(&paced)).unwrap();
-    let seconds_in_memory = |pace_steps: &str| {
-        let output = bench(&[&command[..], &["--pace-steps", pace_steps]].concat());
-        let table = String::from_utf8(output.stdout).unwrap();
-        let line = table.lines().find(|line| line.starts_with("memory")).unwrap();
-        let seconds = line.split_whitespace().nth(1).unwrap().to_string();
-        (seconds, String::from_utf8(output.stderr).unwrap())
-    };
-    let (seconds, said) = seconds_in_memory("20");
-    assert!(seconds == "30.0" && said.contains("converted to the median pace"), "{seconds} {said}");
-    let (seconds, said) = seconds_in_memory("0");
-    assert!(seconds == "90.0" && said.contains("times as measured"), "{seconds} {said}");
-    paced[0]["pace"]["key"] = "another".into();
-    std::fs::write(&results, text_of(&paced)).unwrap();
-    let (seconds, said) = seconds_in_memory("20");
-    assert!(seconds == "90.0" && said.contains("times as measured"), "{seconds} {said}");
+    let slow = paced.iter_mut().find(|rung| rung["name"] == "memory").unwrap();
+    (slow["pace"]["seconds"], slow["seconds"]) = (6.0.into(), 90.0.into());
+    std::fs::write(&results, paced.iter().map(|rung| format!("{rung}\n")).collect::<String>()).unwrap();
+    let (converted, measured) = (said(&bench(&plain)), said(&bench(&with_pace("0"))));
+    assert!(converted.contains(" 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
+    assert!(measured.contains(" 90.0 |") && measured.contains("times as measured"), "{measured}");
 }
 
 /// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
@@ -101,35 +107,25 @@ fn rungs_on_a_device_end_alike() {
     let folder = TempDir::new().unwrap();
     let scene = large_city(folder.path());
     let out = folder.path().join("ladder");
-    let args = ["--steps", "30", "--page-rows", "16", "--strategy", "none", "--share", "70", "--device-mem", "6MiB"];
-    let more =
-        ["--pace-steps", "0", "--rungs", "overlap,memory,pages,ahead,split,resident", "--device", "gpu", "--json"];
-    let rungs = lines(&[&["ladder", text(&scene), "--out", text(&out)][..], &args, &more].concat());
-    let [overlap, memory, pages, ahead, split, resident] = &rungs[..] else { panic!("{rungs:?}") };
+    let sizes = ["--steps", "30", "--share", "70"];
+    let args = sweep("ladder-gpu", &scene, &out, &sizes);
+    let records = lines(&[&args[..], &["--device-mem", "6MiB", "--device", "gpu", "--json"]].concat());
+    let [overlap, memory, pages, ahead, split, resident] =
+        ["overlap", "memory", "pages", "ahead", "split", "resident"].map(|name| of(&records, name, 42));
     assert!(
         overlap["ply"] == memory["ply"] && [ahead, split, resident].iter().all(|r| r["ply"] == pages["ply"]),
-        "{rungs:?}"
+        "{records:?}"
     );
-    assert!(rungs.iter().all(|r| r["pace"].is_null()), "no pace was wanted");
+    assert!(records.iter().all(|r| r["pace"].is_null()), "no pace was wanted");
     assert!(number(split, "device_bytes_peak") <= 3.0 * 1048576.0, "{split}");
     assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
-    assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{rungs:?}");
-    assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{rungs:?}");
+    assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{records:?}");
+    assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{records:?}");
     let words =
         ["The results of overlap, memory are the same", "The results of pages, ahead, split, resident are the same"];
-    check_page(&out.join("ladder.html"), &words, folder.path());
-    let of_none = [&["ladder", text(&scene), "--out", text(&out)][..], &args[..args.len() - 2], &["--rungs", "split"]];
-    let output = bench(&of_none.concat());
-    assert!(!output.status.success() && stderr(&output).contains("name --device-mem"), "{}", stderr(&output));
-    let on_cpu = [&["ladder", text(&scene), "--out", text(&out)][..], &args, &["--rungs", "pages", "--device", "cpu"]];
-    let output = bench(&on_cpu.concat());
+    check_page(&out.join(scene.file_name().unwrap()).join("sweep.html"), &words, folder.path());
+    let output = bench(&[&args[..], &["--device", "cpu"]].concat());
     assert!(!output.status.success() && stderr(&output).contains("use --device auto or gpu"), "{}", stderr(&output));
-}
-
-fn sweep<'a>(scene: &'a Path, out: &'a Path) -> Vec<&'a str> {
-    let sizes = ["--steps", "20", "--page-rows", "16", "--strategy", "none", "--seeds", "1,2", "--setting-seeds", "2"];
-    let knobs = ["--pace-steps", "20", "--knobs", "optimizer,budget,sh,resolution", "--json"];
-    [&["pareto", text(scene), "--out", text(out)][..], &sizes, &knobs].concat()
 }
 
 #[test]
@@ -137,14 +133,16 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     let folder = TempDir::new().unwrap();
     let scene = large_city(folder.path());
     let out = folder.path().join("sweep");
-    let args = sweep(&scene, &out);
-    let listed = bench(&[&args[..], &["--list"]].concat());
-    let planned = String::from_utf8_lossy(&listed.stdout).lines().filter(|l| l.contains("to do")).count();
+    let knobs = ["--steps", "20", "--seeds", "1,2", "--other-seeds", "2", "--only", "optimizer,budget,sh,resolution"];
+    let plain = sweep("pareto", &scene, &out, &knobs);
+    let args = [&plain[..], &["--json"]].concat();
+    let planned = said(&bench(&[&args[..], &["--list-runs"]].concat())).matches("to do").count();
     assert!(planned >= 16 && !out.exists(), "listing runs nothing");
 
     // Killed in the middle of a run.
     let program = env!("CARGO_BIN_EXE_gsscale-bench");
     let mut killed = Command::new(program).args(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let out = out.join(scene.file_name().unwrap());
     let results = out.join("results.jsonl");
     let began = Instant::now();
     while std::fs::read_to_string(&results).map_or(0, |t| t.lines().count()) < 2 {
@@ -157,14 +155,14 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     let done = kept.lines().count();
     // And as after a crash of the machine in the middle of a line.
     std::fs::write(&results, format!("{kept}{{\"key\":\"0123")).unwrap();
-    std::fs::create_dir_all(out.join("runs/base-base-seed9-00000000.part/renders")).unwrap();
+    std::fs::create_dir_all(out.join("runs/base-seed9-00000000.part/renders")).unwrap();
 
     // The holder of the lock is at work, even if only a run that outlived its sweep.
     let lock = std::fs::File::open(out.join("sweep.lock")).unwrap();
     lock.lock().unwrap();
     let refused = bench(&args);
     assert!(!refused.status.success() && stderr(&refused).contains("left behind"), "{}", stderr(&refused));
-    assert!(out.join("runs/base-base-seed9-00000000.part").is_dir(), "it may be in use");
+    assert!(out.join("runs/base-seed9-00000000.part").is_dir(), "it may be in use");
     drop(lock);
 
     let after = lines(&[&args[..], &["--max-runs", "3"]].concat());
@@ -180,36 +178,29 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     assert!(records.iter().all(|r| r["problem"].is_null()), "{records:?}");
     assert!(names(&out.join("runs")).iter().all(|name| !name.contains(".part")), "half runs are removed");
     assert_eq!(names(&out.join("runs")).len(), planned);
-    check_sweep(&records, &out, folder.path());
     assert!(lines(&args).is_empty(), "all are done");
-    let plain: Vec<&str> = args.iter().copied().filter(|arg| *arg != "--json").collect();
-    let table = String::from_utf8(bench(&plain).stdout).unwrap();
-    assert!(table.starts_with("knob ") && table.contains("the same bits") && !table.contains('{'), "{table}");
-}
+    let table = said(&bench(&plain));
+    assert!(table.starts_with("| run ") && table.contains("the same bits") && !table.contains('{'), "{table}");
 
-/// Checks the figures that follow from the knobs, and the page.
-fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
-    let of = |knob: &str, label: &str, seed: u64| -> &Value {
-        let found = records.iter().find(|r| r["knob"] == knob && r["label"] == label && r["seed"] == seed);
-        found.unwrap_or_else(|| panic!("{knob} {label} {seed}"))
-    };
-    let base = of("base", "base", 1);
-    assert_ne!(base["ply"], of("base", "base", 2)["ply"], "seeds matter");
-    let paged = records.iter().find(|r| r["knob"] == "budget" && r["seed"] == 1).unwrap();
+    // The figures that follow from the settings.
+    let base = of(&records, "base", 1);
+    assert_ne!(base["ply"], of(&records, "base", 2)["ply"], "seeds matter");
+    let paged = of(&records, "budget/75 %", 1);
     assert_eq!(paged["ply"], base["ply"], "a budget changes no bit");
     assert!(number(paged, "bytes_read") > 0.0 && number(base, "bytes_read") == 0.0);
-    let sparse = of("optimizer", "sparse", 1);
-    assert_ne!(sparse["ply"], base["ply"]);
-    assert_eq!(sparse["settings"]["optimizer"], "sparse");
-    assert!(records.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each run");
-    // Quality is measured on the photos of the base: half of the resolution is worse there, and would be better on its
+    let sparse = of(&records, "optimizer/sparse", 1);
+    assert!(sparse["ply"] != base["ply"] && sparse["settings"]["optimizer"] == "sparse");
+    // Quality is measured on the photos of the reference: half of the resolution is worse there, and would be better on its
     // own photos.
-    let small = of("resolution", "1/2", 1);
+    let small = of(&records, "resolution/1/2", 1);
     assert!(number(small, "psnr") < number(base, "psnr"), "{small} {base}");
-    let parts = ["Pareto front", "the same bits", "mean of the base less its spread", "CPU seconds"];
-    check_page(&out.join("pareto.html"), &parts, scratch);
+    check_page(&out.join("sweep.html"), &["Pareto front", "the same bits", "CPU seconds"], folder.path());
+    compare(&out, small, folder.path());
+}
+
+/// As the help says: all runs of the sweep on one page, the reference first.
+fn compare(out: &Path, small: &Value, scratch: &Path) {
     let names = names(&out.join("runs"));
-    // As the help says: all runs of the sweep, the base first.
     let folders: Vec<_> = names.iter().map(|name| out.join("runs").join(name)).collect();
     let folders: Vec<&str> = folders.iter().map(|folder| text(folder)).collect();
     let page = out.join("compare.html");
@@ -219,87 +210,90 @@ fn check_sweep(records: &[Value], out: &Path, scratch: &Path) {
     let marks = ["PSNR and SSIM are of evaluated.json", "trained with data-factor 2 instead of 1", "are left out"];
     check_page(&page, &[&marks[..], &["PSNR of training views", figure.as_str()]].concat(), scratch);
     let sliders = std::fs::read_to_string(&page).unwrap().matches("class=\"slider\"").count();
-    assert_eq!((names[0].starts_with("base-base-seed1"), sliders), (true, 12));
+    assert_eq!((names[0].starts_with("base-seed1"), sliders), (true, 12));
 }
 
 #[test]
 fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     let folder = TempDir::new().unwrap();
     let scene = large_city(folder.path());
-    let out = folder.path().join("out");
-    let (scene, out) = (text(&scene), text(&out));
+    let (out, own) = (folder.path().join("out"), folder.path().join("own.toml"));
+    let (scene_text, out_text, own_text) = (text(&scene), text(&out), text(&own));
     let refuses = |args: &[&str], words: &str| {
         let output = bench(args);
         assert_eq!(output.status.code(), Some(1));
         assert!(stderr(&output).contains(words) && stderr(&output).contains("remedy"), "{}", stderr(&output));
     };
-    let is_usage = |args: &[&str], word: &str| {
-        let output = bench(args);
-        assert_eq!(output.status.code(), Some(2));
-        assert!(stderr(&output).contains(word) && stderr(&output).contains("possible values"), "{}", stderr(&output));
+    let refuses_list = |list: &str, words: &str| {
+        std::fs::write(&own, list).unwrap();
+        refuses(&["sweep", own_text, scene_text, "--out", out_text], words);
     };
-    is_usage(&["pareto", scene, "--out", out, "--knobs", "sh,colour"], "colour");
-    is_usage(&["ladder", scene, "--out", out, "--rungs", "gpu"], "gpu");
-    refuses(&["pareto", scene, "--out", out, "--share", "1"], "--share");
-    refuses(&["ladder", "/nowhere", "--out", out], "nowhere");
-    refuses(&["compare", scene, scene, "--out", out], "metrics.jsonl");
-    assert!(!Path::new(out).exists(), "bad input leaves nothing behind");
-    refuses(&["ladder", scene, "--out", out], "nothing would leave memory");
-    refuses(&[scene, "--spill-dir", out], "--spill-dir");
-    refuses(&[scene, "--steps", "1", "--device", "gpu"], "--device");
-    assert!(!Path::new(out).exists(), "nor does a flag that means nothing here");
+    refuses(&["sweep", "pareto", scene_text, "--out", out_text, "--only", "sh,colour"], "possible values");
+    refuses(&["sweep", "pareto", scene_text, "--out", out_text, "--share", "100"], "--share");
+    refuses(&["sweep", "pareto", scene_text, scene_text, "--out", out_text], "another scene has this name");
+    refuses(&["sweep", "ladder", "/nowhere", "--out", out_text], "nowhere");
+    refuses(&["sweep", "no-such-list", scene_text, "--out", out_text], "no-such-list");
+    refuses(&["compare", scene_text, scene_text, "--out", out_text], "metrics.jsonl");
+    let list = "seeds = [1]\n[base]\nsteps = 4\n[view]\ntitle = \"own\"\nreference = \"plain\"\nfigures = [\"psnr\"]\n\
+                charts = []\n[[group]]\nname = \"\"\nruns = [{ name = \"plain\" }, RUN]\n";
+    let with = |run: &str| list.replace("RUN", run);
+    refuses_list(
+        &list.replace("reference = \"plain\"", "reference = \"other\"").replace(", RUN", ""),
+        "no run of the list",
+    );
+    refuses_list(&list.replace("psnr", "beauty").replace(", RUN", ""), "beauty");
+    refuses_list(&with("{ name = \"plain\" }"), "two runs plain");
+    refuses_list(&with("{ name = \"a\", environment = { PATH = \"/\" } }"), "PATH");
+    refuses_list(&with("{ name = \"a\", set = { stepz = 3 } }"), "stepz");
+    refuses_list(&with("{ name = \"a\", times = { optimizer = 2.0 } }"), "optimizer is no number");
+    refuses_list(&with("{ name = \"a\", set = { data-factor = 0.5 } }"), "data-factor");
+    refuses_list(
+        &list.replace(", RUN", "").replace("seeds = [1]", "seeds = [1]\nshare = 50"),
+        "nothing would leave memory",
+    );
+    refuses(&[scene_text, "--spill-dir", out_text], "--spill-dir");
+    assert!(!out.exists(), "bad input leaves nothing behind");
 
-    // The drive is unusable: the rungs that need it fail with a reason, the one in memory runs.
-    let file = folder.path().join("file");
-    std::fs::write(&file, "").unwrap();
-    let output = bench(&["ladder", scene, "--out", out, "--steps", "4", "--page-rows", "16", "--spill", text(&file)]);
-    assert!(!output.status.success() && stderr(&output).contains("file"), "{}", stderr(&output));
-    let failing = ["--steps", "4", "--image-cache", "1B", "--host-mem", "1MiB", "--knobs", "budget", "--seeds", "1"];
-    let args =
-        [&["pareto", scene, "--out", out, "--page-rows", "16", "--strategy", "none", "--json"][..], &failing].concat();
-    let records = lines(&args);
-    assert!(records[0]["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
-    assert!(records[1..].iter().all(|r| r["problem"].is_null()) && records.len() > 1, "{records:?}");
+    // Too little memory fails the run without a drive, and no other; what cannot run is left out; equal runs run once.
+    let more = "{ name = \"same\" }, { name = \"paged\", share = 70, set = { page-rows = 16 } }, { name = \"big pages\", share = 1 }";
+    std::fs::write(&own, with(more)).unwrap();
+    let args = ["sweep", own_text, scene_text, "--out", out_text, "--strategy", "none", "--json", "--pace-steps", "0"];
+    let args = [&args[..], &["--image-cache", "1B", "--host-mem", "1MiB"]].concat();
+    let output = bench(&args);
+    assert!(stderr(&output).contains("big pages is left out"), "{}", stderr(&output));
+    let records = parse(&said(&output));
+    assert!(of(&records, "plain", 1)["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
+    assert!(records.len() == 2 && of(&records, "paged", 1)["problem"].is_null(), "{records:?}");
     // Only failed runs are repeated.
     assert_eq!(lines(&args).len(), 1);
-    let page = std::fs::read_to_string(Path::new(out).join("pareto.html")).unwrap();
-    assert!(page.contains("Runs that failed") && page.contains("--host-mem"));
+    let page = std::fs::read_to_string(out.join(scene.file_name().unwrap()).join("sweep.html")).unwrap();
+    assert!(page.contains("failed: ") && page.contains("--host-mem"));
 }
 
 #[test]
-fn faults_of_a_capture_are_charted_and_a_call_that_stopped_goes_on() {
+fn faults_of_a_capture_are_charted_and_their_scenes_are_removed() {
     let folder = TempDir::new().unwrap();
     let scene = crate::support::scenes::city(folder.path(), 24, 48, 32, 400);
     let out = folder.path().join("stability");
-    let sizes = ["--steps", "80", "--seeds", "1,2", "--device", "cpu", "--strategy", "none"];
-    let only = ["--only", "swapped10,exposure1,points10", "--remedies", "none,own"];
-    let plain = [&["stability", text(&scene), "--out", text(&out)][..], &sizes, &only].concat();
+    let only = "swapped10/none,swapped10/own,exposure1/none,exposure1/own,points10/none";
+    let args = ["--steps", "80", "--seeds", "1", "--device", "cpu", "--only", only];
+    let plain = sweep("stability", &scene, &out, &args);
     let json = [&plain[..], &["--json"]].concat();
-    let listed = String::from_utf8(bench(&[&plain[..], &["--list"]].concat()).stdout).unwrap();
-    // The clean scene has no remedy of its own.
-    assert!(listed.matches("to do").count() == 14 && !out.exists(), "{listed}");
-    let first = lines(&[&json[..], &["--max-runs", "5"]].concat());
-    let rest = lines(&json);
-    assert_eq!((first.len(), rest.len()), (5, 9), "nothing is done twice");
-    assert!(lines(&json).is_empty() && names(&out.join("scenes")).is_empty(), "scenes are removed");
-    let of = |knob: &str, label: &str, seed: u64| -> Value {
-        let found = first.iter().chain(&rest).find(|r| r["knob"] == knob && r["label"] == label && r["seed"] == seed);
-        found.unwrap_or_else(|| panic!("{knob} {label} {seed}")).clone()
-    };
-    assert_ne!(of("clean", "none", 1)["ply"], of("points10", "none", 1)["ply"]);
-    assert!(number(&of("points10", "none", 1), "gaussians") < 0.3 * number(&of("clean", "none", 1), "gaussians"));
-    assert!(number(&of("exposure1", "none", 1), "psnr") < number(&of("clean", "none", 1), "psnr"));
-    assert_eq!(of("exposure1", "own", 1)["settings"]["appearance"], "exposure");
-    assert_eq!(of("swapped10", "own", 2)["wrong_views"].as_array().unwrap().len(), 4);
-    assert!(of("clean", "none", 1)["cc_psnr"].is_number());
-    let table = String::from_utf8(bench(&plain).stdout).unwrap();
-    assert!(table.starts_with("disturbance ") && table.contains("spread of the clean scene"), "{table}");
-    assert!(table.lines().all(|line| line.chars().count() <= 80), "{table}");
-    let parts = ["PSNR lost, dB", "wrong views named", "exposure1"];
-    check_page(&out.join("stability.html"), &parts, folder.path());
+    let own = out.join(scene.file_name().unwrap());
+    let records = [lines(&[&json[..], &["--max-runs", "2"]].concat()), lines(&json)].concat();
+    assert_eq!(records.len(), 6, "nothing is done twice");
+    assert!(lines(&json).is_empty() && names(&own.join("scenes")).is_empty(), "scenes are removed");
+    let clean = of(&records, "clean/none", 1);
+    let of = |name: &str| of(&records, name, 1);
+    assert_ne!(clean["ply"], of("points10/none")["ply"]);
+    assert!(number(of("points10/none"), "gaussians") < 0.3 * number(clean, "gaussians"));
+    assert!(number(of("exposure1/none"), "psnr") < number(clean, "psnr"));
+    assert_eq!(of("exposure1/own")["settings"]["appearance"], "exposure");
+    assert_eq!(of("swapped10/own")["wrong_views"].as_array().unwrap().len(), 4);
+    assert!(clean["cc_psnr"].is_number());
+    let parts = ["PSNR, dB: lost against clean/none", "wrong views named", "exposure1/own"];
+    check_page(&own.join("sweep.html"), &parts, folder.path());
     // Other photos are other scenes.
     let smaller = [&json[..], &["--max-resolution", "40", "--max-runs", "1"]].concat();
     assert_eq!(lines(&smaller).len(), 1);
-    let output = bench(&["stability", text(&scene), "--out", text(&out), "--only", "fog"]);
-    assert!(output.status.code() == Some(2) && stderr(&output).contains("possible values"), "{}", stderr(&output));
 }

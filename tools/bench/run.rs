@@ -56,7 +56,7 @@ fn check_flags(config: &TrainConfig) -> InputResult<()> {
         None => Ok(()),
         Some((flag, _)) => {
             let problem = "this measurement runs on the CPU with all pages in memory";
-            Err(InputError::new(flag, problem, "remove the flag, or use gsscale-bench pareto or ladder"))
+            Err(InputError::new(flag, problem, "remove the flag, or use gsscale-bench sweep"))
         }
     }
 }

@@ -1,499 +1,194 @@
-//! Runs the trainings of a sweep or ladder, each in its own process, and logs the results.
+//! `gsscale-bench sweep`: trains the runs of a list on scenes, and compares them in a table and on a page.
 //!
-//! Invariants: 1. a logged run does not run again; its key is a digest of everything that the figures depend on: scene,
-//! settings, seed, bytes of the program, machine and drive; 2. a run's folder gets its final name only after success;
-//! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
-//! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
+//! Not here: the list and its runs ([`super::list`]), the processes and the log ([`super::runs`]).
 
-use clap::Args;
+use super::list::{List, Plan};
+use super::runs::{Place, Planned, RESULTS, Surroundings, Sweep, remove};
+use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
-use gsscale::checkpoint::interval::CommitEvery;
-use gsscale::config::choice::Choice;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
-use gsscale::config::values::ByteSize;
-use gsscale::photos::outlier_views;
-use gsscale::report::pace::convert_to_one_pace;
-use gsscale::report::record::{Pace, RunRecord};
+use gsscale::dataset::disturb::write_disturbed;
 use gsscale::report::results_log::{ResultsLog, successful_run};
-use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
+use gsscale::report::sweep_page::{sweep_page, sweep_table};
 use gsscale::train::error::TrainError;
-use gsscale::train::log::report::Summary;
 use serde_json::Value;
-use std::collections::BTreeMap;
-use std::fs::{File, OpenOptions, TryLockError};
-use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
-use std::time::Instant;
-use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
-/// Stands for a run's own spill directory in the config of a planned run.
-const SPILL_PLACEHOLDER: &str = "spill";
-/// Longest message of a failed run, characters.
-const PROBLEM_MAX: usize = 600;
-/// File in the output folder that the sweep and its current run lock.
-const LOCK: &str = "sweep.lock";
-/// Default steps of a run.
-pub const STEPS_DEFAULT: u32 = 3000;
-/// Default steps of the short trainings that show the pace of the machine.
-pub const PACE_STEPS_DEFAULT: u32 = 200;
-/// Default number of `--sh-every` intervals in a run: the last of three raises comes after three tenths.
-const SH_INTERVALS: u32 = 10;
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench sweep pareto scans/village --out sweeps/pareto --list-runs
+  gsscale-bench sweep pareto scans/village --out sweeps/pareto --only order,moments --page-rows 128 --max-runs 5
+  gsscale-bench sweep ladder scans/village scans/city --out sweeps/ladder --strategy none --share 25
+  gsscale-bench sweep stability scans/village --out sweeps/stability --only swapped10,boxes --seeds 1,2,3
+  gsscale-bench sweep mine.toml scans/village --out sweeps/mine
 
-/// The arguments of every sweep and ladder.
-#[derive(Args)]
-pub struct SweepArgs {
-    /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
-    pub scene: PathBuf,
-    /// Config file of the base; flags override it. Without a file, --steps is 3000 and --sh-every a tenth of the steps.
-    /// Commits by time need an explicit --commit-every
+Lists:
+  pareto      one change of a setting at a time, and a few together: cost in accuracy, savings in time, bytes, Gaussians
+  ladder      the ideas of out-of-core training, added one by one
+  ladder-gpu  the same on a GPU; needs --device gpu --device-mem SIZE
+  stability   faults of photos, poses and points, and remedies
+\"Sweeps\" in configs/README.md says how to write another one.
+
+Each run is a process of its own and adds a line to OUT/SCENE/results.jsonl; the page is OUT/SCENE/sweep.html, and the end is
+a table. A sweep that stopped continues when started again.";
+
+/// Trains the runs of a list on each scene.
+#[derive(Parser)]
+#[command(name = "gsscale-bench sweep", bin_name = "gsscale-bench sweep", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// pareto, ladder, ladder-gpu, stability, or a TOML file
+    list: PathBuf,
+    /// Scenes: COLMAP folders (images/, sparse/), with transforms.json, or in Mega-NeRF's layout
+    #[arg(required = true)]
+    scenes: Vec<PathBuf>,
+    /// Config file over the base of the list; flags override it
     #[arg(long)]
-    pub config: Option<PathBuf>,
-    /// Folder for the results and the page
+    config: Option<PathBuf>,
+    /// Folder with a folder of results for each scene
     #[arg(long, short)]
-    pub out: PathBuf,
-    /// Spill directory, on the drive to measure [default: spill in --out]
+    out: PathBuf,
+    /// Spill directory, on the drive to measure [default: spill in the folder of results]
     #[arg(long, value_name = "DIR")]
-    pub spill: Option<PathBuf>,
+    spill: Option<PathBuf>,
+    /// Groups or runs to train (GROUP, NAME or GROUP/NAME), beside the reference [default: all]
+    #[arg(long, value_delimiter = ',', value_name = "NAME")]
+    only: Vec<String>,
+    /// Seeds [default: those of the list]
+    #[arg(long, value_delimiter = ',', value_name = "N")]
+    seeds: Vec<u64>,
+    /// Seeds for each run but the reference, which uses all [default: that of the list]
+    #[arg(long, value_name = "N")]
+    other_seeds: Option<usize>,
+    /// Frames in percent of the pages; 0 = all pages in memory [default: that of the list]
+    #[arg(long, value_name = "P")]
+    share: Option<f64>,
+    /// Stop after this many runs of each scene; the next call continues
+    #[arg(long, value_name = "N")]
+    max_runs: Option<usize>,
+    /// Print the runs and whether they are done, then stop
+    #[arg(long)]
+    list_runs: bool,
+    /// Train the reference for this many steps before and after each run, and convert times to one pace of the machine where every
+    /// run has these; 0 = do neither. Not for disturbed scenes
+    #[arg(long, default_value_t = 200, value_name = "N")]
+    pace_steps: u32,
     /// Print each result as a line of JSON, instead of a table at the end
     #[arg(long)]
-    pub json: bool,
-    #[command(flatten)]
-    pub keys: TrainOverrides,
-}
-
-impl SweepArgs {
-    /// The config of the base. Runs are short by default.
-    ///
-    /// # Errors
-    /// The errors of a run.
-    pub fn base_config(&self) -> Result<TrainConfig, TrainError> {
-        let mut keys = self.keys.clone();
-        if self.config.is_none() {
-            let steps = *keys.steps.get_or_insert(STEPS_DEFAULT);
-            // A short run then uses all bands for most of its steps, like a long run.
-            keys.sh_every.get_or_insert((steps / SH_INTERVALS).max(1));
-        }
-        // Commits by time would add their bytes to the cost of a setting.
-        keys.commit_every.get_or_insert(CommitEvery::Seconds(0.0));
-        super::settle(self.config.as_deref(), &keys)
-    }
-}
-
-/// Everything except the settings that the figures of a run depend on.
-pub struct Surroundings {
-    /// Scene, drive, program, processor and threads, as one text.
-    text: String,
-    /// Suffix of this sweep's folders on the drive, which other sweeps may also use.
-    mark: String,
-}
-
-impl Surroundings {
-    /// Reads scene, drive, program and machine.
-    ///
-    /// # Errors
-    /// `gsscale-train` is missing.
-    pub fn of(args: &SweepArgs) -> InputResult<Surroundings> {
-        let program = digest(&beside("gsscale-train")?)?;
-        // The default folder in --out is not part of the key: an output folder may move with its results.
-        let drive = args.spill.as_ref().map_or_else(String::new, |path| resolved(path).display().to_string());
-        let (threads, cpu) = (rayon::current_num_threads(), cpu_model());
-        let text = format!("{}\n{drive}\n{program}\n{threads}\n{cpu}", resolved(&args.scene).display());
-        let mark = format!("{:08x}", xxh3_64(resolved(&args.out).as_os_str().as_encoded_bytes()) as u32);
-        Ok(Surroundings { text, mark })
-    }
-}
-
-/// A planned run.
-#[derive(Debug, Clone)]
-pub struct Planned {
-    /// The changed knob.
-    pub knob: String,
-    /// Name of the setting.
-    pub label: String,
-    /// All settings. The sweep replaces a spill directory that is not empty by one of its own.
-    pub config: TrainConfig,
-    /// The scene of the run, if it is not the scene of the sweep.
-    pub scene: Option<MadeScene>,
-    /// Environment variables of the run, by name. The runs of the sweep inherit all others.
-    pub environment: &'static [(&'static str, &'static str)],
-}
-
-/// A scene made from that of the sweep.
-#[derive(Debug, Clone)]
-pub struct MadeScene {
-    /// Its folder, which exists while the run lives.
-    pub folder: PathBuf,
-    /// A complete description of the scene, which stands for the folder in the run's key.
-    pub how: String,
-    /// Training photos that are wrong in it, by name.
-    pub wrong: Vec<String>,
-}
-
-/// An output folder of runs with their results.
-pub struct Sweep {
-    scene: PathBuf,
-    out: PathBuf,
-    spill: PathBuf,
-    base: TrainConfig,
-    surroundings: Surroundings,
-    lock: File,
-    log: ResultsLog,
     json: bool,
-    /// Steps of the short trainings that show the pace of the machine; 0 = the pace is not measured.
-    pace_steps: u32,
-    /// The pace after the last run, which is that before the next run.
-    pace_after_last_run: Option<Pace>,
+    #[command(flatten)]
+    keys: TrainOverrides,
 }
 
-/// Makes a config keep `frames` pages in memory and the others on the drive.
-pub fn use_drive(config: &mut TrainConfig, frames: u64) {
-    config.spill_dir = SPILL_PLACEHOLDER.into();
-    config.frames = u32::try_from(frames).unwrap_or(u32::MAX);
-    config.host_mem = ByteSize(0);
-}
-
-impl Planned {
-    /// A run on the scene of the sweep, in its environment.
-    pub fn new(knob: &str, label: impl Into<String>, config: TrainConfig) -> Planned {
-        Planned { knob: knob.into(), label: label.into(), config, scene: None, environment: &[] }
+/// Runs the sweep.
+///
+/// # Errors
+/// The input is invalid, or the results cannot be written.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    let mut list = List::read(&args.list)?;
+    if !args.only.is_empty() {
+        list.keep(&args.only)?;
     }
-
-    /// Digest of all settings, the seed, the scene, and the surroundings.
-    pub fn key(&self, surroundings: &Surroundings) -> String {
-        let settings = toml::to_string(&self.config).unwrap_or_default();
-        let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
-        let environment: String = self.environment.iter().map(|(name, value)| format!("\n{name}={value}")).collect();
-        let all = format!("{}\n{settings}{how}{environment}", surroundings.text);
-        format!("{:016x}", xxh3_64(all.as_bytes()))
+    if !args.seeds.is_empty() {
+        list.seeds.clone_from(&args.seeds);
     }
-
-    /// Name of the run's folder.
-    fn name(&self, key: &str) -> String {
-        let part = |text: &str| -> String {
-            let keep = |c: char| if c.is_ascii_alphanumeric() || c == '.' { c } else { '-' };
-            text.chars().map(keep).collect()
-        };
-        format!("{}-{}-seed{}-{}", part(&self.knob), part(&self.label), self.config.seed, &key[..8])
+    list.other_seeds = args.other_seeds.or(list.other_seeds);
+    list.share = args.share.unwrap_or(list.share);
+    if !(0.0..100.0).contains(&list.share) {
+        let remedy = "use --share 25, or 0 for all pages in memory";
+        return Err(InputError::new("--share", "the value must be 0 or more, and below 100", remedy).into());
     }
-}
-
-impl Sweep {
-    /// Opens or creates the output folder, with results in `file`; removes the leftovers of interrupted runs.
-    ///
-    /// # Errors
-    /// The folder cannot be written, another sweep uses it, or the results cannot be read.
-    pub fn open(args: &SweepArgs, base: &TrainConfig, file: &str) -> InputResult<Sweep> {
-        let (scene, out, base) = (args.scene.clone(), args.out.clone(), base.clone());
-        make_folder(&out.join("runs"))?;
-        let lock = lock(&out)?;
-        let log = ResultsLog::open(&out.join(file))?;
-        let surroundings = Surroundings::of(args)?;
-        let spill = args.spill.clone().unwrap_or_else(|| out.join("spill"));
-        // This process holds the lock, so no run uses these files.
-        remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
-        remove_parts(&spill, &[&format!("{}.part", surroundings.mark)])?;
-        let (pace_steps, pace_after_last_run, json) = (0, None, args.json);
-        Ok(Sweep { scene, out, spill, base, surroundings, lock, log, json, pace_steps, pace_after_last_run })
-    }
-
-    /// Measures the pace of the machine for each new run, by trainings of this many steps of the base. 0 measures and converts nothing.
-    pub fn with_pace(self, steps: u32) -> Sweep {
-        Sweep { pace_steps: steps, ..self }
-    }
-
-    /// Converts times of runs to one pace of the machine if all runs have a pace, unless the pace is not wanted (0 steps). Returns what the
-    /// times are.
-    pub fn convert_times(&self, records: &mut [RunRecord]) -> &'static str {
-        if self.pace_steps == 0 { "times as measured" } else { convert_to_one_pace(records) }
-    }
-
-    /// The results so far.
-    pub fn records(&self) -> &[RunRecord] {
-        self.log.records()
-    }
-
-    /// The part of a run's key beside the settings.
-    pub fn surroundings(&self) -> &Surroundings {
-        &self.surroundings
-    }
-
-    /// The result of a run, from the log or from a training now. Prints the result as JSON if that was asked for; warns if the run
-    /// failed.
-    ///
-    /// # Errors
-    /// The program is missing or was interrupted, or results cannot be written. A failed run is a result.
-    pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<RunRecord> {
-        let key = planned.key(&self.surroundings);
-        let record = match successful_run(self.log.records(), &key) {
-            Some(done) => done.clone(),
-            None => {
-                let before = self.pace_before_run()?;
-                let mut record = self.train(planned, &key)?;
-                let after = self.measure_pace();
-                // An interrupted pace does not take the run with it.
-                record.pace =
-                    before.zip(after.as_ref().ok().cloned().flatten()).map(|(before, after)| mean(&before, &after));
-                self.log.append(record.clone())?;
-                self.pace_after_last_run = after?;
-                record
-            }
-        };
-        if let Some(problem) = &record.problem {
-            gsscale::tell!("warning: the run failed: {problem}");
+    let given = TrainConfig::given(args.config.as_deref(), &args.keys)?;
+    super::settle(args.config.as_deref(), &args.keys)?;
+    let mut plans: Vec<(Place, Plan)> = Vec::new();
+    for scene in &args.scenes {
+        std::fs::metadata(scene).map_err(|e| InputError::io(scene, "reading the scene", &e))?;
+        let name = scene.file_name().unwrap_or(scene.as_os_str());
+        let place = Place { scene: scene.clone(), out: args.out.join(name), spill: args.spill.clone() };
+        if plans.iter().any(|(other, _)| other.out == place.out) {
+            return Err(InputError::new(scene, "another scene has this name", "use one sweep for each").into());
         }
-        if self.json {
-            print(&serde_json::to_value(&record).unwrap_or_default());
-        }
-        Ok(record)
+        let plan = list.plan(&place, &given)?;
+        plans.push((place, plan));
     }
-
-    /// The pace of the machine before a run.
-    fn pace_before_run(&mut self) -> InputResult<Option<Pace>> {
-        if self.pace_after_last_run.is_none() {
-            // The first training also brings the photos into memory.
-            self.measure_pace()?;
-            self.pace_after_last_run = self.measure_pace()?;
-        }
-        Ok(self.pace_after_last_run.take())
-    }
-
-    /// The pace of a short training of the base; `None` if it is not wanted. A training that fails is the last one.
-    fn measure_pace(&mut self) -> InputResult<Option<Pace>> {
-        if self.pace_steps == 0 {
-            return Ok(None);
-        }
-        let planned = Planned::new("pace", "base", TrainConfig { steps: self.pace_steps, ..self.base.clone() });
-        let key = planned.key(&self.surroundings);
-        let record = self.train(&planned, &key)?;
-        remove(&self.out.join("runs").join(planned.name(&key)))?;
-        if let Some(problem) = record.problem {
-            gsscale::tell!(
-                "warning: the pace of the machine is not measured, because {} steps of the base failed: {problem}",
-                self.pace_steps
-            );
-            self.pace_steps = 0;
-            return Ok(None);
-        }
-        Ok(Some(Pace { key, seconds: record.seconds - record.stall_seconds, cpu_seconds: record.cpu_seconds }))
-    }
-
-    fn train(&self, planned: &Planned, key: &str) -> InputResult<RunRecord> {
-        let name = planned.name(key);
-        let part = self.out.join("runs").join(format!("{name}.part"));
-        let mut config = planned.config.clone();
-        let spill = self.spill.join(format!("{name}-{}.part", self.surroundings.mark));
-        if config.residence().spill_dir().is_some() {
-            make_folder(&self.spill)?;
-            config.spill_dir = spill.display().to_string();
-        }
-        let mut record = self.record(planned, key);
-        let file = self.out.join("runs").join(format!("{name}.part.toml"));
-        write_config(&file, &config)?;
-        let began = Instant::now();
-        let scene = planned.scene.as_ref().map_or(&self.scene, |scene| &scene.folder);
-        let arguments = [scene, Path::new("--out"), &part, Path::new("--config"), &file];
-        let output = self.spawn("gsscale-train", &arguments, planned.environment)?;
-        record.wall_seconds = began.elapsed().as_secs_f64();
-        if !output.status.success() {
-            // Before the folders are removed: an interrupted run keeps its checkpoint.
-            refuse_interrupted(&output)?;
-            record.problem = Some(problem(&output));
-        } else {
-            self.read_figures(&mut record, &config, &part)?;
-        }
-        remove(&spill)?;
-        remove(&file)?;
-        let folder = self.out.join("runs").join(name);
-        remove(&folder)?;
-        match record.problem {
-            Some(_) => remove(&part)?,
-            None => std::fs::rename(&part, &folder).map_err(|e| InputError::io(&folder, "naming the run", &e))?,
-        }
-        Ok(record)
-    }
-
-    fn record(&self, planned: &Planned, key: &str) -> RunRecord {
-        RunRecord {
-            key: key.to_string(),
-            scene: self.scene.display().to_string(),
-            knob: planned.knob.clone(),
-            label: planned.label.clone(),
-            settings: changes(&self.base, &planned.config),
-            seed: planned.config.seed,
-            steps: planned.config.steps,
-            version: env!("CARGO_PKG_VERSION").to_string(),
-            threads: rayon::current_num_threads() as u64,
-            cpu: cpu_model(),
-            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
-            ..RunRecord::default()
+    for (place, plan) in &plans {
+        let in_order = list.in_order(&plan.runs);
+        match args.list_runs {
+            true => list_runs(place, &in_order)?,
+            false => sweep_scene(args, &list, place, plan, &in_order, print)?,
         }
     }
-
-    /// Reads the figures from the run's folder and removes the PLY, which is large.
-    fn read_figures(&self, record: &mut RunRecord, config: &TrainConfig, folder: &Path) -> InputResult<()> {
-        let summary: Summary = read_json(&folder.join(SUMMARY_FILE))?;
-        let ply = folder.join(PLY_FILE);
-        record.ply = digest(&ply)?;
-        (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
-        record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
-        record.outlier_views = outlier_views::names_in(&read_json(&folder.join(SUMMARY_FILE))?);
-        record.seconds = summary.train_seconds;
-        record.cpu_seconds = summary.costs.train_cpu_seconds;
-        record.stall_seconds = summary.costs.train_stall_seconds;
-        record.bytes_read = summary.costs.train_bytes_read;
-        record.bytes_written = summary.costs.train_bytes_written;
-        record.gaussians = summary.gaussians;
-        (record.frames, record.pages) = (summary.tiers.frames, summary.tiers.pages);
-        record.host_bytes_peak = summary.host_bytes_peak;
-        record.device_bytes_peak = summary.costs.device_bytes_peak;
-        record.drive_bytes_peak = summary.costs.drive_bytes_peak;
-        record.view_order = TrainConfig::read(&folder.join(CONFIG_FILE))?.view_order.word().into_owned();
-        let photos = |c: &TrainConfig| (c.data_factor, c.max_resolution);
-        if photos(config) != photos(&self.base) {
-            // Smaller photos raise PSNR, so every run is evaluated on the photos of the base.
-            let file = folder.join(EVALUATED_AS_FILE);
-            write_config(&file, &self.base)?;
-            let json = folder.join(EVALUATED_FILE);
-            let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
-            let output = self.spawn("gsscale-eval", &arguments, &[])?;
-            if !output.status.success() {
-                refuse_interrupted(&output)?;
-                record.problem = Some(problem(&output));
-                return Ok(());
-            }
-            let report: Value = read_json(&json)?;
-            (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
-        }
-        remove(&ply)
-    }
-
-    /// Runs a program from the folder of this program to its end. The program's standard input is the lock file, so the
-    /// lock stays held while the program lives.
-    fn spawn(&self, program: &str, arguments: &[&Path], environment: &[(&str, &str)]) -> InputResult<Output> {
-        let path = beside(program)?;
-        let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
-        let mut command = Command::new(&path);
-        command
-            .args(arguments)
-            .envs(environment.iter().copied())
-            .stdin(Stdio::from(held))
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped());
-        if program == "gsscale-train" {
-            command.arg("--quiet");
-        }
-        command.output().map_err(|e| InputError::io(&path, "starting the program", &e))
-    }
+    Ok(())
 }
 
-/// The mean of two paces of one training.
-fn mean(a: &Pace, b: &Pace) -> Pace {
-    let cpu_seconds = a.cpu_seconds.zip(b.cpu_seconds).map(|(a, b)| (a + b) / 2.0);
-    Pace { key: a.key.clone(), seconds: (a.seconds + b.seconds) / 2.0, cpu_seconds }
-}
-
-/// Keys of `config` that differ from `base`, except the seed.
-fn changes(base: &TrainConfig, config: &TrainConfig) -> BTreeMap<String, String> {
-    let table = |c: &TrainConfig| toml::Table::try_from(c).unwrap_or_default();
-    let base = table(base);
-    let changed = table(config).into_iter().filter(|(key, value)| key != "seed" && base.get(key) != Some(value));
-    changed.map(|(key, value)| (key, value.as_str().map_or_else(|| value.to_string(), str::to_string))).collect()
-}
-
-fn write_config(path: &Path, config: &TrainConfig) -> InputResult<()> {
-    let text = toml::to_string(config)
-        .map_err(|e| InputError::new(path, format!("writing failed: {e}"), "report this as a bug"))?;
-    write_whole(path, text.as_bytes())
-}
-
-fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> InputResult<T> {
-    let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
-    serde_json::from_slice(&text)
-        .map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), "start the sweep again"))
-}
-
-/// The absolute path with links resolved, as far as the path exists: creating the folder does not change the result.
-fn resolved(path: &Path) -> PathBuf {
-    let path = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
-    let of = |up: &Path| Some(std::fs::canonicalize(up).ok()?.join(path.strip_prefix(up).ok()?));
-    path.ancestors().find_map(of).unwrap_or_else(|| path.clone())
-}
-
-/// Path of a program in the folder of this program.
-fn beside(program: &str) -> InputResult<PathBuf> {
-    let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
-    let path = own.with_file_name(format!("{program}{}", std::env::consts::EXE_SUFFIX));
-    match path.is_file() {
-        true => Ok(path),
-        false => Err(InputError::new(&path, "is missing", "build all programs: cargo build --release")),
-    }
-}
-
-/// Takes the lock of an output folder.
-fn lock(out: &Path) -> InputResult<File> {
-    let path = out.join(LOCK);
-    let io = |e: std::io::Error| InputError::io(&path, "opening the lock", &e);
-    let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(io)?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => {
-            let problem = "in use by another sweep, or by a run that a killed sweep left behind";
-            Err(InputError::new(out, problem, "wait for its end, or choose another --out"))
-        }
-        // Without lock support of the file system, the user keeps to one sweep.
-        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
-    }
-}
-
-/// An interrupted run is not a result: the sweep ends too, and the next call repeats this run.
-fn refuse_interrupted(output: &Output) -> InputResult<()> {
-    match output.status.code() {
-        Some(130 | 143) => Err(InputError::new("the sweep", "was interrupted", "start it again to continue")),
-        _ => Ok(()),
-    }
-}
-
-/// The last error message of a failed program, or its exit status.
-fn problem(output: &Output) -> String {
-    let said = String::from_utf8_lossy(&output.stderr);
-    let errors = said.rfind("error: ").map_or(said.trim(), |at| said[at..].trim());
-    let text = if errors.is_empty() { output.status.to_string() } else { errors.replace('\n', " ") };
-    text.chars().take(PROBLEM_MAX).collect()
-}
-
-fn digest(path: &Path) -> InputResult<String> {
-    let io = |e: std::io::Error| InputError::io(path, "reading the result", &e);
-    let mut file = File::open(path).map_err(io)?;
-    let (mut hash, mut buffer) = (Xxh3::new(), vec![0; 1 << 20]);
-    loop {
-        match file.read(&mut buffer).map_err(io)? {
-            0 => return Ok(format!("{:016x}", hash.digest())),
-            n => hash.update(&buffer[..n]),
-        }
-    }
-}
-
-fn make_folder(path: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
-}
-
-/// Removes a file or folder of a run, if it exists.
-fn remove(path: &Path) -> InputResult<()> {
-    let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
-    match removed {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(InputError::io(path, "removing", &e)),
-        _ => Ok(()),
-    }
-}
-
-/// Removes the leftovers of interrupted runs from a folder: names with one of these endings.
-fn remove_parts(folder: &Path, ends: &[&str]) -> InputResult<()> {
-    let Ok(entries) = std::fs::read_dir(folder) else { return Ok(()) };
-    let is_part = |path: &PathBuf| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        name.contains("-seed") && ends.iter().any(|end| name.ends_with(end))
+/// Trains the runs of a scene that are not done.
+fn sweep_scene(
+    args: &Args,
+    list: &List,
+    place: &Place,
+    plan: &Plan,
+    in_order: &[Planned],
+    print: &mut dyn FnMut(&Value),
+) -> Result<(), TrainError> {
+    // The reference of disturbed scenes is no training of the scene itself.
+    let pace_steps = if plan.dataset.is_some() { 0 } else { args.pace_steps };
+    let mut sweep = Sweep::open(place, &plan.reference, pace_steps, args.json)?;
+    let open = sweep.open_runs(&plan.runs);
+    let (all, count) = (plan.runs.len(), open.len().min(args.max_runs.unwrap_or(usize::MAX)));
+    gsscale::tell!("{}: {} of {all} runs are done; {count} to do now", place.scene.display(), all - open.len());
+    let page = place.out.join("sweep.html");
+    let write_page = |sweep: &Sweep| -> InputResult<String> {
+        let (records, times) = sweep.records_of(in_order);
+        let machine = records.first().map_or(String::new(), |r| format!("; {} threads of {}", r.threads, r.cpu));
+        let facts = format!("reference: {}{machine}; {times}", in_words(&plan.reference));
+        let html = sweep_page(&list.view, &place.scene.display().to_string(), &facts, &records);
+        write_whole(&page, html.as_bytes())?;
+        Ok(format!("{}\n{times}", sweep_table(&list.view, &records)))
     };
-    entries.flatten().map(|e| e.path()).filter(is_part).try_for_each(|path| remove(&path))
+    let mut made: Option<&Path> = None;
+    for (i, run) in open.into_iter().take(count).enumerate() {
+        gsscale::tell!("run {} of {count}: {}, seed {}", i + 1, run.name, run.config.seed);
+        let folder = run.scene.as_ref().map(|scene| scene.folder.as_path());
+        if folder != made {
+            made.iter().try_for_each(|folder| remove(folder))?;
+            if let (Some(scene), Some(dataset)) = (&run.scene, &plan.dataset) {
+                // Of an earlier call that was interrupted: the lock of the sweep says that nobody uses it.
+                remove(&scene.folder)?;
+                write_disturbed(&scene.folder, dataset, &scene.disturbance, run.config.seed)?;
+            }
+            made = folder;
+        }
+        sweep.run(run, print)?;
+        write_page(&sweep)?;
+    }
+    made.iter().try_for_each(|folder| remove(folder))?;
+    let table = write_page(&sweep)?;
+    if !args.json {
+        gsscale::say!("{table}");
+    }
+    gsscale::tell!("done: {}", page.display());
+    Ok(())
+}
+
+fn in_words(config: &TrainConfig) -> String {
+    let growth = match (config.strategy.grows(), config.max_gaussians) {
+        (false, _) => "no densification".to_string(),
+        (_, 0) => "densification without a cap".to_string(),
+        (_, cap) => format!("at most {cap} Gaussians"),
+    };
+    format!("{} steps, pages of {} rows, SH {}, {growth}", config.steps, config.page_rows, config.sh_degree)
+}
+
+/// Prints the runs and which of them are done.
+fn list_runs(place: &Place, runs: &[Planned]) -> InputResult<()> {
+    let records = ResultsLog::peek(&place.out.join(RESULTS))?;
+    let surroundings = Surroundings::of(place)?;
+    for run in runs {
+        let state = match successful_run(&records, &run.key(&surroundings)) {
+            Some(record) => format!("done in {:.0} s", record.wall_seconds),
+            None => "to do".to_string(),
+        };
+        gsscale::say!("{:<40} seed {:<4} {:>6} steps  {state}", run.name, run.config.seed, run.config.steps);
+    }
+    Ok(())
 }

@@ -23,10 +23,12 @@ use crate::scene::image::Target;
 use glam::{DMat3, DVec3};
 use photos::Encoded;
 use rayon::prelude::*;
+use serde::Deserialize;
 use std::path::Path;
 
 /// What is wrong with a scene.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case", rename_all_fields = "kebab-case")]
 pub enum Disturbance {
     /// Nothing.
     Nothing,

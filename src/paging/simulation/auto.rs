@@ -20,7 +20,7 @@ const ENOUGH_FACTOR: f64 = 1.5;
 /// ... or below this share of the needed pages, which a drive reads mostly beside the steps, are taken. Randomness is worth
 /// more than the rest: on seneca at 395 px half of the frames make a shuffle read 16 % and a step take 1.12 times as long,
 /// while 4, 9 and 25 groups cost .13, .27 and .55 dB after 3,000 steps; twice the steps bring .62 dB
-/// (`gsscale-bench pareto`).
+/// (`gsscale-bench sweep pareto`).
 const ENOUGH_SHARE: f64 = 0.15;
 
 /// The order for these views and a cache of `frames` frames for `pages` pages. `plan_bytes` bounds the memory that this

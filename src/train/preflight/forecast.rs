@@ -36,7 +36,7 @@ const ADDED_MOST: f64 = 0.6;
 /// Most Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.3 on sheffield_cross, 8 on cities,
 /// see "A count that the program decides" in `benches/RESULTS.md`.
 const DECIDED_MOST: f64 = 8.0;
-/// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench pareto`): step time grows with this power of
+/// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench sweep pareto`): step time grows with this power of
 /// their number.
 pub const STEP_GROWTH: f64 = 0.54;
 /// Seconds that a core takes for another Gaussian in view. Limits that power for scenes that begin with few and large
