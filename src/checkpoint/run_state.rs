@@ -161,7 +161,7 @@ impl From<ValuesError> for RunStateError {
 
 impl RunState {
     /// The state of a run of `rows` Gaussians without history: not trained yet, or history unknown.
-    pub fn without_past(origin: Origin, device: String, rows: u64) -> RunState {
+    pub fn without_history(origin: Origin, device: String, rows: u64) -> RunState {
         let dataset = DatasetPrint { first_rows: rows, ..origin.dataset };
         RunState {
             origin: Origin { dataset, ..origin },

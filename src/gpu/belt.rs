@@ -99,7 +99,7 @@ impl Belt {
             let mut set = Set::default();
             match set.chunk_with_room(&self.pool, self.chunk_bytes, self.set_chunks) {
                 Ok(_) => self.sets.push_front(set),
-                Err(error) if error.lacks_room() => {}
+                Err(error) if error.is_out_of_memory() => {}
                 Err(error) => return Err(error),
             }
         }
@@ -182,7 +182,7 @@ impl Set {
                 match pool.keep("upload staging", chunk_bytes, usage) {
                     Ok(raw) => self.chunks.push(Chunk { raw, state: SharedState::new(MapState::Mapped), used: 0 }),
                     // A smaller set is submitted more often.
-                    Err(error) if error.lacks_room() && !self.chunks.is_empty() => return Ok(None),
+                    Err(error) if error.is_out_of_memory() && !self.chunks.is_empty() => return Ok(None),
                     Err(error) => return Err(error),
                 }
                 self.chunks.len() - 1

@@ -151,7 +151,7 @@ impl GpuError {
 impl GpuError {
     /// Whether a buffer or binding was refused for its size before any command that needs it was recorded. The same work in
     /// smaller parts may succeed.
-    pub fn lacks_room(&self) -> bool {
+    pub fn is_out_of_memory(&self) -> bool {
         matches!(
             self,
             GpuError::OutOfBudget { .. }

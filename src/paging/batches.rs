@@ -103,7 +103,7 @@ impl Pager {
         if self.transfers == Transfers::Demand || !self.mover.has_store() {
             return;
         }
-        self.settle_for_nobody(false);
+        self.poll_completions(false);
         self.write_frozen();
         let mut lacking = 0;
         for &page in pages {
@@ -119,7 +119,7 @@ impl Pager {
                     Some(victim) => {
                         lacking += 1;
                         if self.frames.count(FrameState::Writing) < lacking && self.mover.may_write_ahead() {
-                            self.clean_early(victim);
+                            self.write_back_early(victim);
                         }
                         continue;
                     }

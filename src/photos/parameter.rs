@@ -139,7 +139,7 @@ pub trait PhotoParameter {
     }
 
     /// Whether another view trains at `step` in the turn of this view.
-    fn gives_turn_away(&self, _view: usize, _step: u32) -> bool {
+    fn is_replaced_at(&self, _view: usize, _step: u32) -> bool {
         false
     }
 

@@ -40,7 +40,7 @@ pub(super) fn in_chunks(rows: usize, mut stage: impl FnMut(Range<usize>) -> GpuR
         let part = first..rows.min(first + chunk);
         match stage(part.clone()) {
             Ok(()) => first = part.end,
-            Err(error) if error.lacks_room() && chunk > CHUNK_STEP => {
+            Err(error) if error.is_out_of_memory() && chunk > CHUNK_STEP => {
                 chunk = (chunk / 2).next_multiple_of(CHUNK_STEP);
             }
             Err(error) => return Err(error),

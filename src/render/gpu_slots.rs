@@ -70,8 +70,8 @@ impl Slots {
                     self.slabs.push(Slab { buffer, first: self.len(), slots: next as u32 });
                     added += next;
                 }
-                Err(error) if error.lacks_room() && next > 1 => next /= 2,
-                Err(error) if error.lacks_room() => break,
+                Err(error) if error.is_out_of_memory() && next > 1 => next /= 2,
+                Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
         }
@@ -123,7 +123,7 @@ impl Slots {
             let count = at_once.min(rest.len());
             match self.read_some(gpu, &mut rest[..count]) {
                 Ok(()) => rest = &mut rest[count..],
-                Err(error) if error.lacks_room() && count > 1 => at_once = count / 2,
+                Err(error) if error.is_out_of_memory() && count > 1 => at_once = count / 2,
                 Err(error) => return Err(error),
             }
         }
@@ -143,7 +143,7 @@ impl Slots {
         for (slot, bytes) in slots.iter().take(most as usize) {
             match recorder.read_back("pages", &self.view(*slot, *bytes)?) {
                 Ok(read) => self.under_way.push_back((*slot, read)),
-                Err(error) if error.lacks_room() => break,
+                Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
         }

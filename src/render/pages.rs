@@ -105,7 +105,7 @@ pub trait PageRenderer: Renderer {
     ///
     /// # Errors
     /// Device memory is exhausted.
-    fn hold_pages(&mut self, rules: &PageRules) -> Result<(), RenderError>;
+    fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError>;
 
     /// Device memory that slots and views can still take, bytes; drops the view.
     fn room(&mut self) -> u64;

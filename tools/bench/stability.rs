@@ -63,8 +63,8 @@ const DISTURBANCES: [(&str, Disturbance, Option<Change>); 17] = [
     ("boxes", Disturbance::Boxes { count: 20, are_masked: false }, Some(mask_blocks)),
     ("boxes-masked", Disturbance::Boxes { count: 20, are_masked: true }, None),
     ("third", Disturbance::FewPhotos { one_in: 3 }, None),
-    ("points10", Disturbance::FewPoints { one_in: 10 }, Some(suit_few_points)),
-    ("points-random", Disturbance::RandomPoints, Some(suit_few_points)),
+    ("points10", Disturbance::FewPoints { one_in: 10 }, Some(adapt_to_few_points)),
+    ("points-random", Disturbance::RandomPoints, Some(adapt_to_few_points)),
     ("blurred10", Disturbance::Blurred { one_in: 10 }, Some(leave_out_views)),
 ];
 
@@ -88,9 +88,9 @@ fn mask_blocks(config: &mut TrainConfig) {
     config.robust_pixels = true;
 }
 
-fn suit_few_points(config: &mut TrainConfig) {
+fn adapt_to_few_points(config: &mut TrainConfig) {
     config.strategy = StrategyName::LongAxis;
-    config.suit_poor_points(|_| true);
+    config.adapt_to_poor_points(|_| true);
 }
 
 fn all_remedies(config: &mut TrainConfig) {

@@ -91,7 +91,7 @@ impl Manifest {
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
-        let file = MapFile::holding_back(file)?;
+        let file = MapFile::with_deferred_writes(file)?;
         if file.len()? == 0 {
             return Err(MapError::Damaged("the file is empty".to_string()));
         }

@@ -176,7 +176,7 @@ impl CacheModel {
         let free = self.free.min(change.admit.len());
         self.free -= free;
         for _ in free..change.admit.len() {
-            let far = self.first_exact(&next_use).filter(|page| self.may_go(page, batch, past.is_empty()));
+            let far = self.first_exact(&next_use).filter(|page| self.may_evict(page, batch, past.is_empty()));
             if far.is_none() {
                 self.add_idle(&mut past, &next_use);
             }
@@ -208,7 +208,7 @@ impl CacheModel {
     }
 
     /// Whether a page may be evicted while the batch before `batch` still computes. With `is_last`, no other page can go.
-    fn may_go(&self, victim: &Candidate, batch: u32, is_last: bool) -> bool {
+    fn may_evict(&self, victim: &Candidate, batch: u32, is_last: bool) -> bool {
         let ignores_plan = self.idle.policy().ignores_plan();
         is_last || ignores_plan || victim.next_use > batch.saturating_add(FAR_STEPS)
     }

@@ -189,7 +189,7 @@ mod tests {
         };
         let simd = limits::simd_path(&config).name().to_string();
         let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
-        let state = RunState::without_past(origin, "cpu".to_string(), 1);
+        let state = RunState::without_history(origin, "cpu".to_string(), 1);
         let changes = |config: &TrainConfig| Changes::of_config(Path::new("config.toml"), &state, config).unwrap();
         assert_eq!(changes(&config), Changes::default());
         let on = changes(&TrainConfig { appearance: AppearanceMode::Full, ..config.clone() });
