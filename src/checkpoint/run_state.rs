@@ -58,7 +58,6 @@ pub struct LastTest {
     pub views: u32,
     /// Mean PSNR, dB.
     pub psnr: f64,
-    /// Mean SSIM.
     pub ssim: f64,
 }
 
@@ -82,7 +81,6 @@ pub struct Origin {
     pub simd: String,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
-    /// The dataset.
     pub dataset: DatasetPrint,
     /// Identity and paths of the run.
     pub run: RunIdentity,
@@ -122,7 +120,6 @@ pub struct RunState {
     pub trainer: TrainerState,
     /// What the run knows of its photos.
     pub photos: SavedValues,
-    /// The event log.
     pub events: Vec<Event>,
     /// Histogram since the last round: non-empty bins with their numbers of rows.
     pub histogram: Vec<(u16, u32)>,

@@ -74,7 +74,6 @@ pub(super) struct Belt {
     /// Most staging buffers in one set.
     set_chunks: usize,
     sets: VecDeque<Set>,
-    /// The most sets.
     sets_most: usize,
 }
 

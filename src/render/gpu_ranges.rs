@@ -29,7 +29,6 @@ pub(super) const PLACE_BYTES: u64 = 8;
 /// Words of the demand of one range: intersections, longest list, splats.
 const DEMAND_WORDS: u32 = 3;
 
-/// The compiled stages.
 #[derive(Debug)]
 pub(super) struct RangeStages {
     tally: Arc<Pipeline>,

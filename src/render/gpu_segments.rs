@@ -22,7 +22,6 @@ pub(super) const CHUNK_STEP: usize = WINDOW_STEP as usize;
 pub(super) struct Segment {
     /// The number, in the view, of the first row.
     pub first: usize,
-    /// Rows.
     pub rows: u32,
     /// `[rows]` records of `shaders/shared/splat.wgsl`.
     pub splats: Buffer,

@@ -51,7 +51,6 @@ impl Slots {
         self.slabs.is_empty()
     }
 
-    /// Number of slots.
     pub fn len(&self) -> u32 {
         self.slabs.last().map_or(0, |slab| slab.first + slab.slots)
     }

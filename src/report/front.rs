@@ -8,11 +8,8 @@ use super::record::RunRecord;
 /// Mean and range of a value over seeds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Spread {
-    /// Mean.
     pub mean: f64,
-    /// Lowest.
     pub low: f64,
-    /// Highest.
     pub high: f64,
 }
 
@@ -78,7 +75,6 @@ pub struct Setting {
     pub runs: Vec<RunRecord>,
     /// PSNR, dB.
     pub psnr: Option<Spread>,
-    /// SSIM.
     pub ssim: Option<Spread>,
     /// Accuracy against the base.
     pub verdict: Verdict,

@@ -18,7 +18,6 @@ pub const NO_REMEDY: &str = "none";
 pub struct Lost {
     /// The disturbance.
     pub knob: String,
-    /// The remedy.
     pub remedy: String,
     /// Seeds in the figures.
     pub seeds: usize,

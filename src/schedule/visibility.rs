@@ -59,7 +59,6 @@ impl ViewPages {
         self.ends.push(self.pages.len());
     }
 
-    /// Number of views.
     pub fn views(&self) -> usize {
         self.ends.len()
     }

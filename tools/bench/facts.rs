@@ -25,7 +25,6 @@ const SPLIT_GROWTH: f64 = 1.1;
 
 /// A scene before training.
 pub struct Facts {
-    /// Gaussians.
     pub gaussians: u64,
     /// Pages at the start.
     pub pages: u64,

@@ -18,7 +18,6 @@ use std::path::Path;
 pub const KNOBS: [&str; 11] =
     ["optimizer", "order", "budget", "page", "codec", "moments", "sh", "cap", "resolution", "steps", "together"];
 
-/// Orders of views.
 const ORDERS: [Order; 5] = [Order::Shuffle, Order::Groups(4), Order::Groups(9), Order::Groups(25), Order::Tour];
 /// Numbers of frames, in percent of the pages.
 const BUDGETS: [f64; 4] = [75.0, 50.0, 25.0, 10.0];
@@ -27,7 +26,6 @@ const DRIVE_SHARE: f64 = 50.0;
 
 /// The input of the settings.
 pub struct Knobs<'a> {
-    /// The scene.
     pub scene: &'a Path,
     /// The base, with a resolved order of views.
     pub base: &'a TrainConfig,

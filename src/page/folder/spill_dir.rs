@@ -105,7 +105,6 @@ impl SpillDir {
         !matches!(read_format(folder), Ok(None))
     }
 
-    /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }

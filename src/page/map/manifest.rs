@@ -41,7 +41,6 @@ fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
     }
 }
 
-/// The open map.
 pub struct Manifest {
     database: Option<Database>,
     file: MapFile,

@@ -50,7 +50,6 @@ impl StepChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("step {step} needs {needed} pages at once, but there are {frames} frames")]
 pub struct TooFewFrames {
-    /// The step.
     pub step: u32,
     /// Pages that the step needs.
     pub needed: usize,
@@ -58,7 +57,6 @@ pub struct TooFewFrames {
     pub frames: usize,
 }
 
-/// The model.
 #[derive(Debug, Clone)]
 pub struct CacheModel {
     frames: usize,
@@ -117,7 +115,6 @@ impl CacheModel {
         self.frames = free.saturating_add(self.present.len() + self.idle.len());
     }
 
-    /// Number of frames.
     pub fn frames(&self) -> usize {
         self.frames
     }
@@ -250,7 +247,6 @@ impl CacheModel {
 /// One step of a plan as a cache will go through it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PlannedStep {
-    /// The step.
     pub step: u32,
     /// Number of pages that the step needs.
     pub pages: usize,

@@ -18,7 +18,6 @@ pub struct Resolved {
     /// Identity of the run; its commits hold it too.
     #[serde(default)]
     pub run: RunId,
-    /// The scene.
     pub scene: PathBuf,
     /// Instruction path in use.
     pub simd: String,

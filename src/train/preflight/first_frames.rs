@@ -28,7 +28,6 @@ pub(super) struct LargestNeed {
 /// Frames at the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct FirstFrames {
-    /// Number of frames.
     pub frames: u64,
     /// The most pages of a batch of a view.
     pub pages_most: usize,

@@ -113,7 +113,6 @@ pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
 pub(super) struct FirstTrainer {
     /// Views and frame.
     pub dataset: Dataset,
-    /// The trainer.
     pub trainer: Trainer,
     /// Where its pages live.
     pub tiers: Tiers,

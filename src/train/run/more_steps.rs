@@ -48,7 +48,6 @@ pub(super) fn text_of_rates(config: &TrainConfig) -> Option<String> {
 pub(super) struct Finished<'a> {
     /// Its output folder.
     pub out: &'a Path,
-    /// Its scene.
     pub scene: &'a Path,
     /// Config with more steps.
     pub config: TrainConfig,
@@ -56,7 +55,6 @@ pub(super) struct Finished<'a> {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Its identity.
     pub run: RunId,
-    /// Its summary.
     pub summary: &'a Summary,
     /// Print only warnings and errors.
     pub quiet: bool,

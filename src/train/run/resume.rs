@@ -120,7 +120,6 @@ pub(super) struct Earlier {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Its config, from the file or from the checkpoint.
     pub config: TrainConfig,
-    /// Its scene.
     pub scene: PathBuf,
     /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
     pub run: RunId,
@@ -224,7 +223,6 @@ fn begin_again(
 pub(super) struct Goal {
     /// Accepted differences.
     pub changes: Changes,
-    /// Its scene.
     pub start: Start,
     /// Digest of the dataset.
     pub print: DatasetPrint,

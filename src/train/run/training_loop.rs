@@ -23,7 +23,6 @@ use std::path::Path;
 
 /// Outputs and controls of a loop.
 pub struct LoopOutputs<'a> {
-    /// Output folder.
     pub out: &'a Path,
     /// Writer of metrics.jsonl.
     pub metrics: &'a mut MetricsLog,

@@ -80,15 +80,12 @@ enum Recorded {
 pub struct StepToRecord<'a> {
     /// 0-based step.
     pub step: u32,
-    /// Its camera.
     pub camera: &'a Camera,
     /// Step and camera after it.
     pub next: Option<(u32, &'a Camera)>,
     /// How the view is drawn.
     pub render: &'a RenderOptions,
-    /// Its photo.
     pub target: &'a Target,
-    /// The loss.
     pub loss: &'a LossOptions,
     /// Whether the step collects statistics.
     pub collects: bool,

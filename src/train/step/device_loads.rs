@@ -20,7 +20,6 @@ use crate::render::Renderer;
 use crate::render::pages::{DeviceSlot, SlotPage};
 use crate::train::error::TrainError;
 
-/// A page's payload.
 fn payload(page: &PinnedPage) -> &[u8] {
     &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]
 }

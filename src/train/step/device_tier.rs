@@ -45,18 +45,15 @@ pub struct SlotTraffic {
     /// Those copied while the device computed the step before.
     #[serde(default)]
     pub loads_ahead: u64,
-    /// Their bytes.
     pub bytes_loaded: u64,
     /// Payloads copied back.
     pub drains: u64,
-    /// Their bytes.
     pub bytes_drained: u64,
     /// Pages of batches that were on the device already.
     pub hits: u64,
     /// Pages whose statistics the device cleared after a round, in place of a drain, an edit and a load.
     #[serde(default)]
     pub cleared: u64,
-    /// Slots.
     #[serde(default)]
     pub slots: u64,
     /// The fewest bytes that any order of eviction could have copied to that many slots so far ([`FewestReads`]); to compare
@@ -178,7 +175,6 @@ impl DeviceTier {
         }
     }
 
-    /// Slots.
     pub fn slots(&self) -> usize {
         self.slots.frames_max()
     }
@@ -224,7 +220,6 @@ impl DeviceTier {
         }
     }
 
-    /// A step begins.
     pub(super) fn begin_step(
         &mut self,
         scene: &mut PagedScene,

@@ -63,11 +63,9 @@ pub struct ImportRequest {
 pub struct Imported {
     /// The new folder.
     pub store: PathBuf,
-    /// Gaussians.
     pub gaussians: u64,
     /// Dropped Gaussians with non-finite values.
     pub dropped: u64,
-    /// Pages.
     pub pages: u64,
     /// SH degree of the file.
     pub sh_degree: u8,

@@ -56,13 +56,11 @@ pub struct SalvageRequest {
 /// A page that is missing or an older version.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LostPage {
-    /// The page.
     pub page: String,
     /// Its rows, if its label is known.
     pub rows: Option<u32>,
     /// Generation of the version taken instead; `None` if no version is undamaged.
     pub taken: Option<u64>,
-    /// Description.
     pub what: String,
 }
 
@@ -75,9 +73,7 @@ pub struct Salvaged {
     pub has_state: bool,
     /// Step of the run, or of the newest row.
     pub step: u32,
-    /// Gaussians.
     pub gaussians: u64,
-    /// Pages.
     pub pages: u64,
     /// Pages that are missing, incomplete or older.
     pub lost: Vec<LostPage>,
