@@ -100,6 +100,22 @@ impl Pager {
     /// Begins to read the pages of the next batch of the present step, as far as frames of pages that the step does not need
     /// earlier can be had, and bytes in flight allow it. Never blocks. Calling it again continues.
     pub fn prefetch_batch(&mut self, pages: &[PageNo]) {
+        self.prefetch_for(pages, Asker::Step);
+    }
+
+    /// As [`Pager::prefetch_batch`], between steps: of pages that are acquired next.
+    pub fn prefetch_pages(&mut self, pages: impl Iterator<Item = PageNo>) {
+        if self.transfers == Transfers::Demand || !self.mover.has_store() {
+            return;
+        }
+        let pages: Vec<PageNo> = pages.collect();
+        // So that none of them is evicted for another one.
+        self.set_use_in_step(0, pages.iter().copied(), UseInStep::Coming);
+        self.prefetch_for(&pages, Asker::Other);
+        self.end_batches();
+    }
+
+    fn prefetch_for(&mut self, pages: &[PageNo], asker: Asker) {
         if self.transfers == Transfers::Demand || !self.mover.has_store() {
             return;
         }
@@ -126,7 +142,9 @@ impl Pager {
                     None => break,
                 }
             }
-            self.begin_read(page, true);
+            if self.begin_read(page, true) {
+                self.count_read(page, asker);
+            }
         }
         self.mover.begin_writes();
     }

@@ -98,7 +98,7 @@ impl Pager {
     }
 
     /// Counts the bytes of a read that has begun for an asker that is no step.
-    fn count_read(&mut self, page: PageNo, asker: Asker) {
+    pub(super) fn count_read(&mut self, page: PageNo, asker: Asker) {
         if !asker.is_step() {
             let bytes = self.index.slot(page).map_or(0, |slot| slot.transfer_bytes() as u64);
             self.counters.stats.other_bytes_read += bytes;
