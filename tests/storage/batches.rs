@@ -208,6 +208,20 @@ fn every_row_can_be_read_while_the_drive_is_full() {
     assert!(rows(&mut scene) == want);
 }
 
+/// Pages of the next batch are read ahead, and none of them is evicted again before its use. No step has asked for them.
+#[test]
+fn a_pass_between_steps_reads_no_page_twice() {
+    let mut scene = scene(Some(&Faults::new()));
+    assert!(step(&mut scene, 0).unwrap().skipped.is_none());
+    let (pages, before) = (scene.pager.pages_of_view(&camera()).len() as u64, scene.pager.stats());
+    let rows = rows_of_view(&mut scene);
+    let stats = scene.pager.stats();
+    let read = stats.pages_read - before.pages_read;
+    assert!((pages - FRAMES as u64..=pages).contains(&read), "{read} reads of {pages} pages");
+    assert_eq!(stats.bytes_read - before.bytes_read, stats.other_bytes_read - before.other_bytes_read);
+    assert!(!rows.is_empty());
+}
+
 /// A walk of other batches than the pager's own, with uses that are told to it: what comes back is evicted last.
 #[test]
 fn pages_that_return_stay_longer_than_pages_that_are_done() {
