@@ -33,7 +33,6 @@ pub struct Args {
     pub json: bool,
     /// Instruction path of `--path`.
     pub path: Option<SimdPath>,
-    /// Sizes.
     pub sizes: Vec<usize>,
     /// Parts of names of cases; if not empty, only matching cases run.
     pub only: Vec<String>,
@@ -162,7 +161,6 @@ impl Default for Hash {
 }
 
 impl Hash {
-    /// Adds a word.
     pub fn add(&mut self, word: u64) {
         for byte in word.to_le_bytes() {
             self.0 = (self.0 ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3);

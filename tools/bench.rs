@@ -67,7 +67,7 @@ fn main() -> ExitCode {
         sweep::start(&parse_arguments(&arguments), &mut print)
     } else if named("compare") {
         compare::start(&compare::Args::parse_from(&arguments))
-    } else if named("run") && published::is_meant(&arguments) {
+    } else if named("run") && published::is_published_run(&arguments) {
         match published::start(&parse_arguments(&arguments), &mut print) {
             Ok(code) => return code,
             Err(error) => Err(error),

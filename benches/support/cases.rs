@@ -53,7 +53,6 @@ pub const PHOTO_CASES: [PhotoCase; 4] = [
     photos("sheffield_cross_395", ("sheffield_cross_395", 1.0, None), (0.302, 1.13, Some(5.0))),
 ];
 
-/// One input.
 pub struct Case {
     /// Name in reports.
     pub name: String,

@@ -13,7 +13,6 @@ pub struct CpuCounts {
     pub updated: f64,
     /// Intersections.
     pub isects: f64,
-    /// Pixels.
     pub pixels: f64,
 }
 

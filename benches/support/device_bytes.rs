@@ -10,14 +10,11 @@ pub struct Counts {
     pub rows: f64,
     /// Intersections.
     pub isects: f64,
-    /// Pixels.
     pub pixels: f64,
-    /// Tiles.
     pub tiles: f64,
 }
 
 impl Counts {
-    /// Adds a step.
     pub fn add(&mut self, rows: u64, isects: u64, camera: &Camera) {
         self.rows += rows as f64;
         self.isects += isects as f64;

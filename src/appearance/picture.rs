@@ -42,7 +42,6 @@ pub struct Look {
     pub image: [f64; IMAGE_VALUES],
     /// Vignetting of the camera, by channel.
     pub falloff: [[f64; CHANNEL_VALUES]; 3],
-    /// The lens.
     pub lens: Lens,
 }
 

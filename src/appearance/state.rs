@@ -104,7 +104,7 @@ impl AppearanceState {
     }
 
     /// Whether both have the same numbers of photos and cameras.
-    pub fn is_as_large_as(&self, other: &AppearanceState) -> bool {
+    pub fn has_same_counts(&self, other: &AppearanceState) -> bool {
         (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
     }
 

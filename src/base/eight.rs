@@ -20,7 +20,6 @@ pub struct Avx2(());
 
 /// A kernel written in [`Eight`]s.
 pub trait EightKernel {
-    /// Its result.
     type Out;
     /// Runs the kernel. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`:
     /// other functions are compiled without AVX2 and receive their values through memory.
@@ -100,15 +99,10 @@ macro_rules! lane_by_lane {
 
 impl Eight {
     lane_by_lane! {
-        /// Sum.
         plus(b) = _mm256_add_ps;
-        /// Difference.
         minus(b) = _mm256_sub_ps;
-        /// Product.
         times(b) = _mm256_mul_ps;
-        /// Quotient.
         over(b) = _mm256_div_ps;
-        /// Square root.
         sqrt() = _mm256_sqrt_ps;
         /// Bitwise and.
         and(b) = _mm256_and_ps;

@@ -13,7 +13,6 @@ pub struct InputError {
     pub file: PathBuf,
     /// Place in the file: a byte offset, a line, a key, an image name; empty for the whole file.
     pub place: String,
-    /// The problem.
     pub problem: String,
     /// What the user can do about it.
     pub remedy: String,

@@ -36,7 +36,7 @@ impl RunId {
     }
 
     /// Whether both are known and differ: then neither run may change the other's files.
-    pub fn is_other_than(self, other: RunId) -> bool {
+    pub fn is_known_to_differ(self, other: RunId) -> bool {
         self.is_known() && other.is_known() && self != other
     }
 }
@@ -94,6 +94,10 @@ mod tests {
         for wrong in ["", "12", &format!("+{}", "0".repeat(31)), &"0".repeat(33)] {
             assert!(wrong.parse::<RunId>().is_err(), "{wrong}");
         }
-        assert!(!RunId::UNKNOWN.is_other_than(id) && !id.is_other_than(id) && id.is_other_than(RunId::draw()));
+        assert!(
+            !RunId::UNKNOWN.is_known_to_differ(id)
+                && !id.is_known_to_differ(id)
+                && id.is_known_to_differ(RunId::draw())
+        );
     }
 }

@@ -28,7 +28,6 @@ pub fn resize_with<T>(values: &mut Vec<T>, len: usize, value: impl FnMut() -> T)
     values.resize_with(len, value);
 }
 
-/// Appends values.
 pub fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
     reserve(values, values.len() + more.len());
     values.extend_from_slice(more);

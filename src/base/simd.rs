@@ -30,7 +30,6 @@ pub enum BitsClass {
     RoundedTwice,
 }
 
-/// An instruction path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum SimdPath {
     /// AVX-512 F/BW/DQ/VL with FMA.
@@ -98,7 +97,6 @@ impl SimdPath {
 
 /// A kernel that [`dispatch`] compiles for each path.
 pub trait Kernel {
-    /// Its result.
     type Out;
     /// Runs the kernel. Mark the implementation, and every function it calls in its inner loop, `#[inline(always)]`.
     fn run<const FMA: bool>(self) -> Self::Out;

@@ -55,7 +55,7 @@ impl PartFile {
         drop(file);
         std::fs::rename(&self.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
         match sync_folder(folder_of(target)) {
-            Err(e) if !is_unable(&e) => Err(InputError::io(target, "flushing the folder to the disk", &e)),
+            Err(e) if !is_sync_unsupported(&e) => Err(InputError::io(target, "flushing the folder to the disk", &e)),
             _ => Ok(()),
         }
     }
@@ -101,7 +101,7 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
 }
 
 /// Whether the error says that folders cannot be synced here, not that the drive failed.
-fn is_unable(error: &io::Error) -> bool {
+fn is_sync_unsupported(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::InvalidInput | ErrorKind::Unsupported | ErrorKind::PermissionDenied)
 }
 

@@ -56,7 +56,6 @@ pub struct LastTest {
     pub views: u32,
     /// Mean PSNR, dB.
     pub psnr: f64,
-    /// Mean SSIM.
     pub ssim: f64,
 }
 
@@ -80,7 +79,6 @@ pub struct Origin {
     pub simd: String,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
-    /// The dataset.
     pub dataset: DatasetPrint,
     /// Identity and paths of the run.
     pub run: RunIdentity,
@@ -117,7 +115,6 @@ pub struct RunState {
     pub trainer: TrainerState,
     /// What the run knows of its photos.
     pub photos: SavedValues,
-    /// The event log.
     pub events: Vec<Event>,
     /// Histogram since the last round: non-empty bins with their numbers of rows.
     pub histogram: Vec<(u16, u32)>,
@@ -156,7 +153,7 @@ impl From<ValuesError> for RunStateError {
 
 impl RunState {
     /// The state of a run of `rows` Gaussians without history: not trained yet, or history unknown.
-    pub fn without_past(origin: Origin, device: String, rows: u64) -> RunState {
+    pub fn without_history(origin: Origin, device: String, rows: u64) -> RunState {
         let dataset = DatasetPrint { first_rows: rows, ..origin.dataset };
         RunState {
             origin: Origin { dataset, ..origin },

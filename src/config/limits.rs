@@ -43,11 +43,8 @@ pub struct RunOptions {
     pub view_order: Order,
     /// Render options, except for the current SH degree.
     pub render: RenderOptions,
-    /// Loss.
     pub loss: LossOptions,
-    /// Learning rates.
     pub rates: Rates,
-    /// Adam's constants.
     pub adam: AdamConfig,
     /// Which rows the optimizer updates.
     pub optimizer: Method,
@@ -59,7 +56,6 @@ pub struct RunOptions {
     pub strategy: Arc<dyn Strategy>,
     /// Scene scale, local units.
     pub scene_scale: f32,
-    /// SSIM to report.
     pub ssim_variant: SsimVariant,
     /// Method of the colour-corrected PSNR; `None` for none.
     pub color_correct: Option<ColorCorrect>,

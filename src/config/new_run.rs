@@ -91,13 +91,13 @@ impl TrainConfig {
     fn set_open_keys(&mut self, given: &BTreeSet<String>) {
         self.follow_length(given);
         if self.poor_points {
-            self.suit_poor_points(|field| !given.contains(field));
+            self.adapt_to_poor_points(|field| !given.contains(field));
         }
     }
 
     /// Sets the fields of `poor-points` that are open. The values were chosen by the PSNR of held-out photos of two scenes with a tenth
     /// of their points and with random ones, see "Few or random points" in `benches/RESULTS.md`.
-    pub fn suit_poor_points(&mut self, is_open: impl Fn(&str) -> bool) {
+    pub fn adapt_to_poor_points(&mut self, is_open: impl Fn(&str) -> bool) {
         if is_open("means_lr") {
             self.means_lr *= POOR_MEANS_LR;
         }
@@ -125,7 +125,7 @@ impl TrainConfig {
     /// `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos. A key
     /// that has its value by the length of the run gets the one by the length of the schedule. Returns the steps of the schedule
     /// if it ends before the run.
-    pub fn suit_photos(&mut self, photos: usize) -> Option<u32> {
+    pub fn adapt_schedule(&mut self, photos: usize) -> Option<u32> {
         let steps = (photos as u64).saturating_mul(PHOTO_STEPS_MOST).max(1);
         let follows_length = self.schedule == Schedule::RunLength && self.strategy == StrategyName::LongAxis;
         if !follows_length || self.schedule_steps != 0 || steps >= u64::from(self.steps) {
@@ -153,7 +153,7 @@ impl TrainConfig {
         let mut config = TrainConfig { steps, ..self.clone() };
         config.follow_length(&BTreeSet::new());
         if config.poor_points {
-            config.suit_poor_points(|_| true);
+            config.adapt_to_poor_points(|_| true);
         }
         config
     }
@@ -210,12 +210,12 @@ mod tests {
         let keys = TrainOverrides { means_lr: Some(1e-4), refine_every: Some(50), ..TrainOverrides::default() };
         let (before, mut config) = (of_flags(&keys), of_flags(&keys));
         assert_eq!(
-            (config.suit_photos(200), config.suit_photos(usize::MAX)),
+            (config.adapt_schedule(200), config.adapt_schedule(usize::MAX)),
             (None, None),
             "150 steps a photo or fewer"
         );
         assert_eq!(config, before);
-        assert_eq!(config.suit_photos(28), Some(4200));
+        assert_eq!(config.adapt_schedule(28), Some(4200));
         let short = Lengths::of_run(4200, StrategyName::LongAxis);
         assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
@@ -223,16 +223,16 @@ mod tests {
         // Few photos and poor points: both factors of the rate of positions hold.
         let poor = TrainOverrides { poor_points: Some(true), ..TrainOverrides::default() };
         let mut of_both = of_flags(&poor);
-        assert_eq!(of_both.suit_photos(28), Some(4200));
+        assert_eq!(of_both.adapt_schedule(28), Some(4200));
         assert!((of_both.means_lr / (short.means_lr * POOR_MEANS_LR) - 1.0).abs() < 1e-12, "{}", of_both.means_lr);
-        assert!(config.suit_photos(5).is_none() && config.check().is_ok(), "its schedule is given now");
+        assert!(config.adapt_schedule(5).is_none() && config.check().is_ok(), "its schedule is given now");
         for keys in [
             TrainOverrides { schedule_steps: Some(30_000), ..keys.clone() },
             TrainOverrides { schedule: Some(Schedule::Classic), ..keys.clone() },
             TrainOverrides { strategy: Some(StrategyName::Default), ..keys },
         ] {
             let mut config = of_flags(&keys);
-            assert_eq!((config.suit_photos(28), config == of_flags(&keys)), (None, true));
+            assert_eq!((config.adapt_schedule(28), config == of_flags(&keys)), (None, true));
         }
     }
 

@@ -29,14 +29,12 @@ pub const BUILT_IN: [(&str, &str); 8] = [
     ("aerial", include_str!("../../configs/aerial.toml")),
 ];
 
-/// A published run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PublishedRun {
     /// Its name: the file name without extension.
     pub name: String,
     /// Settings of the active tier.
     pub config: TrainConfig,
-    /// Published facts.
     pub facts: Published,
     /// Densification tiers by name.
     pub tiers: BTreeMap<String, Tier>,
@@ -64,7 +62,6 @@ pub struct Published {
     /// Width and height used in training, pixels.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub size: Option<[u32; 2]>,
-    /// Further notes.
     #[serde(default)]
     pub notes: Vec<String>,
     /// Published quality, if any.
@@ -81,11 +78,8 @@ pub struct Published {
 pub struct Expected {
     /// PSNR, dB.
     pub psnr: f64,
-    /// SSIM.
     pub ssim: f64,
-    /// Variant of SSIM.
     pub ssim_variant: SsimVariant,
-    /// LPIPS.
     pub lpips: f64,
     /// Network and input range of LPIPS: `alex, signed`.
     pub lpips_variant: String,

@@ -3,7 +3,6 @@
 use super::file::TrainConfig;
 use std::path::{Path, PathBuf};
 
-/// Where pages live.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Residence<'a> {
     /// All pages in memory; the run commits to its output folder.

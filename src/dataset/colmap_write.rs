@@ -17,7 +17,6 @@ use std::path::Path;
 /// Id of the PINHOLE camera model (fx, fy, cx, cy).
 const PINHOLE: i32 = 1;
 
-/// A model.
 #[derive(Debug, Clone)]
 pub struct Model {
     /// The cameras; pinholes.

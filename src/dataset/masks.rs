@@ -35,9 +35,7 @@ const SHOWN: usize = 3;
 /// The mask of a photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskSource {
-    /// The mask's file.
     pub path: PathBuf,
-    /// Its header.
     pub header: PhotoHeader,
     /// Whether black is kept instead of white.
     pub invert: bool,

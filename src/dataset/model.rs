@@ -96,11 +96,9 @@ pub enum Split {
 pub struct RawView {
     /// Name in the dataset, `/`-separated, relative to the image folder and checked to stay inside it.
     pub name: String,
-    /// The photo's file.
     pub image_path: PathBuf,
     /// Intrinsics at the size stated by the dataset.
     pub intrinsics: Intrinsics,
-    /// Pose.
     pub pose: Pose,
     /// A mask named by the dataset itself; the loader finds masks by folder.
     pub mask_path: Option<PathBuf>,

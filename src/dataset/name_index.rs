@@ -60,7 +60,6 @@ pub(super) struct Entry {
     folder: String,
     /// Its own name, folded.
     base: String,
-    /// The file.
     pub path: PathBuf,
 }
 

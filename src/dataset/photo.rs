@@ -36,7 +36,6 @@ pub enum Alpha {
 /// Everything needed to decode a view's target; the files were checked at load.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PhotoSource {
-    /// The photo's file.
     pub image_path: PathBuf,
     /// Its header, as read at load.
     pub header: PhotoHeader,
@@ -44,7 +43,6 @@ pub struct PhotoSource {
     pub intrinsics: Intrinsics,
     /// Size of the target, pixels.
     pub target: Size,
-    /// The view's mask.
     pub mask: Option<MaskSource>,
     /// What becomes of transparent pixels.
     pub alpha: Alpha,

@@ -30,7 +30,6 @@ const TAIL: u64 = 64 * 1024;
 pub enum PhotoFormat {
     /// Baseline, extended or progressive JPEG.
     Jpeg,
-    /// PNG.
     Png,
 }
 
@@ -46,7 +45,6 @@ pub struct ExifPlace {
 /// Header of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoHeader {
-    /// File format.
     pub format: PhotoFormat,
     /// Stored width, pixels.
     pub width: u32,

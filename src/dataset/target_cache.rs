@@ -168,7 +168,6 @@ impl TargetCache {
         result
     }
 
-    /// Statistics so far.
     pub fn stats(&self) -> CacheStats {
         self.shared.lock().stats
     }

@@ -59,7 +59,6 @@ pub struct LongAxisStrategy {
     pub recycle: f64,
     /// A row is removed if its opacity is below this value.
     pub prune_opa: f32,
-    /// When rounds happen.
     pub rounds: RoundSteps,
     /// When the checks of [`LongAxisStrategy::growth`] may happen. Checks come by steps, also where rounds come by epochs.
     pub checks: RoundSteps,

@@ -52,7 +52,6 @@ const DRAW_LEAST: f64 = 1e-20;
 pub struct McmcStrategy {
     /// Rows of this opacity or less are dead.
     pub dead_opacity: f32,
-    /// When rounds happen.
     pub rounds: RoundSteps,
     /// Most rows of the scene.
     pub max_gaussians: u64,

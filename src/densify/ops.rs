@@ -33,7 +33,6 @@ const IN_PLACE_OPACITY_LEAST: f32 = 0.005;
 /// The effect of a round in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RoundCounts {
-    /// Duplicated rows.
     pub duplicated: usize,
     /// Rows that were replaced by two children.
     pub split: usize,

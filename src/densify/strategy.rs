@@ -286,10 +286,7 @@ pub enum Effect<'a> {
         max_opacity: f32,
     },
     /// Rows that are stored with a lower SH degree get zeros for the missing bands.
-    RaiseShDegree {
-        /// The degree.
-        degree: u8,
-    },
+    RaiseShDegree { degree: u8 },
 }
 
 /// The effect of an event kind on rows. The only place that names the rounds of all strategies.

@@ -13,7 +13,6 @@ use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::scene::rotation::VIEWER_UP;
 use std::path::{Path, PathBuf};
 
-/// A format.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExportFormat {
     /// All values as they are; the only one that training reads.
@@ -27,7 +26,6 @@ pub enum ExportFormat {
 /// What a run writes for viewers: always a PLY, and these beside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exports {
-    /// An SPZ.
     pub spz: bool,
     /// A folder of SOGs.
     pub sog: bool,
@@ -45,7 +43,6 @@ impl Exports {
 }
 
 impl ExportFormat {
-    /// All formats.
     pub const ALL: [ExportFormat; 3] = [ExportFormat::Ply, ExportFormat::Spz, ExportFormat::Sog];
 
     /// The file names of the formats, for help and remedies.

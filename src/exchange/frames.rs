@@ -94,7 +94,7 @@ impl ExportRow {
 /// Converts Gaussians that were read with `meta` into the local frame of `origin` and `scale`, with the axes of the
 /// dataset.
 ///
-/// An upright file is turned back first ([`turn_back`]). Then, computed in f64 and rounded once: `local = (p - origin) /
+/// An upright file is turned back first ([`rotate_back`]). Then, computed in f64 and rounded once: `local = (p - origin) /
 /// scale` for a file in the dataset's frame; a file in another local frame is first converted to the dataset's. The log of
 /// the ratio of scales is added to log-scales. A file already in this local frame and in these axes keeps its bits. Rows
 /// whose values overflow f32 are removed; returns how many.
@@ -103,7 +103,7 @@ pub fn to_local(columns: &mut Columns, meta: &SceneMeta, origin: [f64; 3], scale
         ExportFrame::Local => (meta.origin, meta.scale),
         ExportFrame::Dataset => ([0.0; 3], 1.0),
     };
-    let turning = way_back(meta);
+    let turning = inverse_rotation(meta);
     let is_there = file_origin == origin && file_scale == scale;
     if is_there && turning.is_identity() {
         return 0;
@@ -114,7 +114,7 @@ pub fn to_local(columns: &mut Columns, meta: &SceneMeta, origin: [f64; 3], scale
         let moved = |i: usize| if is_there { position[i] } else { (position[i] * file_scale + shift[i]) / scale };
         *mean = [0, 1, 2].map(|i| moved(i) as f32);
     }
-    turn_rest(columns, &turning);
+    rotate_quats_and_sh(columns, &turning);
     if !is_there {
         let log_ratio = libm::log(file_scale / scale);
         for s in &mut columns.scales {
@@ -128,20 +128,20 @@ pub fn to_local(columns: &mut Columns, meta: &SceneMeta, origin: [f64; 3], scale
 
 /// Turns the rows of an upright file back to the axes of the dataset, in the file's frame. Leaves other files unchanged, bit
 /// for bit.
-pub fn turn_back(columns: &mut Columns, meta: &SceneMeta) {
-    let turning = way_back(meta);
+pub fn rotate_back(columns: &mut Columns, meta: &SceneMeta) {
+    let turning = inverse_rotation(meta);
     for mean in columns.means.as_chunks_mut::<3>().0 {
         *mean = turning.position(mean.map(f64::from)).map(|x| x as f32);
     }
-    turn_rest(columns, &turning);
+    rotate_quats_and_sh(columns, &turning);
 }
 
-fn way_back(meta: &SceneMeta) -> GaussianRotation {
+fn inverse_rotation(meta: &SceneMeta) -> GaussianRotation {
     GaussianRotation::new(meta.upright.map_or(Rotation::IDENTITY, |upright| upright.inverse()))
 }
 
 /// Turns quaternions and harmonics.
-fn turn_rest(columns: &mut Columns, turning: &GaussianRotation) {
+fn rotate_quats_and_sh(columns: &mut Columns, turning: &GaussianRotation) {
     if turning.is_identity() {
         return;
     }

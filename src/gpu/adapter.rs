@@ -37,7 +37,6 @@ pub enum DeviceKind {
 pub struct AdapterSummary {
     /// Name given by the driver.
     pub name: String,
-    /// Kind.
     pub kind: DeviceKind,
     /// Graphics API and driver.
     pub backend: String,

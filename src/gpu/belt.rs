@@ -74,7 +74,6 @@ pub(super) struct Belt {
     /// Most staging buffers in one set.
     set_chunks: usize,
     sets: VecDeque<Set>,
-    /// The most sets.
     sets_most: usize,
 }
 
@@ -99,7 +98,7 @@ impl Belt {
             let mut set = Set::default();
             match set.chunk_with_room(&self.pool, self.chunk_bytes, self.set_chunks) {
                 Ok(_) => self.sets.push_front(set),
-                Err(error) if error.lacks_room() => {}
+                Err(error) if error.is_out_of_memory() => {}
                 Err(error) => return Err(error),
             }
         }
@@ -182,7 +181,7 @@ impl Set {
                 match pool.keep("upload staging", chunk_bytes, usage) {
                     Ok(raw) => self.chunks.push(Chunk { raw, state: SharedState::new(MapState::Mapped), used: 0 }),
                     // A smaller set is submitted more often.
-                    Err(error) if error.lacks_room() && !self.chunks.is_empty() => return Ok(None),
+                    Err(error) if error.is_out_of_memory() && !self.chunks.is_empty() => return Ok(None),
                     Err(error) => return Err(error),
                 }
                 self.chunks.len() - 1

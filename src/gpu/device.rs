@@ -82,7 +82,6 @@ pub struct GpuOptions {
     pub bus: Option<EmulatedBus>,
 }
 
-/// An open device.
 pub struct Gpu {
     pub(super) driver: Arc<Driver>,
     pub(super) staging: Arc<Staging>,
@@ -164,7 +163,6 @@ impl Gpu {
         lock(&self.belt).allow_steps_in_flight();
     }
 
-    /// The adapter.
     pub fn summary(&self) -> &AdapterSummary {
         &self.summary
     }

@@ -25,7 +25,6 @@ pub enum GpuError {
     Open {
         /// Name of the adapter.
         device: String,
-        /// The driver's message.
         message: String,
     },
     /// The variable that asks for an emulated bus holds something else.
@@ -33,7 +32,6 @@ pub enum GpuError {
         "{variable}: {text:?} is not a rate and a latency\n  remedy: write for example {variable}=12GB/s,20us, or unset it"
     )]
     EmulatedBus {
-        /// The environment variable.
         variable: &'static str,
         /// What it holds.
         text: String,
@@ -58,7 +56,6 @@ pub enum GpuError {
     OutOfMemory {
         /// Stage or buffer.
         stage: String,
-        /// The driver's message.
         message: String,
     },
     /// The device has no memory for a buffer.
@@ -87,7 +84,6 @@ pub enum GpuError {
     /// One binding is larger than the device, or the test's limit, allows.
     #[error("{stage}: binding {binding} would span {need} bytes; the device allows {limit} in one binding")]
     BindingTooLarge {
-        /// Stage.
         stage: String,
         /// Name of the variable in the shader.
         binding: String,
@@ -99,7 +95,6 @@ pub enum GpuError {
     /// The views do not match the shader, or a copy does not match its source or target.
     #[error("{stage}: {problem}")]
     Bindings {
-        /// Stage.
         stage: String,
         /// The mismatch.
         problem: String,
@@ -109,25 +104,14 @@ pub enum GpuError {
     Shader {
         /// Name of the shader.
         shader: String,
-        /// The problem.
         problem: String,
     },
     /// The API refused a call: a bug in this program.
     #[error("{stage}: the graphics API refused the work: {message}")]
-    Validation {
-        /// Stage.
-        stage: String,
-        /// The API's message.
-        message: String,
-    },
+    Validation { stage: String, message: String },
     /// The device is gone: unplugged, reset by the driver, or hung.
     #[error("{stage}: the device was lost: {message}")]
-    DeviceLost {
-        /// Stage.
-        stage: String,
-        /// The driver's message.
-        message: String,
-    },
+    DeviceLost { stage: String, message: String },
 }
 
 #[cfg(feature = "gpu")]
@@ -151,7 +135,7 @@ impl GpuError {
 impl GpuError {
     /// Whether a buffer or binding was refused for its size before any command that needs it was recorded. The same work in
     /// smaller parts may succeed.
-    pub fn lacks_room(&self) -> bool {
+    pub fn is_out_of_memory(&self) -> bool {
         matches!(
             self,
             GpuError::OutOfBudget { .. }

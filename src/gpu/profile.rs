@@ -18,7 +18,6 @@ const PASSES_MAX: u32 = 1024;
 /// Time of one stage since the device was opened.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageTime {
-    /// The stage's name.
     pub stage: &'static str,
     /// Number of timed passes.
     pub passes: u64,

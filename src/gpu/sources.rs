@@ -15,7 +15,6 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::error::{GpuError, GpuResult};
 
-/// A shader file.
 #[derive(Debug, Clone, Copy)]
 pub struct Source {
     /// Path under `shaders/`, with forward slashes.

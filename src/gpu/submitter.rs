@@ -33,7 +33,6 @@ impl Ticket {
 pub(super) struct Job {
     /// What to write to the buffers of uniforms.
     pub(super) uniforms: Vec<(wgpu::Buffer, Vec<u8>)>,
-    /// The commands.
     pub(super) commands: wgpu::CommandBuffer,
     /// Staging memory to map when the commands are done.
     pub(super) mappings: Vec<Mapping>,

@@ -56,7 +56,6 @@ impl fmt::Display for SsimVariant {
     }
 }
 
-/// The reference picture.
 #[derive(Debug, Clone, Copy)]
 pub enum Reference<'a> {
     /// Interleaved `[height][width][3]`; a byte stands for byte / 255.
@@ -74,7 +73,6 @@ pub struct ImagePair<'a> {
     pub height: usize,
     /// The picture to judge, planar `[3][height][width]`.
     pub rgb: &'a [f32],
-    /// The reference.
     pub reference: Reference<'a>,
     /// One byte per pixel, 0 = excluded; `None`: every pixel is used.
     pub mask: Option<&'a [u8]>,
@@ -96,7 +94,6 @@ impl<'a> ImagePair<'a> {
         }
     }
 
-    /// Number of pixels.
     pub fn pixels(&self) -> usize {
         self.width * self.height
     }

@@ -10,7 +10,6 @@ use crate::scene::page_meta::PageBounds;
 crate::wgsl_struct! {
     /// One page of a batch: `DevicePage` in `shaders/shared/page.wgsl`.
     pub struct DevicePage {
-        /// Rows.
         pub rows: u32,
         /// The slab that holds the page.
         pub slab: u32,

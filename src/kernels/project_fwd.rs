@@ -32,7 +32,6 @@ pub struct Projected {
 }
 
 impl Projected {
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.radii.len()
     }

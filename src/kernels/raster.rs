@@ -28,9 +28,7 @@ pub struct Lists<'a> {
     pub tile_offsets: &'a [u64],
     /// Upper clamp of alpha.
     pub max_alpha: f32,
-    /// Background colour.
     pub background: [f32; 3],
-    /// Instruction path.
     pub simd: SimdPath,
 }
 

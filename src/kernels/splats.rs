@@ -24,9 +24,7 @@ pub struct Grid {
     pub width: u32,
     /// Image height, pixels; at most [`Grid::SIDE_MAX`].
     pub height: u32,
-    /// Tile columns.
     pub tiles_x: u32,
-    /// Tile rows.
     pub tiles_y: u32,
 }
 
@@ -64,7 +62,6 @@ pub struct Splat {
     pub c: f32,
     /// log2 of the opacity.
     pub log2_opacity: f32,
-    /// Colour.
     pub color: [f32; 3],
     /// How far the exponent may fall before no contribution is possible; not positive if none is possible at all.
     pub reach: f32,

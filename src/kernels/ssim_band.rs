@@ -72,7 +72,6 @@ pub(super) struct GradientBand<'a> {
 
 /// One band of one channel; run it with `base::simd::dispatch`.
 pub(super) struct BandKernel<'a> {
-    /// The two pictures.
     pub pair: &'a ImagePair<'a>,
     /// Determines the pixels that the map covers, and the values outside the picture.
     pub variant: SsimVariant,

@@ -1,7 +1,6 @@
 //! The stages of one training step, in execution order. Every backend follows this table: a stage's name is its file stem here and in
 //! `shaders/`, and its key in profiles. The CPU form of a stage that only devices run is in `tests/numerics/twins`.
 
-/// One stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stage {
     /// File stem and profile key.

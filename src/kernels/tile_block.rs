@@ -29,7 +29,6 @@ pub(super) struct Local {
     pub a: f32,
     /// Upper bound of the exponent: the opacity's, or that of the clamp if lower.
     pub top: f32,
-    /// Colour.
     pub color: [f32; 3],
     /// The row of the Gaussian.
     pub row: u32,

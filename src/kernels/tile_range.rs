@@ -17,7 +17,6 @@ pub struct TileRange {
 }
 
 impl TileRange {
-    /// All tiles.
     pub fn all(grid: Grid) -> TileRange {
         TileRange { columns: [0, grid.tiles_x as u16], rows: [0, grid.tiles_y as u16] }
     }
@@ -27,7 +26,6 @@ impl TileRange {
         *self == TileRange::all(grid)
     }
 
-    /// Number of tiles.
     pub fn tiles(&self) -> u32 {
         let [columns, rows] = [self.columns, self.rows].map(|[first, end]| u32::from(end - first));
         columns * rows

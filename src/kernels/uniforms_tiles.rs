@@ -102,7 +102,6 @@ crate::wgsl_struct! {
 
     /// Uniform of `isect_offsets.wgsl`.
     pub struct OffsetsUniforms {
-        /// Number of tiles.
         pub tile_count: u32,
         /// Most intersections.
         pub capacity: u32,
@@ -116,7 +115,6 @@ crate::wgsl_struct! {
     pub struct RasterUniforms {
         /// Width, height, tile columns, tile rows.
         pub grid: [u32; 4],
-        /// Background colour.
         pub background: [f32; 3],
         /// Upper clamp of alpha.
         pub max_alpha: f32,

@@ -220,7 +220,6 @@ impl DriftTables {
 /// Constants for the movement of a value.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct EpsFloor {
-    /// eps.
     pub eps: f32,
     /// The series is valid for second moments greater than this.
     pub floor: f32,

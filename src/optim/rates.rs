@@ -19,7 +19,6 @@ const SETTLES_FROM: f64 = 0.9;
 pub struct Rates {
     /// Positions at step 0, in units of the scene: the nominal rate times the scene scale.
     pub means: f64,
-    /// Rotations.
     pub quats: f64,
     /// Log-scales.
     pub scales: f64,

@@ -142,7 +142,6 @@ impl<'a, const W: usize> Table<'a, W> {
         [low, avx2.load_threes(with_behind(self.scales, row), with_behind(self.sh0, row))]
     }
 
-    /// Number of rows.
     #[inline(always)]
     pub fn rows(&self) -> usize {
         self.opacities.len()

@@ -176,7 +176,7 @@ impl BlockOutliers {
     }
 
     /// Whether both have the same number of views.
-    pub fn is_as_large_as(&self, other: &BlockOutliers) -> bool {
+    pub fn has_same_counts(&self, other: &BlockOutliers) -> bool {
         self.views.len() == other.views.len()
     }
 

@@ -40,7 +40,6 @@ impl BlockGrid {
         self.width.div_ceil(self.side)
     }
 
-    /// Number of blocks.
     pub fn blocks(&self) -> usize {
         self.columns() * self.height.div_ceil(self.side)
     }

@@ -144,7 +144,7 @@ impl ViewOutliers {
     }
 
     /// Whether both have the same number of views.
-    pub fn is_as_large_as(&self, other: &ViewOutliers) -> bool {
+    pub fn has_same_counts(&self, other: &ViewOutliers) -> bool {
         self.views.len() == other.views.len()
     }
 
@@ -204,7 +204,7 @@ impl ViewOutliers {
         let mut found = Vec::new();
         if let (true, Some(most)) = (epoch > 0, USUAL.most(measured)) {
             for (number, view) in self.views.iter_mut().enumerate().filter(|(_, view)| view.is_measured) {
-                if view.judge(f64::from(view.measure) > most) {
+                if view.count_epoch(f64::from(view.measure) > most) {
                     found.push(number);
                 }
             }
@@ -233,7 +233,7 @@ impl ViewOutliers {
 
 impl ViewState {
     /// Counts an epoch; whether the view has become an outlier.
-    fn judge(&mut self, is_outlier: bool) -> bool {
+    fn count_epoch(&mut self, is_outlier: bool) -> bool {
         let was_named = self.is_named;
         self.strikes = if is_outlier { (self.strikes + 1).min(STRIKES_MOST) } else { self.strikes.saturating_sub(1) };
         self.is_named = if was_named { self.strikes > 0 } else { self.strikes >= STRIKES_NAMED };

@@ -100,10 +100,26 @@ impl Pager {
     /// Begins to read the pages of the next batch of the present step, as far as frames of pages that the step does not need
     /// earlier can be had, and bytes in flight allow it. Never blocks. Calling it again continues.
     pub fn prefetch_batch(&mut self, pages: &[PageNo]) {
+        self.prefetch_for(pages, Asker::Step);
+    }
+
+    /// As [`Pager::prefetch_batch`], between steps: of pages that are acquired next.
+    pub fn prefetch_pages(&mut self, pages: impl Iterator<Item = PageNo>) {
         if self.transfers == Transfers::Demand || !self.mover.has_store() {
             return;
         }
-        self.settle_for_nobody(false);
+        let pages: Vec<PageNo> = pages.collect();
+        // So that none of them is evicted for another one.
+        self.set_use_in_step(0, pages.iter().copied(), UseInStep::Coming);
+        self.prefetch_for(&pages, Asker::Other);
+        self.end_batches();
+    }
+
+    fn prefetch_for(&mut self, pages: &[PageNo], asker: Asker) {
+        if self.transfers == Transfers::Demand || !self.mover.has_store() {
+            return;
+        }
+        self.poll_completions(false);
         self.write_frozen();
         let mut lacking = 0;
         for &page in pages {
@@ -119,14 +135,16 @@ impl Pager {
                     Some(victim) => {
                         lacking += 1;
                         if self.frames.count(FrameState::Writing) < lacking && self.mover.may_write_ahead() {
-                            self.clean_early(victim);
+                            self.write_back_early(victim);
                         }
                         continue;
                     }
                     None => break,
                 }
             }
-            self.begin_read(page, true);
+            if self.begin_read(page, true) {
+                self.count_read(page, asker);
+            }
         }
         self.mover.begin_writes();
     }

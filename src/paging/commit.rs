@@ -54,27 +54,27 @@ impl Pager {
     /// A page could not be written. It is still in memory, and the call may be repeated.
     pub fn flush(&mut self) -> Result<(), PagingError> {
         debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
-        self.thaw();
+        self.abort_cut();
         // Pages whose write failed are still dirty: they are written again here.
         self.mover.take_failure();
         self.mover.resume_writes();
-        self.settle_below(1)?;
+        self.wait_until_below(1)?;
         let mut dirty: Vec<PageNo> =
             self.frames.held().map(|(_, held)| held.page).filter(|&p| self.frames.is_dirty(p)).collect();
         dirty.sort_unstable();
         for page in dirty {
-            self.settle_below(WRITES_IN_FLIGHT)?;
+            self.wait_until_below(WRITES_IN_FLIGHT)?;
             self.begin_write(page, false).map_err(|f| f.error)?;
         }
-        self.settle_below(1)
+        self.wait_until_below(1)
     }
 
     /// Waits until fewer than `most` transfers are in flight and another page may be encoded. Failed reads are ignored: the page
     /// is read when it is needed.
-    pub(super) fn settle_below(&mut self, most: usize) -> Result<(), PagingError> {
+    pub(super) fn wait_until_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first_error = None;
         while self.mover.in_flight() >= most || !self.mover.has_staging() {
-            for Failure { is_write, error, .. } in self.settle(true, &mut Vec::new()) {
+            for Failure { is_write, error, .. } in self.collect_completions(true, &mut Vec::new()) {
                 if is_write {
                     first_error.get_or_insert(error);
                 }
@@ -110,8 +110,10 @@ impl Pager {
     /// A write that ended meanwhile had failed.
     pub fn freeze(&mut self) -> Result<(), PagingError> {
         debug_assert_eq!(self.frames.count(FrameState::Pinned), 0, "a step holds pages");
-        self.thaw();
-        if let Some(Failure { error, .. }) = self.settle(false, &mut Vec::new()).into_iter().find(|f| f.is_write) {
+        self.abort_cut();
+        if let Some(Failure { error, .. }) =
+            self.collect_completions(false, &mut Vec::new()).into_iter().find(|f| f.is_write)
+        {
             return Err(error);
         }
         let Some(store) = self.mover.store_mut() else { return Ok(()) };
@@ -121,8 +123,8 @@ impl Pager {
     }
 
     /// Gives up a cut that is not committed.
-    pub fn thaw(&mut self) {
-        self.cuts.thaw();
+    pub fn abort_cut(&mut self) {
+        self.cuts.abort();
     }
 
     /// Whether there is a cut that is not committed yet; a failed write has given it up.
@@ -168,10 +170,10 @@ impl Pager {
     /// A page could not be written: the cut is given up.
     pub fn finish_frozen(&mut self) -> Result<(), PagingError> {
         while let Some(page) = self.cuts.next_waiting() {
-            self.settle_below(WRITES_IN_FLIGHT)?;
+            self.wait_until_below(WRITES_IN_FLIGHT)?;
             self.begin_write(page, false).map_err(|f| f.error)?;
         }
-        self.settle_below(1)
+        self.wait_until_below(1)
     }
 
     /// Commits the cut, right after [`Pager::finish_frozen`]; returns its generation and the bytes that were written for
@@ -191,7 +193,7 @@ impl Pager {
         if let Some(page) = lost {
             return Err(nowhere(page));
         }
-        changes.extend(self.cuts.gone_from(&now));
+        changes.extend(self.cuts.removed_since(&now));
         let Some(store) = self.mover.store_mut() else { return Ok(None) };
         let cut = Cut { changes: &changes, run_state, note, pin: None };
         let result = commits.commit_cut(store, &mut Vec::new(), generation, &cut);

@@ -87,7 +87,7 @@ impl Cuts {
     }
 
     /// Gives up a cut that is not committed.
-    pub fn thaw(&mut self) {
+    pub fn abort(&mut self) {
         self.frozen = None;
     }
 
@@ -158,12 +158,12 @@ impl Cuts {
             now.insert(meta.id, slot.generation);
             changes.extend(self.change(meta, slot));
         }
-        changes.extend(self.gone_from(&now));
+        changes.extend(self.removed_since(&now));
         Ok((changes, now))
     }
 
     /// Pages that the drive may hold as the last commit and that `now` has not.
-    pub fn gone_from<'a>(&'a self, now: &'a Versions) -> impl Iterator<Item = PageChange> + 'a {
+    pub fn removed_since<'a>(&'a self, now: &'a Versions) -> impl Iterator<Item = PageChange> + 'a {
         let not_yet_named = self.unsure.iter().filter(|page| !self.committed.contains_key(page));
         let gone = self.committed.keys().chain(not_yet_named).filter(|page| !now.contains_key(page));
         gone.map(|&page| PageChange { page, version: None::<(SlotRef, Vec<u8>)> })
@@ -248,7 +248,7 @@ mod tests {
         }
         assert!(cuts.is_written() && cuts.next_waiting().is_none());
         let Frozen { generation, mut changes, now, nowhere, .. } = cuts.take().unwrap();
-        changes.extend(cuts.gone_from(&now));
+        changes.extend(cuts.removed_since(&now));
         assert_eq!((generation, nowhere, now.len()), (2, None, 4));
         assert_eq!(named(&changes), [1, 3, 2, 9].map(PageId::initial));
         // A commit at once names the same pages.
@@ -265,7 +265,7 @@ mod tests {
         cuts.freeze(2, &index, &frames);
         assert_eq!(cuts.take().unwrap().nowhere, Some(PageId::initial(3)));
         cuts.freeze(2, &index, &frames);
-        cuts.thaw();
+        cuts.abort();
         assert!(!cuts.is_frozen() && !cuts.is_written());
     }
 }

@@ -30,15 +30,12 @@ pub enum PagingError {
     /// No room on the drive for pages that a step will write back.
     #[error("making room for {pages} pages failed: {source}")]
     Room {
-        /// Pages.
         pages: u64,
         /// What the store said.
         source: PageError,
     },
-    /// The store failed.
     #[error("{doing} page {page} failed: {source}")]
     Store {
-        /// The page.
         page: PageId,
         /// `reading` or `writing`.
         doing: &'static str,

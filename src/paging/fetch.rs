@@ -56,11 +56,11 @@ impl Pager {
     }
 
     fn fetch_into(&mut self, fetch: &mut Fetch, pages: &[PageNo]) -> Result<(), PagingError> {
-        let failures = self.settle(false, &mut Vec::new());
+        let failures = self.collect_completions(false, &mut Vec::new());
         pages.iter().for_each(|&page| self.pin_into(fetch, page));
         fetch.frozen = fetch.outstanding.keys().copied().filter(|&page| self.cuts.holds(page)).collect();
         let frozen = fetch.frozen.len();
-        self.judge(fetch, failures)?;
+        self.handle_failures(fetch, failures)?;
         let is_absent = |page: &PageNo| self.frames.state(*page).is_none();
         let mut to_read: VecDeque<PageNo> = pages.iter().copied().filter(is_absent).collect();
         if fetch.asker.is_step() {
@@ -90,15 +90,15 @@ impl Pager {
             let mut ended = Vec::new();
             let is_delayed = self.cuts.delays(fetch.outstanding.keys().copied());
             let started = Instant::now();
-            let failures = self.settle_for(fetch.asker, &mut ended);
+            let failures = self.wait_for_completion(fetch.asker, &mut ended);
             self.counters.commit_seconds += if is_delayed { started.elapsed().as_secs_f64() } else { 0.0 };
             ended.into_iter().for_each(|page| self.pin_into(fetch, page));
-            self.judge(fetch, failures)?;
+            self.handle_failures(fetch, failures)?;
         }
     }
 
     /// Counts the bytes of a read that has begun for an asker that is no step.
-    fn count_read(&mut self, page: PageNo, asker: Asker) {
+    pub(super) fn count_read(&mut self, page: PageNo, asker: Asker) {
         if !asker.is_step() {
             let bytes = self.index.slot(page).map_or(0, |slot| slot.transfer_bytes() as u64);
             self.counters.stats.other_bytes_read += bytes;
@@ -111,7 +111,7 @@ impl Pager {
         while let Some(&page) = fetch.frozen.front() {
             if self.may_write_frozen(page) {
                 if let Err(Failure { error, .. }) = self.begin_write(page, true) {
-                    self.mover.stop_writes(error, fetch.asker.minds_writes())?;
+                    self.mover.stop_writes(error, fetch.asker.fails_on_write_error())?;
                 }
             } else if self.cuts.holds(page) {
                 // As many are being written as may be at once.
@@ -134,12 +134,12 @@ impl Pager {
 
     /// Failures end the fetch when they are about a page that it needs, or when a step would go on although pages
     /// cannot be written any more.
-    fn judge(&mut self, fetch: &mut Fetch, failures: Vec<Failure>) -> Result<(), PagingError> {
+    fn handle_failures(&mut self, fetch: &mut Fetch, failures: Vec<Failure>) -> Result<(), PagingError> {
         for Failure { page, is_write, error } in failures {
             if is_write {
                 // It is in memory again.
                 self.pin_into(fetch, page);
-                self.mover.stop_writes(error, fetch.asker.minds_writes())?;
+                self.mover.stop_writes(error, fetch.asker.fails_on_write_error())?;
             } else if fetch.outstanding.contains_key(&page) {
                 return Err(error);
             }
@@ -167,10 +167,10 @@ impl Pager {
                 Some(_) if !self.mover.has_staging() => return Ok(false),
                 Some(victim) if self.mover.has_store() => {
                     if let Err(Failure { error, .. }) = self.begin_write(victim.page, false) {
-                        self.mover.stop_writes(error, asker.minds_writes())?;
+                        self.mover.stop_writes(error, asker.fails_on_write_error())?;
                     }
                 }
-                _ if !asker.minds_writes()
+                _ if !asker.fails_on_write_error()
                     && self.mover.are_writes_stopped()
                     && self.mover.in_flight() == 0
                     && self.frames.held_by_callers() == 0 =>
@@ -217,7 +217,7 @@ impl Pager {
             if self.mover.in_flight() == 0 {
                 return Err(self.working_set("a page that splits", self.frames.frames_max() + 1));
             }
-            for Failure { is_write, error, .. } in self.settle_for(asker, &mut Vec::new()) {
+            for Failure { is_write, error, .. } in self.wait_for_completion(asker, &mut Vec::new()) {
                 if is_write {
                     self.mover.stop_writes(error, true)?;
                 }
@@ -231,7 +231,7 @@ impl Pager {
         if self.frames.has_free() || !self.mover.has_store() {
             return Ok(());
         }
-        for Failure { is_write, error, .. } in self.settle(false, &mut Vec::new()) {
+        for Failure { is_write, error, .. } in self.collect_completions(false, &mut Vec::new()) {
             if is_write {
                 self.mover.stop_writes(error, true)?;
             }

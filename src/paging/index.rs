@@ -36,7 +36,6 @@ impl PageIndex {
         self.meta(page).rows > 0
     }
 
-    /// Adds a page.
     pub fn push(&mut self, meta: PageMeta, slot: Option<SlotRef>) -> PageNo {
         self.metas.push(meta);
         self.slots.push(slot);

@@ -150,7 +150,7 @@ impl Pager {
             match self.make_room(0, Asker::Step) {
                 Ok(true) => {}
                 Ok(false) if self.mover.in_flight() == 0 => return,
-                Ok(false) => self.settle_for_nobody(true),
+                Ok(false) => self.poll_completions(true),
                 Err(error) => {
                     self.mover.keep_failure(error);
                     return;

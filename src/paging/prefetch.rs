@@ -26,7 +26,7 @@ impl Pager {
         if self.transfers == Transfers::Demand {
             return;
         }
-        self.settle_for_nobody(false);
+        self.poll_completions(false);
         if !self.mover.has_store() {
             return;
         }
@@ -45,7 +45,9 @@ impl Pager {
             if !self.mover.may_read_ahead() {
                 break;
             }
-            if self.frames.state(admit.page).is_none() && !self.bring(admit, &mut clean, step) && admit.step == step + 1
+            if self.frames.state(admit.page).is_none()
+                && !self.begin_prefetch(admit, &mut clean, step)
+                && admit.step == step + 1
             {
                 lacking += 1;
             }
@@ -54,7 +56,7 @@ impl Pager {
         self.look_ahead.return_admits(admits);
         self.mover.begin_writes();
         while self.transfers == Transfers::Ahead && self.mover.in_flight() > 0 {
-            self.settle_for_nobody(true);
+            self.poll_completions(true);
         }
     }
 
@@ -66,7 +68,7 @@ impl Pager {
             let now = leaves.and_then(|page| self.frames.as_victim(page)).filter(|v| v.next_use > *step);
             match now {
                 Some(victim) if !victim.dirty => clean.push_back(victim),
-                Some(victim) if self.mover.may_write_ahead() => self.clean_early(victim),
+                Some(victim) if self.mover.may_write_ahead() => self.write_back_early(victim),
                 _ => {}
             }
         }
@@ -74,7 +76,7 @@ impl Pager {
     }
 
     /// Begins to read a coming page, into a free frame or that of an evicted page; `false` if there is neither.
-    fn bring(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
+    fn begin_prefetch(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
         if !self.frames.has_free() {
             let leaves = std::iter::from_fn(|| clean.pop_front()).find(|v| v.next_use > admit.step);
             // The next step may also evict any page that is not needed for long. That page may be read once more than by a cache
@@ -93,11 +95,11 @@ impl Pager {
             && self.mover.may_write_ahead()
             && let Some(victim) = self.frames.dirty_victim().filter(|v| is_far(v, step))
         {
-            self.clean_early(victim);
+            self.write_back_early(victim);
         }
     }
 
-    pub(super) fn clean_early(&mut self, victim: Victim) {
+    pub(super) fn write_back_early(&mut self, victim: Victim) {
         if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
             // The next step gets the error.
             let _ = self.mover.stop_writes(error, false);

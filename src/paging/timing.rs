@@ -31,7 +31,7 @@ impl Asker {
     }
 
     /// Whether a failed write ends the call.
-    pub fn minds_writes(self) -> bool {
+    pub fn fails_on_write_error(self) -> bool {
         self == Asker::Step
     }
 }

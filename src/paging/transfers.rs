@@ -47,7 +47,7 @@ impl Pager {
                 Ok(())
             }
             Err((source, buffer)) => {
-                self.cuts.thaw();
+                self.cuts.abort();
                 self.frames.finish_write(page, buffer, false);
                 Err(self.failure(page, true, source))
             }
@@ -76,9 +76,9 @@ impl Pager {
     }
 
     /// Takes the ends of transfers and waits for one, if any is in flight; the time counts as waited by `asker`.
-    pub(super) fn settle_for(&mut self, asker: Asker, ended: &mut Vec<PageNo>) -> Vec<Failure> {
+    pub(super) fn wait_for_completion(&mut self, asker: Asker, ended: &mut Vec<PageNo>) -> Vec<Failure> {
         let before = self.counters.stats.stall_seconds;
-        let failures = self.settle(true, ended);
+        let failures = self.collect_completions(true, ended);
         let stats = &mut self.counters.stats;
         if !asker.is_step() {
             stats.other_stall_seconds += stats.stall_seconds - before;
@@ -89,7 +89,7 @@ impl Pager {
 
     /// Takes the ends of transfers; with `wait`, blocks until one has ended, if any is in flight, and counts the time.
     /// `ended` gets the pages whose transfer ended well.
-    pub(super) fn settle(&mut self, wait: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {
+    pub(super) fn collect_completions(&mut self, wait: bool, ended: &mut Vec<PageNo>) -> Vec<Failure> {
         if !self.mover.has_store() {
             return Vec::new();
         }
@@ -112,7 +112,7 @@ impl Pager {
                     continue;
                 }
                 (Err(source), Direction::Write) => {
-                    self.cuts.thaw();
+                    self.cuts.abort();
                     self.frames.finish_write(page, buffer, false);
                     failures.push(self.failure(page, true, source));
                     continue;
@@ -124,8 +124,8 @@ impl Pager {
     }
 
     /// Takes the ends of transfers that nobody waits for.
-    pub(super) fn settle_for_nobody(&mut self, wait: bool) {
-        for Failure { is_write, error, .. } in self.settle(wait, &mut Vec::new()) {
+    pub(super) fn poll_completions(&mut self, wait: bool) {
+        for Failure { is_write, error, .. } in self.collect_completions(wait, &mut Vec::new()) {
             if is_write {
                 // The next step gets the error.
                 let _ = self.mover.stop_writes(error, false);

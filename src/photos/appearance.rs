@@ -94,7 +94,7 @@ impl PhotoParameter for Appearance {
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
         let (state, first_exposures) = decoded(saved)?;
-        if state.is_as_large_as(&self.state) {
+        if state.has_same_counts(&self.state) {
             (self.state, self.first_exposures) = (state, first_exposures);
         }
         Ok(())

@@ -71,7 +71,7 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, BlockOutliers::check, BlockOutliers::is_as_large_as)
+        saved.restore(&mut self.state, BlockOutliers::check, BlockOutliers::has_same_counts)
     }
 
     fn needs_host(&self) -> bool {

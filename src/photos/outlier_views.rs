@@ -87,7 +87,7 @@ impl PhotoParameter for OutlierViews {
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
         let saved = decoded(saved)?;
-        if saved.is_as_large_as(&self.state) {
+        if saved.has_same_counts(&self.state) {
             self.state = saved;
         }
         Ok(())
@@ -98,7 +98,7 @@ impl PhotoParameter for OutlierViews {
     }
 
     /// Every [`MEASURED_EVERY`]th epoch such a view is compared with its photo, so that it can return.
-    fn gives_turn_away(&self, view: usize, step: u32) -> bool {
+    fn is_replaced_at(&self, view: usize, step: u32) -> bool {
         let epoch = step / self.train_views.max(1);
         self.leaves_out(view) && !(epoch as usize + view).is_multiple_of(MEASURED_EVERY)
     }
@@ -353,8 +353,8 @@ mod tests {
     #[test]
     fn a_view_that_is_left_out_keeps_one_turn_in_four() {
         let outliers = outliers(&[3]);
-        let kept: Vec<u32> = (0..8).filter(|epoch| !outliers.gives_turn_away(3, 10 * epoch + 7)).collect();
+        let kept: Vec<u32> = (0..8).filter(|epoch| !outliers.is_replaced_at(3, 10 * epoch + 7)).collect();
         assert_eq!(kept, [1, 5]);
-        assert!((0..80).all(|step| !outliers.gives_turn_away(4, step)));
+        assert!((0..80).all(|step| !outliers.is_replaced_at(4, step)));
     }
 }

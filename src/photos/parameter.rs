@@ -30,7 +30,6 @@ pub struct Kind {
     pub file: Option<&'static str>,
     /// Its parameters in a run that has seen nothing; `None` in a run without it.
     pub first: fn(&PhotoOptions, &Dataset) -> Option<Box<dyn PhotoParameter>>,
-    /// Checks saved values.
     pub check: fn(&Encoded) -> Result<(), ValuesError>,
     /// What the report of a run says about it.
     pub section: Section,
@@ -46,7 +45,6 @@ pub fn steps_after_reset(events: &EventLog, step: u32) -> Option<u32> {
 /// A coming step, or the rehearsal of one.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoStep<'a> {
-    /// The view.
     pub view: usize,
     /// Steps done.
     pub step: u32,
@@ -73,7 +71,6 @@ impl PhotoStep<'_> {
 /// A step that was done.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoOutcome<'a> {
-    /// The view.
     pub view: usize,
     /// The step, from 0.
     pub step: u32,
@@ -87,7 +84,6 @@ pub struct PhotoOutcome<'a> {
     pub after_reset: Option<u32>,
     /// Mean squared error of the picture, of values in 0..1.
     pub mse: f64,
-    /// The photo.
     pub photo: &'a Target,
     /// The dataset, for names.
     pub dataset: &'a Dataset,
@@ -139,7 +135,7 @@ pub trait PhotoParameter {
     }
 
     /// Whether another view trains at `step` in the turn of this view.
-    fn gives_turn_away(&self, _view: usize, _step: u32) -> bool {
+    fn is_replaced_at(&self, _view: usize, _step: u32) -> bool {
         false
     }
 

@@ -59,7 +59,7 @@ impl PhotoParameter for Poses {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, PoseState::check, PoseState::is_as_large_as)
+        saved.restore(&mut self.state, PoseState::check, PoseState::has_same_counts)
     }
 
     fn camera(&self, view: usize, camera: Camera) -> Camera {

@@ -56,10 +56,10 @@ impl Encoded {
         &self,
         values: &mut T,
         check: impl Fn(&T) -> Result<(), &'static str>,
-        is_as_large_as: impl Fn(&T, &T) -> bool,
+        has_same_counts: impl Fn(&T, &T) -> bool,
     ) -> Result<(), ValuesError> {
         let saved = self.decoded(check)?;
-        if is_as_large_as(&saved, values) {
+        if has_same_counts(&saved, values) {
             *values = saved;
         }
         Ok(())

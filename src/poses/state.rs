@@ -86,7 +86,7 @@ impl PoseState {
     }
 
     /// Whether the motions are of as many photos as `other`.
-    pub fn is_as_large_as(&self, other: &PoseState) -> bool {
+    pub fn has_same_counts(&self, other: &PoseState) -> bool {
         self.views.len() == other.views.len()
     }
 

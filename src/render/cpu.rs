@@ -38,7 +38,6 @@ use std::time::Instant;
 /// Counters of the last view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RenderStats {
-    /// Visible rows.
     pub visible: u64,
     /// Intersections of rows and tiles.
     pub isects: u64,

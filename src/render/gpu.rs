@@ -198,7 +198,7 @@ impl GpuRenderer {
         let mut view = self.view.take().ok_or(RenderError::OutOfOrder { call, needs: "picture" })?;
         let result = loop {
             match stage(self, &mut view) {
-                Err(RenderError::Device(error)) if error.lacks_room() => match self.give_back(&mut view) {
+                Err(RenderError::Device(error)) if error.is_out_of_memory() => match self.give_back(&mut view) {
                     Ok(true) => {}
                     Ok(false) => break Err(error.into()),
                     Err(other) => break Err(other.into()),
@@ -267,7 +267,7 @@ pub(super) fn submit_batch(
 ) -> GpuResult<RowsIn> {
     if is_whole {
         match submit_whole((gpu, stages, tiles), rows, view) {
-            Err(error) if error.lacks_room() => {}
+            Err(error) if error.is_out_of_memory() => {}
             submitted => return submitted,
         }
     }

@@ -9,7 +9,6 @@ use crate::kernels::image_loss::{LossPlan, LossValue};
 use crate::kernels::uniforms::LossUniforms;
 use std::sync::Arc;
 
-/// The compiled stage.
 #[derive(Debug)]
 pub struct LossStage {
     ssim_map: Arc<Pipeline>,

@@ -21,12 +21,12 @@ use crate::kernels::page_words::{PageResult, PageSurvey};
 use crate::scene::optimizer_numbers::StepNumbers;
 
 fn held_mut(pages: &mut Option<Box<DevicePages>>) -> Result<&mut DevicePages, RenderError> {
-    pages.as_deref_mut().ok_or(RenderError::OutOfOrder { call: "pages", needs: "hold_pages" })
+    pages.as_deref_mut().ok_or(RenderError::OutOfOrder { call: "pages", needs: "prepare_page_storage" })
 }
 
 impl GpuRenderer {
     fn held(&self) -> Result<&DevicePages, RenderError> {
-        self.pages.as_deref().ok_or(RenderError::OutOfOrder { call: "pages", needs: "hold_pages" })
+        self.pages.as_deref().ok_or(RenderError::OutOfOrder { call: "pages", needs: "prepare_page_storage" })
     }
 
     /// Updates the rows of the segments of a batch: at once where the columns are still on the device, else in chunks.
@@ -45,7 +45,7 @@ impl GpuRenderer {
                     return self.update_chunk(view, &source, (segment, 0, &all), &columns, &room, (results, collects));
                 }
                 // The rows are gathered again, in chunks.
-                (Err(error), _) if !error.lacks_room() => return Err(error),
+                (Err(error), _) if !error.is_out_of_memory() => return Err(error),
                 _ => {}
             }
         }
@@ -141,7 +141,7 @@ impl GpuRenderer {
 }
 
 impl PageRenderer for GpuRenderer {
-    fn hold_pages(&mut self, rules: &PageRules) -> Result<(), RenderError> {
+    fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError> {
         self.drop_view();
         self.pages = None; // frees the slots
         self.pages = Some(Box::new(DevicePages::new(&self.gpu, rules)?));

@@ -43,7 +43,6 @@ fn parts() -> impl Iterator<Item = Part> {
     narrow.into_iter().map(|column| (column, column.width(0), 0)).chain(bands)
 }
 
-/// The compiled stages.
 #[derive(Debug)]
 pub(super) struct Stages {
     pub(super) cull: Arc<Pipeline>,
@@ -63,7 +62,6 @@ pub(super) struct Stages {
 /// The pages of a run on a device.
 #[derive(Debug)]
 pub struct DevicePages {
-    /// The slots.
     pub slots: Slots,
     pub(super) stages: Stages,
     rules: PageRules,

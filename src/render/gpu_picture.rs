@@ -74,7 +74,7 @@ impl GpuRenderer {
                     return Ok(View::new(of, segments, Some(columns), pixels, Lists::Whole(Box::new(lists))));
                 }
                 // Smaller views may need less than the largest so far.
-                Err(error) if error.lacks_room() => self.tiles.halve_capacity(),
+                Err(error) if error.is_out_of_memory() => self.tiles.halve_capacity(),
                 Err(error) => return Err(error),
             }
         }
@@ -111,7 +111,7 @@ impl GpuRenderer {
             let recorded = fits.and_then(|_| self.frame_again(view, blend));
             match recorded {
                 Ok(()) => {}
-                Err(error) if error.lacks_room() => {
+                Err(error) if error.is_out_of_memory() => {
                     self.tiles.halve_capacity();
                     view.columns = None;
                     self.draw_in_ranges(view)?;

@@ -29,7 +29,6 @@ pub(super) const PLACE_BYTES: u64 = 8;
 /// Words of the demand of one range: intersections, longest list, splats.
 const DEMAND_WORDS: u32 = 3;
 
-/// The compiled stages.
 #[derive(Debug)]
 pub(super) struct RangeStages {
     tally: Arc<Pipeline>,
@@ -96,7 +95,9 @@ impl Ranges<'_> {
             match self.blend_all(segments, &mut planned) {
                 Ok(true) => return Ok(planned),
                 Ok(false) => tally.slack = 2 * tally.slack + 64,
-                Err(error) if error.lacks_room() && planned.iter().any(|range| range.can_be_cut) => limits.bytes /= 2,
+                Err(error) if error.is_out_of_memory() && planned.iter().any(|range| range.can_be_cut) => {
+                    limits.bytes /= 2
+                }
                 Err(error) => return Err(error),
             }
         }
@@ -117,7 +118,7 @@ impl Ranges<'_> {
         loop {
             zero_gradients(self.gpu, segments)?;
             match self.back_all(segments, planned, picture) {
-                Err(error) if error.lacks_room() && planned.iter().any(|range| range.can_be_cut) => {
+                Err(error) if error.is_out_of_memory() && planned.iter().any(|range| range.can_be_cut) => {
                     bytes = (bytes / 2).min(self.gpu.room() / 2);
                     *planned = self.draw(segments, bytes)?;
                 }

@@ -23,7 +23,7 @@ use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
 use super::gpu_segments::Segment;
 use super::gpu_view::{DemandState, InFlight, Lists, LossSums, Recorded, View, WholeLists, blend_of};
 use super::pages::{RecordedUpdate, SlotPage, StepDone, StepJob};
-use super::{RenderError, Renderer, RowBatches};
+use super::{RenderError, Renderer, RowBatches, none_if_out_of_memory};
 use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder, groups_1d};
 use crate::kernels::gate::{GateUniforms, StepVerdict};
 use crate::kernels::page_words::PageResult;
@@ -34,15 +34,6 @@ use bytemuck::Zeroable;
 
 /// Bytes of a listed row: number of the page, number of the row.
 const LISTED_BYTES: u64 = 8;
-
-/// `None` where memory is short.
-fn unless_short<T>(done: Result<T, RenderError>) -> Result<Option<T>, RenderError> {
-    match done {
-        Ok(done) => Ok(Some(done)),
-        Err(RenderError::Device(error)) if error.lacks_room() => Ok(None),
-        Err(error) => Err(error),
-    }
-}
 
 impl DevicePages {
     /// Records the list of the rows that the camera may draw, with room for `rows` rows. Returns it with the counts of the pages and
@@ -79,13 +70,14 @@ impl GpuRenderer {
         }
         self.begin_view(job.camera, job.options, RowBatches::One)?;
         let recorded = self.rows_and_picture(job, room);
-        self.or_no_step(recorded)
+        self.false_if_out_of_memory(recorded)
     }
 
     fn rows_and_picture(&mut self, job: &StepJob<'_>, room: FrameRoom) -> Result<(), RenderError> {
         let (of, _) = self.sequence.rows_in(job.rows_room as usize, job.options.sh_degree)?;
         self.sequence.picture()?;
-        let held = self.pages.as_deref().ok_or(RenderError::OutOfOrder { call: "pages", needs: "hold_pages" })?;
+        let held =
+            self.pages.as_deref().ok_or(RenderError::OutOfOrder { call: "pages", needs: "prepare_page_storage" })?;
         let (gpu, blend, camera, count) = (&self.gpu, blend_of(&of), &of.camera, job.rows_room);
         let mut recorder = gpu.begin("forward");
         let mut view = held.begin_in(&mut recorder, camera, job.numbers)?;
@@ -119,11 +111,11 @@ impl GpuRenderer {
         // A view that has given memory back takes other ways than the recorded one.
         let is_whole = |view: &View| view.columns.is_some() && view.tiles_back.is_some();
         if recorded.is_ok() && !self.view.as_ref().is_some_and(is_whole) {
-            return self.or_no_step(Ok(())).map(|_| false);
+            return self.false_if_out_of_memory(Ok(())).map(|_| false);
         }
         let in_flight = recorded.and_then(|()| self.back_and_update(update));
         let in_flight = in_flight.map(|step| self.in_flight.push_back(step));
-        let done = self.or_no_step(in_flight);
+        let done = self.false_if_out_of_memory(in_flight);
         self.drop_view();
         self.records = None;
         done
@@ -192,12 +184,12 @@ impl GpuRenderer {
     }
 
     /// Gives up the view of a step that could not be recorded; false where memory is short.
-    fn or_no_step(&mut self, recorded: Result<(), RenderError>) -> Result<bool, RenderError> {
+    fn false_if_out_of_memory(&mut self, recorded: Result<(), RenderError>) -> Result<bool, RenderError> {
         if recorded.is_err() {
             self.drop_view();
             self.records = None;
         }
-        Ok(unless_short(recorded)?.is_some())
+        Ok(none_if_out_of_memory(recorded)?.is_some())
     }
 
     /// Waits for the first step in flight.

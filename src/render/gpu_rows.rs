@@ -35,7 +35,6 @@ pub(super) const ROWS_OF_THREAD: usize = 4096;
 /// Columns of rows on the device, or the gradients of the columns.
 #[derive(Debug)]
 pub struct DeviceColumns {
-    /// Rows.
     pub rows: u32,
     /// `[rows][3]`.
     pub means: Buffer,
@@ -229,7 +228,6 @@ impl<'a> From<&'a Buffer> for SplatRows<'a> {
 pub(super) struct Window {
     /// First row.
     pub first: u64,
-    /// Rows.
     pub rows: u32,
 }
 

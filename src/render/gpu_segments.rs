@@ -22,7 +22,6 @@ pub(super) const CHUNK_STEP: usize = WINDOW_STEP as usize;
 pub(super) struct Segment {
     /// The number, in the view, of the first row.
     pub first: usize,
-    /// Rows.
     pub rows: u32,
     /// `[rows]` records of `shaders/shared/splat.wgsl`.
     pub splats: Buffer,
@@ -40,7 +39,7 @@ pub(super) fn in_chunks(rows: usize, mut stage: impl FnMut(Range<usize>) -> GpuR
         let part = first..rows.min(first + chunk);
         match stage(part.clone()) {
             Ok(()) => first = part.end,
-            Err(error) if error.lacks_room() && chunk > CHUNK_STEP => {
+            Err(error) if error.is_out_of_memory() && chunk > CHUNK_STEP => {
                 chunk = (chunk / 2).next_multiple_of(CHUNK_STEP);
             }
             Err(error) => return Err(error),

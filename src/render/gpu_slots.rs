@@ -51,7 +51,6 @@ impl Slots {
         self.slabs.is_empty()
     }
 
-    /// Number of slots.
     pub fn len(&self) -> u32 {
         self.slabs.last().map_or(0, |slab| slab.first + slab.slots)
     }
@@ -70,8 +69,8 @@ impl Slots {
                     self.slabs.push(Slab { buffer, first: self.len(), slots: next as u32 });
                     added += next;
                 }
-                Err(error) if error.lacks_room() && next > 1 => next /= 2,
-                Err(error) if error.lacks_room() => break,
+                Err(error) if error.is_out_of_memory() && next > 1 => next /= 2,
+                Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
         }
@@ -123,7 +122,7 @@ impl Slots {
             let count = at_once.min(rest.len());
             match self.read_some(gpu, &mut rest[..count]) {
                 Ok(()) => rest = &mut rest[count..],
-                Err(error) if error.lacks_room() && count > 1 => at_once = count / 2,
+                Err(error) if error.is_out_of_memory() && count > 1 => at_once = count / 2,
                 Err(error) => return Err(error),
             }
         }
@@ -143,7 +142,7 @@ impl Slots {
         for (slot, bytes) in slots.iter().take(most as usize) {
             match recorder.read_back("pages", &self.view(*slot, *bytes)?) {
                 Ok(read) => self.under_way.push_back((*slot, read)),
-                Err(error) if error.lacks_room() => break,
+                Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
         }

@@ -52,7 +52,7 @@ fn window_of_sums(gpu: &Gpu, isects: u32, bytes: u64) -> GpuResult<(Buffer, u32)
     let least = isects.div_ceil(WINDOWS_MOST).max(WINDOW_MIN);
     loop {
         match gpu.buffer("sums of intersections", bytes * u64::from(window)) {
-            Err(error) if error.lacks_room() && window > least => window = window.div_ceil(2).max(least),
+            Err(error) if error.is_out_of_memory() && window > least => window = window.div_ceil(2).max(least),
             buffer => return Ok((buffer?, window)),
         }
     }

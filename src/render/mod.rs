@@ -197,6 +197,18 @@ pub enum RenderError {
     Device(#[from] GpuError),
 }
 
+/// `None` where the device has too little memory for the work, which a caller can do in smaller parts or later.
+///
+/// # Errors
+/// Every other error.
+pub(crate) fn none_if_out_of_memory<T>(done: Result<T, RenderError>) -> Result<Option<T>, RenderError> {
+    match done {
+        Ok(done) => Ok(Some(done)),
+        Err(RenderError::Device(error)) if error.is_out_of_memory() => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
 impl RenderError {
     /// What the user can do about the error; `None` when the message itself contains the remedy.
     pub fn remedy(&self) -> Option<&'static str> {

@@ -47,9 +47,7 @@ pub struct StepJob<'a> {
     pub pages: &'a [SlotPage],
     /// The optimizer's numbers of the step.
     pub numbers: &'a StepNumbers,
-    /// The view.
     pub camera: &'a Camera,
-    /// Render options.
     pub options: &'a RenderOptions,
     /// Capacity of the list of rows: an upper bound, or the caller's prediction. A step that lists more rows is not taken.
     pub rows_room: u32,
@@ -60,9 +58,7 @@ pub struct StepJob<'a> {
 /// The second part of a recorded step: loss, backward pass, update.
 #[derive(Debug, Clone, Copy)]
 pub struct RecordedUpdate<'a> {
-    /// The photo.
     pub target: &'a Target,
-    /// The loss.
     pub loss: &'a LossOptions,
     /// Whether statistics are collected.
     pub collects: bool,
@@ -105,7 +101,7 @@ pub trait PageRenderer: Renderer {
     ///
     /// # Errors
     /// Device memory is exhausted.
-    fn hold_pages(&mut self, rules: &PageRules) -> Result<(), RenderError>;
+    fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError>;
 
     /// Device memory that slots and views can still take, bytes; drops the view.
     fn room(&mut self) -> u64;

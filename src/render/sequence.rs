@@ -32,7 +32,6 @@ enum Progress {
     SplatGradients,
 }
 
-/// The current view.
 #[derive(Debug)]
 struct Current {
     view: ViewOptions,
@@ -79,7 +78,6 @@ impl Sequence {
         self.current.as_ref().map(|current| current.view)
     }
 
-    /// Drops the view.
     #[cfg(feature = "gpu")]
     pub fn drop_view(&mut self) {
         self.current = None;

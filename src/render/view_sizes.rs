@@ -10,7 +10,6 @@ pub struct ViewSizes {
     pub rows: u64,
     /// Intersections of splats and tiles.
     pub isects: u64,
-    /// Pixels.
     pub pixels: u64,
 }
 

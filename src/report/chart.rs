@@ -79,16 +79,13 @@ pub struct Series {
     pub name: String,
     /// (x, y).
     pub points: Vec<(f64, f64)>,
-    /// The mark.
     pub mark: Mark,
     /// Number of the colour; numbers beyond the palette repeat it in other shades.
     pub color: usize,
 }
 
-/// A chart.
 #[derive(Debug, Clone, Default)]
 pub struct Chart {
-    /// Title.
     pub title: String,
     /// Name and unit of the x axis.
     pub x: String,
@@ -113,7 +110,6 @@ impl Chart {
         Chart { title, x, y, ..Chart::default() }
     }
 
-    /// Adds a series.
     #[must_use]
     pub fn with(self, name: &str, points: Vec<(f64, f64)>, mark: Mark) -> Chart {
         let color = self.series.len();

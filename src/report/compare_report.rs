@@ -88,7 +88,7 @@ impl Compared {
     }
 
     /// Whether the held-out photos of both runs have the same size, as far as known.
-    fn is_judged_as(&self, other: &Compared) -> bool {
+    fn has_same_photo_size(&self, other: &Compared) -> bool {
         let mut pairs = self.judged_on.into_iter().zip(other.judged_on);
         pairs.all(|(own, other)| own.zip(other).is_none_or(|(own, other)| own == other))
     }
@@ -227,7 +227,8 @@ fn add_table(page: &mut Page, runs: &[Compared]) {
     let first = &runs[0];
     // PSNR on other photos is a different measure.
     let against = |run: &Compared| {
-        let both = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.is_judged_as(first));
+        let both =
+            run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.has_same_photo_size(first));
         both.map(|(own, first)| own - first)
     };
     let number = |run: &Compared, key: &str, digits: usize| Cell::number(run.summary[key].as_f64(), digits);

@@ -8,11 +8,8 @@ use super::record::RunRecord;
 /// Mean and range of a value over seeds.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Spread {
-    /// Mean.
     pub mean: f64,
-    /// Lowest.
     pub low: f64,
-    /// Highest.
     pub high: f64,
 }
 

@@ -105,12 +105,10 @@ impl Page {
         Page { title: title.to_string(), body }
     }
 
-    /// A heading.
     pub fn heading(&mut self, text: &str) {
         self.body += &format!("<h2>{}</h2>\n", escape(text));
     }
 
-    /// A paragraph.
     pub fn paragraph(&mut self, text: &str) {
         self.body += &format!("<p>{}</p>\n", escape(text));
     }
@@ -149,7 +147,6 @@ impl Page {
         self.body += &format!("<figure class=\"{class}\">{svg}<figcaption>{caption}</figcaption></figure>\n");
     }
 
-    /// A table.
     pub fn table<T>(&mut self, rows: &[T], columns: &[Column<'_, T>]) {
         let headings: String = columns.iter().map(|(heading, _)| format!("<th>{}</th>", escape(heading))).collect();
         self.body += &format!("<div class=\"table\"><table><thead><tr>{headings}</tr></thead><tbody>\n");

@@ -8,7 +8,6 @@ use super::html::{Cell, Page};
 pub struct LevelFigures {
     /// Its number; the finest is 0.
     pub level: u32,
-    /// Its Gaussians.
     pub gaussians: u64,
     /// PSNR of held-out photos, dB.
     pub psnr: Option<f64>,

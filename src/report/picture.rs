@@ -26,9 +26,7 @@ const FULL_DIFFERENCE: f32 = 64.0;
 
 /// The pictures of a view as data URIs.
 pub struct ViewPictures {
-    /// The render.
     pub render: String,
-    /// The photo.
     pub photo: String,
     /// The difference map: black for no difference, then red, yellow, and white from a quarter of the range.
     pub difference: String,

@@ -23,7 +23,6 @@ pub struct Pace {
 pub struct RunRecord {
     /// Digest of everything that the figures depend on: scene, settings, seed, program, machine and drive.
     pub key: String,
-    /// The scene.
     pub scene: String,
     /// Group and name in the list of the sweep, such as `order/groups:9`.
     pub name: String,
@@ -32,9 +31,7 @@ pub struct RunRecord {
     pub bits: String,
     /// Config keys that differ from the base, with their values.
     pub settings: BTreeMap<String, String>,
-    /// Seed.
     pub seed: u64,
-    /// Steps.
     pub steps: u32,
     /// Message of a failed run, which has no figures.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -85,9 +82,7 @@ pub struct RunRecord {
     pub view_order: String,
     /// Version of the program.
     pub version: String,
-    /// Worker threads.
     pub threads: u64,
-    /// Processor.
     pub cpu: String,
 }
 

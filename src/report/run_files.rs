@@ -53,9 +53,7 @@ pub enum RunFile {
 pub enum Tells {
     /// How the run began.
     Start,
-    /// Its steps.
     Steps,
-    /// Its result.
     Result,
     /// A later evaluation of its result.
     Evaluation,

@@ -38,7 +38,7 @@ pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, 
     let name = folder.file_name().map_or("run".into(), |n| n.to_string_lossy().into_owned());
     let mut page = Page::new(&format!("gsscale: {name}"), &scene);
     page.tiles(&tiles(&summary, &metrics));
-    if let Some(text) = why_unfinished(folder, &summary) {
+    if let Some(text) = unfinished_text(folder, &summary) {
         page.paragraph(&text);
     }
     page.heading("Training");
@@ -70,7 +70,7 @@ pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, 
 }
 
 /// Says after how many steps a run was stopped and how it goes on; `None` for a finished run.
-fn why_unfinished(folder: &Path, summary: &Value) -> Option<String> {
+fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     if summary["finished"] != false {
         return None;
     }

@@ -154,7 +154,6 @@ impl Columns {
         (rows - kept) as u64
     }
 
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.opacities.len()
     }

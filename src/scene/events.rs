@@ -63,10 +63,8 @@ pub enum EventKind {
     },
     /// Bands up to this degree are rendered from now on. Rows stored without them get zeros.
     RaiseShDegree {
-        /// The degree.
         degree: u8,
     },
-    /// A densification round.
     Densify(RoundThresholds),
     /// A round of long-axis splits and removals.
     LongAxis(LongAxisRound),
@@ -109,7 +107,6 @@ impl EventLog {
         self.events.len() - 1
     }
 
-    /// Number of events.
     pub fn len(&self) -> usize {
         self.events.len()
     }

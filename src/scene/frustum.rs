@@ -188,7 +188,7 @@ pub struct PagePlanes {
 
 impl PagePlanes {
     /// Whether a row within these bounds may be drawn. `schedule::visibility` computes the same for many pages at once.
-    pub fn may_meet(&self, bounds: &PageBounds) -> bool {
+    pub fn may_intersect(&self, bounds: &PageBounds) -> bool {
         if bounds.is_empty() {
             return false;
         }

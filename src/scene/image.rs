@@ -55,7 +55,6 @@ impl Image {
 }
 
 impl Target {
-    /// Number of pixels.
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }

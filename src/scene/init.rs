@@ -84,7 +84,6 @@ pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &
 /// A point with the first size of its Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FirstPoint {
-    /// Position.
     pub point: [f32; 3],
     /// Row among all first Gaussians: part of the key of its random rotation.
     pub row: u32,

@@ -16,9 +16,7 @@ const LIMIT: f32 = 30.0;
 /// The least and the greatest log-scale.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LogScaleRange {
-    /// The least.
     pub low: f32,
-    /// The greatest.
     pub high: f32,
 }
 

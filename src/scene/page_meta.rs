@@ -37,7 +37,6 @@ impl PageBounds {
 pub struct PageMeta {
     /// Id by lineage.
     pub id: PageId,
-    /// Number of rows.
     pub rows: u32,
     /// SH degree of the stored page.
     pub sh_degree: u8,

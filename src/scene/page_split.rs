@@ -15,7 +15,6 @@ use crate::base::ids::PageId;
     "page {page} cannot be split any further\n  remedy: use larger pages (--page-rows) or fewer Gaussians (--max-gaussians)"
 )]
 pub struct SplitTooDeep {
-    /// The page's id.
     pub page: PageId,
 }
 

@@ -25,9 +25,7 @@ const FILL_PERCENT: usize = 70;
 
 /// An entry to divide: it has a position and a unique row number.
 pub trait Placed: Copy + Send + Sync {
-    /// Position.
     fn point(&self) -> [f32; 3];
-    /// Row number.
     fn row(&self) -> u32;
 }
 
@@ -43,9 +41,7 @@ impl Placed for PointRow {
 /// A position and its row number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointRow {
-    /// Position.
     pub point: [f32; 3],
-    /// Row number.
     pub row: u32,
 }
 
@@ -59,7 +55,6 @@ pub struct Partition {
 }
 
 impl Partition {
-    /// Number of pages.
     pub fn pages(&self) -> usize {
         self.starts.len() - 1
     }
@@ -158,9 +153,7 @@ impl GiantCut {
 /// Pages of nearly equal size for a number of rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pages {
-    /// Number of rows.
     pub rows: usize,
-    /// Number of pages.
     pub pages: usize,
 }
 

@@ -58,7 +58,6 @@ impl Rotation {
         self.0
     }
 
-    /// The way back.
     #[must_use]
     pub fn inverse(&self) -> Rotation {
         let [w, x, y, z] = self.0;
@@ -116,7 +115,6 @@ impl GaussianRotation {
         }
     }
 
-    /// Whether nothing turns.
     pub fn is_identity(&self) -> bool {
         self.rotation == Rotation::IDENTITY
     }

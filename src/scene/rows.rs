@@ -57,7 +57,6 @@ impl Columns {
 }
 
 impl<'a> ColumnsRef<'a> {
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.opacities.len()
     }
@@ -102,7 +101,6 @@ impl<'a> ColumnsRef<'a> {
 }
 
 impl<'a> ColumnsMut<'a> {
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.opacities.len()
     }
@@ -167,7 +165,6 @@ pub struct Rows<'a> {
     pub exp_avg_sq: ColumnsRef<'a>,
     /// Optimizer steps contained in the row.
     pub stamp: &'a [u32],
-    /// Identities.
     pub uid: &'a [u64],
     /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
     pub grad2d: &'a [f32],
@@ -188,7 +185,6 @@ pub struct RowsMut<'a> {
     pub exp_avg_sq: ColumnsMut<'a>,
     /// Optimizer steps contained in the row.
     pub stamp: &'a mut [u32],
-    /// Identities.
     pub uid: &'a mut [u64],
     /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
     pub grad2d: &'a mut [f32],
@@ -200,7 +196,6 @@ pub struct RowsMut<'a> {
 macro_rules! impl_rows {
     ($View:ident, $split:ident) => {
         impl<'a> $View<'a> {
-            /// Number of rows.
             pub fn rows(&self) -> usize {
                 self.stamp.len()
             }

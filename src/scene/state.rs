@@ -50,7 +50,6 @@ impl SceneState {
         }
     }
 
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.stamp.len()
     }

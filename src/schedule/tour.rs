@@ -42,8 +42,8 @@ pub fn length(places: &[Place], way: &[u32]) -> f64 {
 /// Strips of the plane of the two widest directions, there and back.
 fn serpentine(places: &[Place]) -> Vec<u32> {
     let mut left: Vec<Place> = centred(places);
-    let (along, extent) = take_widest(&mut left);
-    let (across, breadth) = take_widest(&mut left);
+    let (along, extent) = extract_principal_axis(&mut left);
+    let (across, breadth) = extract_principal_axis(&mut left);
     let mut way: Vec<u32> = (0..places.len() as u32).collect();
     // Square cells: as many strips as places across.
     let strips = (places.len() as f64 * breadth / extent.max(1e-300)).sqrt().clamp(1.0, places.len().max(1) as f64);
@@ -70,7 +70,7 @@ fn centred(places: &[Place]) -> Vec<Place> {
 
 /// The coordinates along the direction in which centred places vary most, with their standard deviation; the places
 /// lose that direction.
-fn take_widest(places: &mut [Place]) -> (Vec<f64>, f64) {
+fn extract_principal_axis(places: &mut [Place]) -> (Vec<f64>, f64) {
     // Started from the coordinate that varies most, which is never across the widest direction.
     let spread = |i: usize| places.iter().map(|p| p[i] * p[i]).sum::<f64>();
     let widest = (0..6).fold(0, |best, i| if spread(i) > spread(best) { i } else { best });

@@ -59,7 +59,6 @@ impl ViewPages {
         self.ends.push(self.pages.len());
     }
 
-    /// Number of views.
     pub fn views(&self) -> usize {
         self.ends.len()
     }
@@ -104,13 +103,13 @@ impl Kernel for ListPages<'_> {
         }
         for (page, meta) in index.iter().enumerate().skip(whole) {
             out[found] = PageNo(page as u32);
-            found += usize::from(planes.may_meet(&meta.bounds));
+            found += usize::from(planes.may_intersect(&meta.bounds));
         }
         found
     }
 }
 
-/// [`PagePlanes::may_meet`] of [`LANES`] pages at once.
+/// [`PagePlanes::may_intersect`] of [`LANES`] pages at once.
 #[inline(always)]
 fn needed_lanes(planes: &PagePlanes, pages: &[PageMeta]) -> [bool; LANES] {
     let (mut lo, mut hi) = ([[0.0f32; LANES]; 3], [[0.0f32; LANES]; 3]);

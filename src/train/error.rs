@@ -12,10 +12,8 @@ use crate::scene::page_split::SplitTooDeep;
 /// Error that ends a run.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
-    /// Invalid input.
     #[error(transparent)]
     Input(#[from] InputError),
-    /// The renderer failed.
     #[error("rendering failed: {0}{remedy}", remedy = .0.remedy().map_or(String::new(), |r| format!("\n  remedy: {r}")))]
     Render(#[from] RenderError),
     /// Pages could not be pinned or stored.
@@ -74,7 +72,6 @@ pub enum TrainError {
         view: String,
         /// Consecutive steps.
         count: u32,
-        /// Remedy.
         remedy: String,
     },
 }

@@ -119,7 +119,7 @@ impl Dense {
 }
 
 #[test]
-fn the_form_of_devices_follows_dense_adam() {
+fn gpu_adam_matches_dense_adam() {
     for eps in [1e-15, 1e-8] {
         let (mut dense, words, layout) = Dense::new(eps, STEPS);
         let adam = dense.adam.clone();

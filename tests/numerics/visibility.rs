@@ -87,7 +87,7 @@ fn no_row_that_may_be_drawn_lies_in_a_page_that_is_not_listed() {
         for (page, rows) in pages.iter().enumerate() {
             let is_listed = list.binary_search(&PageNo(page as u32)).is_ok();
             // The scalar and the SIMD form are the same test.
-            assert_eq!(frustum.planes().may_meet(&index[page].bounds), is_listed);
+            assert_eq!(frustum.planes().may_intersect(&index[page].bounds), is_listed);
             let drawn = rows.iter().any(|row| frustum.may_draw(row.mean, row.sigma_max));
             assert!(is_listed || !drawn, "page {page} of {camera:?}");
             drawn_pages += usize::from(drawn);

@@ -339,7 +339,7 @@ fn a_drive_that_fails_in_either_pass_loses_one_step_at_most() {
 }
 
 #[test]
-fn what_passes_by_itself_changes_no_bit() {
+fn transient_io_errors_do_not_change_results() {
     let world = World::new();
     let life = world.live("once", &Faults::new(), |faults| {
         let reads = faults.count(Operation::Read);

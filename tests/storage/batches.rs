@@ -182,7 +182,7 @@ fn a_full_drive_never_tears_a_step() {
 /// The bits of the rows of a view, as evaluations and checks of growth gather them.
 fn rows_of_view(scene: &mut PagedScene) -> Vec<u32> {
     let (pages, mut working) = (scene.pager.pages_of_view(&camera()), WorkingSet::default());
-    scene.gather_pages(&pages, &camera(), STEPS, &mut working).unwrap();
+    scene.gather_pages((&pages, &[]), &camera(), STEPS, &mut working).unwrap();
     Column::ALL.into_iter().flat_map(|column| working.columns.column(column)).map(|x| x.to_bits()).collect()
 }
 
@@ -206,6 +206,20 @@ fn every_row_can_be_read_while_the_drive_is_full() {
     assert!(error.is_out_of_space() && !matches!(error, TrainError::Torn { .. }), "{error}");
     faults.clear();
     assert!(rows(&mut scene) == want);
+}
+
+/// Pages of the next batch are read ahead, and none of them is evicted again before its use. No step has asked for them.
+#[test]
+fn a_pass_between_steps_reads_no_page_twice() {
+    let mut scene = scene(Some(&Faults::new()));
+    assert!(step(&mut scene, 0).unwrap().skipped.is_none());
+    let (pages, before) = (scene.pager.pages_of_view(&camera()).len() as u64, scene.pager.stats());
+    let rows = rows_of_view(&mut scene);
+    let stats = scene.pager.stats();
+    let read = stats.pages_read - before.pages_read;
+    assert!((pages - FRAMES as u64..=pages).contains(&read), "{read} reads of {pages} pages");
+    assert_eq!(stats.bytes_read - before.bytes_read, stats.other_bytes_read - before.other_bytes_read);
+    assert!(!rows.is_empty());
 }
 
 /// A walk of other batches than the pager's own, with uses that are told to it: what comes back is evicted last.

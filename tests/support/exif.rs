@@ -9,7 +9,6 @@ pub struct Settings {
     pub seconds: f64,
     /// f-number.
     pub aperture: f64,
-    /// ISO.
     pub iso: u16,
 }
 

@@ -50,7 +50,6 @@ pub struct Rule {
     pub nth: u64,
     /// Whether all later operations of the kind fail as well.
     pub for_ever: bool,
-    /// The fault.
     pub fault: Fault,
 }
 
@@ -123,7 +122,6 @@ struct Changed {
     bytes: usize,
 }
 
-/// The failing engine.
 pub struct FaultyEngine {
     inner: Box<dyn PageEngine>,
     faults: Faults,

@@ -26,11 +26,9 @@ pub struct TextModel {
     pub size: [u32; 2],
     /// fx, fy, cx, cy.
     pub pinhole: [f64; 4],
-    /// Views.
     pub views: Vec<TextView>,
     /// Positions.
     pub points: Vec<[f64; 3]>,
-    /// Colours.
     pub colors: Vec<[u8; 3]>,
 }
 

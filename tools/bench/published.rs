@@ -84,7 +84,7 @@ pub struct Args {
 
 /// Whether these arguments (the program's name first) request a published run: they contain `--data`, or start with the
 /// name of a published run or a config file.
-pub fn is_meant(arguments: &[OsString]) -> bool {
+pub fn is_published_run(arguments: &[OsString]) -> bool {
     let is_run =
         |a: &OsString| BUILT_IN.iter().any(|(name, _)| a == name) || Path::new(a).extension() == Some("toml".as_ref());
     let is_data = |a: &OsString| a.to_str().is_some_and(|a| a == "--data" || a.starts_with("--data="));

@@ -17,9 +17,7 @@ use std::path::Path;
 pub struct Ours {
     /// Means over the held-out views.
     pub test: Option<TestMetrics>,
-    /// Variant of SSIM.
     pub ssim_variant: SsimVariant,
-    /// Variant of LPIPS.
     pub lpips_variant: Option<String>,
     summary: Summary,
     /// Bytes of all Gaussians with their moments and statistics.
@@ -106,7 +104,6 @@ type MakeCell = Box<dyn Fn(&Vec<String>) -> Cell>;
 
 /// The input of the report.
 pub struct Comparison<'a> {
-    /// The published run.
     pub run: &'a PublishedRun,
     /// Densification tier, if the settings are those of a tier.
     pub tier: Option<&'a str>,
@@ -114,11 +111,9 @@ pub struct Comparison<'a> {
     pub layout: &'a str,
     /// Folder of the dataset.
     pub data: &'a Path,
-    /// Output folder.
     pub out: &'a Path,
     /// Differences to the published run.
     pub caveats: &'a [String],
-    /// Our figures.
     pub ours: &'a Ours,
     /// Our figures with the defaults of gsscale, if such a run was asked for.
     pub with_defaults: Option<&'a Ours>,
@@ -220,7 +215,6 @@ impl Comparison<'_> {
         lines.join("\n")
     }
 
-    /// The page.
     pub fn page(&self) -> String {
         let tier = self.tier.unwrap_or("none");
         let title = format!("gsscale: {} beside the published figures", self.run.facts.title);

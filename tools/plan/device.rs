@@ -22,7 +22,6 @@ const RESULTS: (f64, f64) = (56.0, 6.0);
 /// The device and its bus.
 #[derive(Debug, Clone, Copy)]
 pub struct DeviceModel {
-    /// The bus.
     pub bus: EmulatedBus,
     /// Slots of the device.
     pub slots: usize,
@@ -81,7 +80,6 @@ impl StepParts {
 pub struct DeviceRow {
     /// The order of views.
     pub order: Order,
-    /// The device.
     pub model: DeviceModel,
     /// What the steps after the first epoch move, where pages of a step and of the next one lie in slots at a time.
     pub figures: Figures,

@@ -33,15 +33,9 @@ pub enum Disturbance {
     /// Nothing.
     Nothing,
     /// Pixel values of each photo times 2^dt, dt uniform within so many stops.
-    Exposure {
-        /// Stops.
-        stops: f64,
-    },
+    Exposure { stops: f64 },
     /// Red times 2^t and blue times 2^-t, t uniform within so many stops.
-    WhiteBalance {
-        /// Stops.
-        stops: f64,
-    },
+    WhiteBalance { stops: f64 },
     /// This share of the photos have changed places in pairs that share less than half of what they see.
     Swapped {
         /// Of the training photos.

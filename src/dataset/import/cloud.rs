@@ -28,7 +28,6 @@ pub struct Cloud {
 /// The points of a [`Cloud`] in the local frame, without implausibly far ones.
 #[derive(Debug)]
 pub struct LocalCloud<'a> {
-    /// The points.
     pub cloud: &'a Cloud,
     /// Decides which points are too far.
     pub extent: Extent,

@@ -74,14 +74,11 @@ pub struct ImportOptions<'a> {
     pub init: &'a InitOptions,
     /// Most rows of a first page ([`crate::scene::partition::first_fill`]).
     pub fill: usize,
-    /// The budget.
     pub budget: Budget<'a>,
 }
 
-/// A first page.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FirstPage {
-    /// Its id.
     pub id: PageId,
     /// Numbers of its rows among all first rows, ascending: their uids.
     pub rows: Vec<u32>,

@@ -145,7 +145,6 @@ impl<T: Pod> SpoolWriter<T> {
 }
 
 impl<T: Pod> Spool<T> {
-    /// Number of records.
     pub fn len(&self) -> usize {
         self.len
     }

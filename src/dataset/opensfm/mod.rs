@@ -24,7 +24,6 @@ use glam::{DMat3, DVec3};
 use json::{Camera, Reconstruction, Shot};
 use std::path::{Path, PathBuf};
 
-/// The file's name.
 const FILE: &str = "reconstruction.json";
 /// Folder in which OpenDroneMap keeps it.
 const FOLDER_OF_ODM: &str = "opensfm";

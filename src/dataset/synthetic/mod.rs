@@ -97,7 +97,6 @@ impl CityOptions {
 /// Summary of a written scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CitySummary {
-    /// The scene's folder.
     pub folder: PathBuf,
     /// Photos written.
     pub views: u32,

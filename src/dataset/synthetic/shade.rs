@@ -82,7 +82,7 @@ impl Scene {
     pub(super) fn hit(&self, ray: &Ray) -> Option<Hit> {
         let ground = if ray.along.z < 0.0 { -ray.from.z * ray.inverse.z } else { f64::INFINITY };
         if let Some((k, Entry { t, normal, face })) = self.grid.nearest(&self.world.solids, ray, ground.min(1e5)) {
-            let normal = self.world.solids[k as usize].turn_out(normal);
+            let normal = self.world.solids[k as usize].rotate_to_world(normal);
             return Some(Hit { t, point: ray.at(t), normal, solid: Some((k, face)) });
         }
         if !ground.is_finite() {
@@ -178,7 +178,7 @@ impl Scene {
 
 /// The surface of a solid at a world point.
 fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> Look {
-    let p = solid.turn_in(point - solid.origin);
+    let p = solid.rotate_to_local(point - solid.origin);
     let (half_x, half_y, height) = match solid.shape {
         Shape::Block { half_x, half_y, height } | Shape::Roof { half_x, half_y, height, .. } => {
             (half_x, half_y, height)

@@ -93,21 +93,21 @@ impl Solid {
 
     /// Rotates a direction, or the difference of two points, from the world to the solid's frame.
     #[inline(always)]
-    pub(super) fn turn_in(&self, p: DVec3) -> DVec3 {
+    pub(super) fn rotate_to_local(&self, p: DVec3) -> DVec3 {
         DVec3::new(self.cos * p.x + self.sin * p.y, self.cos * p.y - self.sin * p.x, p.z)
     }
 
     /// Rotates a direction from the solid's frame to the world.
     #[inline(always)]
-    pub(super) fn turn_out(&self, p: DVec3) -> DVec3 {
+    pub(super) fn rotate_to_world(&self, p: DVec3) -> DVec3 {
         DVec3::new(self.cos * p.x - self.sin * p.y, self.sin * p.x + self.cos * p.y, p.z)
     }
 
     /// The place where `ray` enters, if its distance is in (0, limit).
     #[inline]
     pub(super) fn enter(&self, ray: &Ray, limit: f64) -> Option<Entry> {
-        let from = self.turn_in(ray.from - self.origin);
-        let along = self.turn_in(ray.along);
+        let from = self.rotate_to_local(ray.from - self.origin);
+        let along = self.rotate_to_local(ray.along);
         let entry = match self.shape {
             Shape::Block { half_x, half_y, height } => enter_block(from, along, half_x, half_y, height),
             Shape::Roof { half_x, half_y, height, run, cap } => {

@@ -39,7 +39,6 @@ pub enum PlyContent {
     },
     /// Coloured points.
     Points {
-        /// Positions.
         positions: Vec<[f64; 3]>,
         /// sRGB, one per position; mid grey if the file has no colours.
         colors: Vec<[u8; 3]>,

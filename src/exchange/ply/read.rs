@@ -27,13 +27,13 @@ pub fn read_ply(path: &Path) -> InputResult<PlyContent> {
     let (reader, total_bytes) = open(path)?;
     let mut content = parse_ply(reader, total_bytes, path)?;
     if let PlyContent::Gaussians { meta, .. } = &mut content {
-        look_beside(path, meta)?;
+        read_transform_beside(path, meta)?;
     }
     Ok(content)
 }
 
 /// Takes frame and axes of Gaussians that do not state them from the transform file beside `path`, if there is one.
-fn look_beside(path: &Path, meta: &mut SceneMeta) -> InputResult<()> {
+fn read_transform_beside(path: &Path, meta: &mut SceneMeta) -> InputResult<()> {
     if meta.is_stated {
         return Ok(());
     }
@@ -217,7 +217,7 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
     let header = parse_header(&mut reader, path)?;
     let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
     let mut meta = stream_gaussian_rows(&mut body, &header, vertex, take)?;
-    look_beside(path, &mut meta)?;
+    read_transform_beside(path, &mut meta)?;
     Ok(meta)
 }
 
@@ -229,7 +229,7 @@ pub fn gaussians_header(path: &Path) -> InputResult<(SceneMeta, u8)> {
     let header = parse_header(&mut open(path)?.0, path)?;
     let (_, vertex) = vertex_of(&header, path)?;
     let mut meta = meta_from_comments(path, &header.comments)?;
-    look_beside(path, &mut meta)?;
+    read_transform_beside(path, &mut meta)?;
     Ok((meta, sh_degree_of(path, vertex)?))
 }
 

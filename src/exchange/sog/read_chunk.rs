@@ -94,7 +94,6 @@ impl Chunk {
         Ok(Chunk { path: path.to_path_buf(), meta })
     }
 
-    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.meta.count
     }

@@ -40,7 +40,6 @@ impl Symmetric {
         Symmetric(std::array::from_fn(|i| self.0[i] + factor * outer[i]))
     }
 
-    /// The diagonal.
     pub fn diagonal(&self) -> [f64; 3] {
         [self.0[0], self.0[3], self.0[5]]
     }

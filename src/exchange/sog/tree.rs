@@ -20,7 +20,6 @@ pub struct Part {
     pub file: usize,
     /// Its first row in the file.
     pub first: usize,
-    /// Its rows.
     pub rows: usize,
 }
 

@@ -69,7 +69,6 @@ impl fmt::Display for IoEngine {
 
 /// An open engine, with notes for the user on how it was chosen.
 pub struct OpenedEngine {
-    /// The engine.
     pub store: Box<dyn PageEngine>,
     /// Fallbacks and their reasons, as whole sentences to print. Empty if the engine asked for works in full.
     pub notes: Vec<String>,

@@ -36,13 +36,11 @@ pub enum Direction {
 pub struct Transfer {
     /// An identifier chosen by the caller.
     pub token: u64,
-    /// Read or write.
     pub direction: Direction,
     /// The place in the store.
     pub place: Place,
     /// Number of bytes, from the start of the buffer; a multiple of [`crate::page::engine::buffer::ALIGNMENT`].
     pub bytes: usize,
-    /// The buffer.
     pub buffer: PageBuffer,
 }
 
@@ -51,7 +49,6 @@ pub struct Transfer {
 pub struct Completion {
     /// The transfer, with its buffer.
     pub transfer: Transfer,
-    /// The outcome.
     pub result: io::Result<()>,
 }
 

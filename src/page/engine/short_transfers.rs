@@ -63,7 +63,7 @@ impl Resume {
                 let problem = "the drive makes no progress: it moves only parts of a block";
                 io::Error::new(io::ErrorKind::TimedOut, problem)
             }
-            Err(error) if may_pass(&error) => error,
+            Err(error) if is_transient(&error) => error,
             Err(error) => return Err(error),
         };
         self.tries += 1;
@@ -72,7 +72,7 @@ impl Resume {
 }
 
 /// Whether a retry of the same request may succeed.
-fn may_pass(error: &io::Error) -> bool {
+fn is_transient(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::Interrupted | io::ErrorKind::WouldBlock)
         || (cfg!(target_os = "linux") && error.raw_os_error().is_some_and(|raw| THREAD_ENDED.contains(&raw)))
 }

@@ -59,7 +59,7 @@ impl ThreadedEngine {
         let (direct, name) = (segments.is_direct(), if maps.is_some() { "mmap" } else { "pread" });
         let shared = Arc::new(Shared { segments: Mutex::new(segments), maps, behind: Mutex::default(), direct });
         let worker = Arc::clone(&shared);
-        let pool = TransferPool::new(name, threads, move |transfer| worker.carry_out(transfer))?;
+        let pool = TransferPool::new(name, threads, move |transfer| worker.execute(transfer))?;
         Ok(ThreadedEngine { shared, pool })
     }
 
@@ -70,7 +70,7 @@ impl ThreadedEngine {
 }
 
 impl Shared {
-    fn carry_out(&self, transfer: &mut Transfer) -> io::Result<()> {
+    fn execute(&self, transfer: &mut Transfer) -> io::Result<()> {
         let file = lock(&self.segments).file_of(transfer)?;
         match (&self.maps, transfer.direction) {
             (Some(maps), Direction::Read) => maps.copy_out(&file, transfer)?,

@@ -179,7 +179,7 @@ impl UringEngine {
     }
 
     /// Submits the queue to the kernel and waits for `want` completions.
-    fn enter(&mut self, want: usize) {
+    fn submit_and_wait(&mut self, want: usize) {
         let mut refusals = 0;
         while self.broken.is_none() {
             let Err(error) = self.ring.submit_and_wait(want) else { break };
@@ -294,7 +294,7 @@ impl PageEngine for UringEngine {
         self.take_answers();
         self.fill_ring();
         if !self.offered.is_empty() {
-            self.enter(0);
+            self.submit_and_wait(0);
         }
     }
 
@@ -303,12 +303,12 @@ impl PageEngine for UringEngine {
         self.take_answers();
         self.fill_ring();
         while wait && self.done.is_empty() && self.with_kernel > 0 {
-            self.enter(1);
+            self.submit_and_wait(1);
             self.take_answers();
             self.fill_ring();
         }
         if !self.offered.is_empty() {
-            self.enter(0);
+            self.submit_and_wait(0);
         }
         done.append(&mut self.done);
     }

@@ -52,7 +52,6 @@ pub struct Case {
 /// A case with its rates, bytes per second; `None` if time ran out before it was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
-    /// The case.
     pub case: Case,
     /// Rate of random reads.
     pub read: Option<f64>,

@@ -89,7 +89,7 @@ impl Folder for DriveFolder {
     }
 
     fn remove(&self, name: &str) -> io::Result<()> {
-        std::fs::remove_file(self.0.join(name)).or_else(unless_missing)
+        std::fs::remove_file(self.0.join(name)).or_else(ignore_not_found)
     }
 
     fn sync(&self) -> io::Result<()> {
@@ -98,7 +98,7 @@ impl Folder for DriveFolder {
 }
 
 /// The error, unless the file did not exist.
-pub(in crate::page) fn unless_missing(error: io::Error) -> io::Result<()> {
+pub(in crate::page) fn ignore_not_found(error: io::Error) -> io::Result<()> {
     if error.kind() == io::ErrorKind::NotFound { Ok(()) } else { Err(error) }
 }
 

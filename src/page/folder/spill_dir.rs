@@ -11,7 +11,7 @@ use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
-    MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, unless_missing,
+    MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, ignore_not_found,
 };
 use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
 use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, SlotLayout, SpillFormat};
@@ -105,7 +105,6 @@ impl SpillDir {
         !matches!(read_format(folder), Ok(None))
     }
 
-    /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
@@ -168,7 +167,7 @@ impl SpillDir {
             }
         }
         for path in ours.iter().map(|name| self.folder.join(name)) {
-            if let Err(error) = std::fs::remove_file(&path).or_else(unless_missing) {
+            if let Err(error) = std::fs::remove_file(&path).or_else(ignore_not_found) {
                 return Err(InputError::io(path, "removing", &error));
             }
         }

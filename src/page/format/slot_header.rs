@@ -172,7 +172,6 @@ pub fn checksum(bytes: &[u8]) -> u128 {
 pub struct SlotHeader {
     /// Identity of the store.
     pub store: u128,
-    /// The page.
     pub page: PageId,
     /// Serial number of the write within the store: of two versions of a page the later one has the higher number.
     /// Exception: a process that ended before its first commit; the next process uses the same numbers again.

@@ -43,7 +43,6 @@ pub struct CommitConfig {
 /// A page that changed since the last generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PageChange {
-    /// The page.
     pub page: PageId,
     /// Its slot and label; `None`: the page was removed.
     pub version: Option<(SlotRef, Vec<u8>)>,

@@ -11,7 +11,6 @@ pub enum CommitError {
     /// Pages could not be made durable.
     #[error(transparent)]
     Pages(#[from] PageError),
-    /// The map failed.
     #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
     Map(#[from] MapError),
     /// No space. Nothing is lost; the commit may be repeated once there is space.
@@ -24,7 +23,6 @@ pub enum CommitError {
     File {
         /// Name of the file in the store's folder.
         name: &'static str,
-        /// The system's error.
         source: io::Error,
     },
     /// An earlier error ended all commits of this process.

@@ -113,7 +113,6 @@ pub struct Counters {
 /// One version of a page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MapVersion {
-    /// The page.
     pub page: PageId,
     /// First generation that sees it.
     pub generation: u64,
@@ -124,7 +123,6 @@ pub struct MapVersion {
 /// Content of a map, except the run states.
 #[derive(Debug, Default)]
 pub struct MapContent {
-    /// The counters.
     pub counters: Counters,
     /// All versions, ordered by page, then generation.
     pub versions: Vec<MapVersion>,
@@ -145,9 +143,7 @@ pub struct MapBatch {
     pub put_generation: Option<(u64, Vec<u8>, Vec<u8>)>,
     /// Generations that are no longer kept.
     pub drop_generations: Vec<u64>,
-    /// Pins to add.
     pub put_pins: Vec<(String, u64)>,
-    /// Pins to remove.
     pub drop_pins: Vec<String>,
     /// The latest generation after this transaction.
     pub latest: u64,

@@ -41,7 +41,6 @@ fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
     }
 }
 
-/// The open map.
 pub struct Manifest {
     database: Option<Database>,
     file: MapFile,
@@ -91,7 +90,7 @@ impl Manifest {
         acknowledged: u64,
         cache_bytes: usize,
     ) -> Result<(Manifest, MapContent), MapError> {
-        let file = MapFile::holding_back(file)?;
+        let file = MapFile::with_deferred_writes(file)?;
         if file.len()? == 0 {
             return Err(MapError::Damaged("the file is empty".to_string()));
         }

@@ -53,7 +53,7 @@ impl MapFile {
     ///
     /// # Errors
     /// The length of the file cannot be read.
-    pub fn holding_back(file: Arc<dyn StorageBackend>) -> io::Result<MapFile> {
+    pub fn with_deferred_writes(file: Arc<dyn StorageBackend>) -> io::Result<MapFile> {
         let len = file.len()?;
         let map = MapFile::new(file);
         *map.held_back() = Some(HeldBack { operations: Vec::new(), len });

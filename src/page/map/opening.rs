@@ -33,9 +33,7 @@ const WRONG_SEGMENTS_LISTED: usize = 8;
 /// A page of a generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredPage {
-    /// The page.
     pub page: PageId,
-    /// Its slot.
     pub slot: SlotRef,
     /// The label, opaque to this layer.
     pub label: Vec<u8>,
@@ -53,7 +51,6 @@ struct Past {
 /// A store as opened.
 #[derive(Debug)]
 pub struct Opened {
-    /// The store's commits.
     pub commits: Commits,
     /// Pages of the last generation, ascending by id; empty before the first commit.
     pub pages: Vec<StoredPage>,

@@ -91,7 +91,6 @@ pub struct StoreReader {
 /// A kept generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct GenerationUse {
-    /// The generation's number.
     pub generation: u64,
     /// The names it is pinned under.
     pub names: Vec<String>,
@@ -126,7 +125,6 @@ impl StoreReader {
         Ok(StoreReader { folder, format, features, manifest, content, generations, used_by, _lock: lock })
     }
 
-    /// The folder.
     pub fn folder(&self) -> &Path {
         &self.folder
     }

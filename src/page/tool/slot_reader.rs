@@ -68,7 +68,7 @@ impl SlotReader {
         }
         self.read(slot.place, bytes)?;
         if slot.codec != StoredAs::Raw {
-            make_longer(&mut self.decoded, needed);
+            ensure_len(&mut self.decoded, needed);
         }
         let decoded = self.decoded.as_mut_slice();
         verify(self.store, page, slot, &self.stored.as_slice()[..bytes], Some(decoded))?;
@@ -96,7 +96,7 @@ impl SlotReader {
         if place.offset.saturating_add(bytes as u64) > *length {
             return Err(failed(io::ErrorKind::UnexpectedEof.into()));
         }
-        make_longer(&mut self.stored, bytes);
+        ensure_len(&mut self.stored, bytes);
         let buffer = &mut self.stored.as_mut_slice()[..bytes];
         file.read(place.offset, buffer).map_err(failed)?;
         Ok(buffer)
@@ -104,7 +104,7 @@ impl SlotReader {
 }
 
 /// Replaces the buffer with a longer one if it is too short; its content is then lost.
-fn make_longer(buffer: &mut PageBuffer, bytes: usize) {
+fn ensure_len(buffer: &mut PageBuffer, bytes: usize) {
     if buffer.len() < bytes {
         *buffer = PageBuffer::zeroed(bytes);
     }

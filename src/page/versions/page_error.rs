@@ -12,7 +12,6 @@ use std::io;
 /// The slot of a version, for messages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotName {
-    /// The page.
     pub page: PageId,
     /// Place of the slot.
     pub place: Place,
@@ -54,9 +53,7 @@ pub enum PageError {
     Grow {
         /// Number of the segment.
         segment: u32,
-        /// Its length.
         bytes: u64,
-        /// The system's error.
         source: io::Error,
     },
     /// The drive failed to make writes durable. The store accepts no more writes.
@@ -73,7 +70,6 @@ pub enum PageError {
          {LABEL_BYTES_MAX})\n  remedy: report this as a bug"
     )]
     TooLong {
-        /// The page.
         page: PageId,
         /// Bytes of the payload.
         payload_bytes: usize,

@@ -29,20 +29,16 @@ pub enum PageMoved {
 pub struct PageDone {
     /// An identifier chosen by the caller.
     pub token: u64,
-    /// The page.
     pub page: PageId,
     /// The caller's buffer. After a write it holds the payload unchanged; after a failed read, garbage.
     pub buffer: PageBuffer,
-    /// The outcome.
     pub result: Result<PageMoved, PageError>,
 }
 
 /// Bytes moved, headers and padding included.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct PageTraffic {
-    /// Bytes read.
     pub bytes_read: u64,
-    /// Bytes written.
     pub bytes_written: u64,
     /// Payload bytes of the pages written.
     pub payload_bytes_written: u64,

@@ -82,12 +82,10 @@ impl Slots {
         self.layout
     }
 
-    /// Number of segments.
     pub fn segments(&self) -> u32 {
         (self.states.len() / self.layout.slots_per_segment as usize) as u32
     }
 
-    /// Number of slots.
     pub fn total(&self) -> u64 {
         self.states.len() as u64
     }

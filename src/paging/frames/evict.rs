@@ -53,7 +53,6 @@ impl EvictPolicy {
 /// A page that could be evicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Candidate {
-    /// The page.
     pub page: PageNo,
     /// The next planned step that needs the page, or [`NEVER`].
     pub next_use: u32,
@@ -86,7 +85,6 @@ impl EvictOrder {
         EvictOrder { policy, uses: Vec::new(), len: 0, heap: BinaryHeap::new() }
     }
 
-    /// The policy.
     pub fn policy(&self) -> EvictPolicy {
         self.policy
     }

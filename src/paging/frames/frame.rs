@@ -26,7 +26,6 @@ pub enum FrameState {
 }
 
 impl FrameState {
-    /// Number of states.
     pub(super) const COUNT: usize = FrameState::Retired as usize + 1;
 }
 

@@ -19,7 +19,6 @@ const ABSENT: u32 = u32::MAX;
 /// A resident page that could be evicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Victim {
-    /// The page.
     pub page: PageNo,
     /// Whether the page must be written back first.
     pub dirty: bool,

@@ -39,7 +39,6 @@ impl FewestReads {
         self.pages
     }
 
-    /// Their bytes.
     pub fn bytes(&self) -> u64 {
         self.bytes
     }

@@ -50,7 +50,6 @@ impl StepChange {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[error("step {step} needs {needed} pages at once, but there are {frames} frames")]
 pub struct TooFewFrames {
-    /// The step.
     pub step: u32,
     /// Pages that the step needs.
     pub needed: usize,
@@ -58,7 +57,6 @@ pub struct TooFewFrames {
     pub frames: usize,
 }
 
-/// The model.
 #[derive(Debug, Clone)]
 pub struct CacheModel {
     frames: usize,
@@ -117,7 +115,6 @@ impl CacheModel {
         self.frames = free.saturating_add(self.present.len() + self.idle.len());
     }
 
-    /// Number of frames.
     pub fn frames(&self) -> usize {
         self.frames
     }
@@ -176,7 +173,7 @@ impl CacheModel {
         let free = self.free.min(change.admit.len());
         self.free -= free;
         for _ in free..change.admit.len() {
-            let far = self.first_exact(&next_use).filter(|page| self.may_go(page, batch, past.is_empty()));
+            let far = self.first_exact(&next_use).filter(|page| self.may_evict(page, batch, past.is_empty()));
             if far.is_none() {
                 self.add_idle(&mut past, &next_use);
             }
@@ -208,7 +205,7 @@ impl CacheModel {
     }
 
     /// Whether a page may be evicted while the batch before `batch` still computes. With `is_last`, no other page can go.
-    fn may_go(&self, victim: &Candidate, batch: u32, is_last: bool) -> bool {
+    fn may_evict(&self, victim: &Candidate, batch: u32, is_last: bool) -> bool {
         let ignores_plan = self.idle.policy().ignores_plan();
         is_last || ignores_plan || victim.next_use > batch.saturating_add(FAR_STEPS)
     }
@@ -250,7 +247,6 @@ impl CacheModel {
 /// One step of a plan as a cache will go through it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PlannedStep {
-    /// The step.
     pub step: u32,
     /// Number of pages that the step needs.
     pub pages: usize,

@@ -42,7 +42,6 @@ pub struct ReplayOptions {
     pub plan_bytes: u64,
 }
 
-/// One step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct StepTraffic {
     /// Batches in which the step walks its view, forwards and back; 1 for a view that fits, 0 for a view without pages.

@@ -17,7 +17,6 @@ use crate::scene::image::{Image, Target};
 use conv::{Conv, Planes, max_pool};
 use rayon::prelude::*;
 
-/// The feature network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Network {
     /// AlexNet, as reported by gsplat, GS-Scale and nerfstudio.
@@ -141,7 +140,6 @@ pub struct Lpips {
 }
 
 impl Lpips {
-    /// The feature network.
     pub fn network(&self) -> Network {
         self.network
     }

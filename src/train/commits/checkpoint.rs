@@ -192,7 +192,7 @@ impl Checkpoint {
             _ if self.name.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
-            None if self.may_be_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
+            None if self.may_commit_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
             Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
             _ => Ok(()),
         }
@@ -201,12 +201,12 @@ impl Checkpoint {
     /// Whether [`Checkpoint::between_steps`] may have something to do now.
     pub fn is_due(&self, trainer: &Trainer) -> bool {
         let is_begun = self.name.is_some() || self.beside.is_some();
-        is_begun || self.is_time() || (self.may_be_early() && self.space_is_short(trainer))
+        is_begun || self.is_time() || (self.may_commit_early() && self.space_is_short(trainer))
     }
 
     /// Whether an early commit for free slots is allowed. The time limit prevents a commit at every step, since slots
     /// kept by names stay taken.
-    fn may_be_early(&self) -> bool {
+    fn may_commit_early(&self) -> bool {
         !self.is_optional && self.last.elapsed().as_secs_f64() >= EARLY_SECONDS
     }
 
@@ -226,7 +226,7 @@ impl Checkpoint {
     /// Abandons the commit in progress of a run whose pages are all in memory.
     pub(super) fn give_up(&mut self, trainer: &mut Trainer) {
         self.beside = None;
-        trainer.scene.pager.thaw();
+        trainer.scene.pager.abort_cut();
     }
 
     /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;
@@ -335,14 +335,14 @@ impl Checkpoint {
 
     /// Whether an early commit is needed to free slots.
     fn space_is_short(&self, trainer: &Trainer) -> bool {
-        let Some(space) = trainer.scene.pager.slot_space().filter(is_worth_a_commit) else { return false };
+        let Some(space) = trainer.scene.pager.slot_space().filter(should_commit_for_slots) else { return false };
         let left = crate::page::folder::file_system::free_bytes(&self.folder).ok().flatten();
         left.is_some_and(|left| left < space.segment_bytes)
     }
 }
 
 /// Whether few slots are free and a commit would free enough.
-fn is_worth_a_commit(space: &SlotSpace) -> bool {
+fn should_commit_for_slots(space: &SlotSpace) -> bool {
     let SlotSpace { total, free, retired, .. } = *space;
     free * FEW_FREE < total && retired * WORTH_FREEING >= total
 }
@@ -400,9 +400,9 @@ mod tests {
     #[test]
     fn a_commit_before_its_time_must_be_needed_and_of_use() {
         let space = |total, free, retired| SlotSpace { total, free, retired, segment_bytes: 1 };
-        assert!(is_worth_a_commit(&space(100, 9, 5)) && is_worth_a_commit(&space(100, 0, 100)));
-        assert!(!is_worth_a_commit(&space(100, 10, 50)), "there are slots");
-        assert!(!is_worth_a_commit(&space(100, 0, 4)), "it would make hardly any free");
-        assert!(!is_worth_a_commit(&space(0, 0, 0)), "there are none yet");
+        assert!(should_commit_for_slots(&space(100, 9, 5)) && should_commit_for_slots(&space(100, 0, 100)));
+        assert!(!should_commit_for_slots(&space(100, 10, 50)), "there are slots");
+        assert!(!should_commit_for_slots(&space(100, 0, 4)), "it would make hardly any free");
+        assert!(!should_commit_for_slots(&space(0, 0, 0)), "there are none yet");
     }
 }

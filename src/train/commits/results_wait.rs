@@ -27,9 +27,7 @@ pub(crate) struct Results<'a> {
     pub metrics: &'a mut MetricsLog,
     /// The run's checkpoint, if it has one.
     pub checkpoint: Option<&'a mut Checkpoint>,
-    /// Output folder.
     pub out: &'a Path,
-    /// Stop request.
     pub stop: &'a StopFlag,
     /// What is left of `--disk-full-wait`.
     pub wait: Duration,

@@ -62,7 +62,6 @@ pub(crate) struct GaussianFile {
 /// What [`GaussianFile::read`] found besides Gaussians.
 #[derive(Debug, Clone)]
 pub(crate) struct GaussiansRead {
-    /// The file's metadata.
     pub meta: SceneMeta,
     /// Gaussians dropped because they are too far away for the local frame.
     pub far: u64,
@@ -91,7 +90,6 @@ impl GaussianFile {
         self.sh_degree
     }
 
-    /// The file.
     pub fn path(&self) -> &Path {
         &self.path
     }

@@ -17,7 +17,6 @@ pub struct Resolved {
     pub version: String,
     /// Identity of the run; its commits hold it too.
     pub run: RunId,
-    /// The scene.
     pub scene: PathBuf,
     /// Instruction path in use.
     pub simd: String,

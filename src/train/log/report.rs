@@ -32,7 +32,6 @@ pub const PSNR_PERFECT: f64 = 100.0;
 /// The counters of the pager, with frames and pages.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct TierTraffic {
-    /// The counters.
     #[serde(flatten)]
     pub stats: PagerStats,
     /// Frames in use.
@@ -97,7 +96,6 @@ pub struct TestMetrics {
     pub views: u32,
     /// Mean PSNR, dB.
     pub psnr: f64,
-    /// Mean SSIM.
     pub ssim: f64,
     /// Mean LPIPS, if weights were given; the report names network and input range.
     #[serde(skip_serializing_if = "Option::is_none", default)]

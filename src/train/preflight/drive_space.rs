@@ -116,7 +116,6 @@ pub(crate) struct SimulatedRun {
     pub growth: f64,
     /// Seconds of a step that waits for nothing, with the Gaussians of now and with those of the end.
     pub step_seconds: [f64; 2],
-    /// The drive.
     pub drive: DriveRate,
 }
 

@@ -28,7 +28,6 @@ pub(super) struct LargestNeed {
 /// Frames at the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct FirstFrames {
-    /// Number of frames.
     pub frames: u64,
     /// The most pages of a batch of a view.
     pub pages_most: usize,
@@ -56,7 +55,7 @@ pub(super) fn first_frames(
     if let Some(frames) = whole_views(need, host_mem, memory) {
         return Ok((frames, host_mem));
     }
-    let host_mem = raise_to_least(config, host_mem, least_memory(need, memory, host_mem));
+    let host_mem = raise_to_minimum(config, host_mem, least_memory(need, memory, host_mem));
     Ok((frames_of_budget(config, need, host_mem, memory)?, host_mem))
 }
 
@@ -132,7 +131,12 @@ pub(super) fn frames_of_budget(
 
 /// Reduces the estimate of a grown scene to `budget` as the run will do: by fewer frames and, if these do not hold the largest view of
 /// the grown scene (`need`), by views in batches. Returns the number of frames.
-pub(super) fn obey(config: &TrainConfig, need: &LargestNeed, budget: u64, memory: &mut MemoryEstimate) -> u64 {
+pub(super) fn shrink_to_budget(
+    config: &TrainConfig,
+    need: &LargestNeed,
+    budget: u64,
+    memory: &mut MemoryEstimate,
+) -> u64 {
     let FirstFrames { frames, pages_most } = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
         let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
         let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
@@ -153,7 +157,7 @@ pub(super) fn in_batches(config: &TrainConfig, memory: &mut MemoryEstimate, page
 }
 
 /// `host_mem`, raised to `least` with a warning if the user set no budget and the machine has the memory.
-pub(super) fn raise_to_least(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
+pub(super) fn raise_to_minimum(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> Option<u64> {
     let budget = host_mem.filter(|&budget| config.host_mem.0 == 0 && least > budget);
     let Some(short) = budget.filter(|_| obtainable_bytes().is_some_and(|most| least <= most)) else { return host_mem };
     crate::tell!(

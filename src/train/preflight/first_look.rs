@@ -44,11 +44,9 @@ const TIMED_SHARE: u64 = 4;
 pub struct FirstLook {
     /// Views and frame.
     pub dataset: Dataset,
-    /// The pages.
     pub index: Vec<PageMeta>,
     /// Bytes of each page on disk at the full SH degree, without header and padding.
     pub page_bytes: Vec<u32>,
-    /// Gaussians.
     pub gaussians: u64,
     /// Approximate frames of a CPU run within the requested memory.
     pub frames: Option<u64>,

@@ -9,7 +9,7 @@
 //! those of the drive only through the number of commits in the time of the run.
 
 use super::drive_space::{DriveUse, StepUse, VERSIONS};
-use super::first_frames::{LargestNeed, obey};
+use super::first_frames::{LargestNeed, shrink_to_budget};
 use super::plan::TierPlan;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
@@ -256,7 +256,7 @@ pub(crate) fn limit_memory(
     for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
         let growth = rows_then as f64 / rows.max(1) as f64;
         let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
-        let frames = obey(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
+        let frames = shrink_to_budget(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
         frames_at_end = Some(if rows_then > rows { frames.min(now) } else { now });
     }
     frames_at_end

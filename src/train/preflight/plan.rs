@@ -5,7 +5,8 @@
 
 use super::drive_space::check_drive;
 use super::first_frames::{
-    FirstFrames, LargestNeed, first_frames, frames_of_budget, in_batches, obey, page_working, raise_to_least,
+    FirstFrames, LargestNeed, first_frames, frames_of_budget, in_batches, page_working, raise_to_minimum,
+    shrink_to_budget,
 };
 use super::probe::{Probe, estimate};
 use crate::base::error::{InputError, InputResult};
@@ -115,7 +116,7 @@ fn plan_in_memory(
     asked: Option<u64>,
     memory: &[MemoryEstimate; 3],
 ) -> InputResult<()> {
-    let host_mem = raise_to_least(config, asked, memory[0].total());
+    let host_mem = raise_to_minimum(config, asked, memory[0].total());
     if trainer.scene.pager.slot_space().is_none() {
         // A resumed run has a drive already and can start paging.
         check_in_memory(memory, host_mem)?;
@@ -235,7 +236,7 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
         None => frames,
         Some(budget) => {
             let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: then };
-            obey(config, &need, budget, &mut memory[1].clone()).min(frames)
+            shrink_to_budget(config, &need, budget, &mut memory[1].clone()).min(frames)
         }
     };
     let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);

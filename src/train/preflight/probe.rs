@@ -23,7 +23,6 @@ const RENDERER_ROW_BYTES_MOST: u64 = 2048;
 /// Input of an estimate.
 #[derive(Debug, Clone)]
 pub struct Probe {
-    /// Views to render.
     pub views: Vec<usize>,
     /// Gaussians of the scene.
     pub rows: u64,

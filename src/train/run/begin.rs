@@ -58,7 +58,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let _mark = Beginning::mark(request)?;
     let host_mem = host_budget(config);
     let start = Start::read(&request.scene, config, host_mem)?;
-    let request = &suit_photos(request, &start);
+    let request = &adapt_schedule(request, &start);
     let config = &request.config;
     let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
@@ -78,10 +78,10 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
 }
 
 /// The request, with a schedule that suits the number of training photos.
-fn suit_photos(request: &RunRequest, start: &Start) -> RunRequest {
+fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     let mut request = request.clone();
     let photos = start.dataset.train_views().len();
-    if let Some(steps) = request.config.suit_photos(photos).filter(|_| !request.quiet) {
+    if let Some(steps) = request.config.adapt_schedule(photos).filter(|_| !request.quiet) {
         crate::say!(
             "photos  {photos} to train on: the rates fall until step {steps}, and stay low (see --schedule-steps)"
         );
@@ -113,7 +113,6 @@ pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
 pub(super) struct FirstTrainer {
     /// Views and frame.
     pub dataset: Dataset,
-    /// The trainer.
     pub trainer: Trainer,
     /// Where its pages live.
     pub tiers: Tiers,
@@ -208,7 +207,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     };
     let host_mem = host_budget(&request.config);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
-    let request = suit_photos(&request, &start);
+    let request = adapt_schedule(&request, &start);
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }

@@ -33,7 +33,7 @@ use std::path::{Path, PathBuf};
 
 /// What more steps mean for the rates; `None` if the schedule is as long as the run. A run that goes on keeps its schedule, because
 /// rates that rose again would undo what the last steps have settled.
-pub(super) fn told_of_rates(config: &TrainConfig) -> Option<String> {
+pub(super) fn text_of_rates(config: &TrainConfig) -> Option<String> {
     let end = schedule_steps(config);
     (end < config.steps).then(|| {
         let [end, steps] = [end, config.steps].map(|steps| format_grouped(steps.into()));
@@ -48,7 +48,6 @@ pub(super) fn told_of_rates(config: &TrainConfig) -> Option<String> {
 pub(super) struct Finished<'a> {
     /// Its output folder.
     pub out: &'a Path,
-    /// Its scene.
     pub scene: &'a Path,
     /// Config with more steps.
     pub config: TrainConfig,
@@ -56,7 +55,6 @@ pub(super) struct Finished<'a> {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Its identity.
     pub run: RunId,
-    /// Its summary.
     pub summary: &'a Summary,
     /// Print only warnings and errors.
     pub quiet: bool,
@@ -83,7 +81,7 @@ impl Finished<'_> {
             out.display(),
             kept.display()
         );
-        if let Some(rates) = told_of_rates(&self.config) {
+        if let Some(rates) = text_of_rates(&self.config) {
             crate::tell!("{rates}");
         }
         let init_ply = absolute(&kept).to_string_lossy().into_owned();

@@ -32,7 +32,6 @@ pub struct RunOutcome {
     pub summary: Option<Summary>,
     /// Exit code of the process: 0, or 130/143 after a stop request.
     pub exit_code: i32,
-    /// The output folder.
     pub out: PathBuf,
     /// The run keeps its checkpoint after its end.
     pub keeps_checkpoint: bool,

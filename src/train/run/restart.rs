@@ -27,7 +27,7 @@ impl TrainError {
 }
 
 /// Whether the run in an output folder has a commit, or can begin again because all of it was in memory.
-fn can_go_on(out: &Path) -> bool {
+fn can_continue(out: &Path) -> bool {
     TrainConfig::read(&out.join(CONFIG_FILE)).is_ok_and(|config| {
         let residence = config.residence();
         residence.spill_dir().is_none() || SpillDir::exists_in(&residence.checkpoint_folder(out))
@@ -46,7 +46,7 @@ pub fn go_on(
 ) -> Result<RunOutcome, TrainError> {
     for restart in 1..=most {
         match ended {
-            Err(error) if error.is_device_lost() && can_go_on(&request.out) => {
+            Err(error) if error.is_device_lost() && can_continue(&request.out) => {
                 crate::tell!(
                     "warning: {error}\n  the run goes on in this process (restart {restart} of at most {most})"
                 );

@@ -9,7 +9,7 @@
 use super::begin::{begin, plan_and_train, run};
 use super::beginning::settings_of_mark;
 use super::changes::{Changes, kept_config};
-use super::more_steps::{Finished, told_of_rates};
+use super::more_steps::{Finished, text_of_rates};
 use super::out_folder::{self, Existing, check_restart, has_results};
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
@@ -120,7 +120,6 @@ pub(super) struct Earlier {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Its config, from the file or from the checkpoint.
     pub config: TrainConfig,
-    /// Its scene.
     pub scene: PathBuf,
     /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
     pub run: RunId,
@@ -224,7 +223,6 @@ fn begin_again(
 pub(super) struct Goal {
     /// Accepted differences.
     pub changes: Changes,
-    /// Its scene.
     pub start: Start,
     /// Digest of the dataset.
     pub print: DatasetPrint,
@@ -362,7 +360,7 @@ fn print_resume(
         free => format!("; {}", free.join(", ")),
     };
     crate::tell!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
-    if let Some(rates) = told_of_rates(config) {
+    if let Some(rates) = text_of_rates(config) {
         crate::tell!("{rates}");
     }
 }

@@ -5,7 +5,7 @@
 //! Invariant: no file is changed, even while another process trains the run.
 
 use super::beginning::settings_of_mark;
-use super::more_steps::told_of_rates;
+use super::more_steps::text_of_rates;
 use super::out_folder::{self, check_restart};
 use super::resume::{Earlier, ResumeRequest, goal, read_summary, result_to_continue, stored_folder};
 use crate::base::units::{format_grouped, format_seconds};
@@ -83,7 +83,7 @@ fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> Strin
         }
         None => String::new(),
     };
-    let rates = told_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
+    let rates = text_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
     format!(
         "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",
         out.display()

@@ -23,7 +23,6 @@ use std::path::Path;
 
 /// Outputs and controls of a loop.
 pub struct LoopOutputs<'a> {
-    /// Output folder.
     pub out: &'a Path,
     /// Writer of metrics.jsonl.
     pub metrics: &'a mut MetricsLog,
@@ -58,7 +57,7 @@ impl Trainer {
             if !self.is_ahead() {
                 self.start_paging_if_outgrown(outputs)?;
             }
-            self.goes_ahead = self.nothing_follows_next_step(outputs);
+            self.goes_ahead = self.may_run_ahead(outputs);
             let before = self.renderer.traffic();
             let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
             self.check_statistics(outputs)?;
@@ -101,7 +100,7 @@ impl Trainer {
     }
 
     /// Whether the loop neither reads nor changes the scene between the next step and the one after it.
-    fn nothing_follows_next_step(&self, outputs: &LoopOutputs<'_>) -> bool {
+    fn may_run_ahead(&self, outputs: &LoopOutputs<'_>) -> bool {
         let (done, options) = (self.state.step + 1, &self.options);
         let due = |every: u32| every > 0 && done.is_multiple_of(every);
         let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;

@@ -33,7 +33,6 @@ const FIT_ROUNDS: usize = 10;
 pub struct EvalRequest<'a> {
     /// Indices in `dataset.views`.
     pub views: &'a [usize],
-    /// Variant of SSIM.
     pub ssim: SsimVariant,
     /// Folder for pictures (render beside photo) and the figures of each view, created if missing; `None` for none.
     pub pictures: Option<&'a Path>,

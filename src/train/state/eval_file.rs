@@ -40,7 +40,6 @@ pub struct EvalReport {
     pub scene: PathBuf,
     /// Gaussians in the file; of the finest level.
     pub gaussians: u64,
-    /// Variant of SSIM.
     pub ssim_variant: String,
     /// Network and input range of LPIPS (`alex, signed`), if measured.
     #[serde(skip_serializing_if = "Option::is_none", default)]
@@ -66,7 +65,6 @@ pub struct Figures {
 pub struct LevelReport {
     /// Number of the level; the finest is 0.
     pub level: u32,
-    /// Its figures.
     #[serde(flatten)]
     pub figures: Figures,
 }

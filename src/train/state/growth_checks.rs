@@ -5,7 +5,7 @@
 //!
 //! Invariants: 1. a check changes no row; 2. a check that failed is still due.
 
-use super::leave_out::{Compared, Now, psnr_of_view, psnr_without_faint};
+use super::leave_out::{Compared, psnr_of_view, psnr_without_faint};
 use super::trainer::Trainer;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -14,6 +14,7 @@ use crate::render::Renderer;
 use crate::render::color_correct::ColorCorrect;
 use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
+use crate::train::step::view::Now;
 use std::time::Instant;
 
 impl Trainer {

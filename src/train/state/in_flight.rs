@@ -37,7 +37,7 @@ impl Trainer {
         if let Some(error) = self.ahead_failed.take() {
             return Err(error);
         }
-        if !self.is_ahead() && self.compares_plainly() {
+        if !self.is_ahead() && self.compares_without_correction() {
             self.record(dataset, (0, target))?;
         }
         if self.is_ahead() {
@@ -58,7 +58,7 @@ impl Trainer {
     }
 
     /// Whether pictures are compared with photos without correction or masks, so that no step needs its picture on the host.
-    fn compares_plainly(&self) -> bool {
+    fn compares_without_correction(&self) -> bool {
         !self.photos.iter().any(|parameter| parameter.needs_host())
     }
 
@@ -90,7 +90,7 @@ impl Trainer {
     /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
     fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let may_record = self.device.as_ref().is_some_and(DeviceTier::may_record);
-        if !may_record || !self.goes_ahead || !self.decides_nothing_after(self.state.step) {
+        if !may_record || !self.goes_ahead || !self.has_no_event_or_end_after(self.state.step) {
             return Ok(());
         }
         let Some(&view) = self.coming_views(2).get(1) else { return Ok(()) };
@@ -105,7 +105,7 @@ impl Trainer {
     }
 
     /// Whether no event follows 0-based `step`, and no outcome of the step can end the run.
-    fn decides_nothing_after(&self, step: u32) -> bool {
+    fn has_no_event_or_end_after(&self, step: u32) -> bool {
         let strategy = &self.options.strategy;
         let reads = strategy.reads_histogram(step) || strategy.growth_check(step).is_some();
         let is_steady = self.state.steps_skipped_in_a_row == 0 && self.idle.is_busy();

@@ -8,7 +8,6 @@
 //! weight, then by their place in the view; 3. memory beside the renderer's is that of one batch of rows, and four bytes a
 //! row of the view.
 
-use crate::base::ids::PageNo;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::metrics::psnr;
 use crate::render::{LossOptions, RenderOptions, Renderer};
@@ -17,7 +16,7 @@ use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use crate::train::log::report::json_psnr;
 use crate::train::step::pages::PagedScene;
-use crate::train::step::view::{batches, begin};
+use crate::train::step::view::{Now, ViewPass};
 use crate::train::step::working_set::WorkingSet;
 
 /// One in this many drawn rows is left out.
@@ -34,9 +33,6 @@ pub(super) struct Compared<'a> {
     /// A correction of the pictures before they are compared.
     pub correct: Option<ColorCorrect>,
 }
-
-/// The scene after so many steps, and room for the rows of a view.
-pub(super) type Now<'a> = (&'a mut PagedScene, u32, &'a mut WorkingSet);
 
 /// PSNR of a view with all rows, dB.
 ///
@@ -75,9 +71,8 @@ fn drawn<T>(
     view: &Compared<'_>,
     measure: impl FnOnce(&mut Draw<'_, '_>) -> Result<T, TrainError>,
 ) -> Result<T, TrainError> {
-    let pages = scene.pager.pages_of_view(view.camera);
-    let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(view.pages_most));
-    measure(&mut Draw { scene, now, working, renderer, view, batches: &batches })
+    let pass = ViewPass::new(scene, view.camera, view.render, view.pages_most);
+    measure(&mut Draw { scene, now, working, renderer, view, pass: &pass })
 }
 
 /// Whether each row stays: all but the faintest quarter of those that were drawn.
@@ -99,23 +94,20 @@ struct Draw<'a, 'v> {
     working: &'a mut WorkingSet,
     renderer: &'a mut dyn Renderer,
     view: &'a Compared<'v>,
-    batches: &'a [&'a [PageNo]],
+    pass: &'a ViewPass<'v>,
 }
 
 impl Draw<'_, '_> {
     /// Draws the rows that stay, all without a list, and compares the picture; returns its PSNR.
     fn picture(&mut self, kept: Option<&[bool]>) -> Result<f64, TrainError> {
-        begin(self.renderer, self.view.camera, self.view.render, self.batches)?;
         let mut first = 0;
-        for batch in self.batches {
-            self.scene.gather_pages(batch, self.view.camera, self.now, self.working)?;
-            let rows = self.working.columns.rows();
+        self.pass.rows_in((&mut *self.scene, self.now, &mut *self.working), &mut *self.renderer, |columns| {
+            let rows = columns.rows();
             if let Some(kept) = kept {
-                self.working.columns.retain_rows(|_, row| kept[first + row]);
+                columns.retain_rows(|_, row| kept[first + row]);
             }
-            self.renderer.rows_in(&self.working.columns)?;
             first += rows;
-        }
+        })?;
         self.renderer.picture()?;
         let (image, target) = (self.renderer.image()?, self.view.target);
         Ok(json_psnr(match self.view.correct {
@@ -128,15 +120,10 @@ impl Draw<'_, '_> {
     fn weights(&mut self) -> Result<Vec<f32>, TrainError> {
         self.renderer.loss(self.view.target, self.view.loss)?;
         self.renderer.picture_back()?;
-        let mut parts = Vec::with_capacity(self.batches.len());
-        for (i, batch) in self.batches.iter().enumerate().rev() {
-            if i + 1 < self.batches.len() {
-                self.scene.gather_pages(batch, self.view.camera, self.now, self.working)?;
-            }
-            let WorkingSet { columns, gradients, .. } = &mut *self.working;
-            self.renderer.rows_out(i, columns, gradients)?;
+        let mut parts = Vec::new();
+        self.pass.rows_out((&mut *self.scene, self.now, &mut *self.working), &mut *self.renderer, |gradients| {
             parts.push(gradients.weights.iter().map(|[weight, _]| *weight).collect::<Vec<f32>>());
-        }
+        })?;
         parts.reverse();
         Ok(parts.concat())
     }

@@ -65,7 +65,7 @@ impl Trainer {
     pub(super) fn view_in_turn(&self, step: u32, position: usize) -> usize {
         let views = self.train_views.len();
         let at = |position: usize| self.train_views[self.held_out.trained_at(step, position)];
-        let gives_away = |position: usize| self.photos.iter().any(|photo| photo.gives_turn_away(at(position), step));
+        let gives_away = |position: usize| self.photos.iter().any(|photo| photo.is_replaced_at(at(position), step));
         at(substitute((position, views), step as usize / views, gives_away))
     }
 }

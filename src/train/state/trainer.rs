@@ -50,7 +50,6 @@ const PREFETCH_VIEWS: u32 = 8;
 pub struct Trainer {
     /// The pages, the optimizer and the event log.
     pub scene: PagedScene,
-    /// The renderer.
     pub renderer: Box<dyn Renderer>,
     /// The pages on the renderer's device, from the first step of a run that updates them there.
     pub(crate) device: Option<DeviceTier>,
@@ -101,7 +100,6 @@ fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
 /// The largest sizes of the views of [`Trainer::probe_views`].
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Probed {
-    /// Pixels.
     pub pixels: usize,
     /// Rows in view.
     pub visible: usize,
@@ -222,7 +220,6 @@ impl Trainer {
         self.held_out = HeldOut::new(&self.options.strategy, self.train_views.len());
     }
 
-    /// The view order.
     pub fn view_order(&self) -> &ViewOrder {
         &self.order
     }
@@ -234,7 +231,6 @@ impl Trainer {
         [self.working.bytes() as u64, self.renderer.host_bytes() + due + photos]
     }
 
-    /// The options.
     pub fn options(&self) -> &RunOptions {
         &self.options
     }
@@ -244,7 +240,6 @@ impl Trainer {
         (self.scene.rules.sh_degree(), self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
     }
 
-    /// Steps done.
     pub fn steps_done(&self) -> u32 {
         self.state.step
     }
@@ -275,7 +270,6 @@ impl Trainer {
         RenderOptions { sh_degree: self.scene.rules.sh_degree(), ..self.options.render }
     }
 
-    /// The event log.
     pub fn events(&self) -> &EventLog {
         self.scene.events()
     }

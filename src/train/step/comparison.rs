@@ -15,9 +15,7 @@ use crate::scene::image::Target;
 
 /// What the picture of a view is compared with.
 pub struct Comparison<'a> {
-    /// The photo.
     pub target: &'a Target,
-    /// The loss.
     pub loss: LossOptions,
     /// What acts on the picture or learns from the step; each has begun the step.
     pub photos: &'a mut [Box<dyn PhotoParameter>],

@@ -43,7 +43,7 @@ impl DeviceTier {
         (step, of_view): (u32, &[PageNo]),
         leaves: Leaves,
     ) -> Result<(), TrainError> {
-        if !self.serves(step) {
+        if !self.is_payload_valid_at(step) {
             return Ok(());
         }
         let missing = of_view.iter().copied().filter(|page| self.slots.state(*page).is_none());

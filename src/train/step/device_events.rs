@@ -24,7 +24,7 @@ use crate::densify::strategy::Extremes;
 use crate::kernels::page_words::PageSurvey;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::SlotPage;
-use crate::render::{RenderError, Renderer};
+use crate::render::{Renderer, none_if_out_of_memory};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::sightings::WEIGHT_MOST;
 use crate::train::error::TrainError;
@@ -44,14 +44,6 @@ fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
 fn best_facts(page: &PageMeta) -> PageFacts {
     let [lowest_opacity, least_weight] = [f32::INFINITY.to_bits(); 2];
     facts(page, &PageSurvey { largest_mean: 0, lowest_opacity, least_weight, pad: 0 })
-}
-
-/// `None` where memory is short.
-fn unless_short<T>(done: Result<T, RenderError>) -> Result<Option<T>, TrainError> {
-    match done {
-        Err(RenderError::Device(error)) if error.lacks_room() => Ok(None),
-        done => Ok(Some(done?)),
-    }
 }
 
 /// Whether the events that a page is behind in certainly edit its rows, so that its payload in a slot serves no step any more.
@@ -107,13 +99,13 @@ impl DeviceTier {
         }
         let _span = trace::span("clear statistics").with("pages", pages.len() as u64);
         let device = device_of(renderer)?;
-        let Some(surveys) = unless_short(device.survey(&in_slots))? else { return Ok(()) };
+        let Some(surveys) = none_if_out_of_memory(device.survey(&in_slots))? else { return Ok(()) };
         let of_pages = pages.into_iter().zip(in_slots).zip(&surveys);
         let (cleared, in_slots): (Vec<&mut PinnedPage>, Vec<SlotPage>) = of_pages
             .filter(|((page, _), survey)| only_clears(page, &facts(&page.meta, survey)))
             .map(|(page_in_slot, _)| page_in_slot)
             .unzip();
-        if cleared.is_empty() || unless_short(device.clear_statistics(&in_slots))?.is_none() {
+        if cleared.is_empty() || none_if_out_of_memory(device.clear_statistics(&in_slots))?.is_none() {
             return Ok(());
         }
         self.traffic.cleared += cleared.len() as u64;

@@ -80,15 +80,12 @@ enum Recorded {
 pub struct StepToRecord<'a> {
     /// 0-based step.
     pub step: u32,
-    /// Its camera.
     pub camera: &'a Camera,
     /// Step and camera after it.
     pub next: Option<(u32, &'a Camera)>,
     /// How the view is drawn.
     pub render: &'a RenderOptions,
-    /// Its photo.
     pub target: &'a Target,
-    /// The loss.
     pub loss: &'a LossOptions,
     /// Whether the step collects statistics.
     pub collects: bool,
@@ -141,7 +138,7 @@ impl DeviceTier {
         let widened = |page: &PageNo| self.flights.one_step.widened(&index[page.index()].bounds, now);
         let known: BTreeSet<PageNo> = pages.iter().copied().collect();
         let others = self.flights.pages.keys().filter(|page| !known.contains(page));
-        pages.extend(others.filter(|page| planes.may_meet(&widened(page))));
+        pages.extend(others.filter(|page| planes.may_intersect(&widened(page))));
         pages.sort_unstable_by_key(|page| index[page.index()].id);
         pages
     }
@@ -232,19 +229,19 @@ impl DeviceTier {
         let _span = trace::span("record step").with("recorded", recorded).with("pages", of_view);
         let flying = std::mem::take(&mut self.flights.pages);
         let pinned: Vec<&PinnedPage> = pages.iter().filter_map(|page| flying.get(page)).map(|(page, _)| page).collect();
-        let in_slots = self.load_behind(scene, renderer, step.step, &pinned);
+        let in_slots = self.load_after_queued_work(scene, renderer, step.step, &pinned);
         self.flights.pages = flying;
         let Some(in_slots) = in_slots? else { return Ok(Recorded::TooEarly) };
         let rows_in_pages: u64 = in_slots.iter().map(|page| page.layout.rows as u64).sum();
-        let strikes = |fault: StepFault| self.flights.faults.strikes(fault, step.step);
-        let (rows_room, closes) = (step.rows_room(rows_in_pages), strikes(StepFault::Closed));
+        let is_injected = |fault: StepFault| self.flights.faults.is_injected_at(fault, step.step);
+        let (rows_room, closes) = (step.rows_room(rows_in_pages), is_injected(StepFault::Closed));
         let job = StepJob {
             pages: &in_slots,
             numbers: &scene.rules.adam.at(step.step).numbers(),
             camera: step.camera,
             options: step.render,
-            rows_room: if strikes(StepFault::Rows) { 1 } else { rows_room },
-            isects_most: if strikes(StepFault::Isects) { 1 } else { u32::MAX },
+            rows_room: if is_injected(StepFault::Rows) { 1 } else { rows_room },
+            isects_most: if is_injected(StepFault::Isects) { 1 } else { u32::MAX },
         };
         if !device_of(renderer)?.record_picture(&job)? {
             return Ok(Recorded::Short);

@@ -1,4 +1,4 @@
-//! Eviction in the order of the device's queue: a page leaves its slot behind the work submitted so far, and another payload takes the
+//! Eviction in the order of the device's queue: a page is evicted after the queued work, and another payload takes the
 //! slot, while the host waits for nothing.
 //!
 //! ```text
@@ -63,7 +63,7 @@ impl DeviceTier {
         if wanted > 0 {
             let latest = coming.iter().map(|page| page.next_use).max().unwrap_or(0);
             let victims = self.in_order_of_eviction(scene, kept, latest, wanted);
-            self.evict_behind(renderer, behind, leaves, &victims)?;
+            self.evict_after_queued_work(renderer, behind, leaves, &victims)?;
         }
         let (mut copies, mut pages) = (Vec::new(), Vec::new());
         for page in coming {
@@ -110,7 +110,7 @@ impl DeviceTier {
     }
 
     /// Empties the slots of these pages, behind the work submitted so far. Pages for whose copies back there is no memory stay.
-    fn evict_behind(
+    fn evict_after_queued_work(
         &mut self,
         renderer: &mut dyn Renderer,
         behind: u32,

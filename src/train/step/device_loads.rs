@@ -1,7 +1,7 @@
 //! Puts the pages of a batch into slots of a device: finds those that have one, and copies up the payloads of the others.
 //!
 //! Two ways make room. A step that waits for its numbers copies back first, and waits ([`DeviceTier::load`]). A step that is recorded lets pages
-//! leave behind the work under way ([`DeviceTier::load_behind`]). Both evict by Belady's order.
+//! leave behind the work under way ([`DeviceTier::load_after_queued_work`]). Both evict by Belady's order.
 //!
 //! Not here: payloads of the next step (`device_ahead`), the eviction itself where nothing waits (`device_leaving`).
 //!
@@ -20,7 +20,6 @@ use crate::render::Renderer;
 use crate::render::pages::{DeviceSlot, SlotPage};
 use crate::train::error::TrainError;
 
-/// A page's payload.
 fn payload(page: &PinnedPage) -> &[u8] {
     &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]
 }
@@ -71,7 +70,7 @@ impl DeviceTier {
 
     /// As [`DeviceTier::load`], for a step that is recorded: room is made behind the steps in flight, and nothing waits. Without memory for
     /// that, a step that is alone waits; `None` for a step behind another one.
-    pub(super) fn load_behind(
+    pub(super) fn load_after_queued_work(
         &mut self,
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
@@ -187,7 +186,7 @@ impl DeviceTier {
         let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
         for page in pages {
             let next_use = scene.pager.next_use(page);
-            let is_kept = self.serves(next_use) && !are_edits_due(scene, page);
+            let is_kept = self.is_payload_valid_at(next_use) && !are_edits_due(scene, page);
             self.slots.set_next_use(page, if is_kept { next_use } else { NEVER });
         }
     }

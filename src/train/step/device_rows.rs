@@ -25,7 +25,6 @@ const SLOTS_AHEAD_SHARE: usize = 4;
 pub struct DeviceRows<'a> {
     tier: &'a mut DeviceTier,
     renderer: &'a mut dyn Renderer,
-    /// This step.
     step: u32,
     /// The camera of the next step.
     next: Option<&'a Camera>,

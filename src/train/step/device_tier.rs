@@ -6,7 +6,7 @@
 //! nor evicts it.
 //!
 //! Not here: pages that events change (`device_events`); steps in flight (`device_flights`); how a batch gets its slots (`device_loads`);
-//! copies for the next step while the device computes this one (`device_ahead`); pages that leave their slots behind work under way
+//! copies for the next step while the device computes this one (`device_ahead`); pages evicted after the queued work
 //! (`device_leaving`).
 //!
 //! Invariants: 1. a held page differs from its frame, and every other page equals it; 2. slots, frames and the order of
@@ -44,17 +44,14 @@ pub struct SlotTraffic {
     pub loads: u64,
     /// Those copied while the device computed the step before.
     pub loads_ahead: u64,
-    /// Their bytes.
     pub bytes_loaded: u64,
     /// Payloads copied back.
     pub drains: u64,
-    /// Their bytes.
     pub bytes_drained: u64,
     /// Pages of batches that were on the device already.
     pub hits: u64,
     /// Pages whose statistics the device cleared after a round, in place of a drain, an edit and a load.
     pub cleared: u64,
-    /// Slots.
     pub slots: u64,
     /// The fewest bytes that any order of eviction could have copied to that many slots so far ([`FewestReads`]); to compare
     /// with `bytes_loaded`. Pages that events changed on the host are copied again in any order.
@@ -135,7 +132,7 @@ impl DeviceTier {
         let flights = Flights::new(OneStep::new(&numbers, scene.rules.splits()));
         let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;
-        device.hold_pages(&PageRules {
+        device.prepare_page_storage(&PageRules {
             payload_bytes,
             numbers,
             splits,
@@ -174,7 +171,6 @@ impl DeviceTier {
         }
     }
 
-    /// Slots.
     pub fn slots(&self) -> usize {
         self.slots.frames_max()
     }
@@ -197,8 +193,8 @@ impl DeviceTier {
         }
     }
 
-    /// Whether the payloads of now serve 0-based `step`, unless events edit their page alone.
-    pub(super) fn serves(&self, step: u32) -> bool {
+    /// Whether the payloads of now are valid at 0-based `step`, unless events edit their page alone.
+    pub(super) fn is_payload_valid_at(&self, step: u32) -> bool {
         self.edits_after.is_none_or(|after| step <= after)
     }
 
@@ -220,7 +216,6 @@ impl DeviceTier {
         }
     }
 
-    /// A step begins.
     pub(super) fn begin_step(
         &mut self,
         scene: &mut PagedScene,
@@ -249,7 +244,7 @@ impl DeviceTier {
         // As many frames again as the batch has pages: for pages that split, and for reads ahead.
         let in_flight = self.flights.pages() + self.pages_leaving();
         let most = scene.pager.frames_max().saturating_sub(in_flight + others.len() + pages.len()).max(own.len());
-        self.drain_to(scene, renderer, most, pages)?;
+        self.write_back_down_to(scene, renderer, most, pages)?;
         scene.pager.set_held(in_flight + self.held.len() - own.len());
         let mut pinned = pin(scene, &others)?;
         pinned.extend(own.iter().filter_map(|page| self.held.remove(page)));
@@ -258,7 +253,7 @@ impl DeviceTier {
     }
 
     /// Copies held pages back until at most `most` are held, the pages with the farthest next use first, but none of `kept`.
-    fn drain_to(
+    fn write_back_down_to(
         &mut self,
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
@@ -327,7 +322,7 @@ impl DeviceTier {
             return Err(RenderError::OutOfOrder { call: "drain", needs: "finish of every step in flight" }.into());
         }
         self.finish_leaving(scene, renderer, u32::MAX, &mut [])?;
-        self.drain_to(scene, renderer, 0, &[])?;
+        self.write_back_down_to(scene, renderer, 0, &[])?;
         self.take_bins(scene, renderer)
     }
 

@@ -19,7 +19,6 @@ pub const STEPS_IN_FLIGHT: usize = 2;
 pub(super) struct Flight {
     /// Its number, 0-based.
     pub step: u32,
-    /// Its camera.
     pub camera: Camera,
     /// Its pages, ascending by id.
     pub pages: Vec<PageNo>,
@@ -40,7 +39,6 @@ pub(super) struct Flights {
     pub is_sure: bool,
     /// How far an update moves bounds.
     pub one_step: OneStep,
-    /// Injected faults.
     pub faults: StepFaults,
 }
 

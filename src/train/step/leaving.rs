@@ -11,7 +11,6 @@ use crate::render::pages::DeviceSlot;
 /// A page that is leaving.
 #[derive(Debug)]
 pub(super) struct Leaving {
-    /// The page.
     pub page: PageNo,
     /// The slot that is copied back.
     pub slot: DeviceSlot,

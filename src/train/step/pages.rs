@@ -45,7 +45,6 @@ pub struct PageRules {
     events: EventLog,
     seed: u64,
     page_rows: usize,
-    /// The densification strategy.
     pub(crate) strategy: Arc<dyn Strategy>,
     /// Limits within which an unseen row may split; used by page bounds.
     splits: SplitLimits,
@@ -189,7 +188,6 @@ impl PagedScene {
         self.rows_bound
     }
 
-    /// The event log.
     pub fn events(&self) -> &EventLog {
         &self.rules.events
     }
@@ -333,13 +331,13 @@ impl PagedScene {
     }
 
     /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
-    /// copies. Stored pages stay unchanged.
+    /// copies. Begins to read the pages `next`. Stored pages stay unchanged.
     ///
     /// # Errors
     /// Pages could not be pinned.
     pub fn gather_pages(
         &mut self,
-        pages: &[PageNo],
+        (pages, next): (&[PageNo], &[PageNo]),
         camera: &Camera,
         now: u32,
         working: &mut WorkingSet,
@@ -350,7 +348,7 @@ impl PagedScene {
         }
         columns.resize(0);
         let mut part = Columns::zeros(0, self.rules.sh_degree);
-        self.visit(pages, &mut |rules, tables| {
+        self.visit((pages, next), &mut |rules, tables| {
             visible_rows(tables, &rules.adam, now, camera, row_from_working);
             gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
             append(columns, &part);
@@ -388,7 +386,7 @@ impl PagedScene {
         now: u32,
         each: &mut dyn FnMut(&Columns) -> Result<(), E>,
     ) -> Result<(), E> {
-        self.visit(pages, &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+        self.visit((pages, &[]), &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
     /// Pins the first pages of a list, `batch` at most, and returns the list of the others. Where dirty pages cannot be written,
@@ -407,14 +405,19 @@ impl PagedScene {
         }
     }
 
-    /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies.
-    pub(crate) fn visit<E: From<PagingError>>(&mut self, pages: &[PageNo], each: &mut Visitor<'_, E>) -> Result<(), E> {
+    /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies, and prefetches.
+    pub(crate) fn visit<E: From<PagingError>>(
+        &mut self,
+        (pages, next): (&[PageNo], &[PageNo]),
+        each: &mut Visitor<'_, E>,
+    ) -> Result<(), E> {
         // The copies of a batch take as much memory as its frames.
         let mut batch = PAGES_PER_BATCH.min(self.pager.frames_max() / 2).max(1);
         let mut rest = pages;
         while !rest.is_empty() {
             let (pinned, later) = self.acquire_first(rest, &mut batch)?;
             rest = later;
+            self.pager.prefetch_pages(rest.iter().chain(next).copied().take(batch));
             let rules = &self.rules;
             let pending = rules.pending();
             let copies: Vec<Option<SceneState>> = pinned

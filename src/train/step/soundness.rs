@@ -17,7 +17,6 @@ const UNSOUND_STEPS_MAX: u32 = 3;
 /// The steps since a row was last rewritten, in this process.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Idle {
-    /// Steps.
     steps: usize,
     /// Steps whose photo is masked completely.
     masked: usize,

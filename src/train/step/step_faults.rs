@@ -46,8 +46,8 @@ impl StepFaults {
         std::env::var(FAULTS).map_or(StepFaults::default(), |text| StepFaults::parse(&text))
     }
 
-    /// Whether a fault strikes a step.
-    pub fn strikes(&self, fault: StepFault, step: u32) -> bool {
+    /// Whether a fault is injected at a step.
+    pub fn is_injected_at(&self, fault: StepFault, step: u32) -> bool {
         self.0.contains(&(fault, step))
     }
 }
@@ -65,8 +65,8 @@ mod tests {
     #[test]
     fn faults_strike_the_steps_they_name() {
         let faults = StepFaults::parse("rows@12, closed@13,fire@1,isects@,closed");
-        assert!(faults.strikes(StepFault::Rows, 12) && faults.strikes(StepFault::Closed, 13));
-        assert!(!faults.strikes(StepFault::Rows, 13) && !faults.strikes(StepFault::Isects, 12));
+        assert!(faults.is_injected_at(StepFault::Rows, 12) && faults.is_injected_at(StepFault::Closed, 13));
+        assert!(!faults.is_injected_at(StepFault::Rows, 13) && !faults.is_injected_at(StepFault::Isects, 12));
         assert_eq!(faults.0.len(), 2);
         assert!(StepFaults::parse("").0.is_empty());
     }

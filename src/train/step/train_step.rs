@@ -267,7 +267,7 @@ impl Passes<'_, '_> {
         drop(span);
         if is_first {
             self.read_loss()?;
-            self.outcome.skipped = self.why_skipped()?;
+            self.outcome.skipped = self.skip_reason()?;
         }
         self.prefetch_before_last();
         if self.outcome.skipped.is_some() {
@@ -283,7 +283,7 @@ impl Passes<'_, '_> {
     }
 
     /// Why the step is skipped, decided for the whole view before its first batch is updated.
-    fn why_skipped(&mut self) -> Result<Option<Skipped>, TrainError> {
+    fn skip_reason(&mut self) -> Result<Option<Skipped>, TrainError> {
         if !self.outcome.loss.loss.is_finite() {
             return Ok(Some(Skipped::Loss));
         }

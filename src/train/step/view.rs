@@ -1,6 +1,8 @@
-//! A view as it is now, outside of a training step: for evaluation, and to see what a view takes before the first step.
+//! A view as it is now, outside of a training step: for evaluation, checks of growth and pictures, and to see what a view takes before
+//! the first step. Steps change rows, and have their own passes (`train_step`).
 //!
-//! Rows go to the renderer batch by batch, as in a step, with the events that pages miss applied to copies.
+//! Rows go to the renderer batch by batch ([`ViewPass`]), as in a step, with the events that pages miss applied to copies. While a batch is
+//! gathered, the pages of the next one are read.
 //!
 //! Invariants: 1. nothing is stored; 2. memory beside the renderer's is bounded by the rows of one batch, however many rows
 //! the view has.
@@ -9,30 +11,118 @@ use super::comparison::Comparison;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
-use crate::render::{RenderOptions, Renderer, RowBatches};
+use crate::render::{Gradients, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
+use std::iter::Peekable;
+use std::vec::IntoIter;
 
 /// Pages of a batch of an evaluation, at most.
 const PAGES_PER_BATCH: usize = 64;
+
+/// The scene after so many steps, and room for the rows of a view.
+pub type Now<'a> = (&'a mut PagedScene, u32, &'a mut WorkingSet);
+
+/// The passes of a renderer over the pages of one view: in, as often as wanted, and out.
+pub(crate) struct ViewPass<'a> {
+    camera: &'a Camera,
+    options: &'a RenderOptions,
+    pages: Vec<PageNo>,
+    per_batch: usize,
+}
+
+/// Batches of a pass that are still to come, each with its number. While one is gathered, the next one is prefetched.
+struct Batches<'p> {
+    camera: &'p Camera,
+    coming: Peekable<IntoIter<(usize, &'p [PageNo])>>,
+}
+
+impl<'a> ViewPass<'a> {
+    /// Lists the pages that the camera may see; a batch has at most `pages_most` of them.
+    pub fn new(scene: &PagedScene, camera: &'a Camera, options: &'a RenderOptions, pages_most: usize) -> ViewPass<'a> {
+        let pages = scene.pager.pages_of_view(camera);
+        let per_batch = scene.pager.pages_per_batch(pages.len()).min(pages_most).max(1);
+        ViewPass { camera, options, pages, per_batch }
+    }
+
+    /// The pass in: hands the rows to the renderer, each batch as `edit` leaves it; [`Renderer::picture`] is next. Returns the rows of
+    /// the view before they were edited.
+    ///
+    /// # Errors
+    /// Pages could not be had, or the renderer failed.
+    pub fn rows_in(
+        &self,
+        (scene, now, working): Now<'_>,
+        renderer: &mut dyn Renderer,
+        mut edit: impl FnMut(&mut Columns),
+    ) -> Result<usize, TrainError> {
+        let batches = self.batches();
+        let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
+        renderer.begin_view(self.camera, self.options, how)?;
+        let mut batches = Batches { camera: self.camera, coming: batches.into_iter().peekable() };
+        let mut rows = 0;
+        while batches.gather_next((&mut *scene, now, &mut *working))?.is_some() {
+            rows += working.columns.rows();
+            edit(&mut working.columns);
+            renderer.rows_in(&working.columns)?;
+        }
+        Ok(rows)
+    }
+
+    /// The pass out, from the last batch to the first, after a pass in with the same working set that edited no row; `each` gets the
+    /// gradients of a batch.
+    ///
+    /// # Errors
+    /// As [`ViewPass::rows_in`].
+    pub fn rows_out(
+        &self,
+        (scene, now, working): Now<'_>,
+        renderer: &mut dyn Renderer,
+        mut each: impl FnMut(&Gradients),
+    ) -> Result<(), TrainError> {
+        let mut batches = self.batches();
+        // The pass in has left the rows of the last batch in the working set.
+        let mut gathered = batches.pop().map(|(number, _)| number);
+        batches.reverse();
+        let mut batches = Batches { camera: self.camera, coming: batches.into_iter().peekable() };
+        while let Some(number) = gathered {
+            renderer.rows_out(number, &working.columns, &mut working.gradients)?;
+            each(&working.gradients);
+            gathered = batches.gather_next((&mut *scene, now, &mut *working))?;
+        }
+        Ok(())
+    }
+
+    /// At least one batch, though a view may see nothing.
+    fn batches(&self) -> Vec<(usize, &[PageNo])> {
+        let no_pages: &[PageNo] = &[];
+        let first = self.pages.is_empty().then_some(no_pages);
+        first.into_iter().chain(self.pages.chunks(self.per_batch)).enumerate().collect()
+    }
+}
+
+impl Batches<'_> {
+    /// Gathers the rows of the next batch; returns its number, `None` after the last.
+    fn gather_next(&mut self, (scene, now, working): Now<'_>) -> Result<Option<usize>, TrainError> {
+        let Some((number, pages)) = self.coming.next() else { return Ok(None) };
+        let next = self.coming.peek().map_or(&[][..], |(_, pages)| *pages);
+        scene.gather_pages((pages, next), self.camera, now, working)?;
+        Ok(Some(number))
+    }
+}
 
 /// Renders the picture that `camera` has after `now` steps; [`Renderer::image`] gives it.
 ///
 /// # Errors
 /// Pages could not be had, or the renderer failed.
 pub fn draw(
-    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
+    now: Now<'_>,
     renderer: &mut dyn Renderer,
     camera: &Camera,
     options: &RenderOptions,
 ) -> Result<(), TrainError> {
-    let pages = scene.pager.pages_of_view(camera);
-    let batches = batches(&pages, PAGES_PER_BATCH.min(scene.pager.pages_per_batch(pages.len())));
-    begin(renderer, camera, options, &batches)?;
-    for batch in batches {
-        scene.gather_pages(batch, camera, now, working)?;
-        renderer.rows_in(&working.columns)?;
-    }
+    ViewPass::new(now.0, camera, options, PAGES_PER_BATCH).rows_in(now, renderer, |_| {})?;
     Ok(renderer.picture()?)
 }
 
@@ -42,45 +132,18 @@ pub fn draw(
 /// # Errors
 /// As [`draw`].
 pub fn rehearse(
-    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
+    (scene, now, working): Now<'_>,
     renderer: &mut dyn Renderer,
     camera: &Camera,
     (options, comparison): (&RenderOptions, &mut Comparison<'_>),
     pages_most: usize,
 ) -> Result<usize, TrainError> {
-    let pages = scene.pager.pages_of_view(camera);
-    let batches = batches(&pages, scene.pager.pages_per_batch(pages.len()).min(pages_most));
-    begin(renderer, camera, options, &batches)?;
-    let mut rows = 0;
-    for batch in &batches {
-        scene.gather_pages(batch, camera, now, working)?;
-        renderer.rows_in(&working.columns)?;
-        rows += working.columns.rows();
-    }
+    let pass = ViewPass::new(scene, camera, options, pages_most);
+    let rows = pass.rows_in((&mut *scene, now, &mut *working), renderer, |_| {})?;
     renderer.picture()?;
     comparison.loss_and_back(renderer)?;
-    for (i, batch) in batches.iter().enumerate().rev() {
-        if i + 1 < batches.len() {
-            scene.gather_pages(batch, camera, now, working)?;
-        }
-        renderer.rows_out(i, &working.columns, &mut working.gradients)?;
-    }
+    pass.rows_out((scene, now, working), renderer, |_| {})?;
     renderer.loss_value()?;
     renderer.unusable_splats()?;
     Ok(rows)
-}
-
-/// At least one batch, though a view may see nothing.
-pub(crate) fn batches(pages: &[PageNo], per_batch: usize) -> Vec<&[PageNo]> {
-    if pages.is_empty() { vec![pages] } else { pages.chunks(per_batch.max(1)).collect() }
-}
-
-pub(crate) fn begin(
-    renderer: &mut dyn Renderer,
-    camera: &Camera,
-    options: &RenderOptions,
-    batches: &[&[PageNo]],
-) -> Result<(), TrainError> {
-    let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
-    Ok(renderer.begin_view(camera, options, how)?)
 }

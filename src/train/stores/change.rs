@@ -19,7 +19,6 @@ use serde::Serialize;
 pub struct RolledBack {
     /// The latest generation after the rollback.
     pub generation: u64,
-    /// Its step.
     pub step: u32,
     /// Dropped later generations.
     pub dropped: Vec<u64>,
@@ -78,7 +77,6 @@ pub struct PruneRequest {
 /// Result of a prune, done or planned.
 #[derive(Debug, Clone, Serialize)]
 pub struct Pruned {
-    /// Removed names.
     pub dropped_names: Vec<String>,
     /// Generations that are no longer kept.
     pub dropped: Vec<u64>,

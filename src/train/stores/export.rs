@@ -36,14 +36,12 @@ use std::path::PathBuf;
 const FRAMES_MAX: usize = 64;
 /// Copies of a page in memory: the frame, the copy with pending events, the evaluated rows, the engine's buffer.
 const COPIES: u64 = 4;
-/// Threads that read.
 const READERS: usize = 4;
 /// Bytes of an entry of the map in memory: version, page, index.
 const ENTRY_BYTES: u64 = 512;
 /// Other memory of the program, bytes.
 const FIXED_BYTES: u64 = 32 << 20;
 
-/// What to export.
 #[derive(Debug, Clone)]
 pub struct ExportRequest {
     /// Number or name of the generation; `None` for the latest.
@@ -63,11 +61,8 @@ pub struct ExportRequest {
 /// Result of an export.
 #[derive(Debug, Clone, Serialize)]
 pub struct Exported {
-    /// The file.
     pub file: PathBuf,
-    /// The generation.
     pub generation: u64,
-    /// Its step.
     pub step: u32,
     /// Gaussians in the file.
     pub gaussians: u64,

@@ -15,7 +15,7 @@ use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::Up;
-use crate::exchange::frames::turn_back;
+use crate::exchange::frames::rotate_back;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::ply::{gaussians_header, holds_gaussians, push_row, stream_gaussians};
 use crate::page::format::codec::Codec;
@@ -63,11 +63,9 @@ pub struct ImportRequest {
 pub struct Imported {
     /// The new folder.
     pub store: PathBuf,
-    /// Gaussians.
     pub gaussians: u64,
     /// Dropped Gaussians with non-finite values.
     pub dropped: u64,
-    /// Pages.
     pub pages: u64,
     /// SH degree of the file.
     pub sh_degree: u8,
@@ -130,7 +128,7 @@ fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMe
     let none = || Columns::zeros(0, sh_degree);
     let (mut some, mut sample) = (none(), PositionSample::default());
     let mut hand_on = |mut columns: Columns| {
-        turn_back(&mut columns, &header);
+        rotate_back(&mut columns, &header);
         sample.add(&columns.means);
         rows.push_all(&columns)
     };
@@ -213,6 +211,6 @@ fn first_state(
     let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale, origin, scale };
     let simd = limits::simd_path(config).name().to_string();
     let origin = Origin { config: text, simd, sh_degree_start: sh_degree, dataset, run: RunIdentity::default() };
-    let state = RunState::without_past(origin, "none".to_string(), rows);
+    let state = RunState::without_history(origin, "none".to_string(), rows);
     Ok(state.to_bytes().map_err(|e| fail(e.to_string()))?)
 }

@@ -21,7 +21,6 @@ use serde::Serialize;
 /// Facts of a store and of one generation.
 #[derive(Debug, Clone, Serialize)]
 pub struct Inspected {
-    /// The store's folder.
     pub store: std::path::PathBuf,
     /// Its identity, hexadecimal.
     pub identity: String,
@@ -37,7 +36,6 @@ pub struct Inspected {
     pub slot_bytes: u64,
     /// Slots in a segment.
     pub slots_per_segment: u32,
-    /// Segment files.
     pub segments: u64,
     /// Bytes of the segment files.
     pub segment_bytes: u64,
@@ -153,11 +151,8 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
 /// Minimum, mean and maximum of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Spread {
-    /// Minimum.
     pub least: f64,
-    /// Mean.
     pub mean: f64,
-    /// Maximum.
     pub most: f64,
 }
 
@@ -168,19 +163,16 @@ pub struct PageInspected {
     pub page: String,
     /// The first generation with this version.
     pub since: u64,
-    /// Segment file.
     pub file: String,
     /// Offset in it, bytes.
     pub offset: u64,
     /// Serial number of the write in this store.
     pub serial: u64,
-    /// Codec.
     pub codec: String,
     /// Bytes of the payload, decoded and stored.
     pub payload_bytes: [u32; 2],
     /// xxh3-128 of the stored payload, hexadecimal.
     pub checksum: String,
-    /// Rows.
     pub rows: u32,
     /// SH degree of the page.
     pub sh_degree: u8,

@@ -10,7 +10,6 @@ use serde::Serialize;
 pub struct GenerationLine {
     /// Its number.
     pub generation: u64,
-    /// Its names.
     pub names: Vec<String>,
     /// Whether `--resume` continues from it.
     pub is_latest: bool,
@@ -22,7 +21,6 @@ pub struct GenerationLine {
     pub gaussians: u64,
     /// Gaussians at most, once all pages have applied all events.
     pub gaussians_at_most: u64,
-    /// Pages.
     pub pages: u64,
     /// Bytes on the drive that no other kept generation needs.
     pub bytes_alone: u64,
@@ -33,7 +31,6 @@ pub struct GenerationLine {
 /// All kept generations of a store.
 #[derive(Debug, Clone, Serialize)]
 pub struct Listed {
-    /// The store's folder.
     pub store: std::path::PathBuf,
     /// The process that writes to it, if any.
     pub used_by: Option<String>,

@@ -38,7 +38,7 @@ use std::path::Path;
 /// # Errors
 /// `of_store` and `run` are both known and differ.
 pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> InputResult<()> {
-    if !of_store.id.is_other_than(run) {
+    if !of_store.id.is_known_to_differ(run) {
         return Ok(());
     }
     let (problem, remedy) = match of_store.out.as_str() {
@@ -77,7 +77,7 @@ impl Claim<'_> {
         if !self.run.is_known() && of_store.id.is_known() && !self.is_named && !is_here {
             return check_owner(folder, of_store, RunId::draw());
         }
-        if is_here && of_store.id.is_other_than(self.run) {
+        if is_here && of_store.id.is_known_to_differ(self.run) {
             let problem = "it holds the checkpoint of an earlier run in the same output folder";
             let remedy = "name the folder that holds the pages of this run with --spill-dir; to resume the earlier run, \
                           name a new output folder and this folder with --spill-dir";

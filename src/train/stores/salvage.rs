@@ -56,13 +56,11 @@ pub struct SalvageRequest {
 /// A page that is missing or an older version.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct LostPage {
-    /// The page.
     pub page: String,
     /// Its rows, if its label is known.
     pub rows: Option<u32>,
     /// Generation of the version taken instead; `None` if no version is undamaged.
     pub taken: Option<u64>,
-    /// Description.
     pub what: String,
 }
 
@@ -75,9 +73,7 @@ pub struct Salvaged {
     pub has_state: bool,
     /// Step of the run, or of the newest row.
     pub step: u32,
-    /// Gaussians.
     pub gaussians: u64,
-    /// Pages.
     pub pages: u64,
     /// Pages that are missing, incomplete or older.
     pub lost: Vec<LostPage>,
@@ -235,7 +231,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         match meta.filter(|_| *is_older) {
             Some(meta) => copy.put(*id, label, &without_statistics(&meta, payload))?,
             None => {
-                if let Some(meta) = meta.filter(|meta| !misses_a_round(meta, &state)) {
+                if let Some(meta) = meta.filter(|meta| !has_pending_round(meta, &state)) {
                     histogram.add_rows(&layout_of(&meta).rows(payload, 0));
                 }
                 copy.put(*id, label, payload)?;
@@ -254,7 +250,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
 
 /// Whether the statistics of a page belong to a round that the page has yet to apply, so the next round's histogram
 /// does not count them.
-fn misses_a_round(meta: &PageMeta, state: &RunState) -> bool {
+fn has_pending_round(meta: &PageMeta, state: &RunState) -> bool {
     let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
     missed.iter().any(|event| matches!(effect_of(&event.kind), Effect::Round(_)))
 }
@@ -470,6 +466,6 @@ fn state_for(
     let simd = limits::simd_path(config).name().to_string();
     let sh_degree_start = sh_degree_start.min(options.sh_degree);
     let origin = Origin { config: text, simd, sh_degree_start, dataset: print.clone(), run };
-    let state = RunState::without_past(origin, "unknown".to_string(), rows);
+    let state = RunState::without_history(origin, "unknown".to_string(), rows);
     Ok(RunState { trainer: TrainerState { step, ..TrainerState::default() }, ..state })
 }

@@ -19,7 +19,6 @@ use serde::Serialize;
 pub struct Fault {
     /// The faulty part: map, state, segment, entry, header, payload, values.
     pub kind: &'static str,
-    /// The page.
     pub page: Option<String>,
     /// First generation of the version, or the generation of a state.
     pub generation: Option<u64>,
@@ -27,14 +26,12 @@ pub struct Fault {
     pub file: Option<String>,
     /// Offset of the slot in it, bytes.
     pub offset: Option<u64>,
-    /// Description.
     pub what: String,
 }
 
 /// Result of a verification.
 #[derive(Debug, Clone, Serialize)]
 pub struct Verdict {
-    /// The store's folder.
     pub store: std::path::PathBuf,
     /// Whether payloads were read.
     pub deep: bool,

@@ -9,7 +9,6 @@ use std::ops::{Add, Div, Mul, Sub};
 pub trait Real: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
     /// Rounds to the type.
     fn from_f64(x: f64) -> Self;
-    /// Square root.
     fn sqrt(self) -> Self;
 }
 
@@ -37,7 +36,6 @@ pub struct DenseAdam<F> {
     config: AdamConfig,
     /// Steps taken.
     pub steps: u32,
-    /// The values.
     pub values: Vec<F>,
     /// First moments, without bias correction.
     pub exp_avg: Vec<F>,

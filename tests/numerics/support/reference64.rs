@@ -210,7 +210,6 @@ fn project_from(rows: &Rows64, (camera, m): (&Camera, &Pose64), settings: &Setti
     })
 }
 
-/// Renders rows.
 pub fn render(rows: &Rows64, camera: &Camera, settings: &Settings) -> Render64 {
     render_from(rows, (camera, &pose_of(camera)), settings)
 }

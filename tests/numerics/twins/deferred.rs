@@ -29,7 +29,6 @@ impl TableWords<'_> {
         std::array::from_fn(|k| self.float(first + k))
     }
 
-    /// Adam's epsilon.
     pub fn eps(&self) -> f32 {
         self.float(10)
     }

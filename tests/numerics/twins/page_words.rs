@@ -10,7 +10,6 @@ use gsscale::scene::state::SceneState;
 /// The three tables of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Table {
-    /// Values.
     Values,
     /// First moments.
     ExpAvg,

@@ -87,7 +87,6 @@ impl Image {
     }
 }
 
-/// An unsynced change.
 #[derive(Debug, Clone)]
 enum Unsynced {
     Write(u64, Arc<[u8]>),
@@ -126,7 +125,6 @@ pub enum Survival {
     Sectors(u64, usize, bool),
 }
 
-/// An injected error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     /// EIO.

@@ -71,7 +71,7 @@ fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> 
             }
             None => {}
             Some(_) if draws.below(24) == 0 => {
-                run.pager.thaw();
+                run.pager.abort_cut();
                 done.given_up += 1;
                 cut = None;
             }

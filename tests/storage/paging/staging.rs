@@ -58,7 +58,7 @@ fn a_view_of_many_encoded_pages_takes_no_more_buffers_than_were_reckoned_with() 
                         pager.freeze().unwrap();
                         (0..3).for_each(|step| pager.prefetch(step));
                         pager.finish_frozen().unwrap();
-                        pager.thaw();
+                        pager.abort_cut();
                     }
                     _ => {}
                 }
