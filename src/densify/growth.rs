@@ -9,7 +9,7 @@
 //! check comes once the first Gaussians are trained somewhat, the last one soon after, because Gaussians that come later bring
 //! less. A stage of growth is mostly whole doublings: where only the rows of the largest scores were split, the faintest rows
 //! of a view would be the children of the most important ones, and the loss would say nothing about the count.
-//! `benches/RESULTS.md` has the measurements, also of what failed.
+//! `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
 //!
 //! A loss below the price can mean two things. In a scene of few points, or of few steps a photo, every doubling pays. In other scenes
 //! growth only fits noise. The second kind shows training views much better than held-out ones. A scene without that gap doubles on

@@ -42,8 +42,8 @@ pub const STEP_GROWTH: f64 = 0.54;
 /// Seconds that a core takes for another Gaussian in view. Limits that power for scenes that begin with few and large
 /// Gaussians: 150,000 of them at 790x594 take a step of 48 ms on two cores, 422,000 at 395x297 one of some 120 ms on one.
 const ROW_SECONDS: f64 = 0.4e-6;
-/// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache. Runs of four photo
-/// scenes and a city took 1.3 to 1.7, see "Forecasts" in `benches/RESULTS.md`.
+/// A step over the rendering of its view forward and backward: update, photo, and rows that are not in the processor's cache. Runs of four
+/// scenes fit it, see "Forecasts" in `benches/RESULTS.md`.
 pub(crate) const STEP_OVER_RENDERING: f64 = 1.35;
 /// Bytes of a store's map and its other small files without pages, and bytes of the map for each version of a page, with a margin.
 const MAP_BYTES: u64 = 2 << 20;
