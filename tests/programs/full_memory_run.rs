@@ -183,8 +183,11 @@ fn a_drive_that_stays_full_ends_a_run_in_memory_with_its_last_commit() {
     let (want, all) = bench.alone(&[]);
     // The run is not over before the little that is left then is taken.
     bench.fill(ROOM / 10);
-    let run = bench.begin(&["--commit-every", "0.02", "--disk-full-wait", "0.3"]);
+    let mut run = bench.begin(&["--commit-every", "0.02", "--disk-full-wait", "5"]);
     bench.wait_for_commits(1);
+    bench.fill(0);
+    assert!(run.wait_for("paused:"), "{}", run.said);
+    // A commit that fails gives back what it had taken.
     bench.fill(0);
     let (code, said) = run.end();
     assert_eq!(code, Some(1), "{said}");

@@ -15,7 +15,8 @@ use std::path::{Path, PathBuf};
 pub struct Resolved {
     /// Version of the program.
     pub version: String,
-    /// Identity of the run; its commits hold it too.
+    /// Identity of the run; its commits hold it too. Unknown if somebody removed the line.
+    #[serde(default)]
     pub run: RunId,
     pub scene: PathBuf,
     /// Instruction path in use.
@@ -36,7 +37,8 @@ pub struct Resolved {
     pub scale: f64,
     /// Scene scale, dataset units.
     pub scene_scale: f64,
-    /// The run made the folder of its spill directory, and so removes it at its end.
+    /// The run made the folder of its spill directory, and so removes it at its end; not if the line is missing.
+    #[serde(default)]
     pub made_spill_dir: bool,
 }
 
