@@ -1,7 +1,7 @@
 //! A view as it is now, outside of a training step: for evaluation, checks of growth and pictures, and to see what a view takes before
 //! the first step. Steps change rows, and have their own passes (`train_step`).
 //!
-//! Rows go to the renderer batch by batch ([`ViewPass`]), as in a step, with the events that pages miss applied to copies. While a batch is
+//! Rows go to the renderer batch by batch (`ViewPass`), as in a step, with the events that pages miss applied to copies. While a batch is
 //! gathered, the pages of the next one are read.
 //!
 //! Invariants: 1. nothing is stored; 2. memory beside the renderer's is bounded by the rows of one batch, however many rows
