@@ -91,9 +91,4 @@ impl RunRecord {
     pub fn group(&self) -> &str {
         self.name.split('/').next().unwrap_or_default()
     }
-
-    /// Bytes read and written.
-    pub fn bytes_moved(&self) -> u64 {
-        self.bytes_read.saturating_add(self.bytes_written)
-    }
 }

@@ -12,7 +12,8 @@
 //! completed transfers.
 //!
 //! Invariants: 1. nothing here knows clocks or files: the same input gives the same report; 2. bytes are counted when a
-//! page moves, whole pages only; an evicted page is written if a batch on the way back, or the only batch of a step, had it since it was read.
+//! page moves, whole pages only. An evicted page is written only if a step has
+//! updated the page since it was read; batches that only render update nothing.
 
 use crate::base::ids::PageNo;
 use crate::paging::frames::evict::EvictPolicy;

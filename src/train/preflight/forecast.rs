@@ -190,11 +190,11 @@ impl Forecast {
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
         let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
-        // Slots that wait for a commit, and those of pages that the scene gains after its first commit, take another segment where there
-        // is time for them.
+        // A run that makes a second commit fills one more segment: evicted versions wait there until the next commit frees them, and
+        // the scene gains pages after its first commit.
         let is_short = first_commit_seconds(config).is_none_or(|first| seconds < 2.0 * first);
-        let more = if is_short { 0 } else { segment_bytes };
-        let beside = more + if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
+        let extra_segment = if is_short { 0 } else { segment_bytes };
+        let beside = extra_segment + if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
         let drive_bytes_peak = beside + store_bytes_peak(slots, tiers.frame_bytes, segment_bytes);
         let mut forecast = Forecast {
             gaussians: [rows, last],
@@ -241,8 +241,8 @@ impl Forecast {
     }
 }
 
-/// Makes the memory of a scene that grows to `last` Gaussians obey the budget of the run: `memory` is that of `rows` Gaussians, of the cap, and
-/// of `last`. Returns the frames that are left at the end; `None` for a run in memory.
+/// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
+/// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run in memory.
 pub(crate) fn limit_memory(
     config: &TrainConfig,
     tiers: &TierPlan,

@@ -193,7 +193,7 @@ impl DeviceTier {
         }
     }
 
-    /// Whether the payloads of now are valid at 0-based `step`, unless events edit their page alone.
+    /// Whether the payloads on the device are still valid at 0-based `step`. An event that edits one page is not considered.
     pub(super) fn is_payload_valid_at(&self, step: u32) -> bool {
         self.edits_after.is_none_or(|after| step <= after)
     }
