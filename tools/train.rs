@@ -14,7 +14,7 @@ use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::progress::Count;
 use gsscale::train::run::begin::run;
-use gsscale::train::run::out_folder::{Existing, default_out, remedy_of_existing};
+use gsscale::train::run::out_folder::{Existing, default_out, is_trace, remedy_of_existing};
 use gsscale::train::run::request::{RunOutcome, RunRequest};
 use gsscale::train::run::restart::go_on;
 use gsscale::train::run::resume::{ResumeRequest, resume};
@@ -202,7 +202,7 @@ fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
 /// Refuses an output folder of a demo that holds more than the city of an earlier demo.
 fn check_demo_out(out: &Path, overwrite: bool) -> InputResult<()> {
     // A demo that was stopped before its first step left only its city.
-    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene" && entry.file_name() != ".gsscale-lock";
+    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene" && !is_trace(&entry.file_name());
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
         return Err(InputError::new(out, "exists already", remedy_of_existing(out)));

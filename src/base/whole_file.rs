@@ -28,10 +28,7 @@ impl PartFile {
     /// The folder cannot be written, or `target` names no file.
     pub fn create(target: &Path) -> InputResult<(PartFile, File)> {
         let no_name = || InputError::new(target, "this path has no file name", "give a file name");
-        let mut name = std::ffi::OsString::from(".");
-        name.push(target.file_name().ok_or_else(no_name)?);
-        name.push(".part");
-        let part = PartFile { path: target.with_file_name(name), target: target.to_path_buf() };
+        let part = PartFile { path: part_path(target).ok_or_else(no_name)?, target: target.to_path_buf() };
         let file = File::create(&part.path).map_err(|e| InputError::io(target, "creating the file", &e))?;
         Ok((part, file))
     }
@@ -66,6 +63,14 @@ impl Drop for PartFile {
         // After the rename the file no longer exists, and this call fails as expected.
         let _ = std::fs::remove_file(&self.path);
     }
+}
+
+/// The temporary file `.NAME.part` of a target, which a process that is killed leaves; `None` if the target names no file.
+pub fn part_path(target: &Path) -> Option<PathBuf> {
+    let mut name = std::ffi::OsString::from(".");
+    name.push(target.file_name()?);
+    name.push(".part");
+    Some(target.with_file_name(name))
 }
 
 /// Writes a file of these bytes.

@@ -5,7 +5,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
-use crate::base::whole_file::{folder_of, sync_folder};
+use crate::base::whole_file::{folder_of, part_path, sync_folder};
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
 use crate::exchange::format::ExportFormat;
@@ -37,6 +37,9 @@ pub enum Existing {
 /// Lock file of an output folder; it stays there, empty.
 const LOCK: &str = ".gsscale-lock";
 
+/// File that shows that an output folder can be written; removed at once.
+const PROBE: &str = ".gsscale-probe";
+
 /// The lock on an output folder, held until dropped.
 #[derive(Debug)]
 pub(crate) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
@@ -65,10 +68,16 @@ pub(super) fn refuse_in_use(out: &Path) -> InputResult<()> {
     if out.join(LOCK).is_file() { lock(out).map(drop) } else { Ok(()) }
 }
 
-/// Whether a folder is empty except for the lock file and the mark of a run that had no config.toml yet.
+/// Whether a folder is empty except for what a run leaves that is killed before it has a config.toml ([`is_trace`]).
 pub fn is_empty(out: &Path) -> bool {
-    let is_ours = |name: &OsStr| name == LOCK || name == BEGUN_FILE;
-    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| is_ours(&e.file_name()))))
+    std::fs::read_dir(out).is_ok_and(|mut entries| entries.all(|e| e.is_ok_and(|e| is_trace(&e.file_name()))))
+}
+
+/// Whether a run that is killed before it has a config.toml can have left a file of this name: the lock, the probe, the mark, or
+/// the temporary file of the mark or of config.toml.
+pub fn is_trace(name: &OsStr) -> bool {
+    let is_part = |file: &str| part_path(Path::new(file)).is_some_and(|part| part.as_os_str() == name);
+    name == LOCK || name == PROBE || name == BEGUN_FILE || is_part(BEGUN_FILE) || is_part(CONFIG_FILE)
 }
 
 /// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
@@ -172,7 +181,7 @@ pub(super) fn make_folder(out: &Path) -> InputResult<()> {
 pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     make_folder(out)?;
-    let probe = out.join(".gsscale-probe");
+    let probe = out.join(PROBE);
     std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
     // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
     let is_runs = [CONFIG_FILE, BEGUN_FILE].iter().any(|file| out.join(file).is_file());
@@ -319,6 +328,18 @@ mod tests {
         make(out, Existing::Overwrite).unwrap();
         assert!(!events.exists());
         assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
+    }
+
+    #[test]
+    fn traces_of_a_kill_before_the_config_leave_a_folder_empty() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path();
+        for name in [LOCK, PROBE, BEGUN_FILE, "..gsscale-begun.toml.part", ".config.toml.part"] {
+            std::fs::write(out.join(name), "").unwrap();
+            check(out, Existing::Refuse).unwrap();
+        }
+        std::fs::write(out.join("notes.txt.part"), "somebody's").unwrap();
+        assert!(check(out, Existing::Refuse).is_err());
     }
 
     /// For every format, so that none can be left out.
