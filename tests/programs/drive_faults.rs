@@ -26,12 +26,13 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::schedule::order::Order;
 use gsscale::train::commits::checkpoint::Checkpoint;
+use gsscale::train::commits::save::save;
 use gsscale::train::error::TrainError;
 use gsscale::train::inputs::signals::StopFlag;
 use gsscale::train::log::facts::{Resolved, write_config};
 use gsscale::train::log::progress::Progress;
 use gsscale::train::log::report::MetricsLog;
-use gsscale::train::run::training_loop::LoopOutputs;
+use gsscale::train::run::training_loop::TrainingLoop;
 use gsscale::train::start::first_scene::Start;
 use gsscale::train::start::first_scene::dataset_print;
 use gsscale::train::state::trainer::Trainer;
@@ -201,7 +202,10 @@ impl World {
         checkpoint.commit(&mut trainer, &mut metrics)?;
         plan(faults);
         let (mut progress, stop) = (Progress::new(config.steps, true), StopFlag::default());
-        let mut outputs = LoopOutputs {
+        let looped = TrainingLoop {
+            trainer: &mut trainer,
+            dataset: &dataset,
+            targets: &targets,
             out,
             metrics: &mut metrics,
             progress: &mut progress,
@@ -209,12 +213,13 @@ impl World {
             checkpoint: Some(&mut checkpoint),
             live: None,
             costs: Default::default(),
-        };
-        if let Err(error) = trainer.run(&dataset, &targets, &mut outputs) {
+        }
+        .run();
+        if let Err(error) = looped {
             self.after_failure(out, &mut trainer, &dataset, &checkpoint, &error);
             return Err(error);
         }
-        trainer.save(&dataset, &Trainer::ply_path(out))?;
+        save(&mut trainer, &dataset, &Trainer::ply_path(out))?;
         let report = checkpoint.report();
         assert!(
             self.is_optional
@@ -238,7 +243,7 @@ impl World {
             return;
         }
         let path = out.join("torn.ply");
-        let refused = trainer.save(dataset, &path).expect_err("pages of two steps are no result").to_string();
+        let refused = save(trainer, dataset, &path).expect_err("pages of two steps are no result").to_string();
         assert!(refused.contains("failed half-way") && refused.contains("--resume") && !path.exists(), "{refused}");
         let (step, last) = (trainer.steps_done(), checkpoint.last_step().unwrap());
         let is_read = error.to_string().contains("cannot be read");

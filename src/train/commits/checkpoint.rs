@@ -247,7 +247,7 @@ impl Checkpoint {
         let cut = Instant::now();
         trainer.drain()?;
         let pager_seconds = trainer.scene.pager.commit_seconds();
-        let state = trainer.run_state(origin, metrics.sync()?)?;
+        let state = run_state(trainer, origin, metrics.sync()?)?;
         let run_state = bytes_of(&state)?;
         trainer.scene.pager.freeze()?;
         self.beside = Some(Beside { run_state, step: state.trainer.step, cut, waited: cut.elapsed(), pager_seconds });
@@ -298,7 +298,7 @@ impl Checkpoint {
         let Some(commits) = &mut self.commits else { return Ok(()) };
         let written = trainer.scene.pager.stats().bytes_written;
         trainer.scene.pager.flush()?;
-        let state = trainer.run_state(origin, metrics.sync()?)?;
+        let state = run_state(trainer, origin, metrics.sync()?)?;
         let note = format!("step {}", state.trainer.step);
         trainer.scene.pager.commit(commits, &bytes_of(&state)?, note.as_bytes(), name.as_deref())?;
         self.name = None;
@@ -360,37 +360,36 @@ fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
     state.to_bytes().map_err(invalid)
 }
 
-impl Trainer {
-    /// The run state between two steps, without the pages.
-    ///
-    /// # Errors
-    /// A value cannot be encoded; none of a valid state.
-    pub fn run_state(&self, origin: &Origin, metrics_bytes: u64) -> Result<RunState, CommitError> {
-        Ok(RunState {
-            origin: origin.clone(),
-            device: self.renderer.device(),
-            trainer: self.state.clone(),
-            photos: photos::save(&self.photos).map_err(invalid)?,
-            events: self.events().events().to_vec(),
-            histogram: self.scene.histogram.filled(),
-            rows: self.scene.rows(),
-            rows_bound: self.scene.rows_bound(),
-            metrics_bytes,
-            traffic: self.scene.pager.stats(),
-        })
-    }
+/// The run state between two steps, without the pages.
+///
+/// # Errors
+/// A value cannot be encoded; none of a valid state.
+fn run_state(trainer: &Trainer, origin: &Origin, metrics_bytes: u64) -> Result<RunState, CommitError> {
+    let scene = &trainer.scene;
+    Ok(RunState {
+        origin: origin.clone(),
+        device: trainer.renderer.device(),
+        trainer: trainer.state.clone(),
+        photos: photos::save(&trainer.photos).map_err(invalid)?,
+        events: scene.events().events().to_vec(),
+        histogram: scene.histogram.filled(),
+        rows: scene.rows(),
+        rows_bound: scene.rows_bound(),
+        metrics_bytes,
+        traffic: scene.pager.stats(),
+    })
+}
 
-    /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
-    /// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
-    ///
-    /// # Errors
-    /// No run can have written the values of photos; those of a decoded state are checked.
-    pub fn restore(&mut self, state: &RunState) -> Result<(), CommitError> {
-        photos::restore(&mut self.photos, &state.photos).map_err(invalid)?;
-        self.state = state.trainer.clone();
-        self.scene.pager.restore_stats(state.traffic);
-        Ok(())
-    }
+/// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
+/// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
+///
+/// # Errors
+/// No run can have written the values of photos; those of a decoded state are checked.
+pub fn restore(trainer: &mut Trainer, state: &RunState) -> Result<(), CommitError> {
+    photos::restore(&mut trainer.photos, &state.photos).map_err(invalid)?;
+    trainer.state = state.trainer.clone();
+    trainer.scene.pager.restore_stats(state.traffic);
+    Ok(())
 }
 
 #[cfg(test)]

@@ -5,4 +5,4 @@ pub(crate) mod first_commit;
 pub mod full_drive;
 pub(crate) mod reserve;
 pub(crate) mod results_wait;
-mod save;
+pub mod save;

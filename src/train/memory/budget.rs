@@ -93,11 +93,6 @@ impl HostBudget {
         HostBudget { failed_after: commits, ..self }
     }
 
-    /// The whole budget, bytes.
-    pub(crate) fn bytes(&self) -> u64 {
-        self.bytes
-    }
-
     /// Frames for a step whose view needs `needed` pages: the budget minus the run's current memory and the growth that
     /// the view may have had since its rows were last counted. If the view needs more frames, it gets them, with spare
     /// frames for splits, from the memory reserved for growth.

@@ -7,7 +7,6 @@ pub(crate) mod device_memory;
 pub(crate) mod drive_space;
 mod first_frames;
 pub mod first_look;
-mod fitting;
 pub mod forecast;
 pub(crate) mod growth_costs;
 pub mod plan;

@@ -88,7 +88,7 @@ pub fn plan_tiers(
     memory.iter_mut().for_each(|m| m.staging = staging);
     let (frames, host_mem) = plan_frames(config, trainer, &plan, host_mem, memory)?;
     plan.frames = Some(frames);
-    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.pages_most);
+    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.fitting.pages_most);
     if config.view_order.0.is_none() {
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
@@ -123,7 +123,7 @@ fn plan_in_memory(
     }
     if let Some(budget) = host_mem {
         let first = budget_in_memory(config, budget, &memory[0]);
-        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.fitting.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
     }
     Ok(())
 }
@@ -138,12 +138,12 @@ fn plan_frames(
 ) -> InputResult<(u64, Option<u64>)> {
     let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
     let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
-    trainer.pages_most = pages_most;
+    trainer.fitting.pages_most = pages_most;
     trainer.scene.pager.allow_frames(frames as usize);
     trainer.scene.pager.limit_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
         let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
-        trainer.set_budget(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.fitting.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
     }
     for memory in memory {
         memory.frames = memory.frames.min(frames * plan.frame_bytes);
@@ -173,7 +173,7 @@ pub fn allow_largest_view(
     if let Some(budget) = most.filter(|budget| needed * of_page > budget / 4 * PROBE_WHOLE_OF_4) {
         let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
         if (fewer as u64) < needed {
-            (frames, trainer.pages_most) = (fewer as u64, pages);
+            (frames, trainer.fitting.pages_most) = (fewer as u64, pages);
         }
     }
     trainer.scene.pager.allow_frames(frames as usize);

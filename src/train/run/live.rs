@@ -15,6 +15,7 @@ use crate::scene::camera::Camera;
 use crate::scene::image::Image;
 use crate::train::error::TrainError;
 use crate::train::state::trainer::Trainer;
+use crate::train::step::pages::PagedScene;
 use crate::train::step::view::draw;
 use glam::{Mat3, Vec3};
 use std::time::{Duration, Instant};
@@ -56,79 +57,75 @@ impl LivePage {
     fn may_draw(&self) -> bool {
         100 * self.spent <= PICTURE_PERCENT * self.began.elapsed()
     }
-}
 
-impl Trainer {
     /// Reports the progress to the page, and draws the picture that the page requests.
-    pub(super) fn show_live(&mut self, dataset: &Dataset, page: &mut LivePage, psnr: f64) {
-        if page.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
-            page.told = Some(Instant::now());
-            page.live.set_status(Status {
-                step: self.steps_done(),
-                steps: self.options.steps,
-                gaussians: self.scene.rows(),
+    pub(super) fn show(&mut self, trainer: &mut Trainer, dataset: &Dataset, psnr: f64) {
+        if self.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
+            self.told = Some(Instant::now());
+            self.live.set_status(Status {
+                step: trainer.steps_done(),
+                steps: trainer.options.steps,
+                gaussians: trainer.scene.rows(),
                 psnr,
                 views: dataset.train_views().len() as u32,
                 picture_percent: PICTURE_PERCENT,
             });
         }
         // A step in flight is finished first; the page waits.
-        let Some((ticket, orbit)) = page.due().filter(|_| !self.is_ahead()) else { return };
+        let Some((ticket, orbit)) = self.due().filter(|_| !trainer.is_ahead()) else { return };
         let started = Instant::now();
         let _span = trace::span("live picture");
-        let picture = match self.live_picture(dataset, orbit) {
+        let picture = match picture(trainer, dataset, orbit) {
             Ok(image) => png(image).map_err(|e| format!("the picture cannot be written: {e}")),
             Err(error) => Err(format!("the picture cannot be drawn: {error}")),
         };
-        page.live.show((ticket, orbit), picture);
-        page.spent += started.elapsed();
+        self.live.show((ticket, orbit), picture);
+        self.spent += started.elapsed();
     }
+}
 
-    /// The scene after the last step, from an orbit.
-    fn live_picture(&mut self, dataset: &Dataset, orbit: Orbit) -> Result<&Image, TrainError> {
-        self.drain()?;
-        let views = dataset.train_views();
-        let view = views[orbit.view as usize % views.len().max(1)];
-        let base = &dataset.views[view].camera;
-        let pivot = self.median_depth(base).unwrap_or(dataset.scene_scale);
-        let camera = orbit_camera(base, pivot, self.options.up, orbit);
-        self.check_picture(&camera)?;
-        self.fit_picture(&camera);
-        let render = self.render_options();
-        let now = (&mut self.scene, self.state.step, &mut self.working);
-        draw(now, &mut *self.renderer, &camera, &render)?;
-        Ok(self.renderer.image()?)
-    }
+/// The scene after the last step, from an orbit.
+fn picture<'a>(trainer: &'a mut Trainer, dataset: &Dataset, orbit: Orbit) -> Result<&'a Image, TrainError> {
+    trainer.drain()?;
+    let views = dataset.train_views();
+    let view = views[orbit.view as usize % views.len().max(1)];
+    let base = &dataset.views[view].camera;
+    let pivot = median_depth(&trainer.scene, base).unwrap_or(dataset.scene_scale);
+    let camera = orbit_camera(base, pivot, trainer.options.up, orbit);
+    check_picture(trainer, &camera)?;
+    trainer.fit().for_picture(&camera);
+    let render = trainer.render_options();
+    draw(&mut trainer.now(), &camera, &render)?;
+    Ok(trainer.renderer.image()?)
+}
 
-    /// Refuses a picture for which the renderer would need too much memory ([`PICTURE_SHARE`]). Batches bound the memory of gathered rows,
-    /// not that of the splats, which the renderer keeps for every visible row.
-    ///
-    /// # Errors
-    /// The camera may see too many Gaussians.
-    fn check_picture(&self, camera: &Camera) -> InputResult<()> {
-        let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return Ok(()) };
-        let index = self.scene.pager.index();
-        let rows: u64 =
-            self.scene.pager.pages_of_view(camera).iter().map(|page| u64::from(index[page.index()].rows)).sum();
-        let needed = self.renderer.host_bytes_for_rows(rows);
-        if needed <= self.renderer.host_bytes_of_rows().max(budget.bytes / PICTURE_SHARE) {
-            return Ok(());
-        }
-        let problem = format!("{rows} Gaussians may be in view, which takes {} of memory", format_bytes(needed));
-        Err(InputError::new("--serve", problem, "move nearer"))
+/// Refuses a picture for which the renderer would need too much memory ([`PICTURE_SHARE`]). Batches bound the memory of gathered rows,
+/// not that of the splats, which the renderer keeps for every visible row.
+///
+/// # Errors
+/// The camera may see too many Gaussians.
+fn check_picture(trainer: &Trainer, camera: &Camera) -> InputResult<()> {
+    let Some(budget) = trainer.fitting.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
+    let pager = &trainer.scene.pager;
+    let rows: u64 = pager.pages_of_view(camera).iter().map(|page| u64::from(pager.index()[page.index()].rows)).sum();
+    let needed = trainer.renderer.host_bytes_for_rows(rows);
+    if needed <= trainer.renderer.host_bytes_of_rows().max(budget.bytes / PICTURE_SHARE) {
+        return Ok(());
     }
+    let problem = format!("{rows} Gaussians may be in view, which takes {} of memory", format_bytes(needed));
+    Err(InputError::new("--serve", problem, "move nearer"))
+}
 
-    /// Median depth of the pages that a camera sees, local units; `None` if no page is in front of the camera.
-    fn median_depth(&self, camera: &Camera) -> Option<f32> {
-        let index = self.scene.pager.index();
-        let [_, _, axis] = camera.viewmat;
-        let depth = |centre: [f32; 3]| axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2] + axis[3];
-        let pages = self.scene.pager.pages_of_view(camera);
-        let mut depths: Vec<f32> = pages.iter().map(|page| depth(index[page.index()].bounds.centre())).collect();
-        depths.retain(|depth| depth.is_finite() && *depth > camera.near_plane);
-        depths.sort_unstable_by(f32::total_cmp);
-        depths.get(depths.len() / 2).copied()
-    }
+/// Median depth of the pages that a camera sees, local units; `None` if no page is in front of the camera.
+fn median_depth(scene: &PagedScene, camera: &Camera) -> Option<f32> {
+    let index = scene.pager.index();
+    let [_, _, axis] = camera.viewmat;
+    let depth = |centre: [f32; 3]| axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2] + axis[3];
+    let pages = scene.pager.pages_of_view(camera);
+    let mut depths: Vec<f32> = pages.iter().map(|page| depth(index[page.index()].bounds.centre())).collect();
+    depths.retain(|depth| depth.is_finite() && *depth > camera.near_plane);
+    depths.sort_unstable_by(f32::total_cmp);
+    depths.get(depths.len() / 2).copied()
 }
 
 /// The camera of an orbit around the point `pivot`, which lies in front of `base`. `up` is the direction that points up, if it is known.

@@ -9,7 +9,6 @@ pub mod costs;
 pub mod live;
 mod more_steps;
 pub mod out_folder;
-mod outgrown;
 pub mod page_map;
 pub mod request;
 pub mod restart;

@@ -32,6 +32,7 @@ use crate::render::Renderer;
 use crate::report::live::Live;
 use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
+use crate::train::commits::checkpoint::restore;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::places::absolute;
@@ -277,7 +278,7 @@ fn resume_from(
         true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
-    trainer.restore(&state)?;
+    restore(&mut trainer, &state)?;
     let past = Past {
         config: kept_config(&earlier.path, &earlier.config, &config)?,
         metrics_bytes: state.metrics_bytes,

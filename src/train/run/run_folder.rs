@@ -13,7 +13,7 @@ use super::live::LivePage;
 use super::out_folder;
 use super::page_map::write_page_map;
 use super::request::{RunOutcome, RunRequest};
-use super::training_loop::LoopOutputs;
+use super::training_loop::TrainingLoop;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
@@ -31,6 +31,7 @@ use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_F
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::{Checkpoint, full_wait};
 use crate::train::commits::results_wait::Results;
+use crate::train::commits::save::{export, save, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::inputs::signals::StopFlag;
@@ -158,9 +159,19 @@ pub(super) fn train_into(
     let meter = Meter::start(&trainer);
     metrics.start_clock(trainer.train_seconds());
     let costs = GrowthCosts::new(forecast);
-    let mut outputs =
-        LoopOutputs { out, metrics: &mut metrics, progress: &mut progress, stop, checkpoint, live, costs };
-    let looped = trainer.run(dataset, &targets, &mut outputs);
+    let looped = TrainingLoop {
+        trainer: &mut trainer,
+        dataset,
+        targets: &targets,
+        out,
+        metrics: &mut metrics,
+        progress: &mut progress,
+        stop,
+        checkpoint,
+        live,
+        costs,
+    }
+    .run();
     let step_costs =
         StepCosts { forecast: Some(forecast.facts()), ..meter.stop(&trainer, &*tiers, metrics.cpu_seconds()) };
     let mut results = Results {
@@ -253,10 +264,10 @@ fn write_results(
 
 /// Writes the Gaussians at the current step as a PLY, and its transform to the dataset's coordinates.
 fn save_result(dataset: &Dataset, results: &mut Results<'_>, ply: &Path) -> Result<Written, TrainError> {
-    let written = results.write(|results| results.trainer.save(dataset, ply))?;
+    let written = results.write(|results| save(results.trainer, dataset, ply))?;
     results.has_ply = true;
     results.write(|results| {
-        let meta = results.trainer.scene_meta(dataset);
+        let meta = scene_meta(results.trainer, dataset);
         Ok(ExportFormat::Ply.write_transform(ply, &meta, written.frame)?)
     })?;
     Ok(written)
@@ -291,8 +302,8 @@ fn export_beside(
     (format, other): (ExportFormat, &Path),
     written: &Written,
 ) -> Result<ExportFacts, TrainError> {
-    let exported = trainer.export(dataset, other, format)?;
-    format.write_transform(other, &trainer.scene_meta(dataset), exported.frame)?;
+    let exported = export(trainer, dataset, other, format)?;
+    format.write_transform(other, &scene_meta(trainer, dataset), exported.frame)?;
     let left_out = written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
         crate::tell!(

@@ -1,28 +1,39 @@
-//! The loop over steps, with evaluation, saves, metrics, progress and commits between them.
+//! The loop over steps, with evaluation, saves, metrics, progress and commits between them. Also what a run does that lacks memory or
+//! drive space between two steps: a scene in memory that has outgrown it starts paging to the drive of its checkpoint, and a run that
+//! ends for lack of memory commits first, with an error that names the photo and the memory that suffices.
+//!
+//! Not here: views in batches (`step`), frames of a growing scene (`state::memory`).
 //!
 //! Invariants: 1. logging, evaluation, saves and commits change no bit of the result; 2. a step that lacks drive space
-//! or frames is repeated once they are available, or the run ends with its last good step committed.
+//! or frames is repeated once they are available, or the run ends with its last good step committed; no step is lost.
 
+use super::live::LivePage;
 use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::paging::error::PagingError;
 use crate::render::Traffic;
 use crate::report::run_files::saved_ply_name;
 use crate::train::commits::checkpoint::Checkpoint;
+use crate::train::commits::save::save;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{Progress, Shown};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::memory::staging::PLAN_BYTES;
 use crate::train::preflight::growth_costs::GrowthCosts;
-use crate::train::run::live::LivePage;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::train_step::StepOutcome;
 use std::path::Path;
 
-/// Outputs and controls of a loop.
-pub struct LoopOutputs<'a> {
+/// A run between its first and its last step: the trainer and its photos, outputs and controls.
+pub struct TrainingLoop<'a> {
+    pub trainer: &'a mut Trainer,
+    pub dataset: &'a Dataset,
+    pub targets: &'a TargetCache,
     pub out: &'a Path,
     /// Writer of metrics.jsonl.
     pub metrics: &'a mut MetricsLog,
@@ -38,185 +49,255 @@ pub struct LoopOutputs<'a> {
     pub costs: GrowthCosts,
 }
 
-impl Trainer {
+impl TrainingLoop<'_> {
     /// Runs until the last step or a stop request.
     ///
     /// # Errors
     /// As [`Trainer::step`], or an output cannot be written.
-    pub fn run(
-        &mut self,
-        dataset: &Dataset,
-        targets: &TargetCache,
-        outputs: &mut LoopOutputs<'_>,
-    ) -> Result<(), TrainError> {
+    pub fn run(&mut self) -> Result<(), TrainError> {
+        let (steps, eval_every, save_every, log_every) = {
+            let options = self.trainer.options();
+            (options.steps, options.eval_every, options.save_every, options.log_every)
+        };
         // A step in flight is always finished.
-        while self.state.step < self.options.steps && (outputs.stop.exit_code().is_none() || self.is_ahead()) {
-            if !self.log_due_events_with_space(dataset, targets, outputs)? {
+        while self.trainer.steps_done() < steps && (self.stop.exit_code().is_none() || self.trainer.is_ahead()) {
+            if !self.log_due_events()? {
                 break;
             }
-            if !self.is_ahead() {
-                self.start_paging_if_outgrown(outputs)?;
+            if !self.trainer.is_ahead() {
+                self.start_paging_if_outgrown()?;
             }
-            self.goes_ahead = self.may_run_ahead(outputs);
-            let before = self.renderer.traffic();
-            let Some(outcome) = self.step_with_space(dataset, targets, outputs)? else { break };
-            self.check_statistics(outputs)?;
-            let (done, is_last) = (self.state.step, self.state.step == self.options.steps);
-            let due = |every: u32| every > 0 && done.is_multiple_of(every);
+            self.trainer.ahead.is_allowed = self.may_run_ahead();
+            let before = self.trainer.renderer.traffic();
+            let Some(outcome) = self.step()? else { break };
+            self.check_statistics()?;
+            let done = self.trainer.steps_done();
+            let (due, is_last) = (|every: u32| every > 0 && done.is_multiple_of(every), done == steps);
             let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
             let mut test: Option<TestMetrics> = None;
-            if due(self.options.eval_every) && !is_last {
-                test = self.evaluate(dataset, targets, None, &|_| {})?;
-                if let Some(t) = test {
-                    let (psnr, ssim, views) = (t.psnr, t.ssim, t.views);
-                    outputs
-                        .progress
-                        .say(&format!("step {done}: PSNR {psnr:.2} dB, SSIM {ssim:.4} on {views} held-out views"));
+            if due(eval_every) && !is_last {
+                test = self.trainer.evaluate(self.dataset, self.targets, None, &|_| {})?;
+                if let Some(TestMetrics { psnr, ssim, views, .. }) = test {
+                    let text = format!("step {done}: PSNR {psnr:.2} dB, SSIM {ssim:.4} on {views} held-out views");
+                    self.progress.say(&text);
                 }
             }
-            if due(self.options.save_every) && !is_last {
-                self.save_if_space(dataset, &outputs.out.join(saved_ply_name(done)))?;
-                if let Some(checkpoint) = outputs.checkpoint.as_deref_mut() {
+            if due(save_every) && !is_last {
+                self.save_if_space(&self.out.join(saved_ply_name(done)))?;
+                if let Some(checkpoint) = self.checkpoint.as_deref_mut() {
                     checkpoint.keep_next_as(format!("step-{done}"));
                 }
             }
-            if due(self.options.log_every) || is_last || due(self.options.eval_every) {
-                let line = self.step_line(&outcome, psnr, before, outputs);
-                let written = outputs.metrics.write(StepLine { test, ..line }).map_err(TrainError::from);
-                written.or_else(|error| self.make_space(outputs, error))?;
+            if due(log_every) || is_last || due(eval_every) {
+                let line = StepLine { test, ..self.step_line(&outcome, psnr, before) };
+                let written = self.metrics.write(line).map_err(TrainError::from);
+                written.or_else(|error| self.make_space(error))?;
             }
-            outputs.progress.step(done, Shown { gaussians: self.scene.rows(), psnr });
-            if let Some(live) = &mut outputs.live {
-                self.show_live(dataset, live, psnr);
+            self.progress.step(done, Shown { gaussians: self.trainer.scene.rows(), psnr });
+            if let Some(live) = &mut self.live {
+                live.show(self.trainer, self.dataset, psnr);
             }
-            if let Some(checkpoint) = outputs.checkpoint.as_deref_mut().filter(|_| !self.is_ahead()) {
-                let done = checkpoint.between_steps(self, outputs.metrics);
-                done.or_else(|error| self.make_space(outputs, error))?;
+            if let Some(checkpoint) = self.checkpoint.as_deref_mut().filter(|_| !self.trainer.is_ahead()) {
+                let done = checkpoint.between_steps(self.trainer, self.metrics);
+                done.or_else(|error| self.make_space(error))?;
             }
         }
-        self.commit_last(outputs)?;
-        outputs.progress.finish();
+        self.commit_last()?;
+        self.progress.finish();
         Ok(())
     }
 
     /// Whether the loop neither reads nor changes the scene between the next step and the one after it.
-    fn may_run_ahead(&self, outputs: &LoopOutputs<'_>) -> bool {
-        let (done, options) = (self.state.step + 1, &self.options);
+    fn may_run_ahead(&mut self) -> bool {
+        let (done, options) = (self.trainer.steps_done() + 1, self.trainer.options());
         let due = |every: u32| every > 0 && done.is_multiple_of(every);
         let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;
-        let is_due = outputs.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self));
-        let is_shown = outputs.live.as_ref().is_some_and(LivePage::is_due);
-        !is_wanted && !is_due && !is_shown && outputs.stop.exit_code().is_none() && !self.is_outgrown()
+        let is_due = self.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self.trainer));
+        let is_shown = self.live.as_ref().is_some_and(LivePage::is_due);
+        !is_wanted && !is_due && !is_shown && self.stop.exit_code().is_none() && !self.trainer.fit().is_outgrown()
     }
 
     /// The metrics of the last step, without an evaluation.
-    fn step_line(&self, outcome: &StepOutcome, psnr: f64, before: Traffic, outputs: &LoopOutputs<'_>) -> StepLine {
-        let traffic = self.renderer.traffic();
+    fn step_line(&self, outcome: &StepOutcome, psnr: f64, before: Traffic) -> StepLine {
+        let trainer = &*self.trainer;
+        let traffic = trainer.renderer.traffic();
         StepLine {
-            step: self.state.step,
+            step: trainer.steps_done(),
             loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
             psnr,
-            gaussians: self.scene.rows(),
-            seconds: self.state.train_seconds,
-            train_cpu_seconds: outputs.metrics.cpu_seconds(),
+            gaussians: trainer.scene.rows(),
+            seconds: trainer.train_seconds(),
+            train_cpu_seconds: self.metrics.cpu_seconds(),
             host_bytes_peak: host_bytes_peak().unwrap_or(0),
             bytes_uploaded: traffic.bytes_uploaded - before.bytes_uploaded,
             bytes_read_back: traffic.bytes_read_back - before.bytes_read_back,
             device_bytes_peak: traffic.device_bytes_peak,
-            tiers: self.tier_traffic(),
-            slots: self.device.as_ref().map(DeviceTier::traffic),
-            commits: outputs.checkpoint.as_deref().map(Checkpoint::report),
-            growth: self.growth().last().copied(),
+            tiers: trainer.tier_traffic(),
+            slots: trainer.device.as_ref().map(DeviceTier::traffic),
+            commits: self.checkpoint.as_deref().map(Checkpoint::report),
+            growth: trainer.growth().last().copied(),
             test: None,
         }
     }
 
     /// Logs the events of the last step; a check of growth that finds the drive full is repeated after waiting for space. False
     /// if a stop was requested meanwhile.
-    fn log_due_events_with_space(
-        &mut self,
-        dataset: &Dataset,
-        targets: &TargetCache,
-        outputs: &mut LoopOutputs<'_>,
-    ) -> Result<bool, TrainError> {
-        let (checks, allowed) = (self.growth().len(), self.state.growth.allowed());
+    fn log_due_events(&mut self) -> Result<bool, TrainError> {
+        let (checks, allowed) = (self.trainer.growth().len(), self.trainer.state.growth.allowed());
         loop {
-            match self.log_due_events(dataset, targets) {
+            match self.trainer.log_due_events(self.dataset, self.targets) {
                 Ok(()) => break,
-                Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
-                Err(error) => return Err(self.commit_before_end(error, outputs)),
+                Err(error) if error.is_out_of_space() => self.make_space(error)?,
+                Err(error) => return Err(self.commit_before_end(error)),
             }
-            if outputs.stop.exit_code().is_some() {
+            if self.stop.exit_code().is_some() {
                 return Ok(false);
             }
         }
-        if let Some(check) = self.growth().get(checks) {
-            outputs.progress.say(&check.to_string());
-            let costs = outputs.costs.text(check.allowed).filter(|_| check.allowed != allowed);
-            costs.iter().for_each(|line| outputs.progress.say(line));
+        if let Some(check) = self.trainer.growth().get(checks) {
+            self.progress.say(&check.to_string());
+            let costs = self.costs.text(check.allowed).filter(|_| check.allowed != allowed);
+            costs.iter().for_each(|line| self.progress.say(line));
         }
         Ok(true)
     }
 
     /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested
     /// meanwhile.
-    fn step_with_space(
-        &mut self,
-        dataset: &Dataset,
-        targets: &TargetCache,
-        outputs: &mut LoopOutputs<'_>,
-    ) -> Result<Option<StepOutcome>, TrainError> {
+    fn step(&mut self) -> Result<Option<StepOutcome>, TrainError> {
         loop {
-            match self.step(dataset, targets) {
+            match self.trainer.step(self.dataset, self.targets) {
                 Ok(outcome) => return Ok(Some(outcome)),
-                Err(error) if error.is_out_of_space() => self.make_space(outputs, error)?,
-                Err(error) => return Err(self.commit_before_end(error, outputs)),
+                Err(error) if error.is_out_of_space() => self.make_space(error)?,
+                Err(error) => return Err(self.commit_before_end(error)),
             }
-            if outputs.stop.exit_code().is_some() {
+            if self.stop.exit_code().is_some() {
                 return Ok(None);
             }
         }
     }
 
     /// Fails if pages hold gradient statistics that the histogram lacks: densification would use wrong numbers.
-    fn check_statistics(&self, outputs: &LoopOutputs<'_>) -> InputResult<()> {
-        let rows = self.scene.histogram.uncounted();
+    fn check_statistics(&self) -> InputResult<()> {
+        let rows = self.trainer.scene.histogram.uncounted();
         if rows == 0 {
             return Ok(());
         }
-        let store = outputs.checkpoint.as_deref().map_or(outputs.out, Checkpoint::folder);
+        let store = self.checkpoint.as_deref().map_or(self.out, Checkpoint::folder);
         let problem = format!("the pages hold statistics of {rows} rows that the run's histogram lacks");
         let remedy = "the last commit is intact: make a consistent store with gsscale-ckpt salvage, then continue with \
                       gsscale-train --resume and --spill-dir";
-        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.state.step)))
+        Err(InputError::new(store, problem, remedy).at(format!("step {}", self.trainer.steps_done())))
     }
 
     /// Frees or awaits drive space after `error`; without a checkpoint, returns the error.
-    fn make_space(&mut self, outputs: &mut LoopOutputs<'_>, error: TrainError) -> Result<(), TrainError> {
-        match outputs.checkpoint.as_deref_mut() {
-            Some(checkpoint) => checkpoint.make_space(self, outputs.metrics, outputs.stop, error),
+    fn make_space(&mut self, error: TrainError) -> Result<(), TrainError> {
+        match self.checkpoint.as_deref_mut() {
+            Some(checkpoint) => checkpoint.make_space(self.trainer, self.metrics, self.stop, error),
             None => Err(error),
         }
     }
 
     /// Commits after the last step. A lack of space is only a warning: a finished run has its results, and a stopped
     /// run keeps its previous commit.
-    fn commit_last(&mut self, outputs: &mut LoopOutputs<'_>) -> Result<(), TrainError> {
-        let Some(checkpoint) = outputs.checkpoint.as_deref_mut() else { return Ok(()) };
-        match self.state.step < self.options.steps || checkpoint.needs_last_commit() {
-            true => checkpoint.commit_or_warn(self, outputs.metrics),
+    fn commit_last(&mut self) -> Result<(), TrainError> {
+        let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
+        match self.trainer.steps_done() < self.trainer.options().steps || checkpoint.needs_last_commit() {
+            true => checkpoint.commit_or_warn(self.trainer, self.metrics),
             false => Ok(()),
         }
     }
 
-    /// As [`Trainer::save`], but a full drive is only a warning, because the run does not need the file.
-    fn save_if_space(&mut self, dataset: &Dataset, path: &Path) -> Result<(), TrainError> {
-        match self.save(dataset, path) {
+    /// As [`save`], but a full drive is only a warning, because the run does not need the file.
+    fn save_if_space(&mut self, path: &Path) -> Result<(), TrainError> {
+        match save(self.trainer, self.dataset, path) {
             Err(error) if error.is_out_of_space() => {
                 crate::tell!("warning: {} is not written: {error}", path.display());
                 Ok(())
             }
             done => done.map(|_| ()),
         }
+    }
+
+    /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can
+    /// be evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay
+    /// in memory while the machine has it.
+    ///
+    /// # Errors
+    /// The commit failed for a reason other than space.
+    fn start_paging_if_outgrown(&mut self) -> Result<(), TrainError> {
+        let trainer = &mut *self.trainer;
+        if !trainer.fit().is_outgrown() {
+            return Ok(());
+        }
+        let Some(budget) = trainer.fitting.budget else { return Ok(()) };
+        let view = trainer.fit().view_memory();
+        let needed = trainer.scene.pager.stats().pinned_max;
+        let frames = budget.frames(&trainer.scene, view, needed);
+        let is_tight = budget.frames_at_most(&trainer.scene, view) < needed;
+        if is_tight && trainer.fit().raise_for_all_pages(budget) {
+            return Ok(());
+        }
+        let step = trainer.steps_done();
+        let outgrown = format!("from step {step} on the scene does not fit into {}", format_bytes(budget.bytes));
+        // Warn once: without the budget, later steps do not try again.
+        trainer.fitting.budget = None;
+        let Some(checkpoint) = self.checkpoint.as_deref_mut() else {
+            crate::tell!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
+            return Ok(());
+        };
+        let commits = Some(checkpoint.commits_done());
+        if budget.failed_after == commits {
+            trainer.fitting.budget = Some(budget);
+            return Ok(());
+        }
+        match checkpoint.commit(trainer, self.metrics) {
+            Ok(()) if checkpoint.has_commit() => {}
+            Ok(()) => {
+                crate::tell!(
+                    "warning: {outgrown} (--host-mem), and without commits its pages cannot be moved to a drive"
+                );
+                return Ok(());
+            }
+            Err(error) if error.is_out_of_space() => {
+                crate::tell!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
+                // Try again after the next successful commit.
+                trainer.fitting.budget = Some(budget.with_failure_after(commits));
+                return Ok(());
+            }
+            Err(error) => return Err(error),
+        }
+        checkpoint.set_optional(false);
+        crate::tell!(
+            "warning: {outgrown} (--host-mem): its pages move between memory and {}; a new run with --spill-dir can \
+             choose a view order that moves fewer pages",
+            checkpoint.folder().display()
+        );
+        trainer.fitting.budget = Some(budget);
+        trainer.scene.pager.begin_paging(frames, budget.prefetch_bytes, PLAN_BYTES);
+        Ok(())
+    }
+
+    /// Commits what a run can be resumed from, before it ends with `error`: the last good step of a run that lacked frames or
+    /// whose renderer failed, or the cut in progress of a step that failed half-way. Adds the least memory to an error about
+    /// frames.
+    fn commit_before_end(&mut self, error: TrainError) -> TrainError {
+        let is_last_step_good =
+            matches!(error, TrainError::Render(_) | TrainError::Paging(PagingError::WorkingSet { .. }));
+        if let Some(checkpoint) = self.checkpoint.as_deref_mut() {
+            let done = match self.trainer.is_torn {
+                true => checkpoint.finish_cut(self.trainer),
+                false if is_last_step_good => checkpoint.commit(self.trainer, self.metrics),
+                false => Ok(()),
+            };
+            if let Err(second) = done {
+                crate::tell!("warning: the run could not be committed: {second}");
+            }
+        }
+        let TrainError::Paging(source @ PagingError::WorkingSet { pages, .. }) = error else { return error };
+        let view = self.trainer.fit().view_memory();
+        let scene = &self.trainer.scene;
+        let least = self.trainer.fitting.budget.map(|budget| budget.least_for(scene, view, pages));
+        TrainError::Outgrown { source, least }
     }
 }

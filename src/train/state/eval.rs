@@ -12,18 +12,16 @@ use crate::base::png_rows::write_rgb_rows;
 use crate::base::whole_file::{write_whole, write_whole_with};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::render::RenderOptions;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::metrics::{SsimVariant, mean, psnr, psnr_of_columns, ssim};
-use crate::render::{RenderOptions, Renderer};
 use crate::report::run_files::VIEWS_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
 use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
-use crate::train::step::pages::PagedScene;
-use crate::train::step::view::draw;
-use crate::train::step::working_set::WorkingSet;
+use crate::train::step::view::{Now, draw};
 use std::path::{Path, PathBuf};
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
@@ -46,16 +44,16 @@ pub struct EvalRequest<'a> {
     pub progress: &'a dyn Fn(u32),
 }
 
-/// Evaluates the scene after `now` steps on the requested views; `working` is scratch. Fully masked views have no
+/// Evaluates the scene on the requested views. Fully masked views have no
 /// metrics and do not count in the means. Nor do photos that cannot be decoded, which a warning names: a photo must not cost the
 /// figures of all others. `None` if no view has metrics, with a warning.
 ///
 /// # Errors
 /// Pages could not be pinned, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
-    (scene, now, working): (&mut PagedScene, u32, &mut WorkingSet),
-    renderer: &mut dyn Renderer,
-    (dataset, targets): (&Dataset, &TargetCache),
+    now: &mut Now<'_>,
+    dataset: &Dataset,
+    targets: &TargetCache,
     options: &RenderOptions,
     request: &EvalRequest<'_>,
 ) -> Result<Option<TestMetrics>, TrainError> {
@@ -76,8 +74,8 @@ pub fn evaluate(
             }
         };
         let camera = &dataset.views[view].camera;
-        draw((&mut *scene, now, &mut *working), renderer, camera, options)?;
-        let image = renderer.image()?;
+        draw(now, camera, options)?;
+        let image = now.renderer.image()?;
         let mut of_view = (None, None);
         if target.counts() {
             psnrs.push(json_psnr(psnr(image, &target)));
@@ -99,7 +97,7 @@ pub fn evaluate(
         }
         if request.appearance.is_on() {
             // Last, since it changes the picture in its place.
-            halves.extend(half_fitted(renderer.picture_mut()?, &target, camera, request.appearance));
+            halves.extend(half_fitted(now.renderer.picture_mut()?, &target, camera, request.appearance));
         }
         (request.progress)(i as u32 + 1);
     }

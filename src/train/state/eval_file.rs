@@ -27,6 +27,7 @@ use crate::train::log::report::TestMetrics;
 use crate::train::memory::estimate::{check_photos_fit, host_budget};
 use crate::train::memory::eval_needs::check_evaluation_fits;
 use crate::train::step::pages::PagedScene;
+use crate::train::step::view::Now;
 use crate::train::step::working_set::WorkingSet;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -230,9 +231,9 @@ impl<'a> Evaluator<'a> {
             appearance: run.photos.appearance,
             progress: &|done| shown.show(done),
         };
-        let now = (&mut pages, 0, &mut WorkingSet::default());
-        let photos = (&self.dataset, &self.targets);
-        let test = evaluate(now, &mut *self.renderer, photos, &render, &request)?;
+        let working = &mut WorkingSet::default();
+        let mut now = Now { scene: &mut pages, step: 0, working, renderer: &mut *self.renderer };
+        let test = evaluate(&mut now, &self.dataset, &self.targets, &render, &request)?;
         Ok(Figures { gaussians, test })
     }
 }

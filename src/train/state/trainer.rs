@@ -9,7 +9,9 @@
 //! the run with the result of the last good step; 3. the events of a step are logged once.
 
 use super::eval::{EvalRequest, evaluate};
-use super::held_out::HeldOut;
+use super::fitting::{Fit, Fitting};
+use super::growth_checks::{Comparing, growth_values};
+use super::turns::Turns;
 use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
@@ -19,9 +21,12 @@ use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::{RowCount, Strategy};
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::paging::pager::{Pager, PagerConfig};
-use crate::photos::{PhotoParameters, first_parameters};
+use crate::photos::parameter::{PhotoOutcome, PhotoStep, steps_after_reset};
+use crate::photos::{self, PhotoParameters, first_parameters};
+use crate::render::color_correct::ColorCorrect;
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::PLY_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
@@ -29,19 +34,28 @@ use crate::scene::image::Target;
 use crate::schedule::order::{Order, ViewOrder};
 use crate::train::error::TrainError;
 use crate::train::log::report::{TestMetrics, TierTraffic};
-use crate::train::memory::budget::HostBudget;
 use crate::train::step::batch::HostRows;
 use crate::train::step::comparison::Comparison;
 use crate::train::step::dense::settle_all;
+use crate::train::step::device_flights::StepToRecord;
+use crate::train::step::device_rows::DeviceRows;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::pages::PagedScene;
 use crate::train::step::soundness::{Idle, note_soundness};
 use crate::train::step::train_step::{StepOutcome, train_step};
-use crate::train::step::view::rehearse;
+use crate::train::step::view::{Now, rehearse};
 use crate::train::step::working_set::WorkingSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
+
+/// Steps between two updates of the pager's plan, and the least and most views that a plan covers.
+const LOOK_AHEAD_EVERY: u32 = 8;
+const LOOK_AHEAD_LEAST: u32 = 64;
+const LOOK_AHEAD_MOST: u32 = 8192;
+
+/// Memory for the plan of a run in memory whose device holds a part of the pages, bytes.
+const DEVICE_PLAN_BYTES: usize = 4 << 20;
 
 /// Views whose photos are prefetched.
 const PREFETCH_VIEWS: u32 = 8;
@@ -54,10 +68,8 @@ pub struct Trainer {
     /// The pages on the renderer's device, from the first step of a run that updates them there.
     pub(crate) device: Option<DeviceTier>,
     pub(crate) options: RunOptions,
-    pub(crate) order: ViewOrder,
-    pub(crate) train_views: Vec<usize>,
-    /// Training views that the run decides its count by.
-    pub(crate) held_out: HeldOut,
+    /// Which view each step trains on.
+    turns: Turns,
     /// What the run knows of its photos.
     pub(crate) photos: PhotoParameters,
     pub(crate) working: WorkingSet,
@@ -65,26 +77,23 @@ pub struct Trainer {
     pub(crate) state: TrainerState,
     /// A step failed after it had changed rows, so the state must not be committed.
     pub(crate) is_torn: bool,
-    /// Memory budget from which the number of frames follows; `None` without a budget.
-    pub(crate) budget: Option<HostBudget>,
-    /// The most pages of a batch of a step.
-    pub(crate) pages_most: usize,
-    /// The most rows in the pages of a view that was one batch, since the working set was allocated.
-    pub(crate) whole_rows: u64,
-    /// The most rows in the pages of a view since the renderer freed its rows, and the bytes that the rows of the coming view
-    /// need in the renderer.
-    pub(crate) rendered_rows: u64,
-    pub(crate) row_bytes_due: u64,
-    /// The largest share of the rows in its pages that a view has drawn so far.
-    pub(crate) visible_share: f64,
+    /// The memory budget, and what views have taken so far.
+    pub(crate) fitting: Fitting,
     /// The steps since a row was last rewritten.
     pub(super) idle: Idle,
-    /// The caller does nothing with the scene between the step that it takes and the next one, which may be recorded ahead.
-    pub(crate) goes_ahead: bool,
+    /// Steps recorded ahead.
+    pub(crate) ahead: Ahead,
+}
+
+/// Steps of a run whose pages lie on a device that are recorded before the step before them has ended.
+#[derive(Default)]
+pub(crate) struct Ahead {
+    /// The caller does nothing with the scene between the step that it takes and the next one.
+    pub is_allowed: bool,
     /// The error that kept a step from being recorded ahead.
-    pub(super) ahead_failed: Option<TrainError>,
+    failed: Option<TrainError>,
     /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
-    pub(super) rows_of_views: Vec<u32>,
+    rows_of_views: Vec<u32>,
 }
 
 /// The strategy of a run whose views come in this order, from the strategy of its config.
@@ -142,14 +151,11 @@ impl Trainer {
 
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
-        let train_views = dataset.train_views();
         let order = view_order(options.view_order, options.seed, dataset);
         let options = RunOptions { strategy: strategy_in(&order, &options.strategy), ..options };
         Trainer {
             scene,
-            order,
-            held_out: HeldOut::new(&options.strategy, train_views.len()),
-            train_views,
+            turns: Turns::new(order, dataset.train_views(), &options.strategy, options.steps),
             photos: first_parameters(&options.photos, dataset),
             working: WorkingSet::default(),
             renderer,
@@ -157,17 +163,33 @@ impl Trainer {
             options,
             state: TrainerState::default(),
             is_torn: false,
-            budget: None,
-            pages_most: usize::MAX,
-            whole_rows: 0,
-            rendered_rows: 0,
-            row_bytes_due: 0,
-            visible_share: 0.0,
+            fitting: Fitting::default(),
             idle: Idle::default(),
-            goes_ahead: false,
-            ahead_failed: None,
-            rows_of_views: Vec::new(),
+            ahead: Ahead::default(),
         }
+    }
+
+    /// The scene as it is now, to be drawn.
+    pub(crate) fn now(&mut self) -> Now<'_> {
+        let Trainer { scene, working, renderer, state, .. } = self;
+        Now { scene, step: state.step, working, renderer: &mut **renderer }
+    }
+
+    /// The memory of the run, to be fitted.
+    pub(crate) fn fit(&mut self) -> Fit<'_> {
+        let sh_degree_last = self.sh_degrees().1;
+        let Trainer { scene, working, renderer, photos, fitting, state, .. } = self;
+        Fit { fitting, scene, renderer: &mut **renderer, working, photos, step: state.step, sh_degree_last }
+    }
+
+    /// Gives what is known of photos its start values, which the files of the dataset state. Returns warnings for the user.
+    pub(crate) fn start_photos(&mut self, dataset: &Dataset) -> Vec<String> {
+        self.photos.iter_mut().flat_map(|parameter| parameter.start(dataset)).collect()
+    }
+
+    /// Path of the final PLY in an output folder.
+    pub fn ply_path(out: &Path) -> PathBuf {
+        out.join(PLY_FILE)
     }
 
     /// Counts the steps from `step` on: an earlier run has done them, in `train_seconds` seconds. Call this before the first
@@ -186,19 +208,20 @@ impl Trainer {
         let render = self.render_options();
         let (mut probed, mut seconds) = (Probed::default(), Vec::new());
         for &view in views {
-            let camera = &self.camera(dataset, view);
+            let camera = &photos::camera(&self.photos, dataset, view);
             let rgb = vec![0; 3 * camera.pixels()];
             let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
             self.begin_step_of_photo(view, camera, false, true);
             let mut comparison = Comparison { photos: &mut self.photos, ..Comparison::new(&target, self.options.loss) };
-            let now = (&mut self.scene, self.state.step, &mut self.working);
-            let began = Instant::now();
-            let rows = rehearse(now, &mut *self.renderer, camera, (&render, &mut comparison), self.pages_most)?;
+            let (scene, working, renderer) = (&mut self.scene, &mut self.working, &mut *self.renderer);
+            let mut now = Now { scene, step: self.state.step, working, renderer };
+            let (pages_most, began) = (self.fitting.pages_most, Instant::now());
+            let rows = rehearse(&mut now, camera, &render, &mut comparison, pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
-            let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(self.pages_most) >= pages.len();
-            self.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
+            let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
+            self.fitting.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
             (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
             let sizes = self.renderer.device_sizes();
             probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.max(sizes)));
@@ -213,22 +236,16 @@ impl Trainer {
     /// Sets the view order before the first step, for orders that depend on the pages. Rounds and held-out views follow from the order,
     /// so the trainer then equals one that was created with it.
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
-        self.order = view_order(order, self.options.seed, dataset);
-        self.options.view_order = order;
+        let options = &mut self.options;
+        options.view_order = order;
+        let order = view_order(order, options.seed, dataset);
         // The rules of the pages hold the strategy of the config.
-        self.options.strategy = strategy_in(&self.order, &self.scene.rules.strategy);
-        self.held_out = HeldOut::new(&self.options.strategy, self.train_views.len());
+        options.strategy = strategy_in(&order, &self.scene.rules.strategy);
+        self.turns = Turns::new(order, dataset.train_views(), &options.strategy, options.steps);
     }
 
     pub fn view_order(&self) -> &ViewOrder {
-        &self.order
-    }
-
-    /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
-    pub fn view_bytes(&self) -> [u64; 2] {
-        let due = self.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
-        let photos: u64 = self.photos.iter().map(|parameter| parameter.buffer_bytes()).sum();
-        [self.working.bytes() as u64, self.renderer.host_bytes() + due + photos]
+        &self.turns.order
     }
 
     pub fn options(&self) -> &RunOptions {
@@ -246,8 +263,7 @@ impl Trainer {
 
     /// Index in `dataset.views` of the next step's view.
     pub fn next_view(&mut self) -> usize {
-        let position = self.order.view_at(self.state.step);
-        self.view_in_turn(self.state.step, position)
+        self.turns.view_at(self.state.step, &self.photos)
     }
 
     /// Seconds spent in steps.
@@ -284,9 +300,10 @@ impl Trainer {
         let _span = trace::span("step");
         self.log_due_events(dataset, targets)?;
         let view = self.next_view();
-        targets.prefetch(&self.coming_views(PREFETCH_VIEWS));
+        targets.prefetch(&self.turns.coming(self.state.step, PREFETCH_VIEWS, &self.photos));
         if !self.is_ahead() {
-            self.fit_frames(&self.camera(dataset, view));
+            let camera = photos::camera(&self.photos, dataset, view);
+            self.fit().for_step(&camera);
         }
         self.prepare_device()?;
         self.look_ahead(dataset);
@@ -294,20 +311,19 @@ impl Trainer {
         let target = targets.get(view)?;
         drop(photo);
         let started = Instant::now();
-        let render = self.render_options();
         let is_left_out = self.photos.iter().any(|parameter| parameter.leaves_out(view));
         let stepped = loop {
-            let stepped = self.attempt((dataset, targets), view, &render, (&target, is_left_out));
+            let stepped = self.attempt(dataset, targets, view, &target, is_left_out);
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
-                Err(TrainError::Paging(error)) if self.add_missing_frames(&error) => {}
+                Err(TrainError::Paging(error)) if self.fit().add_missing_frames(&error) => {}
                 stepped => break stepped,
             }
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
-        self.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
-        self.note_rows_of(view, outcome.rows);
+        self.fitting.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
+        self.ahead.note_rows_of(view, outcome.rows);
         note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
         self.idle.note(&outcome, (self.state.step, self.scene.rows()), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
@@ -325,22 +341,126 @@ impl Trainer {
     /// Attempts a step on a view.
     fn attempt(
         &mut self,
-        inputs: (&Dataset, &TargetCache),
+        dataset: &Dataset,
+        targets: &TargetCache,
         view: usize,
-        render: &RenderOptions,
-        (target, is_left_out): (&Target, bool),
+        target: &Target,
+        is_left_out: bool,
     ) -> Result<StepOutcome, TrainError> {
-        let (step, camera) = (self.state.step, &self.camera(inputs.0, view));
+        let (step, camera) = (self.state.step, &photos::camera(&self.photos, dataset, view));
         self.begin_step_of_photo(view, camera, is_left_out, false);
         if self.options.optimizer_on == OptimizerPlace::Device {
-            return self.step_on_device(inputs, view, (target, is_left_out));
+            return self.step_on_device(dataset, targets, view, target, is_left_out);
         }
+        let render = self.render_options();
         let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
         let collects = self.options.strategy.collects(step);
         let mut rows = HostRows::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
-        let how = (render, &mut comparison);
-        train_step(scene, working, &mut rows, (step, camera), how, collects, self.pages_most)
+        let how = (&render, &mut comparison);
+        train_step(scene, working, &mut rows, (step, camera), how, collects, self.fitting.pages_most)
+    }
+
+    /// Whether the coming step is recorded on the device already. Nothing may read or change the scene then.
+    pub fn is_ahead(&self) -> bool {
+        self.device.as_ref().is_some_and(|tier| tier.in_flight() > 0)
+    }
+
+    /// Takes the current step on a device that holds the pages. Records the next step before it waits for the current one, if the next step
+    /// may be recorded ahead.
+    fn step_on_device(
+        &mut self,
+        dataset: &Dataset,
+        targets: &TargetCache,
+        view: usize,
+        target: &Target,
+        is_left_out: bool,
+    ) -> Result<StepOutcome, TrainError> {
+        let (step, render) = (self.state.step, self.render_options());
+        if let Some(error) = self.ahead.failed.take() {
+            return Err(error);
+        }
+        // Without corrections and masks no step needs its picture on the host.
+        if !self.is_ahead() && !self.photos.iter().any(|parameter| parameter.needs_host()) {
+            self.record(dataset, 0, target)?;
+        }
+        if self.is_ahead() {
+            self.record_next(dataset, targets)?;
+            let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
+            let _span = trace::span("finish step").with("in_flight", tier.in_flight() as u64);
+            if let Some(outcome) = tier.finish(&mut self.scene, &mut *self.renderer)? {
+                return Ok(outcome);
+            }
+        }
+        let next = self.turns.coming(self.state.step, 2, &self.photos).get(1).map(|&view| &dataset.views[view].camera);
+        let (renderer, scene, working) = (&mut *self.renderer, &mut self.scene, &mut self.working);
+        let tier = DeviceTier::of_run(&mut self.device, scene, renderer, self.options.steps)?;
+        let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
+        let (camera, collects) = (&dataset.views[view].camera, self.options.strategy.collects(step));
+        let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
+        train_step(
+            scene,
+            working,
+            &mut rows,
+            (step, camera),
+            (&render, &mut comparison),
+            collects,
+            self.fitting.pages_most,
+        )
+    }
+
+    /// Records the step `ahead` steps from now, whose photo is `target`. False if the step cannot be recorded now.
+    fn record(&mut self, dataset: &Dataset, ahead: u32, target: &Target) -> Result<bool, TrainError> {
+        let views = self.turns.coming(self.state.step, ahead + 2, &self.photos);
+        let Some(&view) = views.get(ahead as usize) else { return Ok(false) };
+        let (step, render) = (self.state.step + ahead, self.render_options());
+        let camera_of = |view: usize| -> &Camera { &dataset.views[view].camera };
+        let to_record = StepToRecord {
+            step,
+            camera: camera_of(view),
+            next: views.get(ahead as usize + 1).map(|&view| (step + 1, camera_of(view))),
+            render: &render,
+            target,
+            loss: &self.options.loss,
+            collects: self.options.strategy.collects(step),
+            rows_before: self.ahead.rows_of_views.get(view).copied().unwrap_or(0),
+            share: self.fitting.visible_share,
+            pages_most: self.fitting.pages_most,
+        };
+        let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
+        if !tier.may_record() {
+            return Ok(false);
+        }
+        tier.record(&mut self.scene, &mut *self.renderer, &to_record)
+    }
+
+    /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
+    fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
+        let may_record = self.device.as_ref().is_some_and(DeviceTier::may_record);
+        if !may_record || !self.ahead.is_allowed || !self.has_no_event_or_end_after(self.state.step) {
+            return Ok(());
+        }
+        let Some(&view) = self.turns.coming(self.state.step, 2, &self.photos).get(1) else { return Ok(()) };
+        let photo = trace::span("photo");
+        let target = targets.get(view)?;
+        drop(photo);
+        match self.record(dataset, 1, &target) {
+            Err(error @ TrainError::Paging(_)) => self.ahead.failed = Some(error),
+            other => drop(other?),
+        }
+        Ok(())
+    }
+
+    /// Whether no event follows 0-based `step`, and no outcome of the step can end the run.
+    fn has_no_event_or_end_after(&self, step: u32) -> bool {
+        let strategy = &self.options.strategy;
+        let reads = strategy.reads_histogram(step) || strategy.growth_check(step).is_some();
+        let is_steady = self.state.steps_skipped_in_a_row == 0 && self.idle.is_busy();
+        if reads || !is_steady || self.options.sh_degree_at(step + 1) > self.scene.rules.sh_degree() {
+            return false;
+        }
+        let count = RowCount::unlimited(self.scene.rows_bound());
+        strategy.events_after(step, self.options.scene_scale, count, &self.scene.histogram).is_empty()
     }
 
     /// Gives the pages of a run that updates on a device their slots, so that the first plan knows them.
@@ -362,13 +482,6 @@ impl Trainer {
             Some(tier) => tier.drain(&mut self.scene, &mut *self.renderer),
             None => Ok(()),
         }
-    }
-
-    /// Stores how many of the rows in the pages of a view were drawn, and whether the view was one batch.
-    fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
-        self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
-        self.rendered_rows = self.rendered_rows.max(in_pages as u64);
-        self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
     }
 
     /// Decides and logs the events of the last step, unless that is done. They act on values after that step's update.
@@ -428,7 +541,7 @@ impl Trainer {
         self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();
-        self.fit_widest(views.iter().map(|&view| &dataset.views[view].camera));
+        self.fit().for_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let request = EvalRequest {
             views: &views,
             ssim: self.options.ssim_variant,
@@ -438,10 +551,113 @@ impl Trainer {
             appearance: self.options.photos.appearance,
             progress,
         };
-        let now = (&mut self.scene, self.state.step, &mut self.working);
-        let test = evaluate(now, &mut *self.renderer, (dataset, targets), &render, &request)?;
+        let test = evaluate(&mut self.now(), dataset, targets, &render, &request)?;
         let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
         self.state.test = test.map(of).or(self.state.test);
         Ok(test)
+    }
+
+    /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
+    fn look_ahead(&mut self, dataset: &Dataset) {
+        let pages = self.scene.pager.index().len();
+        let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.slots() < pages);
+        let has_plan = !self.scene.is_in_memory() || is_on_device_in_part;
+        self.expect_edits();
+        // The step in flight has begun already.
+        let first = usize::from(self.is_ahead());
+        // Views are judged between epochs.
+        let is_due = self.state.step.is_multiple_of(LOOK_AHEAD_EVERY)
+            || self.state.step.is_multiple_of(self.turns.views.len() as u32);
+        if !has_plan || !is_due {
+            return;
+        }
+        if self.scene.is_in_memory() {
+            self.scene.pager.plan_for_tier_above(DEVICE_PLAN_BYTES);
+        }
+        // Two epochs contain a use of every page that any view needs.
+        let count = (2 * self.turns.views.len() as u32).clamp(LOOK_AHEAD_LEAST, LOOK_AHEAD_MOST);
+        let coming = self.turns.coming(self.state.step, count, &self.photos);
+        let cameras: Vec<Camera> =
+            coming.iter().skip(first).map(|&view| photos::camera(&self.photos, dataset, view)).collect();
+        let cameras: Vec<&Camera> = cameras.iter().collect();
+        self.scene.pager.look_ahead(self.state.step + first as u32, &cameras);
+    }
+
+    /// Tells the device which coming step is the next after which events edit every page: an opacity reset, or a raise of the SH degree.
+    fn expect_edits(&mut self) {
+        let options = &self.options;
+        let raises = |step: u32| options.sh_degree_at(step + 1) > options.sh_degree_at(step);
+        if let Some(tier) = &mut self.device {
+            let edits_all = |step| options.strategy.edits_all_after(step) || raises(step);
+            tier.expect_edits(self.state.step, options.steps, edits_all);
+        }
+    }
+
+    /// Prepares the parameters for the coming step on a view, or for its rehearsal.
+    fn begin_step_of_photo(&mut self, view: usize, camera: &Camera, is_left_out: bool, is_rehearsal: bool) {
+        let (step, events) = (self.state.step, self.scene.events());
+        let at = PhotoStep { view, step, camera, events, is_left_out, is_rehearsal };
+        self.photos.iter_mut().for_each(|parameter| parameter.begin_step(&at));
+    }
+
+    /// Lets the parameters learn from the current step, which was taken or skipped.
+    fn end_step_of_photo(&mut self, view: usize, done: &StepOutcome, photo: &Target, dataset: &Dataset) {
+        let StepOutcome { is_left_out, ref loss, .. } = *done;
+        let (step, is_skipped, mse) = (self.state.step, done.skipped.is_some(), loss.mse);
+        let ended_group = self.turns.order.group_ended_by(step);
+        let after_reset = steps_after_reset(self.scene.events(), step);
+        let outcome =
+            PhotoOutcome { view, step, is_skipped, is_left_out, ended_group, after_reset, mse, photo, dataset };
+        let warnings = self.photos.iter_mut().flat_map(|parameter| parameter.end_step(&outcome));
+        warnings.for_each(|warning| crate::tell!("warning: {warning}"));
+    }
+
+    /// Decides how many Gaussians the run allows from the round after the last step on, if that is due.
+    ///
+    /// # Errors
+    /// A photo cannot be decoded, pages could not be had, or the renderer failed. The decision is still due then.
+    fn check_growth(&mut self, step: u32, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
+        let strategy = self.options.strategy.clone();
+        let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };
+        let positions = self.turns.held_out.positions();
+        // Without held-out views the count stays as it is.
+        if positions.is_empty() || self.state.growth.checks.last().is_some_and(|last| last.step > step) {
+            return Ok(());
+        }
+        let started = Instant::now();
+        // The view after a held-out one is trained on in its place, so twice as often as others. Views that were trained on may have moved.
+        let views = &self.turns.views;
+        let [held_out, trained] = [0, 2].map(|after| {
+            let view = |&at: &usize| views[(at + after) % views.len()];
+            let camera = |view: usize| (view, photos::camera(&self.photos, dataset, view));
+            positions.iter().map(view).map(camera).collect::<Vec<_>>()
+        });
+        self.drain()?;
+        self.fit().for_widest(held_out.iter().chain(&trained).map(|(_, camera)| camera));
+        let compared = Comparing {
+            targets,
+            render: &self.render_options(),
+            loss: &self.options.loss.clone(),
+            pages_most: self.fitting.pages_most,
+            // A photo that was never trained on has no exposure yet.
+            correct: self.photos.iter().any(|parameter| parameter.corrects()).then_some(ColorCorrect::Affine),
+        };
+        // Without a view that counts the count stays as it is, too.
+        if let Some(values) = growth_values(&mut self.now(), &compared, &held_out, &trained)? {
+            let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
+            self.state.growth.checks.push(check);
+        }
+        self.state.train_seconds += started.elapsed().as_secs_f64();
+        Ok(())
+    }
+}
+
+impl Ahead {
+    /// Notes how many rows a view listed.
+    fn note_rows_of(&mut self, view: usize, rows: usize) {
+        if self.rows_of_views.len() <= view {
+            self.rows_of_views.resize(view + 1, 0);
+        }
+        self.rows_of_views[view] = u32::try_from(rows).unwrap_or(u32::MAX);
     }
 }

@@ -178,6 +178,11 @@ impl PagedScene {
         Ok(())
     }
 
+    /// Whether all pages stay in memory.
+    pub fn is_in_memory(&self) -> bool {
+        self.pager.frames_max() == usize::MAX
+    }
+
     /// Rows of the stored pages, without the effect of pending events.
     pub fn rows(&self) -> u64 {
         self.rows

@@ -21,8 +21,13 @@ use std::vec::IntoIter;
 /// Pages of a batch of an evaluation, at most.
 const PAGES_PER_BATCH: usize = 64;
 
-/// The scene after so many steps, and room for the rows of a view.
-pub type Now<'a> = (&'a mut PagedScene, u32, &'a mut WorkingSet);
+/// The scene after `step` steps, the renderer that draws it, and room for the rows of a batch.
+pub struct Now<'a> {
+    pub scene: &'a mut PagedScene,
+    pub step: u32,
+    pub working: &'a mut WorkingSet,
+    pub renderer: &'a mut dyn Renderer,
+}
 
 /// The passes of a renderer over the pages of one view: in, as often as wanted, and out.
 pub(crate) struct ViewPass<'a> {
@@ -51,21 +56,16 @@ impl<'a> ViewPass<'a> {
     ///
     /// # Errors
     /// Pages could not be had, or the renderer failed.
-    pub fn rows_in(
-        &self,
-        (scene, now, working): Now<'_>,
-        renderer: &mut dyn Renderer,
-        mut edit: impl FnMut(&mut Columns),
-    ) -> Result<usize, TrainError> {
+    pub fn rows_in(&self, now: &mut Now<'_>, mut edit: impl FnMut(&mut Columns)) -> Result<usize, TrainError> {
         let batches = self.batches();
         let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
-        renderer.begin_view(self.camera, self.options, how)?;
+        now.renderer.begin_view(self.camera, self.options, how)?;
         let mut batches = Batches { camera: self.camera, coming: batches.into_iter().peekable() };
         let mut rows = 0;
-        while batches.gather_next((&mut *scene, now, &mut *working))?.is_some() {
-            rows += working.columns.rows();
-            edit(&mut working.columns);
-            renderer.rows_in(&working.columns)?;
+        while batches.gather_next(now)?.is_some() {
+            rows += now.working.columns.rows();
+            edit(&mut now.working.columns);
+            now.renderer.rows_in(&now.working.columns)?;
         }
         Ok(rows)
     }
@@ -75,21 +75,16 @@ impl<'a> ViewPass<'a> {
     ///
     /// # Errors
     /// As [`ViewPass::rows_in`].
-    pub fn rows_out(
-        &self,
-        (scene, now, working): Now<'_>,
-        renderer: &mut dyn Renderer,
-        mut each: impl FnMut(&Gradients),
-    ) -> Result<(), TrainError> {
+    pub fn rows_out(&self, now: &mut Now<'_>, mut each: impl FnMut(&Gradients)) -> Result<(), TrainError> {
         let mut batches = self.batches();
         // The pass in has left the rows of the last batch in the working set.
         let mut gathered = batches.pop().map(|(number, _)| number);
         batches.reverse();
         let mut batches = Batches { camera: self.camera, coming: batches.into_iter().peekable() };
         while let Some(number) = gathered {
-            renderer.rows_out(number, &working.columns, &mut working.gradients)?;
-            each(&working.gradients);
-            gathered = batches.gather_next((&mut *scene, now, &mut *working))?;
+            now.renderer.rows_out(number, &now.working.columns, &mut now.working.gradients)?;
+            each(&now.working.gradients);
+            gathered = batches.gather_next(now)?;
         }
         Ok(())
     }
@@ -104,26 +99,21 @@ impl<'a> ViewPass<'a> {
 
 impl Batches<'_> {
     /// Gathers the rows of the next batch; returns its number, `None` after the last.
-    fn gather_next(&mut self, (scene, now, working): Now<'_>) -> Result<Option<usize>, TrainError> {
+    fn gather_next(&mut self, now: &mut Now<'_>) -> Result<Option<usize>, TrainError> {
         let Some((number, pages)) = self.coming.next() else { return Ok(None) };
         let next = self.coming.peek().map_or(&[][..], |(_, pages)| *pages);
-        scene.gather_pages((pages, next), self.camera, now, working)?;
+        now.scene.gather_pages((pages, next), self.camera, now.step, now.working)?;
         Ok(Some(number))
     }
 }
 
-/// Renders the picture that `camera` has after `now` steps; [`Renderer::image`] gives it.
+/// Renders the picture that `camera` has; [`Renderer::image`] gives it.
 ///
 /// # Errors
 /// Pages could not be had, or the renderer failed.
-pub fn draw(
-    now: Now<'_>,
-    renderer: &mut dyn Renderer,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<(), TrainError> {
-    ViewPass::new(now.0, camera, options, PAGES_PER_BATCH).rows_in(now, renderer, |_| {})?;
-    Ok(renderer.picture()?)
+pub fn draw(now: &mut Now<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
+    ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |_| {})?;
+    Ok(now.renderer.picture()?)
 }
 
 /// Renders the view forwards and back, as a step does whose batches have at most `pages_most` pages, so that the memory of
@@ -132,18 +122,18 @@ pub fn draw(
 /// # Errors
 /// As [`draw`].
 pub fn rehearse(
-    (scene, now, working): Now<'_>,
-    renderer: &mut dyn Renderer,
+    now: &mut Now<'_>,
     camera: &Camera,
-    (options, comparison): (&RenderOptions, &mut Comparison<'_>),
+    options: &RenderOptions,
+    comparison: &mut Comparison<'_>,
     pages_most: usize,
 ) -> Result<usize, TrainError> {
-    let pass = ViewPass::new(scene, camera, options, pages_most);
-    let rows = pass.rows_in((&mut *scene, now, &mut *working), renderer, |_| {})?;
-    renderer.picture()?;
-    comparison.loss_and_back(renderer)?;
-    pass.rows_out((scene, now, working), renderer, |_| {})?;
-    renderer.loss_value()?;
-    renderer.unusable_splats()?;
+    let pass = ViewPass::new(now.scene, camera, options, pages_most);
+    let rows = pass.rows_in(now, |_| {})?;
+    now.renderer.picture()?;
+    comparison.loss_and_back(now.renderer)?;
+    pass.rows_out(now, |_| {})?;
+    now.renderer.loss_value()?;
+    now.renderer.unusable_splats()?;
     Ok(rows)
 }

@@ -1,13 +1,18 @@
-//! Adjusts the number of frames between steps and raises the budget, as [`crate::train::memory::budget`] computes them.
+//! The memory of a run between its steps: adjusts the number of frames and raises the budget, as [`crate::train::memory::budget`]
+//! computes them.
+//!
+//! Invariant: no bit of the result depends on it.
 
 use crate::base::allocator::return_small_blocks;
 use crate::base::units::format_bytes;
 use crate::paging::error::PagingError;
+use crate::photos::PhotoParameters;
+use crate::render::Renderer;
 use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 use crate::train::memory::budget::{HostBudget, SPARE_SHARE, ViewMemory};
 use crate::train::memory::staging::PLAN_BYTES_LEAST;
-use crate::train::state::trainer::Trainer;
+use crate::train::step::pages::PagedScene;
 use crate::train::step::working_set::WorkingSet;
 
 /// The number of frames rises only by more than 1/16, to avoid small changes at every step.
@@ -19,17 +24,71 @@ const WIDER_KEPT: u64 = 4;
 /// Memory below this share of the budget is never freed: frames would gain little.
 const KEPT_SHARE: u64 = 16;
 
-impl Trainer {
-    /// Keeps the run within this budget from now on by adjusting its number of frames.
-    pub fn set_budget(&mut self, budget: HostBudget) {
-        self.budget = Some(budget);
+/// The budget of a run, and what its views have taken so far.
+#[derive(Debug)]
+pub(crate) struct Fitting {
+    /// Memory budget from which the number of frames follows; `None` without a budget.
+    pub budget: Option<HostBudget>,
+    /// The most pages of a batch of a step.
+    pub pages_most: usize,
+    /// The largest share of the rows in its pages that a view has drawn so far.
+    pub visible_share: f64,
+    /// The most rows in the pages of a view that was one batch, since the working set was allocated.
+    whole_rows: u64,
+    /// The most rows in the pages of a view since the renderer freed its rows, and the bytes that the rows of the coming view
+    /// need in the renderer.
+    rendered_rows: u64,
+    row_bytes_due: u64,
+}
+
+impl Default for Fitting {
+    fn default() -> Fitting {
+        let (budget, pages_most, visible_share) = (None, usize::MAX, 0.0);
+        Fitting { budget, pages_most, visible_share, whole_rows: 0, rendered_rows: 0, row_bytes_due: 0 }
+    }
+}
+
+impl Fitting {
+    /// Stores how many of the rows in the pages of a view were drawn, and whether the view was one batch.
+    pub fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
+        self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
+        self.rendered_rows = self.rendered_rows.max(in_pages as u64);
+        self.visible_share = self.visible_share.max(visible as f64 / in_pages.max(1) as f64);
+    }
+}
+
+/// A run whose memory is being fitted: the budget, and what holds the memory of a view.
+pub(crate) struct Fit<'a> {
+    pub fitting: &'a mut Fitting,
+    pub scene: &'a mut PagedScene,
+    pub renderer: &'a mut dyn Renderer,
+    pub working: &'a mut WorkingSet,
+    pub photos: &'a mut PhotoParameters,
+    /// Steps done.
+    pub step: u32,
+    /// SH degree of the last step.
+    pub sh_degree_last: u8,
+}
+
+impl Fit<'_> {
+    /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
+    pub fn view_bytes(&self) -> [u64; 2] {
+        let due = self.fitting.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
+        let photos: u64 = self.photos.iter().map(|parameter| parameter.buffer_bytes()).sum();
+        [self.working.bytes() as u64, self.renderer.host_bytes() + due + photos]
+    }
+
+    /// Whether a scene in memory no longer fits into its budget.
+    pub fn is_outgrown(&self) -> bool {
+        let budget = self.fitting.budget.filter(|_| self.scene.is_in_memory());
+        budget.is_some_and(|budget| !budget.holds_all(self.scene, self.view_memory().at_last))
     }
 
     /// Memory of the largest view so far.
-    pub(crate) fn view_memory(&self) -> ViewMemory {
+    pub fn view_memory(&self) -> ViewMemory {
         let [working, rendering] = self.view_bytes();
         let width = row_width(self.working.columns.sh_degree) as u64;
-        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degree_last]
             .map(|degree| working / width * row_width(degree) as u64 + rendering);
         ViewMemory { now, at_last }
     }
@@ -38,11 +97,11 @@ impl Trainer {
     /// been one batch before.
     fn view_memory_of(&self, rows: u64) -> ViewMemory {
         let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
-        if rows <= self.whole_rows {
+        if rows <= self.fitting.whole_rows {
             return held;
         }
-        let visible = (rows as f64 * self.visible_share) as u64;
-        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degrees().1]
+        let visible = (rows as f64 * self.fitting.visible_share) as u64;
+        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degree_last]
             .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
         ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
     }
@@ -50,67 +109,67 @@ impl Trainer {
     /// Prepares memory for a view whose pages hold `rows` rows: frees what only far wider views need in the renderer and the
     /// working set, so that frames can have it, and expects what the renderer will need if no view as wide was rendered since.
     fn expect_rows(&mut self, rows: u64, budget: HostBudget) {
-        let visible = (rows as f64 * self.visible_share) as u64;
+        let visible = (rows as f64 * self.fitting.visible_share) as u64;
         let due = self.renderer.host_bytes_for_rows(visible);
         let is_too_large =
             |held: u64, due: u64| held > due.saturating_mul(WIDER_KEPT) && held > budget.bytes / KEPT_SHARE;
         if is_too_large(self.renderer.host_bytes_of_rows(), due) {
             self.renderer.free_rows();
-            self.rendered_rows = 0;
+            self.fitting.rendered_rows = 0;
         }
         let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree()) as u64;
         if is_too_large(self.working.bytes() as u64, working_due) {
             self.shrink_working_set(visible as usize);
         }
-        self.row_bytes_due = if rows <= self.rendered_rows { 0 } else { due };
+        self.fitting.row_bytes_due = if rows <= self.fitting.rendered_rows { 0 } else { due };
     }
 
     /// Frees the memory of a working set that has room for many more than `rows` rows, and what photos take beside it.
     fn shrink_working_set(&mut self, rows: usize) {
         if self.working.shrink_to(rows) {
             self.photos.iter_mut().for_each(|parameter| parameter.free_buffers());
-            self.whole_rows = 0;
+            self.fitting.whole_rows = 0;
         }
     }
 
-    /// [`Trainer::fit_frames`] for the camera that sees the most pages, before pictures outside of steps.
-    pub(crate) fn fit_widest<'a>(&mut self, cameras: impl IntoIterator<Item = &'a Camera>) {
-        if self.budget.is_some() && !self.is_in_memory() {
+    /// [`Fit::for_step`] for the camera that sees the most pages, before pictures outside of steps.
+    pub fn for_widest<'a>(&mut self, cameras: impl IntoIterator<Item = &'a Camera>) {
+        if self.fitting.budget.is_some() && !self.scene.is_in_memory() {
             let widest = cameras.into_iter().max_by_key(|camera| self.scene.pager.pages_of_view(camera).len());
-            widest.into_iter().for_each(|camera| self.fit_frames(camera));
+            widest.into_iter().for_each(|camera| self.for_step(camera));
         }
     }
 
-    /// [`Trainer::fit_frames`] before a picture of the live page: any camera may ask for one, so it never raises the budget. A picture is
+    /// [`Fit::for_step`] before a picture of the live page: any camera may ask for one, so it never raises the budget. A picture is
     /// drawn in batches.
-    pub(crate) fn fit_picture(&mut self, camera: &Camera) {
-        self.fit_frames_within(camera, false);
+    pub fn for_picture(&mut self, camera: &Camera) {
+        self.frames_within(camera, false);
     }
 
     /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
     /// fit in one batch is cut into batches that do.
-    pub(crate) fn fit_frames(&mut self, camera: &Camera) {
-        self.fit_frames_within(camera, true);
+    pub fn for_step(&mut self, camera: &Camera) {
+        self.frames_within(camera, true);
     }
 
-    fn fit_frames_within(&mut self, camera: &Camera, may_raise: bool) {
-        let Some(budget) = self.budget.filter(|_| !self.is_in_memory()) else { return };
+    fn frames_within(&mut self, camera: &Camera, may_raise: bool) {
+        let Some(budget) = self.fitting.budget.filter(|_| !self.scene.is_in_memory()) else { return };
         let pages = self.scene.pager.pages_of_view(camera);
         let index = self.scene.pager.index();
         let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
         let needed = pages.len();
         self.expect_rows(rows, budget);
         let view = self.view_memory_of(rows);
-        let mut frames = budget.frames(&self.scene, view, needed);
-        self.pages_most = usize::MAX;
+        let mut frames = budget.frames(self.scene, view, needed);
+        self.fitting.pages_most = usize::MAX;
         if frames < needed && may_raise && self.raise_for_frames(budget, needed) {
             frames = needed;
         } else if frames < needed {
-            let row_bytes = WorkingSet::row_bytes(self.sh_degrees().1);
+            let row_bytes = WorkingSet::row_bytes(self.sh_degree_last);
             // Between the passes, the batches keep the numbers of their rows in view.
-            let numbers = (rows as f64 * self.visible_share) as u64 * size_of::<u32>() as u64;
-            (frames, self.pages_most) = budget.batches(&self.scene, self.view_bytes()[1] + numbers, row_bytes);
-            self.shrink_working_set(self.pages_most.saturating_mul(self.options.page_rows));
+            let numbers = (rows as f64 * self.fitting.visible_share) as u64 * size_of::<u32>() as u64;
+            (frames, self.fitting.pages_most) = budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
+            self.shrink_working_set(self.fitting.pages_most.saturating_mul(self.scene.rules.page_rows()));
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();
@@ -126,19 +185,21 @@ impl Trainer {
 
     /// Adds the frames that a step lacked, as `error` reports, if memory is left for them. On true the step can be
     /// repeated, with more frames than before.
-    pub(crate) fn add_missing_frames(&mut self, error: &PagingError) -> bool {
+    pub fn add_missing_frames(&mut self, error: &PagingError) -> bool {
         let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
-        let Some(budget) = self.budget.filter(|_| !self.is_in_memory() && needed > now) else { return false };
-        let mut most = budget.frames_at_most(&self.scene, self.view_memory());
+        let Some(budget) = self.fitting.budget.filter(|_| !self.scene.is_in_memory() && needed > now) else {
+            return false;
+        };
+        let mut most = budget.frames_at_most(self.scene, self.view_memory());
         if most < needed && !self.raise_for_frames(budget, needed) {
             // The plan is optional: with a small plan the run reads more pages and continues.
             let Some(smaller) = budget.with_small_plan() else { return false };
-            most = smaller.frames_at_most(&self.scene, self.view_memory());
+            most = smaller.frames_at_most(self.scene, self.view_memory());
             if most < needed {
                 return false;
             }
             self.scene.pager.limit_plan(PLAN_BYTES_LEAST);
-            self.budget = Some(smaller);
+            self.fitting.budget = Some(smaller);
         }
         let wanted = needed + needed / SPARE_SHARE;
         self.scene.pager.allow_frames(wanted.min(most).max(needed));
@@ -148,13 +209,13 @@ impl Trainer {
     /// Raises the budget for a step that needs `needed` frames; see [`HostBudget::raised`].
     fn raise_for_frames(&mut self, budget: HostBudget, needed: usize) -> bool {
         let frames = (needed * self.scene.pager.frame_bytes()) as u64;
-        let bytes = budget.bytes_beside_frames(&self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
+        let bytes = budget.bytes_beside_frames(self.scene, self.view_memory().now, 1.0) + budget.staging + frames;
         self.raise_budget(budget, bytes)
     }
 
     /// Raises the budget to keep all pages in memory; see [`HostBudget::raised`].
-    pub(crate) fn raise_for_all_pages(&mut self, budget: HostBudget) -> bool {
-        let bytes = budget.bytes_of_all(&self.scene, self.view_memory().at_last, true);
+    pub fn raise_for_all_pages(&mut self, budget: HostBudget) -> bool {
+        let bytes = budget.bytes_of_all(self.scene, self.view_memory().at_last, true);
         self.raise_budget(budget, bytes)
     }
 
@@ -164,16 +225,11 @@ impl Trainer {
             crate::tell!(
                 "warning: from step {} on the scene needs more than {}, the default share of the free memory: the run \
                  takes more as long as the machine has it; --host-mem sets a limit",
-                self.state.step,
+                self.step,
                 format_bytes(budget.bytes)
             );
         }
-        self.budget = Some(raised);
+        self.fitting.budget = Some(raised);
         true
-    }
-
-    /// Whether all pages stay in memory.
-    pub(crate) fn is_in_memory(&self) -> bool {
-        self.scene.pager.frames_max() == usize::MAX
     }
 }
