@@ -103,7 +103,7 @@
 //!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
 //! 2. `exchange/format.rs`: the ending, the sink, the transform, the name in a run's folder, and how `--overwrite` removes it.
 //!    Runs and `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
-//!    `train/state/eval_file.rs` is where evaluation reads another format.
+//!    `train/run/eval_file.rs` is where evaluation reads another format.
 //! 3. `config/choice.rs`: the word of `--export`. `config/file.rs`: the help of the key.
 //!
 //! **A resumable value**

@@ -7,14 +7,14 @@ use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::{folder_of, write_whole};
 use gsscale::config::command_line::parse_command_line;
+use gsscale::config::facts::read_resolved;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::exchange::sog::is_tree;
 use gsscale::render::lpips::InputRange;
 use gsscale::report::levels_page::{LevelFigures, levels_page};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::log::facts::read_resolved;
-use gsscale::train::state::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
+use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 

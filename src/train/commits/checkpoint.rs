@@ -10,9 +10,8 @@
 
 use super::first_commit::FirstCommit;
 use crate::base::trace;
-use crate::checkpoint::interval::{CommitCost, CommitInterval, CommitReport};
+use crate::checkpoint::interval::{CommitCost, CommitEvery, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{Origin, RunState};
-use crate::config::file::TrainConfig;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitError, Commits};
 use crate::paging::stats::SlotSpace;
@@ -67,9 +66,11 @@ pub struct Checkpoint {
     last_step: Option<u32>,
 }
 
-/// `--disk-full-wait`.
-pub(crate) fn full_wait(config: &TrainConfig) -> Duration {
-    Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default()
+/// When a run commits, and how long it waits for space.
+#[derive(Debug, Clone, Copy)]
+pub struct CommitOptions {
+    pub every: CommitEvery,
+    pub full_wait: Duration,
 }
 
 /// A commit in progress beside training.
@@ -84,18 +85,18 @@ struct Beside {
 }
 
 impl Checkpoint {
-    /// Commits to the store in `folder` at the interval of the config; the first commit follows one interval from now.
-    pub fn new(commits: Commits, folder: &Path, config: &TrainConfig) -> Checkpoint {
-        Checkpoint { commits: Some(commits), ..Checkpoint::without(folder, config) }
+    /// Commits to the store in `folder` at this interval; the first commit follows one interval from now.
+    pub fn new(commits: Commits, folder: &Path, options: CommitOptions) -> Checkpoint {
+        Checkpoint { commits: Some(commits), ..Checkpoint::without(folder, options) }
     }
 
     /// Commits of a run in memory: the first commit creates the store with `first`.
-    pub(crate) fn later(first: FirstCommit, config: &TrainConfig) -> Checkpoint {
-        let folder = first.folder().to_path_buf();
-        Checkpoint { first: Some(first), is_optional: true, ..Checkpoint::without(&folder, config) }
+    pub(crate) fn later(first: FirstCommit, options: CommitOptions) -> Checkpoint {
+        let folder = first.folder.clone();
+        Checkpoint { first: Some(first), is_optional: true, ..Checkpoint::without(&folder, options) }
     }
 
-    fn without(folder: &Path, config: &TrainConfig) -> Checkpoint {
+    fn without(folder: &Path, options: CommitOptions) -> Checkpoint {
         let now = Instant::now();
         Checkpoint {
             commits: None,
@@ -105,9 +106,9 @@ impl Checkpoint {
             folder: folder.to_path_buf(),
             is_optional: false,
             goes_without: false,
-            full_wait: full_wait(config),
+            full_wait: options.full_wait,
             space_made: None,
-            interval: CommitInterval::new(config.commit_every),
+            interval: CommitInterval::new(options.every),
             started: now,
             last: now,
             last_cut: now,

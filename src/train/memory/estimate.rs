@@ -6,7 +6,6 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::memory_available;
 use crate::base::units::format_bytes;
-use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
 use crate::render::view_sizes::ViewSizes;
 use crate::scene::state::row_bytes;
@@ -66,9 +65,9 @@ impl MemoryEstimate {
     }
 }
 
-/// The budget of a run: --host-mem, or a share of the available memory; `None` if the system does not report it.
-pub fn host_budget(config: &TrainConfig) -> Option<u64> {
-    match config.host_mem.0 {
+/// The budget of a run: `asked` (`--host-mem`), or a share of the available memory if that is 0; `None` if the system does not report it.
+pub fn host_budget(asked: u64) -> Option<u64> {
+    match asked {
         0 => memory_available().map(|bytes| bytes / 100 * BUDGET_PERCENT),
         bytes => Some(bytes),
     }
@@ -80,11 +79,6 @@ pub fn obtainable_bytes() -> Option<u64> {
     // Anonymous memory only: cached files count as available already.
     let held = status_field("RssAnon:").or_else(host_bytes_now)?;
     Some(held + memory_available()? / 100 * REACH_PERCENT)
-}
-
-/// Known upper bound of a run's rows: the current rows, or the cap if that is more.
-pub fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
-    if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
 }
 
 /// The most bytes that decoding one photo with its mask takes, and the view of that photo.

@@ -2,10 +2,9 @@
 //!
 //! Not here: evaluations within a run, whose pages, photos and renderer the run has planned ([`super::estimate`]).
 
-use super::estimate::{BASE_BYTES, frames_in_memory, host_budget};
+use super::estimate::{BASE_BYTES, frames_in_memory};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up, format_grouped};
-use crate::config::file::TrainConfig;
 use crate::dataset::loader::{Dataset, View};
 use crate::dataset::target_cache::TargetCache;
 use crate::render::lpips::Network;
@@ -17,7 +16,8 @@ const RENDERER_ROW_BYTES: u64 = 320;
 /// Bytes of a renderer for a pixel: colour and coverage of the picture, and colour, transmittance and last splat of its tile.
 const PIXEL_BYTES: u64 = 36;
 
-/// Refuses an evaluation of these Gaussians on the held-out photos of a scene that may take more than the memory of the program.
+/// Refuses an evaluation of these Gaussians on the held-out photos of a scene that may take more than `budget` bytes, with a cache of
+/// `image_cache` bytes for photos.
 ///
 /// # Errors
 /// The memory is too little; the error names `file`.
@@ -25,14 +25,14 @@ pub(crate) fn check_evaluation_fits(
     file: &Path,
     columns: &Columns,
     dataset: &Dataset,
-    config: &TrainConfig,
+    budget: u64,
+    image_cache: u64,
     lpips: Option<Network>,
 ) -> InputResult<()> {
-    let Some(budget) = host_budget(config) else { return Ok(()) };
     let views: Vec<View> = dataset.test_views().iter().map(|&view| dataset.views[view].clone()).collect();
     let largest_decode = views.iter().map(|view| view.photo.decode_bytes()).max().unwrap_or(0);
     let keep_all = TargetCache::bytes_to_keep_all(&views, rayon::current_num_threads());
-    let photos = config.image_cache.0.min(keep_all).max(largest_decode);
+    let photos = image_cache.min(keep_all).max(largest_decode);
     let Some(largest) = views.iter().map(|view| &view.camera).max_by_key(|camera| camera.pixels()) else {
         return Ok(());
     };

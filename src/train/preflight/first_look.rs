@@ -83,7 +83,7 @@ pub fn first_look(
     folder: &Path,
     look_for: LookFor,
 ) -> Result<FirstLook, TrainError> {
-    let host_mem = host_budget(config);
+    let host_mem = host_budget(config.host_mem.0);
     let mut start = Start::look(scene, config, folder, host_mem)?;
     let options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };

@@ -11,6 +11,7 @@
 use super::drive_space::{DriveUse, StepUse, VERSIONS};
 use super::first_frames::{LargestNeed, shrink_to_budget};
 use super::plan::TierPlan;
+use super::probe::rows_at_most;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
@@ -21,7 +22,7 @@ use crate::page::format::spill_format::SlotLayout;
 use crate::scene::state::row_bytes;
 use crate::train::commits::reserve::reserve_bytes;
 use crate::train::log::report::Foreseen;
-use crate::train::memory::estimate::{MemoryEstimate, rows_at_most};
+use crate::train::memory::estimate::MemoryEstimate;
 
 /// Gaussians that a round of densification adds without a cap, if rounds are [`ROUND_STEPS`] apart. Neither the size of the photos nor the
 /// first number of Gaussians changes it much, see "Gaussians without a cap" in `benches/RESULTS.md`.

@@ -8,7 +8,7 @@ use super::first_frames::{
     FirstFrames, LargestNeed, first_frames, frames_of_budget, in_batches, page_working, raise_to_minimum,
     shrink_to_budget,
 };
-use super::probe::{Probe, estimate};
+use super::probe::{Probe, estimate, rows_at_most};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
@@ -19,7 +19,7 @@ use crate::schedule::order::Order;
 use crate::schedule::visibility::ViewPages;
 use crate::train::error::TrainError;
 use crate::train::memory::budget::{HostBudget, frames_and_batch};
-use crate::train::memory::estimate::{MemoryEstimate, obtainable_bytes, rows_at_most};
+use crate::train::memory::estimate::{MemoryEstimate, obtainable_bytes};
 use crate::train::memory::largest_view::{LargestView, cut_views, largest_view, train_cameras};
 use crate::train::memory::staging::{PLAN_BYTES, staging_bytes};
 use crate::train::start::tiers::{Tiers, budget_in_memory, first_staging_bytes};

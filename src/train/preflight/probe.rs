@@ -8,7 +8,7 @@ use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
 use crate::train::memory::estimate::{
-    BASE_BYTES, INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, largest_decode, rows_at_most,
+    BASE_BYTES, INDEX_BYTES, MemoryEstimate, bytes_of_copies, frames_in_memory, largest_decode,
 };
 use crate::train::state::trainer::{Probed, Trainer};
 use crate::train::step::working_set::WorkingSet;
@@ -19,6 +19,11 @@ const PROBE_VIEWS: usize = 6;
 /// Most bytes of a renderer for a row in view that are expected of any scene: splat, gradients and staging, and some twenty
 /// intersections with tiles.
 const RENDERER_ROW_BYTES_MOST: u64 = 2048;
+
+/// Known upper bound of a run's rows: the current rows, or the cap if that is more.
+pub(crate) fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
+    if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
+}
 
 /// Input of an estimate.
 #[derive(Debug, Clone)]

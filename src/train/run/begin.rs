@@ -28,7 +28,7 @@ use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::estimate::list_bytes;
-use crate::train::memory::estimate::{host_budget, host_bytes_now, rows_at_most};
+use crate::train::memory::estimate::{host_budget, host_bytes_now};
 use crate::train::preflight::device_memory;
 use crate::train::preflight::drive_space::{DriveUse, SimulatedRun, check_first_drive, drive_use};
 use crate::train::preflight::forecast::{
@@ -36,12 +36,12 @@ use crate::train::preflight::forecast::{
 };
 use crate::train::preflight::plan;
 use crate::train::preflight::plan_text;
-use crate::train::preflight::probe::{Probe, estimate};
+use crate::train::preflight::probe::{Probe, estimate, rows_at_most};
 use crate::train::preflight::results_space::check_drive_of_results;
 use crate::train::start::first_scene::Start;
 use crate::train::start::first_scene::dataset_print;
 use crate::train::start::tiers::{self, Tiers};
-use crate::train::state::held_out::{keeps_first_count, too_few_to_decide};
+use crate::train::state::held_out::{are_too_few_to_decide, too_few_to_decide};
 use crate::train::state::trainer::Trainer;
 use crate::train::step::soundness::no_view_sees;
 use std::path::{Path, PathBuf};
@@ -56,7 +56,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     machine::set_up(config)?;
     check_folders(request)?;
     let _mark = Beginning::mark(request)?;
-    let host_mem = host_budget(config);
+    let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
     let request = &adapt_schedule(request, &start);
     let config = &request.config;
@@ -148,6 +148,11 @@ pub(super) fn first_trainer(
     Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
 }
 
+/// Whether a run that is to decide its count has too few training photos for it, and so keeps the count that it starts with.
+fn keeps_first_count(config: &TrainConfig, dataset: &Dataset) -> bool {
+    limits::growth_rule(config).is_some() && are_too_few_to_decide(dataset.train_views().len())
+}
+
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
 pub(crate) fn begin(
     quiet: bool,
@@ -158,7 +163,7 @@ pub(crate) fn begin(
         crate::tell!("warning: {warning}");
     }
     if keeps_first_count(config, &start.dataset) {
-        crate::tell!("warning: {}", too_few_to_decide(&start.dataset));
+        crate::tell!("warning: {}", too_few_to_decide(start.dataset.train_views().len()));
     }
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
@@ -205,7 +210,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
         quiet: true,
         live: None,
     };
-    let host_mem = host_budget(&request.config);
+    let host_mem = host_budget(request.config.host_mem.0);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
     let request = adapt_schedule(&request, &start);
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {

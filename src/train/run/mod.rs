@@ -6,6 +6,7 @@ pub mod begin;
 mod beginning;
 mod changes;
 pub mod costs;
+pub mod eval_file;
 pub mod live;
 mod more_steps;
 pub mod out_folder;

@@ -18,6 +18,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::units::format_grouped;
 use crate::base::whole_file::sync_folder;
+use crate::config::facts::Resolved;
 use crate::config::file::TrainConfig;
 use crate::config::limits::schedule_steps;
 use crate::report::live::Live;
@@ -25,7 +26,6 @@ use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::places::absolute;
-use crate::train::log::facts::Resolved;
 use crate::train::log::report::Summary;
 use crate::train::memory::estimate::host_budget;
 use crate::train::start::first_scene::Start;
@@ -86,7 +86,7 @@ impl Finished<'_> {
         }
         let init_ply = absolute(&kept).to_string_lossy().into_owned();
         let config = TrainConfig { init_ply, ..self.config };
-        let host_mem = host_budget(&config);
+        let host_mem = host_budget(config.host_mem.0);
         let start = Start::read(scene, &config, host_mem)?;
         let (sh_degree_start, first_rows) = (start.sh_degree_start, start.rows);
         let past = Past {

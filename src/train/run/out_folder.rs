@@ -6,6 +6,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, part_path, sync_folder};
+use crate::config::facts::read_resolved;
 use crate::config::file::TrainConfig;
 use crate::config::residence::checkpoint_folder;
 use crate::exchange::format::ExportFormat;
@@ -16,7 +17,6 @@ use crate::report::run_files::{
     BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, is_saved_ply,
 };
 use crate::train::error::TrainError;
-use crate::train::log::facts::read_resolved;
 use crate::train::log::report::StepLine;
 use crate::train::stores::ownership::{check_removable, remove_checkpoint_in};
 use std::ffi::OsStr;

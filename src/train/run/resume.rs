@@ -18,6 +18,7 @@ use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
 use crate::config::choice::Chosen;
+use crate::config::facts::{Resolved, read_resolved};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
 use crate::config::residence::checkpoint_folder;
@@ -36,7 +37,6 @@ use crate::train::commits::checkpoint::restore;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::places::absolute;
-use crate::train::log::facts::{Resolved, read_resolved};
 use crate::train::log::report::Summary;
 use crate::train::memory::estimate::host_budget;
 use crate::train::start::first_scene::Start;
@@ -248,7 +248,7 @@ pub(super) fn goal(
         let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
         return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
-    let start = Start::look(scene, config, &request.out, host_budget(config))?;
+    let start = Start::look(scene, config, &request.out, host_budget(config.host_mem.0))?;
     let print = dataset_print(&start)?;
     changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
     changes.numbers.extend(first_degree_change(&start, state, &print));
@@ -264,7 +264,7 @@ fn resume_from(
     stored: Stored,
 ) -> Result<RunOutcome, TrainError> {
     machine::set_up(&config)?;
-    let host_mem = host_budget(&config);
+    let host_mem = host_budget(config.host_mem.0);
     let state = stored.run_state.clone();
     let Goal { changes, start, print } = goal(request, earlier, &mut config, &state)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;

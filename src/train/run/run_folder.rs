@@ -18,6 +18,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
 use crate::config::choice::{Chosen, LogFormat};
+use crate::config::facts::{Resolved, write_config};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::values::Up;
@@ -29,19 +30,18 @@ use crate::exchange::sink::Written;
 use crate::photos;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
-use crate::train::commits::checkpoint::{Checkpoint, full_wait};
+use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results_wait::Results;
 use crate::train::commits::save::{export, save, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::inputs::signals::StopFlag;
-use crate::train::log::facts::{Resolved, write_config};
 use crate::train::log::progress::{Count, Progress};
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::preflight::forecast::Forecast;
 use crate::train::preflight::growth_costs::GrowthCosts;
-use crate::train::start::tiers::Tiers;
+use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
 use std::collections::BTreeMap;
@@ -181,7 +181,7 @@ pub(super) fn train_into(
         out,
         stop,
         // A run that has failed, perhaps after such a wait, ends.
-        wait: looped.as_ref().map_or(Duration::ZERO, |()| full_wait(config)),
+        wait: looped.as_ref().map_or(Duration::ZERO, |()| commit_options(config).full_wait),
         has_ply: false,
     };
     let ply = Trainer::ply_path(out);

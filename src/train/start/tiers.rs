@@ -5,7 +5,8 @@
 
 use crate::base::error::InputResult;
 use crate::config::file::TrainConfig;
-use crate::config::residence::Residence;
+use crate::config::residence::{Residence, checkpoint_folder};
+use crate::optim::moments::Moments;
 use crate::page::engine::memory::MemoryEngine;
 use crate::page::engine::open::{DEPTH, open_engine};
 use crate::page::engine::page_engine::PageEngine;
@@ -18,8 +19,8 @@ use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::scene::page_layout::capacity_bytes;
-use crate::train::commits::checkpoint::Checkpoint;
-use crate::train::commits::first_commit::{FirstCommit, codec};
+use crate::train::commits::checkpoint::{Checkpoint, CommitOptions};
+use crate::train::commits::first_commit::FirstCommit;
 use crate::train::error::TrainError;
 use crate::train::inputs::places::drive_of;
 use crate::train::memory::budget::HostBudget;
@@ -27,6 +28,7 @@ use crate::train::memory::estimate::MemoryEstimate;
 use crate::train::memory::staging::{PLAN_BYTES, PREFETCH_BYTES_MAX, staging_bytes};
 use crate::train::stores::opened::{Stored, commit_config};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Fewest frames of a run before its views are measured: enough for import and probe.
 const FIRST_FRAMES: usize = 64;
@@ -59,6 +61,21 @@ pub struct Tiers {
     pub segment_bytes: u64,
     /// Messages about the drive and the choice of the engine.
     pub notes: Vec<String>,
+}
+
+/// When a run with this config commits.
+pub fn commit_options(config: &TrainConfig) -> CommitOptions {
+    let full_wait = Duration::try_from_secs_f64(config.disk_full_wait).unwrap_or_default();
+    CommitOptions { every: config.commit_every, full_wait }
+}
+
+/// Codec of `--spill-codec`. Halves cost one pass and save a third of the bytes on any drive. zstd is never chosen: it pays
+/// only on slow drives, for pages that are seldom read, and `gsscale-iotune` advises it there.
+fn codec(config: &TrainConfig) -> Codec {
+    config.spill_codec.0.unwrap_or(match config.moments {
+        Moments::F32 => Codec::Raw,
+        Moments::Bf16 => Codec::Halves,
+    })
 }
 
 /// Pager sizes of a run within `host_mem` bytes.
@@ -139,7 +156,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let (engine, codec) = tiers.take_spill(spill, config)?;
     let opened = Commits::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
-    let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, config);
+    let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, commit_options(config));
     checkpoint.fill_reserve()?;
     tiers.checkpoint = Some(checkpoint);
     Ok((with_transfers(Pager::new(pager, store), config), tiers))
@@ -173,7 +190,7 @@ impl Tiers {
         let (engine, codec) = tiers.take_spill(spill, config)?;
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
-        let mut checkpoint = Checkpoint::new(opened.commits, &folder, config);
+        let mut checkpoint = Checkpoint::new(opened.commits, &folder, commit_options(config));
         checkpoint.set_optional(is_in_memory);
         checkpoint.fill_reserve()?;
         tiers.checkpoint = Some(checkpoint);
@@ -196,7 +213,13 @@ impl Tiers {
     /// directory commits there, and `--frames` alone, which is for comparisons, does not commit.
     pub fn commit_in(&mut self, out: &Path, config: &TrainConfig) {
         if config.residence() == Residence::Memory {
-            self.checkpoint = Some(Checkpoint::later(FirstCommit::of(out, config), config));
+            let first = FirstCommit {
+                folder: checkpoint_folder(out),
+                io: config.io,
+                codec: codec(config),
+                capacity_bytes: capacity_bytes(config.page_rows as usize, config.sh_degree),
+            };
+            self.checkpoint = Some(Checkpoint::later(first, commit_options(config)));
             (self.is_in_memory, self.is_in_output, self.keeps) = (true, true, config.keep_checkpoint);
         }
     }

@@ -10,9 +10,6 @@
 //!
 //! Invariant: which view a step trains on is a function of the step and the views.
 
-use crate::config::file::TrainConfig;
-use crate::config::limits;
-use crate::dataset::loader::Dataset;
 use crate::densify::strategy::Strategy;
 use std::sync::Arc;
 
@@ -61,23 +58,23 @@ impl HeldOut {
     }
 }
 
-/// Whether a run that is to decide its count has too few training views for it, and so keeps the count that it starts with.
-pub(crate) fn keeps_first_count(config: &TrainConfig, dataset: &Dataset) -> bool {
-    limits::growth_rule(config).is_some() && dataset.train_views().len() < TRAIN_VIEWS_LEAST
+/// Whether so many training views are too few for a run to decide its count by them.
+pub(crate) fn are_too_few_to_decide(views: usize) -> bool {
+    views < TRAIN_VIEWS_LEAST
 }
 
-/// What such a run says about it.
-pub(crate) fn too_few_to_decide(dataset: &Dataset) -> String {
+/// What a run with so few training views says about it.
+pub(crate) fn too_few_to_decide(views: usize) -> String {
     format!(
-        "the run keeps the number of Gaussians with which it starts: {} training photos are too few to hold some out and to decide \
-         the number by them ({TRAIN_VIEWS_LEAST} are enough); --max-gaussians sets another number",
-        dataset.train_views().len()
+        "the run keeps the number of Gaussians with which it starts: {views} training photos are too few to hold some out and to decide \
+         the number by them ({TRAIN_VIEWS_LEAST} are enough); --max-gaussians sets another number"
     )
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::file::TrainConfig;
     use crate::config::limits::RunOptions;
     use crate::densify::strategy::StrategyName;
 

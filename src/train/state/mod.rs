@@ -2,7 +2,6 @@
 //! Gaussians the scene needs.
 
 pub mod eval;
-pub mod eval_file;
 pub(crate) mod fitting;
 mod growth_checks;
 pub(crate) mod held_out;

@@ -31,13 +31,13 @@ pub use verify::{Fault, Verdict, verify};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
+use crate::config::facts::read_resolved;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::report::run_files::CONFIG_FILE;
 use crate::train::error::TrainError;
-use crate::train::log::facts::read_resolved;
 use crate::train::stores::ownership::check_owner;
 use std::path::{Path, PathBuf};
 

@@ -1,8 +1,7 @@
 //! Evaluation of a file of Gaussians on the held-out photos of a scene: a PLY, or every level of a folder of SOGs.
 //!
-//! Not here: the figures of a view ([`super::eval`]).
+//! Not here: the figures of a view ([`crate::train::state::eval`]).
 
-use super::eval::{EvalRequest, evaluate};
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -26,6 +25,7 @@ use crate::train::log::progress::Count;
 use crate::train::log::report::TestMetrics;
 use crate::train::memory::estimate::{check_photos_fit, host_budget};
 use crate::train::memory::eval_needs::check_evaluation_fits;
+use crate::train::state::eval::{EvalRequest, evaluate};
 use crate::train::step::pages::PagedScene;
 use crate::train::step::view::Now;
 use crate::train::step::working_set::WorkingSet;
@@ -158,7 +158,7 @@ impl<'a> Evaluator<'a> {
         lpips: Option<(&'a Lpips, InputRange)>,
     ) -> Result<Evaluator<'a>, TrainError> {
         let dataset = load_dataset(read_scene(scene, &limits::read_options(config))?, &limits::load_options(config))?;
-        check_photos_fit(&dataset, host_budget(config))?;
+        check_photos_fit(&dataset, host_budget(config.host_mem.0))?;
         dataset.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
         let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
         let (renderer, word) = machine::renderer(config)?;
@@ -205,13 +205,10 @@ impl<'a> Evaluator<'a> {
             let problem = "no Gaussian lies within the coordinate range of this scene";
             return Err(InputError::new(file, problem, "give a file that was trained on this scene").into());
         }
-        check_evaluation_fits(
-            file,
-            &columns,
-            &self.dataset,
-            self.config,
-            self.lpips.map(|(lpips, _)| lpips.network()),
-        )?;
+        if let Some(budget) = host_budget(self.config.host_mem.0) {
+            let (cache, network) = (self.config.image_cache.0, self.lpips.map(|(lpips, _)| lpips.network()));
+            check_evaluation_fits(file, &columns, &self.dataset, budget, cache, network)?;
+        }
         let run = RunOptions::new(self.config, self.dataset.scene_scale);
         let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
         let gaussians = columns.rows() as u64;

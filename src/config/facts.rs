@@ -2,11 +2,11 @@
 //!
 //! Invariant: the file is a valid `--config`. Resume and evaluation read its facts.
 
+use super::file::{FILE_BYTES_MAX, TrainConfig};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
-use crate::config::file::{FILE_BYTES_MAX, TrainConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
