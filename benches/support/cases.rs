@@ -75,7 +75,7 @@ pub fn photo_case(case: &PhotoCase, views: usize) -> Option<Case> {
         return None;
     }
     let config = TrainConfig { data_factor: case.data_factor, sh_every: 0, ..TrainConfig::default() };
-    let prepared = gsscale::train::inputs::prepare::prepare(&scene, &config);
+    let prepared = gsscale::train::start::first_scene::prepare(&scene, &config);
     let Ok(prepared) = prepared else { panic!("{}: {:?}", scene.display(), prepared.err()) };
     let dataset = prepared.dataset;
     let columns = match case.count {

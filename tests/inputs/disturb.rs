@@ -6,7 +6,7 @@ use gsscale::dataset::loader::{Dataset, View};
 use gsscale::dataset::model::Split;
 use gsscale::dataset::photo::decode;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::train::inputs::prepare::prepare;
+use gsscale::train::start::first_scene::prepare;
 use std::path::Path;
 use tempfile::TempDir;
 

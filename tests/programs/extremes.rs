@@ -4,7 +4,7 @@
 use crate::support::scenes::{TextModel, city, psnr, stderr, summary, text, train};
 use gsscale::config::file::TrainConfig;
 use gsscale::scene::columns::Columns;
-use gsscale::train::inputs::prepare::prepare;
+use gsscale::train::start::first_scene::prepare;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

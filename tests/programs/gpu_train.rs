@@ -14,7 +14,7 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Traffic;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
-use gsscale::train::inputs::prepare::{Prepared, prepare};
+use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;

@@ -5,7 +5,7 @@ use crate::support::scenes::{city, psnr, stderr, summary, text, train};
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
 use gsscale::gpu::GpuOptions;
-use gsscale::train::inputs::prepare::prepare;
+use gsscale::train::start::first_scene::prepare;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;

@@ -8,7 +8,7 @@ use gsscale::dataset::target_cache::TargetCache;
 use gsscale::densify::strategy::StrategyName;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
-use gsscale::train::inputs::prepare::{Prepared, prepare};
+use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
 use std::path::Path;
 use tempfile::TempDir;

@@ -6,8 +6,8 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
-use gsscale::train::inputs::prepare::prepare;
 use gsscale::train::preflight::forecast::{Reach, reach};
+use gsscale::train::start::first_scene::prepare;
 use gsscale::train::step::pages::PagedScene;
 use std::path::Path;
 

@@ -164,7 +164,7 @@ impl List {
                 let problem = "the points of the scene are disturbed, not a PLY";
                 return Err(InputError::new("--init-ply", problem, "leave it out").into());
             }
-            true => Some(gsscale::train::inputs::prepare::prepare(&place.scene, &base)?.dataset),
+            true => Some(gsscale::train::start::first_scene::prepare(&place.scene, &base)?.dataset),
             false => None,
         };
         let mut planner = Planner { list: self, place, given, base, dataset, facts: BTreeMap::new() };

@@ -31,6 +31,15 @@ const OTHER_BYTES: u64 = 1 << 20;
 /// The results take less than 160 % of the bytes of the rows: the PLY 106, a file for viewers 42, and the report.
 const RESULTS_PERCENT: u64 = 160;
 
+/// Least reserve for a last commit on a full drive, bytes: room for the map to grow.
+const RESERVE_BYTES_LEAST: u64 = 2 << 20;
+const RESERVE_BYTES_MOST: u64 = 256 << 20;
+
+/// Bytes that a spill directory holds back for the moment when its drive is full.
+pub(crate) fn reserve_bytes(segment_bytes: u64) -> u64 {
+    segment_bytes.clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST)
+}
+
 impl TrainError {
     /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {

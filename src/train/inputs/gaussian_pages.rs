@@ -6,14 +6,13 @@
 //! Invariants: 1. memory stays within the given bound; 2. pages have the rows of [`crate::scene::partition::partition`]
 //! in its order; the uid of a row is its number in the file.
 
-use super::prepare::{remove_giants, truncate_sh};
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::ply::{ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row};
-use crate::scene::columns::{Columns, sh_n_width};
+use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::Placed;
 use crate::scene::state::SceneState;
@@ -233,4 +232,50 @@ fn state_of(rows: &[Row], sh_degree: u8) -> SceneState {
     let mut state = SceneState::from_columns(columns);
     state.uid.iter_mut().zip(rows).for_each(|(uid, row)| *uid = u64::from(row.row));
     state
+}
+
+/// Drops the SH bands above `sh_degree`.
+pub(crate) fn truncate_sh(columns: Columns, sh_degree: u8) -> Columns {
+    if columns.sh_degree <= sh_degree {
+        return columns;
+    }
+    let (from, to) = (sh_n_width(columns.sh_degree), sh_n_width(sh_degree));
+    let sh_n = columns.sh_n.chunks_exact(from).flat_map(|row| &row[..to]).copied().collect();
+    Columns { sh_degree, sh_n, ..columns }
+}
+
+/// Removes Gaussians that are larger than any of a scene can be; returns how many.
+pub(crate) fn remove_giants(columns: &mut Columns, range: LogScaleRange) -> u64 {
+    columns.retain_rows(|columns, row| columns.row(Column::Scales, row).iter().all(|&s| s <= range.high))
+}
+
+/// The warning about `giants` Gaussians that [`remove_giants`] removed, if any.
+pub(crate) fn giants_warning(ply: &Path, giants: u64) -> Option<String> {
+    let problem = "Gaussians are larger than 10,000 times the spread of the cameras and are dropped";
+    (giants > 0).then(|| format!("{}: {giants} {problem}", ply.display()))
+}
+
+/// Warnings about Gaussians read from `file`, of which `far` were dropped by the change of frame.
+pub fn file_warnings(file: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
+    let mut warnings = Vec::new();
+    if let Some(transform) = &meta.transform {
+        let transform = transform.file_name().unwrap_or_default().display();
+        let file = file.display();
+        warnings.push(format!("{file}: it does not say its frame, which is taken from {transform} beside it"));
+    }
+    if meta.dropped > 0 {
+        warnings.push(format!("{}: {} Gaussians are not finite and are dropped", file.display(), meta.dropped));
+    }
+    if meta.opacities_clamped > 0 {
+        let (file, count) = (file.display(), meta.opacities_clamped);
+        warnings.push(format!("{file}: {count} opacities are exactly 0 or 1, and are read as 1e-6 or 0.999999"));
+    }
+    if far > 0 {
+        warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", file.display()));
+    }
+    if meta.antialiased {
+        let file = file.display();
+        warnings.push(format!("{file}: trained with opacity compensation (antialiased), which is not rendered here"));
+    }
+    warnings
 }

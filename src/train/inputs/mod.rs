@@ -6,5 +6,4 @@ pub(crate) mod fit;
 pub(crate) mod gaussian_pages;
 pub mod machine;
 pub(crate) mod places;
-pub mod prepare;
 pub mod signals;

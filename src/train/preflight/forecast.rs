@@ -9,8 +9,7 @@
 //! those of the drive only through the number of commits in the time of the run.
 
 use super::drive_space::{DriveUse, StepUse, VERSIONS};
-use super::first_frames::{LargestNeed, shrink_to_budget};
-use super::plan::TierPlan;
+use super::plan::{LargestNeed, TierPlan, shrink_to_budget};
 use super::probe::rows_at_most;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
@@ -20,7 +19,7 @@ use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::state::row_bytes;
-use crate::train::commits::reserve::reserve_bytes;
+use crate::train::commits::full_drive::reserve_bytes;
 use crate::train::log::report::Foreseen;
 use crate::train::memory::estimate::MemoryEstimate;
 

@@ -5,7 +5,6 @@
 #[cfg_attr(not(feature = "gpu"), path = "device_memory_absent.rs")]
 pub(crate) mod device_memory;
 pub(crate) mod drive_space;
-mod first_frames;
 pub mod first_look;
 pub mod forecast;
 pub(crate) mod growth_costs;

@@ -5,7 +5,6 @@
 pub mod begin;
 mod beginning;
 mod changes;
-pub mod costs;
 pub mod eval_file;
 pub mod live;
 mod more_steps;

@@ -8,7 +8,6 @@
 
 use super::beginning::remove_mark;
 use super::changes::with_absolute_paths;
-use super::costs::Meter;
 use super::live::LivePage;
 use super::out_folder;
 use super::page_map::write_page_map;
@@ -78,6 +77,36 @@ pub(super) struct Begun {
     pub driver: u64,
     /// Identity of the run.
     pub run: RunId,
+}
+
+/// Counters at the start of a measurement.
+struct Meter {
+    read: u64,
+    written: u64,
+    stall: f64,
+}
+
+impl Meter {
+    /// Starts a measurement.
+    fn start(trainer: &Trainer) -> Meter {
+        let stats = trainer.scene.pager.stats();
+        let (read, written, stall) = (stats.bytes_read, stats.bytes_written, stats.stall_seconds);
+        Meter { read, written, stall }
+    }
+
+    /// Costs since the start, with the CPU seconds of the run.
+    fn stop(&self, trainer: &Trainer, tiers: &Tiers, train_cpu_seconds: Option<f64>) -> StepCosts {
+        let stats = trainer.scene.pager.stats();
+        StepCosts {
+            train_cpu_seconds,
+            train_bytes_read: stats.bytes_read - self.read,
+            train_bytes_written: stats.bytes_written - self.written,
+            train_stall_seconds: stats.stall_seconds - self.stall,
+            device_bytes_peak: trainer.renderer.traffic().device_bytes_peak,
+            drive_bytes_peak: tiers.drive_bytes(),
+            forecast: None,
+        }
+    }
 }
 
 /// The config to keep: with choices resolved and absolute paths.

@@ -1,9 +1,10 @@
-//! The start of a run: first Gaussians in memory, or points or Gaussians that are streamed into pages.
+//! The start of a run: the dataset and its first Gaussians, in memory, or points or Gaussians that are streamed into pages.
 //!
 //! With a spill directory, points and Gaussians in files are streamed, so the scene may exceed memory. The Gaussians of
 //! a store are always streamed. Random points are made in memory.
 //!
-//! Invariant: streamed and whole input give the same pages, bit for bit ([`crate::dataset::import`]).
+//! Invariants: 1. streamed and whole input give the same pages, bit for bit ([`crate::dataset::import`]); 2. bad input is an error
+//! here, before any file is written.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -14,14 +15,16 @@ use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
 use crate::dataset::frame::Extent;
 use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, PointSource, import_points};
+use crate::dataset::load_options::LoadOptions;
 use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
 use crate::dataset::model::{PointCloud, RawScene, TakePoint};
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::up::estimate_up;
-use crate::exchange::ply;
+use crate::exchange::frames::to_local;
+use crate::exchange::ply::{self, PlyContent, read_ply};
 use crate::paging::pager::Pager;
 use crate::scene::columns::{Columns, row_width};
-use crate::scene::init::InitOptions;
+use crate::scene::init::{InitOptions, gaussians_from_points, random_points_in_frusta};
 use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
@@ -30,10 +33,11 @@ use crate::train::error::not_stored;
 use crate::train::inputs::dataset_print::view_print;
 use crate::train::inputs::dataset_print::{GaussiansPrint, points_print};
 use crate::train::inputs::fit::PositionSample;
-use crate::train::inputs::gaussian_pages::{GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead};
+use crate::train::inputs::gaussian_pages::{
+    GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead, file_warnings, giants_warning, remove_giants,
+    truncate_sh,
+};
 use crate::train::inputs::places::folder_beside;
-use crate::train::inputs::prepare::file_warnings;
-use crate::train::inputs::prepare::{Prepared, check_first_rows, check_train_views, giants_warning, prepare};
 use crate::train::memory::estimate::check_photos_fit;
 use crate::train::step::pages::{PagedScene, first_pages};
 use crate::train::stores::StoredStart;
@@ -44,6 +48,56 @@ use std::path::{Path, PathBuf};
 const BUDGET_DEFAULT: u64 = 1 << 30;
 /// The input of the first Gaussians gets 1/3 of the budget.
 const BUDGET_SHARE: u64 = 3;
+
+/// What the start of a run needs of its config.
+struct FirstOptions {
+    read: ReadOptions,
+    load: LoadOptions,
+    /// Without the scene scale.
+    init: InitOptions,
+    /// Highest SH degree of the run.
+    sh_degree: u8,
+    max_gaussians: u64,
+    init_ply: Option<PathBuf>,
+    init_points: u32,
+    poor_points: bool,
+    /// Whether Gaussians may exceed memory.
+    spills: bool,
+}
+
+impl FirstOptions {
+    fn new(config: &TrainConfig) -> FirstOptions {
+        FirstOptions {
+            read: limits::read_options(config),
+            load: limits::load_options(config),
+            init: limits::init_options(config),
+            sh_degree: config.sh_degree,
+            max_gaussians: config.max_gaussians,
+            init_ply: (!config.init_ply.is_empty()).then(|| PathBuf::from(&config.init_ply)),
+            init_points: config.init_points,
+            poor_points: config.poor_points,
+            spills: config.residence().spill_dir().is_some(),
+        }
+    }
+
+    /// The store from which the run begins, if it begins from one.
+    fn store(&self) -> Option<&Path> {
+        self.init_ply.as_deref().filter(|path| path.is_dir())
+    }
+
+    /// Refuses a start without Gaussians, or with more than --max-gaussians.
+    fn check_rows(&self, from: &Path, rows: u64) -> InputResult<()> {
+        if rows == 0 {
+            let problem = "all first Gaussians are too far from the cameras or too large";
+            return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
+        }
+        if self.max_gaussians > 0 && rows > self.max_gaussians {
+            let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
+            return Err(InputError::new(from, problem, "raise --max-gaussians or start from fewer"));
+        }
+        Ok(())
+    }
+}
 
 /// A dataset and the source of its first Gaussians.
 pub struct Start {
@@ -71,10 +125,11 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        if config.residence().spill_dir().is_none() && !Path::new(&config.init_ply).is_dir() {
-            return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
+        let options = FirstOptions::new(config);
+        if !options.spills && options.store().is_none() {
+            return Start::in_memory(scene, &options, host_mem)?.with_photos_that_fit(host_mem);
         }
-        Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
+        Start::with(scene, &options, &folder_beside(Path::new(&config.spill_dir)), host_mem)
     }
 
     /// As [`Start::read`], for inspection of a run's start: avoids creating Gaussians. `folder` holds unnamed temporary
@@ -83,12 +138,16 @@ impl Start {
     /// # Errors
     /// As [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
-        if Path::new(&config.init_ply).is_dir() {
-            return Start::of_store(scene, config, host_mem)?.with_photos_that_fit(host_mem);
-        }
-        let start = match Start::stream(scene, config, &budget(folder, host_mem))? {
-            Some(start) => start,
-            None => Start::in_memory(scene, config, host_mem)?,
+        Start::with(scene, &FirstOptions::new(config), folder, host_mem)
+    }
+
+    fn with(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        let start = match options.store() {
+            Some(store) => Start::of_store(scene, options, store, host_mem)?,
+            None => match Start::stream(scene, options, &budget(folder, host_mem))? {
+                Some(start) => start,
+                None => Start::in_memory(scene, options, host_mem)?,
+            },
         };
         start.with_photos_that_fit(host_mem)
     }
@@ -99,9 +158,9 @@ impl Start {
         Ok(self)
     }
 
-    fn in_memory(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        check_gaussians_fit(config, host_mem)?;
-        let Prepared { dataset, columns, sh_degree_start } = prepare(scene, config)?;
+    fn in_memory(scene: &Path, options: &FirstOptions, host_mem: Option<u64>) -> InputResult<Start> {
+        check_gaussians_fit(options, host_mem)?;
+        let Prepared { dataset, columns, sh_degree_start } = prepare_with(scene, options)?;
         let points = match dataset.points.as_slice() {
             [] => {
                 let mut print = GaussiansPrint::default();
@@ -114,32 +173,31 @@ impl Start {
     }
 
     /// From the Gaussians of a store.
-    fn of_store(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        let folder = Path::new(&config.init_ply);
+    fn of_store(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
         let store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
             TrainError::Input(error) => error,
             other => InputError::new(folder, other.to_string(), "see the cause"),
         })?;
-        let mut raw = read_scene(scene, &limits::read_options(config))?;
+        let mut raw = read_scene(scene, &options.read)?;
         raw.points = PointCloud::default();
-        let dataset = load_dataset(raw, &limits::load_options(config))?;
+        let dataset = load_dataset(raw, &options.load)?;
         check_train_views(scene, &dataset)?;
         let rows = store.rows_at_most();
-        check_first_rows(folder, config, rows)?;
-        let sh_degree_start = store.sh_degree().max(limits::first_sh_degree(config));
+        options.check_rows(folder, rows)?;
+        let sh_degree_start = store.sh_degree().max(options.init.sh_degree);
         let points = store.digest()?;
         Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Store(Box::new(store)) })
     }
 
     /// From the Gaussians of a file, which are read once here to know that all of them can be.
-    fn of_gaussians(scene: &Path, config: &TrainConfig, mut raw: RawScene, file: &Path) -> InputResult<Start> {
+    fn of_gaussians(scene: &Path, options: &FirstOptions, mut raw: RawScene, file: &Path) -> InputResult<Start> {
         raw.points = PointCloud::default();
-        let mut dataset = load_dataset(raw, &limits::load_options(config))?;
+        let mut dataset = load_dataset(raw, &options.load)?;
         check_train_views(scene, &dataset)?;
         let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
         let range = LogScaleRange::of_scene(dataset.scene_scale);
-        let gaussians = GaussianFile::open(file, config.sh_degree, frame, range)?;
+        let gaussians = GaussianFile::open(file, options.sh_degree, frame, range)?;
         let (mut print, mut rows) = (GaussiansPrint::default(), 0);
         let GaussiansRead { meta, far, giants } = gaussians.read(&mut |columns| {
             print.add(columns);
@@ -148,21 +206,17 @@ impl Start {
         })?;
         dataset.warnings.extend(file_warnings(file, &meta, far));
         dataset.warnings.extend(giants_warning(file, giants));
-        check_first_rows(file, config, rows)?;
-        let sh_degree_start = gaussians.sh_degree().max(limits::first_sh_degree(config));
+        options.check_rows(file, rows)?;
+        let sh_degree_start = gaussians.sh_degree().max(options.init.sh_degree);
         Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
     }
 
     /// `None` where neither points nor Gaussians are in a file.
-    fn stream(scene: &Path, config: &TrainConfig, budget: &Budget<'_>) -> InputResult<Option<Start>> {
-        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..limits::read_options(config) })?;
-        let file = match config.init_ply.as_str() {
-            "" => raw.points_path.take(),
-            path => Some(PathBuf::from(path)),
-        };
-        let Some(file) = file else { return Ok(None) };
+    fn stream(scene: &Path, options: &FirstOptions, budget: &Budget<'_>) -> InputResult<Option<Start>> {
+        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..options.read.clone() })?;
+        let Some(file) = options.init_ply.clone().or_else(|| raw.points_path.take()) else { return Ok(None) };
         if is_ply(&file) && ply::holds_gaussians(&file)? {
-            return Start::of_gaussians(scene, config, raw, &file).map(Some);
+            return Start::of_gaussians(scene, options, raw, &file).map(Some);
         }
         let mut warnings = Vec::new();
         let cloud = Cloud::gather(budget, |take| read_points(&file, &mut warnings, take))?;
@@ -170,17 +224,17 @@ impl Start {
             return Ok(None);
         }
         raw.warnings.append(&mut warnings);
-        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &limits::load_options(config))?;
+        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &options.load)?;
         check_train_views(scene, &dataset)?;
         let extent = local.extent;
         let (points, rows) = points_print(&local)?;
         if rows == 0 {
             return Ok(None);
         }
-        let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
+        let init = InitOptions { scene_scale: dataset.scene_scale, ..options.init };
         let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
         let from = FirstRows::Points { cloud, extent, init };
-        Ok(Some(Start { dataset, sh_degree_start: limits::first_sh_degree(config), rows, points, from }))
+        Ok(Some(Start { dataset, sh_degree_start: options.init.sh_degree, rows, points, from }))
     }
 
     /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
@@ -302,18 +356,106 @@ impl Start {
     }
 }
 
+/// A dataset with the Gaussians that training starts from.
+pub struct Prepared {
+    /// Views and frame.
+    pub dataset: Dataset,
+    /// First Gaussians in the local frame. SH bands above the current degree may be missing.
+    pub columns: Columns,
+    /// SH degree of the first step: that of the given Gaussians or of the config, whichever is higher.
+    pub sh_degree_start: u8,
+}
+
+/// Reads the scene and creates the first Gaussians.
+///
+/// # Errors
+/// The scene or the PLY is invalid.
+pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
+    prepare_with(scene, &FirstOptions::new(config))
+}
+
+fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
+    let mut raw = read_scene(scene, &options.read)?;
+    let mut gaussians = None;
+    let mut dropped = None;
+    if let Some(path) = options.init_ply.clone().or(raw.points_path.clone()) {
+        match read_ply(&path)? {
+            PlyContent::Gaussians { columns, meta, .. } => {
+                raw.points = PointCloud::default();
+                gaussians = Some((columns, meta, path));
+            }
+            PlyContent::Points { positions, colors, dropped: count } => {
+                raw.points = PointCloud { positions, colors };
+                dropped = (count > 0).then(|| format!("{}: {count} points are not finite, dropped", path.display()));
+            }
+        }
+    }
+    raw.warnings.extend(dropped);
+    let mut dataset = load_dataset(raw, &options.load)?;
+    check_train_views(scene, &dataset)?;
+    let mut from = scene.to_path_buf();
+    let (columns, sh_degree_start) = match gaussians {
+        Some((mut columns, meta, ply)) => {
+            from.clone_from(&ply);
+            let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+            let giants = remove_giants(&mut columns, LogScaleRange::of_scene(dataset.scene_scale));
+            dataset.warnings.extend(file_warnings(&ply, &meta, far));
+            dataset.warnings.extend(giants_warning(&ply, giants));
+            let in_use = columns.sh_degree.max(options.init.sh_degree);
+            (truncate_sh(columns, options.sh_degree), in_use)
+        }
+        None => (first_gaussians(scene, &mut dataset, options)?, options.init.sh_degree),
+    };
+    options.check_rows(&from, columns.rows() as u64)?;
+    Ok(Prepared { dataset, columns, sh_degree_start })
+}
+
+/// Refuses a dataset without training views.
+fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<()> {
+    if !dataset.train_views().is_empty() {
+        return Ok(());
+    }
+    let problem = "no view is left to train on";
+    Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
+}
+
+fn first_gaussians(scene: &Path, dataset: &mut Dataset, options: &FirstOptions) -> InputResult<Columns> {
+    let init = InitOptions { scene_scale: dataset.scene_scale, ..options.init };
+    if !dataset.points.is_empty() {
+        return Ok(gaussians_from_points(&dataset.points, &dataset.colors, &init));
+    }
+    if options.init_points == 0 {
+        return Err(InputError::new(
+            scene,
+            "the dataset has no points and --init-points is 0",
+            "give points with --init-ply, or let --init-points N draw them in the views' frusta",
+        ));
+    }
+    dataset.warnings.push(format!(
+        "the dataset has no points: starting from {} random points in the views' frusta{}",
+        options.init_points,
+        if options.poor_points { "" } else { "; --poor-points --init-scale 1 suits them" }
+    ));
+    let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let count = options.init_points as usize;
+    // In aerial and object captures the subject lies within a few camera spreads of the cameras.
+    let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
+    let (points, colors) = random_points_in_frusta(&cameras, count, near, far, init.seed);
+    Ok(gaussians_from_points(&points, &colors, &init))
+}
+
 /// A third of the memory: frames take a share, and the system caches the files just written.
 fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
     Budget { folder, bytes: (host_mem.unwrap_or(BUDGET_DEFAULT) / BUDGET_SHARE) as usize }
 }
 
 /// Refuses a PLY of Gaussians that exceeds memory, by its header: without a spill directory the file is read whole.
-fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
-    let file = Path::new(&config.init_ply);
-    let is_read = !config.init_ply.is_empty() && is_ply(file);
-    let Some(budget) = host_mem.filter(|_| is_read) else { return Ok(()) };
+fn check_gaussians_fit(options: &FirstOptions, host_mem: Option<u64>) -> InputResult<()> {
+    let (Some(file), Some(budget)) = (options.init_ply.as_deref().filter(|file| is_ply(file)), host_mem) else {
+        return Ok(());
+    };
     let rows = ply::stated_rows(file)?;
-    let bytes = rows.saturating_mul(row_width(config.sh_degree) as u64 * 4);
+    let bytes = rows.saturating_mul(row_width(options.sh_degree) as u64 * 4);
     if bytes <= budget || !ply::holds_gaussians(file)? {
         return Ok(());
     }

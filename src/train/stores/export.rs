@@ -26,7 +26,7 @@ use crate::scene::partition::GiantCut;
 use crate::scene::rotation::Rotation;
 use crate::scene::select::RankSearch;
 use crate::train::error::TrainError;
-use crate::train::inputs::prepare::truncate_sh;
+use crate::train::inputs::gaussian_pages::truncate_sh;
 use crate::train::memory::estimate::host_bytes_peak;
 use crate::train::step::pages::PagedScene;
 use serde::Serialize;

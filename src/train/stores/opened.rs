@@ -11,7 +11,7 @@ use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::opening::Opened;
 use crate::train::commits::first_commit::MAP_CACHE_BYTES;
-use crate::train::commits::reserve::reserve_bytes;
+use crate::train::commits::full_drive::reserve_bytes;
 use crate::train::error::TrainError;
 use std::path::Path;
 

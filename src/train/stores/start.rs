@@ -14,7 +14,7 @@ use crate::page::tool::reading::{Access, StoreReader};
 use crate::scene::columns::Columns;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
-use crate::train::inputs::prepare::truncate_sh;
+use crate::train::inputs::gaussian_pages::truncate_sh;
 use crate::train::step::catch_up::evaluate_all;
 use crate::train::step::pages::PagedScene;
 use std::path::{Path, PathBuf};
