@@ -4,6 +4,7 @@
 //! the largest view for the frames of a budget, a small enough view for timing; 3. pages and bounds equal those at the
 //! start of a run.
 
+use super::forecast::STEP_OVER_RENDERING;
 use super::plan;
 use super::probe::Probe;
 use crate::base::ids::PageNo;
@@ -11,11 +12,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::paging::pager::{Pager, PagerConfig};
-use crate::photos::first_parameters;
-use crate::photos::parameter::PhotoStep;
-use crate::render::RenderOptions;
 use crate::render::cpu::CpuRenderer;
-use crate::scene::image::Target;
 use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
@@ -25,18 +22,11 @@ use crate::train::memory::estimate::host_budget;
 use crate::train::memory::largest_view::largest_view;
 use crate::train::start::first_scene::Start;
 use crate::train::state::trainer::Trainer;
-use crate::train::step::batch::HostRows;
-use crate::train::step::comparison::Comparison;
 use crate::train::step::pages::{PageRules, PagedScene};
-use crate::train::step::train_step::train_step;
-use crate::train::step::working_set::WorkingSet;
 use std::path::Path;
-use std::time::{Duration, Instant};
 
-/// Duration after which no further step is timed.
-const TIMED: Duration = Duration::from_secs(1);
-/// Most steps that are timed.
-const TIMED_STEPS: u32 = 8;
+/// Views that are rendered for the time of a step.
+const TIMED_STEPS: usize = 5;
 /// Pages of the timed view take at most 1/4 of the memory.
 const TIMED_SHARE: u64 = 4;
 
@@ -146,42 +136,17 @@ impl World<'_> {
         Ok(scene)
     }
 
-    /// Median time of steps with a black photo. Steps of a run take up to a third longer, because their rows are not in
-    /// the processor's cache from the step before.
+    /// Time of a step, from the same measurement as a run's forecast.
     fn step_time(&mut self, options: RunOptions, host_mem: Option<u64>) -> Result<Option<StepTime>, TrainError> {
         let options = RunOptions { sh_degree_start: options.sh_degree_at(options.steps.saturating_sub(1)), ..options };
         let frame_bytes = PagerConfig::in_memory(options.page_rows, options.sh_degree).frame_bytes() as u64;
         let pages_most = host_mem.map_or(u64::MAX, |bytes| bytes / TIMED_SHARE / frame_bytes);
         let Some(view) = self.median_view(pages_most) else { return Ok(None) };
-        let mut scene = self.pages_of(view, &options, host_mem)?;
-        let camera = self.start.dataset.views[view].camera;
-        let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-        let (mut renderer, _) = machine::renderer(self.config)?;
-        let mut working = WorkingSet::default();
-        let rgb = vec![0; 3 * camera.pixels()];
-        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let mut photos = first_parameters(&options.photos, &self.start.dataset);
-        let events = scene.events();
-        let at = PhotoStep { view, step: 0, camera: &camera, events, is_left_out: false, is_rehearsal: true };
-        photos.iter_mut().for_each(|parameter| parameter.begin_step(&at));
-        let mut comparison = Comparison { photos: &mut photos, ..Comparison::new(&target, options.loss) };
-        let mut step = |number| {
-            let (what, how) = ((number, &camera), (&render, &mut comparison));
-            let began = Instant::now();
-            train_step(&mut scene, &mut working, &mut HostRows::new(&mut *renderer), what, how, false, usize::MAX)?;
-            Ok::<_, TrainError>(began.elapsed().as_secs_f64())
-        };
-        // The first step allocates memory, so do not time it.
-        step(0)?;
-        let (mut seconds, began) = (Vec::new(), Instant::now());
-        for number in 1..=TIMED_STEPS {
-            seconds.push(step(number)?);
-            if began.elapsed() > TIMED {
-                break;
-            }
-        }
-        seconds.sort_unstable_by(f64::total_cmp);
-        Ok(Some(StepTime { seconds: seconds[seconds.len() / 2], device: renderer.device() }))
+        let scene = self.pages_of(view, &options, host_mem)?;
+        let (renderer, _) = machine::renderer(self.config)?;
+        let mut trainer = Trainer::of_scene(scene, &self.start.dataset, renderer, options);
+        let probed = trainer.probe_views(&self.start.dataset, &[view; TIMED_STEPS])?;
+        Ok(Some(StepTime { seconds: probed.seconds * STEP_OVER_RENDERING, device: trainer.renderer.device() }))
     }
 
     /// The training view of median page count among those that see pages, or the largest with at most `pages_most`
