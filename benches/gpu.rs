@@ -27,7 +27,7 @@ use gsscale::scene::image::Target;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
-use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 use serde_json::{Map, json};
 use std::time::Instant;
@@ -129,16 +129,9 @@ fn steps<R: Renderer>(
     let (mut step, mut hash, mut counts, mut counted) = (0, Hash::default(), Counts::default(), false);
     let mut round = |counted: bool| {
         for (camera, target) in &views {
-            let how = (&options.render, &mut Comparison::new(target, options.loss));
-            let done = train_step(
-                &mut scene,
-                &mut working,
-                &mut HostRows::new(renderer),
-                (step, camera),
-                how,
-                false,
-                usize::MAX,
-            );
+            let (rows, comparison) = (&mut HostRows::new(renderer), &mut Comparison::new(target, options.loss));
+            let view = StepView { step, camera, render: &options.render, collects: false, pages_most: usize::MAX };
+            let done = train_step(&mut scene, &mut working, rows, &view, comparison);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
             hash.add(outcome.loss.loss.to_bits());
             step += 1;

@@ -36,7 +36,7 @@ use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::catch_up::{gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::{PagedScene, row_tables};
-use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -168,10 +168,10 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
         rounds.push(time(|| {
             for (camera, target) in &views {
                 renderer.begin = Some(Instant::now());
-                let at = (step, camera);
-                let how = (&options.render, &mut Comparison::new(target, options.loss));
-                let done =
-                    train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX);
+                let (rows, comparison) =
+                    (&mut HostRows::new(&mut renderer), &mut Comparison::new(target, options.loss));
+                let view = StepView { step, camera, render: &options.render, collects: true, pages_most: usize::MAX };
+                let done = train_step(&mut scene, &mut working, rows, &view, comparison);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
                 renderer.note_end();
                 let stats = renderer.inner.stats();

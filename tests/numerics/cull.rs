@@ -22,7 +22,7 @@ use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::catch_up::{evaluate_all, gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
-use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 
 fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
@@ -174,17 +174,10 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let how = (&options.render, &mut Comparison::new(&target, options.loss));
-        train_step(
-            &mut pages,
-            &mut working,
-            &mut HostRows::new(&mut renderer),
-            (step, &camera),
-            how,
-            false,
-            usize::MAX,
-        )
-        .unwrap();
+        let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
+        let (camera, render) = (&camera, &options.render);
+        let view = StepView { step, camera, render, collects: false, pages_most: usize::MAX };
+        train_step(&mut pages, &mut working, rows, &view, comparison).unwrap();
     }
     let mut all = Columns::zeros(0, 0);
     let mut append = |rows: &Columns| {

@@ -19,7 +19,7 @@ use gsscale::train::state::trainer::Trainer;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
-use gsscale::train::step::train_step::train_step;
+use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 use std::path::Path;
 use std::process::Command;
@@ -282,10 +282,10 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
     for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
         let view = &dataset.views[view];
         let target = decode(&view.photo).unwrap();
-        let how = (&options.render, &mut Comparison::new(&target, options.loss));
-        let at = (step as u32, &view.camera);
-        let done =
-            train_step(&mut scene, &mut working, &mut HostRows::new(&mut renderer), at, how, true, usize::MAX).unwrap();
+        let (step, camera, render) = (step as u32, &view.camera, &options.render);
+        let view = StepView { step, camera, render, collects: true, pages_most: usize::MAX };
+        let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
+        let done = train_step(&mut scene, &mut working, rows, &view, comparison).unwrap();
         assert!(done.rows > 900 && done.updated > 300 && done.skipped.is_none(), "{done:?}");
         isects = isects.min(renderer.isects());
         let columns = [&working.columns, &working.gradients.columns];

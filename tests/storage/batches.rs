@@ -24,7 +24,7 @@ use gsscale::train::error::TrainError;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
-use gsscale::train::step::train_step::{StepOutcome, train_step};
+use gsscale::train::step::train_step::{StepOutcome, StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 use std::io::ErrorKind;
 
@@ -83,8 +83,9 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-    let how = (&render, &mut Comparison::new(&target, options.loss));
-    train_step(scene, &mut working, &mut HostRows::new(&mut renderer), (step, &camera), how, false, usize::MAX)
+    let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
+    let view = StepView { step, camera: &camera, render: &render, collects: false, pages_most: usize::MAX };
+    train_step(scene, &mut working, rows, &view, comparison)
 }
 
 /// The bits of every row, column by column.

@@ -42,7 +42,7 @@ use crate::train::step::device_rows::DeviceRows;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::pages::PagedScene;
 use crate::train::step::soundness::{Idle, note_soundness};
-use crate::train::step::train_step::{StepOutcome, train_step};
+use crate::train::step::train_step::{StepOutcome, StepView, train_step};
 use crate::train::step::view::{Now, rehearse};
 use crate::train::step::working_set::WorkingSet;
 use std::path::{Path, PathBuf};
@@ -357,8 +357,8 @@ impl Trainer {
         let collects = self.options.strategy.collects(step);
         let mut rows = HostRows::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
-        let how = (&render, &mut comparison);
-        train_step(scene, working, &mut rows, (step, camera), how, collects, self.fitting.pages_most)
+        let view = StepView { step, camera, render: &render, collects, pages_most: self.fitting.pages_most };
+        train_step(scene, working, &mut rows, &view, &mut comparison)
     }
 
     /// Whether the coming step is recorded on the device already. Nothing may read or change the scene then.
@@ -398,15 +398,8 @@ impl Trainer {
         let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         let (camera, collects) = (&dataset.views[view].camera, self.options.strategy.collects(step));
         let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
-        train_step(
-            scene,
-            working,
-            &mut rows,
-            (step, camera),
-            (&render, &mut comparison),
-            collects,
-            self.fitting.pages_most,
-        )
+        let view = StepView { step, camera, render: &render, collects, pages_most: self.fitting.pages_most };
+        train_step(scene, working, &mut rows, &view, &mut comparison)
     }
 
     /// Records the step `ahead` steps from now, whose photo is `target`. False if the step cannot be recorded now.

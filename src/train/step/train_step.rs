@@ -74,8 +74,21 @@ impl StepOutcome {
     }
 }
 
-/// Trains on one view at 0-based `step`: pins its pages batch by batch, applies the events that are due, gathers the rows,
-/// renders them forward and backward, updates the rows, and releases the pages. A batch has at most `pages_most` pages.
+/// The view of a step.
+#[derive(Debug, Clone, Copy)]
+pub struct StepView<'a> {
+    /// 0-based step.
+    pub step: u32,
+    pub camera: &'a Camera,
+    pub render: &'a RenderOptions,
+    /// Whether the step collects statistics for densification.
+    pub collects: bool,
+    /// The most pages of a batch.
+    pub pages_most: usize,
+}
+
+/// Trains on one view: pins its pages batch by batch, applies the events that are due, gathers the rows,
+/// renders them forward and backward, updates the rows, and releases the pages.
 ///
 /// # Errors
 /// A page could not be read, or the renderer failed. The rows are as they were before the step, except under
@@ -84,20 +97,17 @@ pub fn train_step(
     scene: &mut PagedScene,
     working: &mut WorkingSet,
     backend: &mut dyn RowBackend,
-    (step, camera): (u32, &Camera),
-    (render, comparison): (&RenderOptions, &mut Comparison<'_>),
-    collects: bool,
-    pages_most: usize,
+    view: &StepView<'_>,
+    comparison: &mut Comparison<'_>,
 ) -> Result<StepOutcome, TrainError> {
-    backend.renderer().weigh_rows(collects && scene.rules.strategy.needs_weights())?;
-    let pages = scene.pager.begin_view(step, camera)?;
+    backend.renderer().weigh_rows(view.collects && scene.rules.strategy.needs_weights())?;
+    let pages = scene.pager.begin_view(view.step, view.camera)?;
     let (batches, pinned, outcome) = (Vec::new(), Vec::new(), StepOutcome::default());
-    let pages_most = pages_most.min(backend.pages_per_batch(pages.len()));
-    let mut passes = Passes { scene, working, backend, step, camera, comparison, batches, pinned, outcome };
+    let mut passes = Passes { scene, working, backend, view, comparison, batches, pinned, outcome };
     let done = passes
-        .rows_in(pages, pages_most, render)
+        .rows_in(pages)
         .and_then(|()| passes.picture())
-        .and_then(|()| if passes.comparison.is_left_out { passes.leave_out() } else { passes.rows_out(collects) });
+        .and_then(|()| if passes.comparison.is_left_out { passes.leave_out() } else { passes.rows_out() });
     passes.release();
     let outcome = passes.outcome;
     scene.pager.end_batches();
@@ -117,8 +127,7 @@ struct Passes<'a, 'c> {
     scene: &'a mut PagedScene,
     working: &'a mut WorkingSet,
     backend: &'a mut dyn RowBackend,
-    step: u32,
-    camera: &'a Camera,
+    view: &'a StepView<'a>,
     comparison: &'a mut Comparison<'c>,
     /// Batches whose rows the renderer has and whose gradients are still due.
     batches: Vec<Batch>,
@@ -130,16 +139,17 @@ struct Passes<'a, 'c> {
 impl Passes<'_, '_> {
     /// The pass in: brings the pages up to date with all events, batch by batch, and hands their rows to the renderer. The last
     /// batch stays pinned.
-    fn rows_in(&mut self, pages: Vec<PageNo>, pages_most: usize, render: &RenderOptions) -> Result<(), TrainError> {
+    fn rows_in(&mut self, pages: Vec<PageNo>) -> Result<(), TrainError> {
+        let pages_most = self.view.pages_most.min(self.backend.pages_per_batch(pages.len()));
         let mut per_batch = self.scene.pager.pages_per_batch(pages.len()).min(pages_most).max(1);
         let mut coming = VecDeque::from(pages);
         if per_batch < coming.len() {
-            self.scene.pager.set_use_in_step(self.step, coming.iter().copied(), UseInStep::Coming);
+            self.scene.pager.set_use_in_step(self.view.step, coming.iter().copied(), UseInStep::Coming);
         }
         loop {
             let batch: Vec<PageNo> = coming.drain(..per_batch.min(coming.len())).collect();
             let span = trace::span("pin pages").with("pages", batch.len() as u64);
-            self.pinned = self.backend.pin(self.scene, self.step, &batch, false)?;
+            self.pinned = self.backend.pin(self.scene, self.view.step, &batch, false)?;
             drop(span);
             self.prefetch(&coming, per_batch);
             self.backend.before_events(self.scene, &mut self.pinned)?;
@@ -157,12 +167,12 @@ impl Passes<'_, '_> {
                 self.release();
                 per_batch = (per_batch.min(pages.len()) / 2).max(1);
                 pages.into_iter().rev().for_each(|page| coming.push_front(page));
-                self.scene.pager.set_use_in_step(self.step, coming.iter().copied(), UseInStep::Coming);
+                self.scene.pager.set_use_in_step(self.view.step, coming.iter().copied(), UseInStep::Coming);
                 continue;
             }
             // Again and again, since what was read and written since may let more be read.
             self.prefetch(&coming, per_batch);
-            self.batch_in(&coming, render)?;
+            self.batch_in(&coming)?;
             if coming.is_empty() {
                 return Ok(());
             }
@@ -170,12 +180,12 @@ impl Passes<'_, '_> {
     }
 
     /// Hands the rows of the pinned batch to the renderer, and unpins the batch unless it is the last one.
-    fn batch_in(&mut self, coming: &VecDeque<PageNo>, render: &RenderOptions) -> Result<(), TrainError> {
+    fn batch_in(&mut self, coming: &VecDeque<PageNo>) -> Result<(), TrainError> {
         if self.batches.is_empty() {
             let batches = if coming.is_empty() { RowBatches::One } else { RowBatches::Several };
-            self.backend.renderer().begin_view(self.camera, render, batches)?;
+            self.backend.renderer().begin_view(self.view.camera, self.view.render, batches)?;
         }
-        let at = AtStep { step: self.step, camera: self.camera };
+        let at = AtStep { step: self.view.step, camera: self.view.camera };
         let span = trace::span("rows in");
         self.outcome.rows += self.backend.rows_in(self.scene, &self.pinned, at, self.working)?;
         drop(span);
@@ -187,7 +197,7 @@ impl Passes<'_, '_> {
         let mut row_from_working = Vec::new();
         if !coming.is_empty() {
             row_from_working = self.working.row_from_working.clone();
-            self.scene.pager.set_use_in_step(self.step, pages.iter().copied(), UseInStep::Returning);
+            self.scene.pager.set_use_in_step(self.view.step, pages.iter().copied(), UseInStep::Returning);
             self.release();
         }
         self.batches.push(Batch { pages, row_from_working });
@@ -214,7 +224,7 @@ impl Passes<'_, '_> {
         self.outcome.is_left_out = true;
         self.read_loss()?;
         let pages = self.batches.drain(..).flat_map(|batch| batch.pages);
-        self.scene.pager.set_use_in_step(self.step, pages, UseInStep::Done);
+        self.scene.pager.set_use_in_step(self.view.step, pages, UseInStep::Done);
         Ok(())
     }
 
@@ -225,11 +235,11 @@ impl Passes<'_, '_> {
     }
 
     /// The pass out: takes the gradients back to the rows, and updates the rows, from the last batch to the first.
-    fn rows_out(&mut self, collects: bool) -> Result<(), TrainError> {
+    fn rows_out(&mut self) -> Result<(), TrainError> {
         let several = self.batches.len() > 1;
         let mut is_changed = false;
         while let Some(batch) = self.batches.pop() {
-            let out = self.batch_out(batch, collects);
+            let out = self.batch_out(batch);
             self.release();
             match out {
                 Ok(is_done) if is_done => return Ok(()),
@@ -244,21 +254,22 @@ impl Passes<'_, '_> {
 
     /// One batch of the pass out: the first batch if its pages are still pinned. Returns whether the step ends here because it is
     /// skipped.
-    fn batch_out(&mut self, batch: Batch, collects: bool) -> Result<bool, TrainError> {
+    fn batch_out(&mut self, batch: Batch) -> Result<bool, TrainError> {
         let is_first = self.batches.len() + 1 == self.outcome.batches;
         if !is_first {
-            self.pinned = self.backend.pin(self.scene, self.step, &batch.pages, true)?;
+            self.pinned = self.backend.pin(self.scene, self.view.step, &batch.pages, true)?;
             self.working.row_from_working = batch.row_from_working;
         }
-        self.scene.pager.set_use_in_step(self.step, batch.pages, UseInStep::Done);
+        self.scene.pager.set_use_in_step(self.view.step, batch.pages, UseInStep::Done);
         self.prefetch_before_last();
-        let (number, at) = (self.batches.len(), AtStep { step: self.step, camera: self.camera });
+        let (number, at) = (self.batches.len(), AtStep { step: self.view.step, camera: self.view.camera });
         let span = trace::span("rows out");
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
         if self.backend.has_gradients() {
             let (WorkingSet { columns, gradients, .. }, degree) = (&mut *self.working, self.scene.rules.sh_degree());
             let parameters = self.comparison.photos.iter_mut();
-            parameters.for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.camera, degree));
+            parameters
+                .for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.view.camera, degree));
             // After the gradients of poses, which follow from those of the loss alone.
             let Gradients { columns: gradients, radii, .. } = gradients;
             let mut view = ViewGradients { columns, gradients, radii, rows_of_view: self.outcome.rows };
@@ -275,7 +286,7 @@ impl Passes<'_, '_> {
         }
         let _span = trace::span("update");
         let UpdateCounts { updated, skipped, drawn } =
-            self.backend.update(self.scene, number, &mut self.pinned, at, self.working, collects)?;
+            self.backend.update(self.scene, number, &mut self.pinned, at, self.working, self.view.collects)?;
         self.outcome.updated += updated;
         self.outcome.rows_skipped += skipped;
         self.outcome.drawn += drawn;
@@ -294,7 +305,7 @@ impl Passes<'_, '_> {
     /// Begins reads during the pass in: of the next batch or, after the last batch, of the next steps.
     fn prefetch(&mut self, coming: &VecDeque<PageNo>, per_batch: usize) {
         if coming.is_empty() && self.batches.is_empty() {
-            return self.scene.pager.prefetch(self.step);
+            return self.scene.pager.prefetch(self.view.step);
         }
         let next: Vec<PageNo> = coming.iter().copied().take(per_batch).collect();
         self.scene.pager.prefetch_batch(&next);
@@ -306,7 +317,7 @@ impl Passes<'_, '_> {
         let is_out = usize::from(self.outcome.batches != self.batches.len());
         match (self.batches.len() + is_out).checked_sub(2) {
             Some(before) => self.scene.pager.prefetch_batch(&self.batches[before].pages),
-            None => self.scene.pager.prefetch(self.step),
+            None => self.scene.pager.prefetch(self.view.step),
         }
     }
 
