@@ -106,7 +106,7 @@ impl Checkpoint {
             }
         }
         let began = self.space_made.unwrap_or(now).2;
-        self.wait_for_space(trainer, (metrics, stop), lacks, (began, is_stuck))
+        self.wait_for_space(trainer, metrics, stop, lacks, began, is_stuck)
     }
 
     /// Commits twice, because a commit keeps the slots of the previous one; releases the reserve if needed.
@@ -125,9 +125,11 @@ impl Checkpoint {
     fn wait_for_space(
         &mut self,
         trainer: &mut Trainer,
-        (metrics, stop): (&mut MetricsLog, &StopFlag),
+        metrics: &mut MetricsLog,
+        stop: &StopFlag,
         lacks: TrainError,
-        (began, is_told): (Instant, bool),
+        began: Instant,
+        is_told: bool,
     ) -> Result<(), TrainError> {
         let other = self.other_drive(&lacks);
         let is_of_results = self.is_only_of_results(&lacks);

@@ -34,7 +34,8 @@ pub(crate) fn check_drive_of_results(
     config: &TrainConfig,
     out: &Path,
     forecast: &Forecast,
-    (stored, is_resumed): (u64, bool),
+    stored: u64,
+    is_resumed: bool,
 ) -> InputResult<()> {
     let drive = drive_of(out);
     let Some(free) = free_bytes(&drive).ok().flatten() else { return Ok(()) };

@@ -217,7 +217,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
         return Ok(None);
     }
     let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
-    plan(&request.config, &dataset, &tiers, &mut trainer, (host_mem, driver), drive_rate).map(Some)
+    plan(&request.config, &dataset, &tiers, &mut trainer, host_mem, driver, drive_rate).map(Some)
 }
 
 /// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
@@ -226,7 +226,8 @@ fn plan(
     dataset: &Dataset,
     tiers: &Tiers,
     trainer: &mut Trainer,
-    (host_mem, driver): (Option<u64>, u64),
+    host_mem: Option<u64>,
+    driver: u64,
     drive_rate: DriveRate,
 ) -> Result<Forecast, TrainError> {
     trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
@@ -282,7 +283,7 @@ pub(super) fn plan_and_train(
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     trainer.start_photos(dataset).iter().for_each(|warning| crate::tell!("warning: {warning}"));
-    let forecast = plan(config, dataset, &tiers, &mut trainer, (begun.host_mem, begun.driver), DriveRate::COMMON)?;
+    let forecast = plan(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
         let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
@@ -296,7 +297,7 @@ pub(super) fn plan_and_train(
     }
     let slots = trainer.scene.pager.slot_space().map_or(0, |slots| slots.total);
     let stored = slots * forecast.tiers.frame_bytes;
-    check_drive_of_results(config, &request.out, &forecast, (stored, begun.past.is_some()))?;
+    check_drive_of_results(config, &request.out, &forecast, stored, begun.past.is_some())?;
     if request.dry_run {
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
@@ -310,7 +311,7 @@ pub(super) fn plan_and_train(
         }
         out_folder::make(&request.out, request.existing)?;
     }
-    let outcome = train_into(request, dataset, trainer, (&stop, &mut tiers), begun, &forecast);
+    let outcome = train_into(request, dataset, trainer, &stop, &mut tiers, begun, &forecast);
     if tiers.can_resume() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);

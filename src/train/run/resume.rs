@@ -76,10 +76,10 @@ pub struct ResumeRequest {
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // Do not read or remove files of an active run.
     let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
-    if let Some(marked) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
+    if let Some((config, scene)) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
         drop(lock);
         crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
-        return begin_again(request, marked, Existing::Overwrite);
+        return begin_again(request, config, scene, Existing::Overwrite);
     }
     let earlier = Earlier::find(request)?;
     let mut config = earlier.config.clone();
@@ -208,12 +208,13 @@ pub(super) fn read_summary(out: &Path) -> Option<Summary> {
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
     check_restart(&request.out)?;
     crate::tell!("{} was cut off before its first commit: it begins again", request.out.display());
-    begin_again(request, (config, earlier.scene.clone()), Existing::BeginAgain)
+    begin_again(request, config, earlier.scene.clone(), Existing::BeginAgain)
 }
 
 fn begin_again(
     request: &ResumeRequest,
-    (config, scene): (TrainConfig, PathBuf),
+    config: TrainConfig,
+    scene: PathBuf,
     existing: Existing,
 ) -> Result<RunOutcome, TrainError> {
     let (out, quiet) = (request.out.clone(), request.quiet);

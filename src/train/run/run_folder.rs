@@ -162,7 +162,8 @@ pub(super) fn train_into(
     request: &RunRequest,
     dataset: &Dataset,
     mut trainer: Trainer,
-    (stop, tiers): (&StopFlag, &mut Tiers),
+    stop: &StopFlag,
+    tiers: &mut Tiers,
     begun: Begun,
     forecast: &Forecast,
 ) -> Result<RunOutcome, TrainError> {
@@ -224,7 +225,7 @@ pub(super) fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &written, &ply);
-    let summary = write_results(request, dataset, &targets, results, (looped, &written, step_costs))?;
+    let summary = write_results(request, dataset, &targets, results, looped, &written, step_costs)?;
     tiers.is_done = summary.finished;
     Ok(RunOutcome {
         summary: Some(summary),
@@ -244,7 +245,9 @@ fn write_results(
     dataset: &Dataset,
     targets: &TargetCache,
     mut results: Results<'_>,
-    (looped, written, costs): (Result<(), TrainError>, &Written, StepCosts),
+    looped: Result<(), TrainError>,
+    written: &Written,
+    costs: StepCosts,
 ) -> Result<Summary, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let ply = Trainer::ply_path(out);
@@ -312,7 +315,7 @@ fn export_all(
 ) -> Result<Vec<ExportFacts>, TrainError> {
     let formats = request.config.export.formats().filter_map(|format| Some((format, format.beside(ply)?)));
     let exported = formats.map(|(format, file)| {
-        results.write(|results| export_beside(request, dataset, results.trainer, (format, &file), written))
+        results.write(|results| export_beside(request, dataset, results.trainer, format, &file, written))
     });
     let exported: Result<_, _> = exported.collect();
     if exported.is_err() {
@@ -328,7 +331,8 @@ fn export_beside(
     request: &RunRequest,
     dataset: &Dataset,
     trainer: &mut Trainer,
-    (format, other): (ExportFormat, &Path),
+    format: ExportFormat,
+    other: &Path,
     written: &Written,
 ) -> Result<ExportFacts, TrainError> {
     let exported = export(trainer, dataset, other, format)?;

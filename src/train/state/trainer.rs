@@ -325,7 +325,7 @@ impl Trainer {
         self.fitting.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.ahead.note_rows_of(view, outcome.rows);
         note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
-        self.idle.note(&outcome, (self.state.step, self.scene.rows()), &target, dataset)?;
+        self.idle.note(&outcome, self.state.step, self.scene.rows(), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;

@@ -342,7 +342,8 @@ impl PagedScene {
     /// Pages could not be pinned.
     pub fn gather_pages(
         &mut self,
-        (pages, next): (&[PageNo], &[PageNo]),
+        pages: &[PageNo],
+        next: &[PageNo],
         camera: &Camera,
         now: u32,
         working: &mut WorkingSet,
@@ -353,7 +354,7 @@ impl PagedScene {
         }
         columns.resize(0);
         let mut part = Columns::zeros(0, self.rules.sh_degree);
-        self.visit((pages, next), &mut |rules, tables| {
+        self.visit(pages, next, &mut |rules, tables| {
             visible_rows(tables, &rules.adam, now, camera, row_from_working);
             gather(tables, rules.sh_degree, &rules.adam, now, row_from_working, &mut part);
             append(columns, &part);
@@ -391,7 +392,7 @@ impl PagedScene {
         now: u32,
         each: &mut dyn FnMut(&Columns) -> Result<(), E>,
     ) -> Result<(), E> {
-        self.visit((pages, &[]), &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
+        self.visit(pages, &[], &mut |rules, tables| each(&evaluate_all(tables, rules.sh_degree, &rules.adam, now)))
     }
 
     /// Pins the first pages of a list, `batch` at most, and returns the list of the others. Where dirty pages cannot be written,
@@ -413,7 +414,8 @@ impl PagedScene {
     /// Pins the pages in batches and passes their rows to `each`, with pending events applied to copies, and prefetches.
     pub(crate) fn visit<E: From<PagingError>>(
         &mut self,
-        (pages, next): (&[PageNo], &[PageNo]),
+        pages: &[PageNo],
+        next: &[PageNo],
         each: &mut Visitor<'_, E>,
     ) -> Result<(), E> {
         // The copies of a batch take as much memory as its frames.

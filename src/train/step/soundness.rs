@@ -104,7 +104,8 @@ impl Idle {
     pub fn note(
         &mut self,
         outcome: &StepOutcome,
-        (step, gaussians): (u32, u64),
+        step: u32,
+        gaussians: u64,
         target: &Target,
         dataset: &Dataset,
     ) -> Result<(), TrainError> {

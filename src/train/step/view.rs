@@ -102,7 +102,7 @@ impl Batches<'_> {
     fn gather_next(&mut self, now: &mut Now<'_>) -> Result<Option<usize>, TrainError> {
         let Some((number, pages)) = self.coming.next() else { return Ok(None) };
         let next = self.coming.peek().map_or(&[][..], |(_, pages)| *pages);
-        now.scene.gather_pages((pages, next), self.camera, now.step, now.working)?;
+        now.scene.gather_pages(pages, next, self.camera, now.step, now.working)?;
         Ok(Some(number))
     }
 }

@@ -85,7 +85,7 @@ impl StoredStart {
         let now = self.state.trainer.step;
         for page in pages {
             let (mut uid, mut columns) = (Vec::new(), Columns::default());
-            self.scene.visit((&[page], &[]), &mut |rules, tables| {
+            self.scene.visit(&[page], &[], &mut |rules, tables| {
                 uid = tables.iter().flat_map(|table| table.uid).copied().collect();
                 columns = evaluate_all(tables, rules.sh_degree(), &rules.adam, now);
                 Ok::<(), TrainError>(())
