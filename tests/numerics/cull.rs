@@ -190,7 +190,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let camera = small(camera(&mut draws));
         selected += pages.pager.pages_of_view(&camera).len();
         let seen = pages.pager.pages_of_view(&camera);
-        pages.gather_pages((&seen, &[]), &camera, STEPS, &mut working).unwrap();
+        pages.gather_pages(&seen, &[], &camera, STEPS, &mut working).unwrap();
         left_out += all.rows() - working.columns.rows();
         let [of_view, of_all] = [&working.columns, &all].map(|rows| {
             renderer.draw(rows, &camera, &options.render).unwrap();
