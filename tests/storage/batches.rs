@@ -183,7 +183,7 @@ fn a_full_drive_never_tears_a_step() {
 /// The bits of the rows of a view, as evaluations and checks of growth gather them.
 fn rows_of_view(scene: &mut PagedScene) -> Vec<u32> {
     let (pages, mut working) = (scene.pager.pages_of_view(&camera()), WorkingSet::default());
-    scene.gather_pages((&pages, &[]), &camera(), STEPS, &mut working).unwrap();
+    scene.gather_pages(&pages, &[], &camera(), STEPS, &mut working).unwrap();
     Column::ALL.into_iter().flat_map(|column| working.columns.column(column)).map(|x| x.to_bits()).collect()
 }
 
