@@ -4,6 +4,7 @@
 
 use crate::base::error::InputError;
 use crate::base::units::MIB;
+use crate::gpu::GpuError;
 use crate::page::map::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::render::RenderError;
@@ -77,6 +78,25 @@ pub enum TrainError {
 }
 
 impl TrainError {
+    /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
+    pub fn is_out_of_space(&self) -> bool {
+        match self {
+            TrainError::Commit(error) => error.is_out_of_space(),
+            TrainError::Paging(error) => error.is_out_of_space(),
+            TrainError::Input(error) => error.is_out_of_space(),
+            _ => false,
+        }
+    }
+
+    /// Whether the cause is the loss of the device, so that the run can go on once the device is back.
+    pub fn is_device_lost(&self) -> bool {
+        match self {
+            TrainError::Render(RenderError::Device(error)) => matches!(error, GpuError::DeviceLost { .. }),
+            TrainError::Torn { source } => source.is_device_lost(),
+            _ => false,
+        }
+    }
+
     /// Adds the name of the view to an error about missing frames.
     pub(crate) fn with_view_name(mut self, name: &str) -> TrainError {
         if let TrainError::Paging(PagingError::WorkingSet { what, .. }) = &mut self {

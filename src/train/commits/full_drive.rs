@@ -40,18 +40,6 @@ pub(crate) fn reserve_bytes(segment_bytes: u64) -> u64 {
     segment_bytes.clamp(RESERVE_BYTES_LEAST, RESERVE_BYTES_MOST)
 }
 
-impl TrainError {
-    /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
-    pub fn is_out_of_space(&self) -> bool {
-        match self {
-            TrainError::Commit(error) => error.is_out_of_space(),
-            TrainError::Paging(error) => error.is_out_of_space(),
-            TrainError::Input(error) => error.is_out_of_space(),
-            _ => false,
-        }
-    }
-}
-
 impl Checkpoint {
     /// Fills the reserve if the drive has much more free space.
     ///

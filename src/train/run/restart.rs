@@ -8,23 +8,10 @@
 use super::request::RunOutcome;
 use super::resume::{ResumeRequest, resume};
 use crate::config::file::TrainConfig;
-use crate::gpu::GpuError;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::render::RenderError;
 use crate::report::run_files::CONFIG_FILE;
 use crate::train::error::TrainError;
 use std::path::Path;
-
-impl TrainError {
-    /// Whether the cause is the loss of the device, so that the run can go on once the device is back.
-    pub fn is_device_lost(&self) -> bool {
-        match self {
-            TrainError::Render(RenderError::Device(error)) => matches!(error, GpuError::DeviceLost { .. }),
-            TrainError::Torn { source } => source.is_device_lost(),
-            _ => false,
-        }
-    }
-}
 
 /// Whether the run in an output folder has a commit, or can begin again because all of it was in memory.
 fn can_continue(out: &Path) -> bool {

@@ -36,7 +36,6 @@ use crate::train::error::TrainError;
 use crate::train::log::report::{TestMetrics, TierTraffic};
 use crate::train::step::batch::HostRows;
 use crate::train::step::comparison::Comparison;
-use crate::train::step::dense::settle_all;
 use crate::train::step::device_flights::StepToRecord;
 use crate::train::step::device_rows::DeviceRows;
 use crate::train::step::device_tier::DeviceTier;
@@ -329,7 +328,7 @@ impl Trainer {
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
-            settle_all(&mut self.scene, self.state.step + 1)?;
+            self.scene.settle_all(self.state.step + 1)?;
             self.is_torn = false;
         }
         self.end_step_of_photo(view, &outcome, &target, dataset);

@@ -6,7 +6,6 @@
 pub mod batch;
 pub mod catch_up;
 pub mod comparison;
-pub(crate) mod dense;
 mod device_ahead;
 mod device_events;
 pub mod device_flights;

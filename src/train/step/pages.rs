@@ -309,16 +309,46 @@ impl PagedScene {
         let mut rules = PageRules::new(options);
         rules.events = self.rules.events.clone();
         rules.sh_degree = self.rules.sh_degree;
-        let batch = (self.pager.frames_max() / 2).clamp(1, PAGES_PER_BATCH);
         let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
         let mut histogram = GradHistogram::default();
+        // New pages from splits are counted too.
+        let count = &mut |page: &PinnedPage| histogram.add_rows(&page.rows(0));
+        self.settle(&pages, now, Pager::acquire_pages, Some(&rules), count)?;
+        self.rules = rules;
+        let is_changed = histogram != self.histogram;
+        self.histogram = histogram;
+        Ok(is_changed)
+    }
+
+    /// Stores every row as evaluated after `now` steps: the step of the dense optimizer, for comparison with deferred Adam, since each
+    /// step costs the whole scene in memory and on the drive. A page applies an event at the next step, on values of the event's own step,
+    /// so rows and decisions equal those of the deferred run up to roundings.
+    ///
+    /// # Errors
+    /// Pages could not be pinned, or no frame was free for a split.
+    pub(crate) fn settle_all(&mut self, now: u32) -> Result<(), TrainError> {
+        let pages = self.pages_with_rows();
+        self.settle(&pages, now, Pager::acquire_in_step, None, &mut |_| {})
+    }
+
+    /// Stores every row of these pages, with all events applied, as evaluated after `now` steps, and renews the bounds by `rules`, or by
+    /// those of the scene. `see` gets every page before.
+    fn settle(
+        &mut self,
+        pages: &[PageNo],
+        now: u32,
+        acquire: fn(&mut Pager, &[PageNo]) -> Result<Vec<PinnedPage>, PagingError>,
+        rules: Option<&PageRules>,
+        see: &mut dyn FnMut(&PinnedPage),
+    ) -> Result<(), TrainError> {
+        // The other half of the frames is for pages that split.
+        let batch = (self.pager.frames_max() / 2).clamp(1, PAGES_PER_BATCH);
         for pages in pages.chunks(batch) {
-            let mut pinned = self.pager.acquire_pages(pages)?;
+            let mut pinned = acquire(&mut self.pager, pages)?;
             let applied = self.apply_pending(&mut pinned);
             if applied.is_ok() {
-                // New pages from splits are pinned too, so every row is counted.
-                pinned.iter().for_each(|page| histogram.add_rows(&page.rows(0)));
-                let at = self.rules.adam.at(now);
+                pinned.iter().for_each(&mut *see);
+                let (at, rules) = (self.rules.adam.at(now), rules.unwrap_or(&self.rules));
                 pinned.par_iter_mut().for_each(|page| {
                     let mut rows = page.rows_mut(0);
                     (0..rows.rows()).for_each(|row| at.settle_row(&mut rows, row));
@@ -329,10 +359,16 @@ impl PagedScene {
             self.pager.release(pinned);
             applied?;
         }
-        self.rules = rules;
-        let is_changed = histogram != self.histogram;
-        self.histogram = histogram;
-        Ok(is_changed)
+        Ok(())
+    }
+
+    /// Pages with rows, in the order of their ids.
+    fn pages_with_rows(&self) -> Vec<PageNo> {
+        let index = self.pager.index();
+        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        pages.retain(|p| index[p.index()].rows > 0);
+        pages.sort_unstable_by_key(|p| index[p.index()].id);
+        pages
     }
 
     /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
@@ -375,11 +411,7 @@ impl PagedScene {
         now: u32,
         each: &mut dyn FnMut(&Columns) -> Result<(), E>,
     ) -> Result<(), E> {
-        let index = self.pager.index();
-        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
-        pages.retain(|p| index[p.index()].rows > 0);
-        pages.sort_unstable_by_key(|p| index[p.index()].id);
-        self.for_rows_of(&pages, now, each)
+        self.for_rows_of(&self.pages_with_rows(), now, each)
     }
 
     /// As [`PagedScene::for_all_rows`], for `pages` only.
