@@ -117,16 +117,13 @@ impl PhotoFiles {
         }
     }
 
-    /// The name of a view and the place of its photo; [`PhotoFiles::complete`] looks later whether it is there. Refusals are
-    /// returned as text.
-    pub fn place(&self, stated: &str) -> Result<(String, PathBuf), String> {
+    /// As [`PhotoFiles::find`], without a look whether a photo inside of the scene is there: [`PhotoFiles::complete`] looks later.
+    pub fn place(&self, stated: &str) -> Result<Photo, String> {
         let read = read_name("", stated)?;
         if read.outside.is_some() {
-            let photo = self.find_at(stated, read, "", &as_it_is)?;
-            return Ok((photo.name, photo.path));
+            return self.find_at(stated, read, "", &as_it_is);
         }
-        let path = self.bases[0].join(&read.name);
-        Ok((read.name, path))
+        Ok(Photo { path: self.bases[0].join(&read.name), name: read.name, exists: false })
     }
 
     /// Finds the photos of views that are not at their place; the loader reports those that stay missing.

@@ -96,6 +96,15 @@ pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     }
 }
 
+/// Width and height from the photo's header; nothing is decoded.
+pub(super) fn read_size(path: &Path) -> InputResult<(u64, u64)> {
+    let header = read_header(path).map_err(|mut error| {
+        error.problem.insert_str(0, "the photo's size cannot be read: ");
+        error
+    })?;
+    Ok((u64::from(header.width), u64::from(header.height)))
+}
+
 /// Most segments, fill bytes and pairs of stray bytes before the pixels of a JPEG: each costs a read, and a photo with a large colour profile
 /// and previews has some hundred.
 const MOST_SEGMENTS: u32 = 10_000;

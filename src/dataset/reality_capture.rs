@@ -12,14 +12,13 @@
 //! commas do not separate. `z` stands for `alt`. A name may be a path on the computer of the export: its longest end that is a
 //! photo here counts.
 //!
-//! Invariants: 1. for any content of the file the result is a scene or an [`InputError`] that names file and line; 2. only a
-//! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
+//! Invariant: for any content of the file the result is a scene or an [`InputError`] that names file and line.
 
-use super::checks::{checked_intrinsics, sort_views};
-use super::left_out::LeftOut;
-use super::model::{Lens, RawScene, RawView, ReadOptions};
+use super::checks::checked_intrinsics;
+use super::gathered::{Gathered, PUT_THEM_THERE, Words};
+use super::model::{Lens, RawScene, ReadOptions};
 use super::photo_files::PhotoFiles;
-use super::transforms::photos::read_size;
+use super::photo_header::read_size;
 use super::transforms::pose::make_pose;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::{head_of, read_text};
@@ -58,16 +57,16 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
     if let Some(missing) = REQUIRED.iter().find(|name| header.place(name).is_none()) {
         return Err(InputError::new(&file, format!("there is no column '{missing}'"), EXPORT));
     }
-    let (mut scene, mut left_out) = (RawScene::default(), LeftOut::default());
     let photos = PhotoFiles::with_folders(folder, options.images.as_deref().or(Some("images")), options);
+    let mut gathered = Gathered::new(photos, options);
     for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
         let line = Line { file: &file, number: number + 1, header: &header, cells: cells_of(line, header.separator) };
         line.check_count()?;
-        line.add_view(&photos, &mut scene.views, &mut left_out)?;
+        line.add_view(&mut gathered)?;
     }
-    photos.finish(&mut scene.views, &mut scene.warnings);
-    left_out.report(&file, (options, &photos), scene.views.len(), &mut scene.warnings)?;
-    sort_views(&file, &mut scene.views)?;
+    let mut scene = RawScene::default();
+    let words = Words { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT };
+    scene.views = gathered.finish(&file, &words, &mut scene.warnings)?;
     scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
     Ok(scene)
 }
@@ -188,10 +187,10 @@ impl Line<'_> {
         Ok(numbers)
     }
 
-    fn add_view(&self, photos: &PhotoFiles, views: &mut Vec<RawView>, left_out: &mut LeftOut) -> InputResult<()> {
+    fn add_view(&self, gathered: &mut Gathered<'_>) -> InputResult<()> {
         let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
         let stays = "names must stay in the folder of the photos: export with plain file names";
-        let photo = photos.find(stated).map_err(|problem| self.error(problem, stays))?;
+        let photo = gathered.photos.find(stated).map_err(|problem| self.error(problem, stays))?;
         let [k1, k2, k3, k4, t1, t2] = self.numbers(["k1", "k2", "k3", "k4", "t1", "t2"])?;
         if k4 != 0.0 {
             let remedy = "choose the distortion model Brown3 before the export, or export undistorted photos";
@@ -201,7 +200,7 @@ impl Line<'_> {
         let angles = self.numbers(["heading", "pitch", "roll"])?;
         let centre = self.numbers(["x", "y", "alt"])?;
         if !photo.exists {
-            left_out.missing.push(photo.name);
+            gathered.missing.push(photo.name);
             return Ok(());
         }
         let size = read_size(&photo.path)?;
@@ -210,17 +209,7 @@ impl Line<'_> {
         let lens = Lens::Radial([k1, k2, t1, t2, k3, 0.0, 0.0, 0.0]);
         let intrinsics = checked_intrinsics(size, [f * side / FILM; 2], principal, lens)
             .map_err(|problem| self.error(problem, EXPORT))?;
-        match make_pose(&camera_to_world(angles, centre)) {
-            None => left_out.bad_poses.push(photo.name),
-            Some(pose) => views.push(RawView {
-                name: photo.name,
-                image_path: photo.path,
-                intrinsics,
-                pose,
-                mask_path: None,
-                split: None,
-            }),
-        }
+        gathered.add(photo, intrinsics, make_pose(&camera_to_world(angles, centre)), None);
         Ok(())
     }
 }

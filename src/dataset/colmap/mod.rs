@@ -13,7 +13,8 @@ pub mod parts;
 mod text;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{self, MAX_COORDINATE, listed, sort_views};
+use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::gathered::{Gathered, PUT_THEM_THERE, Words};
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::photo_files::PhotoFiles;
@@ -26,6 +27,12 @@ pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or 
 /// Remedy for a file that COLMAP cannot have written.
 const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
 const STAY_INSIDE: &str = "image names must be relative to the image folder and stay inside it";
+const WORDS: Words = Words {
+    photos: "",
+    views: "",
+    photo_is_missing: PUT_THEM_THERE,
+    no_view: "export the model again; its rotations and translations must be finite numbers",
+};
 /// A quaternion with a smaller largest component has no direction.
 const MIN_QUAT: f64 = 1e-6;
 
@@ -117,12 +124,25 @@ fn read_model(
         (text::read_cameras(&cameras_path, &mut warnings)?, text::read_images(&images_path, &mut warnings)?)
     };
     let unit = if model.is_binary { "byte" } else { "line" };
+    if images.is_empty() {
+        let remedy = "check that COLMAP registered any photo";
+        return Err(InputError::new(images_path, "the model holds no images", remedy));
+    }
     let photos = PhotoFiles::in_folders(folder, image_folders.clone(), options.allow_missing);
-    let mut views = make_views((&images_path, unit), &photos, &cameras, images, &mut warnings)?;
-    parts::find_photos(&mut views, &image_folders)?;
-    photos.complete(&mut views);
-    photos.finish(&mut views, &mut warnings);
-    sort_views(&images_path, &mut views)?;
+    let mut gathered = Gathered::new(photos, options);
+    for image in images {
+        let place = format!("{unit} {}", image.position);
+        let refused = |problem: String| InputError::new(&images_path, problem, STAY_INSIDE).at(&place);
+        let photo = gathered.photos.place(&image.name).map_err(refused)?;
+        let intrinsics = *cameras.get(&image.camera_id).ok_or_else(|| {
+            let problem = format!("camera {} is not in the cameras file", image.camera_id);
+            InputError::new(&images_path, problem, DAMAGED).at(format!("{place}, image '{}'", photo.name))
+        })?;
+        gathered.add(photo, intrinsics, make_pose(image.quat, image.translation), None);
+    }
+    parts::find_photos(&mut gathered.views, &image_folders)?;
+    gathered.photos.complete(&mut gathered.views);
+    let views = gathered.finish(&images_path, &WORDS, &mut warnings)?;
     let (points, points_path) = match points_later {
         None => (PointCloud::default(), None),
         Some(later) => read_points(&model, later, &mut warnings)?,
@@ -181,41 +201,6 @@ fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFo
         (None, Some(error)) => Err(error),
         (None, None) => Err(InputError::new(scene, "no COLMAP model can be read", DAMAGED)),
     }
-}
-
-fn make_views(
-    (file, unit): (&Path, &str),
-    photos: &PhotoFiles,
-    cameras: &Cameras,
-    images: Vec<ImageRecord>,
-    warnings: &mut Vec<String>,
-) -> InputResult<Vec<RawView>> {
-    if images.is_empty() {
-        return Err(InputError::new(file, "the model holds no images", "check that COLMAP registered any photo"));
-    }
-    let mut views = Vec::with_capacity(images.len());
-    let mut left_out = Vec::new();
-    for image in images {
-        let place = format!("{unit} {}", image.position);
-        let (name, image_path) =
-            photos.place(&image.name).map_err(|problem| InputError::new(file, problem, STAY_INSIDE).at(&place))?;
-        let intrinsics = *cameras.get(&image.camera_id).ok_or_else(|| {
-            InputError::new(file, format!("camera {} is not in the cameras file", image.camera_id), DAMAGED)
-                .at(format!("{place}, image '{name}'"))
-        })?;
-        match make_pose(image.quat, image.translation) {
-            Some(pose) => views.push(RawView { name, image_path, intrinsics, pose, mask_path: None, split: None }),
-            None => left_out.push(name),
-        }
-    }
-    if views.is_empty() {
-        let remedy = "export the model again; its rotations and translations must be finite numbers";
-        return Err(InputError::new(file, "no image has a usable pose", remedy).at(listed(&left_out)));
-    }
-    if !left_out.is_empty() {
-        warnings.push(checks::left_out(file, &left_out, "their pose is not finite or not a rotation"));
-    }
-    Ok(views)
 }
 
 /// The pose of a w-first quaternion of any length and a translation; `None` if they are unusable.

@@ -19,8 +19,10 @@ mod torch_file;
 pub mod write;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{checked_intrinsics, left_out, listed, sort_views};
-use crate::dataset::model::{Lens, RawScene, RawView, ReadOptions, Split};
+use crate::dataset::checks::checked_intrinsics;
+use crate::dataset::gathered::{Gathered, Words};
+use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions, Split};
+use crate::dataset::photo_files::{Photo, PhotoFiles};
 use crate::dataset::transforms::pose::make_pose;
 use std::path::{Path, PathBuf};
 use torch_file::TorchFile;
@@ -44,104 +46,56 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
         let problem = format!("origin_drb {origin:?} or pose_scale_factor {scale} is impossible");
         return Err(InputError::new(folder.join("coordinates.pt"), problem, REMEDY));
     }
-    let mut reading = Reading {
-        options,
-        origin: [origin[0], origin[1], origin[2]],
-        scale,
-        views: Vec::new(),
-        missing: Vec::new(),
-        bad_poses: Vec::new(),
+    let words = Words {
+        photos: "",
+        views: "train/metadata and val/metadata",
+        photo_is_missing: "UrbanScene3D's photos are published apart from the poses: copy them into the rgbs folders; or leave \
+                           the views out with --allow-missing",
+        no_view: REMEDY,
     };
+    let photos = PhotoFiles::in_folders(folder, vec![folder.to_path_buf()], options.allow_missing);
+    let mut gathered = Gathered::new(photos, options);
     for (part, split) in [("train", Split::Train), ("val", Split::Test)] {
-        reading.add_part(&folder.join(part), part, split)?;
-    }
-    let mut scene = RawScene::default();
-    reading.report(folder, &mut scene.warnings)?;
-    scene.views = reading.views;
-    scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
-    sort_views(folder, &mut scene.views)?;
-    Ok(scene)
-}
-
-struct Reading<'a> {
-    options: &'a ReadOptions,
-    origin: [f64; 3],
-    scale: f64,
-    views: Vec<RawView>,
-    missing: Vec<String>,
-    bad_poses: Vec<String>,
-}
-
-impl Reading<'_> {
-    fn add_part(&mut self, folder: &Path, part: &str, split: Split) -> InputResult<()> {
-        let metadata = folder.join("metadata");
+        let metadata = folder.join(part).join("metadata");
         if split == Split::Test && !metadata.is_dir() {
-            return Ok(());
+            continue;
         }
         for file in files_with(&metadata, "pt")? {
             let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let Some(photo) = photo_of(&folder.join("rgbs"), &stem) else {
-                self.missing.push(format!("{part}/rgbs/{stem}.*"));
+            let Some(path) = photo_of(&folder.join(part).join("rgbs"), &stem) else {
+                gathered.missing.push(format!("{part}/rgbs/{stem}.*"));
                 continue;
             };
-            self.add_view(&file, photo, part, split)?;
+            let name = format!("{part}/rgbs/{}", path.file_name().unwrap_or_default().to_string_lossy());
+            let (intrinsics, pose) = read_metadata(&file, &origin, scale)?;
+            gathered.add(Photo { name, path, exists: true }, intrinsics, pose, Some(split));
         }
-        Ok(())
     }
+    let mut scene = RawScene::default();
+    scene.views = gathered.finish(folder, &words, &mut scene.warnings)?;
+    scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
+    Ok(scene)
+}
 
-    fn add_view(&mut self, file: &Path, photo: PathBuf, part: &str, split: Split) -> InputResult<()> {
-        let metadata = TorchFile::open(file)?;
-        let size = |key: &str| -> InputResult<u64> {
-            let n = metadata.number(key)?;
-            // An invalid size becomes 0, which the check below refuses by name.
-            Ok(if n.is_finite() && n >= 0.0 && n.fract() == 0.0 { n.min(1e9) as u64 } else { 0 })
-        };
-        let size = (size("W")?, size("H")?);
-        let k = metadata.numbers("intrinsics", &[&[4]])?;
-        let intrinsics = checked_intrinsics(size, [k[0], k[1]], [k[2], k[3]], Lens::Pinhole)
-            .map_err(|problem| InputError::new(file, problem, REMEDY).at("key 'intrinsics'"))?;
-        let c2w = metadata.numbers("c2w", &[&[3, 4], &[4, 4]])?;
-        let mut matrix = [[0.0, 0.0, 0.0, 0.0], [0.0; 4], [0.0; 4], [0.0, 0.0, 0.0, 1.0]];
-        for (row, from) in matrix.iter_mut().zip(c2w.chunks(4)).take(3) {
-            row.copy_from_slice(from);
-        }
-        for (row, origin) in matrix.iter_mut().zip(self.origin) {
-            row[3] = row[3] * self.scale + origin;
-        }
-        let name = photo.file_name().unwrap_or_default().to_string_lossy();
-        let name = format!("{part}/rgbs/{name}");
-        match make_pose(&matrix) {
-            None => self.bad_poses.push(name),
-            Some(pose) => self.views.push(RawView {
-                name,
-                image_path: photo,
-                intrinsics,
-                pose,
-                mask_path: None,
-                split: Some(split),
-            }),
-        }
-        Ok(())
+/// Camera and pose of a file of metadata; no pose if it is impossible.
+fn read_metadata(file: &Path, origin: &[f64], scale: f64) -> InputResult<(Intrinsics, Option<Pose>)> {
+    let metadata = TorchFile::open(file)?;
+    let size = |key: &str| -> InputResult<u64> {
+        let n = metadata.number(key)?;
+        // An invalid size becomes 0, which the check below refuses by name.
+        Ok(if n.is_finite() && n >= 0.0 && n.fract() == 0.0 { n.min(1e9) as u64 } else { 0 })
+    };
+    let size = (size("W")?, size("H")?);
+    let k = metadata.numbers("intrinsics", &[&[4]])?;
+    let intrinsics = checked_intrinsics(size, [k[0], k[1]], [k[2], k[3]], Lens::Pinhole)
+        .map_err(|problem| InputError::new(file, problem, REMEDY).at("key 'intrinsics'"))?;
+    let c2w = metadata.numbers("c2w", &[&[3, 4], &[4, 4]])?;
+    let mut matrix = [[0.0, 0.0, 0.0, 0.0], [0.0; 4], [0.0; 4], [0.0, 0.0, 0.0, 1.0]];
+    for ((row, from), origin) in matrix.iter_mut().zip(c2w.chunks(4)).zip(origin) {
+        row.copy_from_slice(from);
+        row[3] = row[3] * scale + origin;
     }
-
-    fn report(&self, folder: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
-        if !self.missing.is_empty() {
-            let problem = format!("{} photo(s) are missing: {}", self.missing.len(), listed(&self.missing));
-            if !self.options.allow_missing {
-                let remedy = "UrbanScene3D's photos are published apart from the poses: copy them into the rgbs folders; or \
-                              leave the views out with --allow-missing";
-                return Err(InputError::new(folder, problem, remedy));
-            }
-            warnings.push(format!("{}: {problem}; their views are left out", folder.display()));
-        }
-        if !self.bad_poses.is_empty() {
-            warnings.push(left_out(folder, &self.bad_poses, "their pose is not a rotation"));
-        }
-        if self.views.is_empty() {
-            return Err(InputError::new(folder, "no view is left in train/metadata and val/metadata", REMEDY));
-        }
-        Ok(())
-    }
+    Ok((intrinsics, make_pose(&matrix)))
 }
 
 /// Files of a folder with an extension, sorted.

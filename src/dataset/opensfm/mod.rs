@@ -9,17 +9,16 @@
 //! A file may hold several reconstructions, whose frames have nothing in common: the one with the most photos is read,
 //! the others are left out with a warning.
 //!
-//! Invariants: 1. for any content of the file the result is a scene or an [`InputError`] that names file and place; 2. only a
-//! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
+//! Invariant: for any content of the file the result is a scene or an [`InputError`] that names file and place.
 
 mod json;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{MAX_COORDINATE, checked_intrinsics, sort_views};
-use crate::dataset::left_out::LeftOut;
-use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, RawView, ReadOptions};
+use crate::dataset::checks::{MAX_COORDINATE, checked_intrinsics};
+use crate::dataset::gathered::{Gathered, PUT_THEM_THERE, Words};
+use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions};
 use crate::dataset::photo_files::PhotoFiles;
-use crate::dataset::transforms::photos::read_size;
+use crate::dataset::photo_header::read_size;
 use glam::{DMat3, DVec3};
 use json::{Camera, Reconstruction, Shot};
 use std::path::{Path, PathBuf};
@@ -55,16 +54,16 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
     let mut scene = RawScene::default();
     let reconstruction = largest(&file, json::load(&file)?, &mut scene.warnings)?;
     let photos = PhotoFiles::with_folders(project, options.images.as_deref().or(Some("images")), options);
-    let mut left_out = LeftOut::default();
+    let mut gathered = Gathered::new(photos, options);
     for (name, shot) in &reconstruction.shots {
         let stays = |problem: String| InputError::new(&file, problem, EXPORT_AGAIN).at(format!("shot {name:?}"));
         let camera = reconstruction.cameras.get(&shot.camera);
         let camera = camera.ok_or_else(|| stays(format!("its camera {:?} is not in the file", shot.camera)))?;
-        let photo = photos.find(name).map_err(stays)?;
+        let photo = gathered.photos.find(name).map_err(stays)?;
         let size = match (camera.width, camera.height) {
             (0.0, 0.0) if photo.exists => read_size(&photo.path)?,
             (0.0, 0.0) => {
-                left_out.missing.push(photo.name);
+                gathered.missing.push(photo.name);
                 continue;
             }
             (width, height) => (pixels(width), pixels(height)),
@@ -73,26 +72,14 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
             InputError::new(&file, problem, remedy).at(format!("camera {:?}", shot.camera))
         };
         let intrinsics = intrinsics_of(camera, size).map_err(refused)?;
-        match pose_of(shot) {
-            None => left_out.bad_poses.push(photo.name),
-            Some(pose) => scene.views.push(RawView {
-                name: photo.name,
-                image_path: photo.path,
-                intrinsics,
-                pose,
-                mask_path: None,
-                split: None,
-            }),
-        }
+        gathered.add(photo, intrinsics, pose_of(shot), None);
     }
-    photos.finish(&mut scene.views, &mut scene.warnings);
-    left_out.report(&file, (options, &photos), scene.views.len(), &mut scene.warnings)?;
-    sort_views(&file, &mut scene.views)?;
-    if reconstruction.points.dropped > 0 {
-        let dropped = reconstruction.points.dropped;
-        scene
-            .warnings
-            .push(format!("{}: {dropped} points are not finite or farther away than 1e15, dropped", file.display()));
+    let words = Words { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT_AGAIN };
+    scene.views = gathered.finish(&file, &words, &mut scene.warnings)?;
+    let dropped = reconstruction.points.dropped;
+    if dropped > 0 {
+        let said = format!("{}: {dropped} points are not finite or farther away than 1e15, dropped", file.display());
+        scene.warnings.push(said);
     }
     scene.points = reconstruction.points.cloud;
     Ok(scene)

@@ -12,9 +12,9 @@
 //!
 //! Invariant: paths may contain `..`, as those files do, but never leave the scene's folder.
 
-use super::{Reading, json};
+use super::read_files;
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::sort_views;
+use crate::dataset::gathered::Gathered;
 use crate::dataset::model::{RawScene, ReadOptions, Split};
 use crate::dataset::paths::read_name;
 use crate::dataset::photo_files::{Photo, PhotoFiles};
@@ -61,21 +61,13 @@ pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<Raw
             let at = of_set.into_iter().next().unwrap_or_else(|| folder.join(set));
             return Err(InputError::new(at, problem, "fetch small_city/aerial again, with its folder pose"));
         }
-        files.extend(of_set.into_iter().map(|file| (file, split)));
+        files.extend(of_set.into_iter().map(|file| (file, Some(split))));
     }
-    let mut reading = Reading::new(folder, options);
     // Names are relative to the scene, and the image folder lies inside those of the blocks.
-    reading.photos = PhotoFiles::with_folders(folder, None, options);
-    reading.root = Some(folder.to_path_buf());
+    let gathered = Gathered::new(PhotoFiles::with_folders(folder, None, options), options);
     let mut scene = RawScene::default();
-    for (file, split) in &files {
-        reading.add_file(file, &json::load(file)?, Some(*split), &mut scene)?;
-    }
-    reading.photos.finish(&mut reading.views, &mut scene.warnings);
-    reading.report(&files[0].0, &mut scene.warnings)?;
-    scene.views = reading.views;
+    read_files(&files, gathered, Some(folder), &mut scene)?;
     scene.points_path = CLOUDS.iter().map(|name| folder.join(name)).find(|path| path.is_file());
-    sort_views(folder, &mut scene.views)?;
     Ok(scene)
 }
 

@@ -20,14 +20,15 @@
 mod intrinsics;
 mod json;
 mod matrix_city;
-pub(in crate::dataset) mod photos;
 pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{left_out, listed, sort_views};
+use crate::dataset::checks::left_out;
+use crate::dataset::gathered::{Gathered, Words};
 use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::read_name;
-use crate::dataset::photo_files::{PhotoFiles, file_inside};
+use crate::dataset::photo_files::{Photo, PhotoFiles, file_inside};
+use crate::dataset::photo_header::read_size;
 use intrinsics::Levels;
 use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
@@ -49,15 +50,9 @@ pub fn looks_like_transforms(folder: &Path) -> bool {
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
     let files = choose_files(path, &mut scene.warnings)?;
-    let mut reading = Reading::new(files[0].0.parent().unwrap_or(Path::new("")), options);
-    for (file, split) in &files {
-        reading.add_file(file, &json::load(file)?, *split, &mut scene)?;
-    }
-    let file = &files[0].0;
-    reading.photos.finish(&mut reading.views, &mut scene.warnings);
-    reading.report(file, &mut scene.warnings)?;
-    scene.views = reading.views;
-    sort_views(file, &mut scene.views)?;
+    let folder = files[0].0.parent().unwrap_or(Path::new(""));
+    let photos = PhotoFiles::with_folders(folder, options.images.as_deref(), options);
+    read_files(&files, Gathered::new(photos, options), None, &mut scene)?;
     Ok(scene)
 }
 
@@ -84,27 +79,40 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
     Ok([Some((train, Some(Split::Train))), held_out].into_iter().flatten().collect())
 }
 
-/// State of the reader.
-struct Reading<'a> {
-    options: &'a ReadOptions,
-    photos: PhotoFiles,
-    views: Vec<RawView>,
-    bad_poses: Vec<String>,
-    missing: Vec<String>,
-    /// Frames that none of the used lists of file names contains.
-    unlisted: Vec<String>,
-    /// MatrixCity's folder, if its files are read.
-    root: Option<PathBuf>,
+const WORDS: Words = Words {
+    photos: "file_path",
+    views: "frames",
+    photo_is_missing: "put them there, name their folder with --images, or leave them out with --allow-missing",
+    no_view: "write the file again",
+};
+
+/// Reads the frames of files into `scene`. `matrix_city` is MatrixCity's folder, if they are its files.
+fn read_files(
+    files: &[(PathBuf, Option<Split>)],
+    gathered: Gathered<'_>,
+    matrix_city: Option<&Path>,
+    scene: &mut RawScene,
+) -> InputResult<()> {
+    let mut reading = Reading { gathered, unlisted: Vec::new(), matrix_city };
+    for (file, split) in files {
+        reading.add_file(file, &json::load(file)?, *split, scene)?;
+    }
+    let (file, names) = (&files[0].0, &reading.unlisted);
+    let why = "neither train_filenames nor the held-out list has them";
+    scene.warnings.extend((!names.is_empty()).then(|| left_out(file, names, why)));
+    scene.views = reading.gathered.finish(file, &WORDS, &mut scene.warnings)?;
+    Ok(())
 }
 
-impl<'a> Reading<'a> {
-    /// Photos are looked for in `folder`.
-    fn new(folder: &Path, options: &'a ReadOptions) -> Reading<'a> {
-        let (views, bad_poses, missing, unlisted) = Default::default();
-        let photos = PhotoFiles::with_folders(folder, options.images.as_deref(), options);
-        Reading { options, photos, views, bad_poses, missing, unlisted, root: None }
-    }
+/// State of the reader.
+struct Reading<'a> {
+    gathered: Gathered<'a>,
+    /// Frames that none of the used lists of file names contains.
+    unlisted: Vec<String>,
+    matrix_city: Option<&'a Path>,
+}
 
+impl Reading<'_> {
     fn add_file(
         &mut self,
         file: &Path,
@@ -146,26 +154,27 @@ impl<'a> Reading<'a> {
             },
         };
         let mut matrix = pose::read_matrix(frame)?;
-        let photo = match &self.root {
-            None => self.photos.find(&stated),
+        let photos = &self.gathered.photos;
+        let photo = match &self.matrix_city {
+            None => photos.find(&stated),
             Some(root) => {
                 let base = folder.strip_prefix(root).unwrap_or(Path::new("")).to_string_lossy();
-                matrix_city::find_photo(&self.photos, &base, self.options.images.as_deref(), &stated)
+                matrix_city::find_photo(photos, &base, self.gathered.options.images.as_deref(), &stated)
             }
         };
         let photo = photo.map_err(refused)?;
-        if self.root.is_some() {
+        if self.matrix_city.is_some() {
             pose::scale_position(&mut matrix);
         }
         let Some(pose) = pose::make_pose(&matrix) else {
-            self.bad_poses.push(photo.name);
+            self.gathered.bad_poses.push(photo.name);
             return Ok(());
         };
         let size = match levels.size()? {
             Some(size) => size,
-            None if photo.exists => photos::read_size(&photo.path)?,
+            None if photo.exists => read_size(&photo.path)?,
             None => {
-                self.missing.push(photo.name);
+                self.gathered.missing.push(photo.name);
                 return Ok(());
             }
         };
@@ -174,32 +183,8 @@ impl<'a> Reading<'a> {
             None => None,
             Some(mask) => Some(file_inside(folder, mask).map_err(|p| frame.error("mask_path", p, STAY_INSIDE))?.1),
         };
-        self.views.push(RawView { name: photo.name, image_path: photo.path, intrinsics, pose, mask_path, split });
-        Ok(())
-    }
-
-    /// Warns about dropped views; fails if a photo's size was needed or no view remains.
-    fn report(&self, file: &Path, warnings: &mut Vec<String>) -> InputResult<()> {
-        if !self.missing.is_empty() && !self.options.allow_missing {
-            let near = self.photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
-            let problem = format!("{} photo(s) are missing: {}{near}", self.missing.len(), listed(&self.missing));
-            let remedy = "put them there, name their folder with --images, or leave them out with --allow-missing";
-            return Err(InputError::new(file, problem, remedy).at("file_path"));
-        }
-        for (names, why) in [
-            (&self.missing, "their photo is missing"),
-            (&self.bad_poses, "their pose is not finite or not a rotation"),
-            (&self.unlisted, "neither train_filenames nor the held-out list has them"),
-        ] {
-            warnings.extend((!names.is_empty()).then(|| left_out(file, names, why)));
-        }
-        if self.views.is_empty() {
-            let problem = match self.bad_poses.len() {
-                0 => "no view is left".to_string(),
-                n => format!("no view is left: {n} pose(s) are not finite or not a rotation"),
-            };
-            return Err(InputError::new(file, problem, "write the file again").at("frames"));
-        }
+        let Photo { name, path: image_path, .. } = photo;
+        self.gathered.views.push(RawView { name, image_path, intrinsics, pose, mask_path, split });
         Ok(())
     }
 }

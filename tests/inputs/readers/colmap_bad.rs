@@ -165,7 +165,7 @@ fn scenes_without_a_view_are_refused() {
     let mut m = model(1);
     m.images.iter_mut().for_each(|i| i.quat = [0.0; 4]);
     let (scene, _) = scene_with(&m, false);
-    refused(read(scene.path()), "images.txt", &["no image has a usable pose", "'b.jpg'"]);
+    refused(read(scene.path()), "images.txt", &["no view is left", "without a usable pose", "'b.jpg'"]);
 }
 
 #[test]
