@@ -3,22 +3,16 @@
 //! OpenCV axes: x right, y down, z forward. Loading removes distortion from the photos, so cameras are pinholes. The
 //! centre of pixel (0, 0) is (0.5, 0.5).
 
-/// A posed pinhole camera.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     /// World to camera, row-major 3x4: `p_cam = R p + t`, rows of `[R | t]`.
     pub viewmat: [[f32; 4]; 3],
-    /// Focal lengths, pixels.
+    /// Focal lengths, pixels; then the principal point and the size of the image, pixels.
     pub fx: f32,
-    /// Focal lengths, pixels.
     pub fy: f32,
-    /// Principal point, pixels.
     pub cx: f32,
-    /// Principal point, pixels.
     pub cy: f32,
-    /// Image width, pixels.
     pub width: u32,
-    /// Image height, pixels.
     pub height: u32,
     /// Rows at or nearer than this depth are culled.
     pub near_plane: f32,

@@ -73,9 +73,8 @@ pub struct ColumnSet<T> {
 pub type Columns = ColumnSet<Vec<f32>>;
 
 impl<T> ColumnSet<T> {
-    /// What belongs to one column.
     #[inline(always)]
-    pub fn get(&self, column: Column) -> &T {
+    pub fn column(&self, column: Column) -> &T {
         match column {
             Column::Means => &self.means,
             Column::Quats => &self.quats,
@@ -86,9 +85,8 @@ impl<T> ColumnSet<T> {
         }
     }
 
-    /// As [`ColumnSet::get`], mutable.
     #[inline(always)]
-    pub fn get_mut(&mut self, column: Column) -> &mut T {
+    pub fn column_mut(&mut self, column: Column) -> &mut T {
         match column {
             Column::Means => &mut self.means,
             Column::Quats => &mut self.quats,
@@ -99,7 +97,6 @@ impl<T> ColumnSet<T> {
         }
     }
 
-    /// Mutable references to what belongs to each column.
     pub fn each_mut(&mut self) -> ColumnSet<&mut T> {
         ColumnSet {
             sh_degree: self.sh_degree,
@@ -128,7 +125,6 @@ impl<T> ColumnSet<T> {
 }
 
 impl Columns {
-    /// `rows` rows of zeros.
     pub fn zeros(rows: usize, sh_degree: u8) -> Self {
         let mut c = Columns { sh_degree, ..Columns::default() };
         c.resize(rows);
@@ -184,17 +180,7 @@ impl Columns {
 
     /// Bytes allocated.
     pub fn bytes(&self) -> usize {
-        Column::ALL.iter().map(|&column| 4 * self.get(column).capacity()).sum()
-    }
-
-    /// The floats of one column.
-    pub fn column(&self, column: Column) -> &[f32] {
-        self.get(column)
-    }
-
-    /// The floats of one column.
-    pub fn column_mut(&mut self, column: Column) -> &mut Vec<f32> {
-        self.get_mut(column)
+        Column::ALL.iter().map(|&column| 4 * self.column(column).capacity()).sum()
     }
 
     /// The floats of one row of one column.
@@ -203,7 +189,6 @@ impl Columns {
         &self.column(column)[row * width..(row + 1) * width]
     }
 
-    /// The floats of one row of one column.
     pub fn row_mut(&mut self, column: Column, row: usize) -> &mut [f32] {
         let width = column.width(self.sh_degree);
         &mut self.column_mut(column)[row * width..(row + 1) * width]

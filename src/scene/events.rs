@@ -58,7 +58,7 @@ pub struct RelocationRound {
 pub enum EventKind {
     /// Opacities above the given one are lowered to it; the moments of all opacities become zero.
     ResetOpacity {
-        /// Largest remaining opacity (after activation).
+        /// After activation.
         max_opacity: f32,
     },
     /// Bands up to this degree are rendered from now on. Rows stored without them get zeros.
@@ -72,12 +72,10 @@ pub enum EventKind {
     Relocate(RelocationRound),
 }
 
-/// A global change and its step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Event {
     /// 0-based optimizer step after which it happens.
     pub step: u32,
-    /// The change.
     pub kind: EventKind,
 }
 
@@ -88,7 +86,6 @@ impl Event {
     }
 }
 
-/// The events of a run so far.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct EventLog {
     events: Vec<Event>,
@@ -111,7 +108,6 @@ impl EventLog {
         self.events.len()
     }
 
-    /// Whether the log is empty.
     pub fn is_empty(&self) -> bool {
         self.events.is_empty()
     }
@@ -129,7 +125,6 @@ mod tests {
     #[test]
     fn a_log_is_in_the_order_of_time() {
         let mut log = EventLog::default();
-        assert!(log.is_empty());
         for (i, step) in [1000, 3000, 3000].into_iter().enumerate() {
             let kind = EventKind::RaiseShDegree { degree: i as u8 };
             assert_eq!(log.push(Event { step, kind }), i);

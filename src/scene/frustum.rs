@@ -50,11 +50,9 @@ pub struct Frustum {
 /// The row test of a [`Frustum`] as numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrustumNumbers {
-    /// Rows of the pose.
     pub viewmat: [[f32; 4]; 3],
-    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
+    /// As in [`Frustum`], and so is `reach`.
     pub slopes: [f32; 4],
-    /// Reach of a footprint beyond its mean in x and y, in sigmas.
     pub reach: [f32; 2],
     /// Near and far plane.
     pub depth_range: [f32; 2],

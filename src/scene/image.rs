@@ -3,9 +3,7 @@
 /// A rendered picture: planar f32, `[3][height][width]`, not clamped.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Image {
-    /// Width, pixels.
     pub width: u32,
-    /// Height, pixels.
     pub height: u32,
     /// Red plane, green plane, blue plane, each row-major.
     pub rgb: Vec<f32>,
@@ -14,23 +12,18 @@ pub struct Image {
 /// The photo of a view at training size: 8-bit, interleaved `[height][width][3]`.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Target {
-    /// Width, pixels.
     pub width: u32,
-    /// Height, pixels.
     pub height: u32,
-    /// Interleaved RGB, row-major.
     pub rgb: Vec<u8>,
     /// One byte per pixel: 255 = used, 0 = excluded from loss and metrics; `None` if every pixel is used.
     pub mask: Option<Vec<u8>>,
 }
 
 impl Image {
-    /// A black image.
     pub fn new(width: u32, height: u32) -> Self {
         Image { width, height, rgb: vec![0.0; 3 * width as usize * height as usize] }
     }
 
-    /// Number of pixels in one plane.
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
@@ -64,7 +57,6 @@ impl Target {
         self.mask.as_ref().is_none_or(|mask| mask.iter().any(|&byte| byte != 0))
     }
 
-    /// Bytes in memory.
     pub fn bytes(&self) -> u64 {
         (self.rgb.len() + self.mask.as_ref().map_or(0, Vec::len)) as u64
     }

@@ -21,7 +21,6 @@ const SUBSAMPLE: u64 = 0x7375_6273_616d_706c;
 /// Scale of the rows if all points coincide, in units of the scene scale.
 const LONE_POINT_SCALE: f64 = 0.01;
 
-/// Options for the first Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitOptions {
     /// SH degree of the stored rows, 0 to 3. The higher bands start at zero.
@@ -30,9 +29,7 @@ pub struct InitOptions {
     pub opacity: f32,
     /// First scale in units of the distance to the neighbours.
     pub scale_factor: f32,
-    /// Seed of the run.
     pub seed: u64,
-    /// Most rows.
     pub max_gaussians: Option<usize>,
     /// Size of the scene, local units; the two limits below are multiples of it.
     pub scene_scale: f32,
@@ -69,7 +66,12 @@ impl Default for InitOptions {
 /// If there are more than `max_gaussians` points, those with the smallest hashes of (seed, index) are kept, in order,
 /// and distances are those among the kept points.
 pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &InitOptions) -> Columns {
-    let kept = kept_points(points, options);
+    let mut kept: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
+    if let Some(most) = options.max_gaussians.filter(|&most| most < kept.len()) {
+        kept.sort_by_cached_key(|&i| subsample_key(options.seed, i as u64));
+        kept.truncate(most);
+        kept.sort_unstable();
+    }
     let means: Vec<[f32; 3]> = kept.iter().map(|&i| points[i]).collect();
     let scales = log_scales(&means, options);
     let point = |row: usize| FirstPoint {
@@ -81,7 +83,6 @@ pub fn gaussians_from_points(points: &[[f32; 3]], colors: &[[u8; 3]], options: &
     first_gaussians(kept.len(), point, options)
 }
 
-/// A point with the first size of its Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FirstPoint {
     pub point: [f32; 3],
@@ -89,11 +90,9 @@ pub struct FirstPoint {
     pub row: u32,
     /// sRGB.
     pub color: [u8; 3],
-    /// Log of the first scale.
     pub log_scale: f32,
 }
 
-/// Creates the first Gaussians of some points.
 pub fn first_gaussians(rows: usize, point: impl Fn(usize) -> FirstPoint, options: &InitOptions) -> Columns {
     let mut columns = Columns::zeros(rows, options.sh_degree);
     columns.opacities.fill(logit(options.opacity));
@@ -108,16 +107,6 @@ pub fn first_gaussians(rows: usize, point: impl Fn(usize) -> FirstPoint, options
         }
     }
     columns
-}
-
-/// Indices of the points that get a row, ascending.
-fn kept_points(points: &[[f32; 3]], options: &InitOptions) -> Vec<usize> {
-    let mut kept: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|v| v.is_finite())).collect();
-    let Some(most) = options.max_gaussians.filter(|&most| most < kept.len()) else { return kept };
-    kept.sort_by_cached_key(|&i| subsample_key(options.seed, i as u64));
-    kept.truncate(most);
-    kept.sort_unstable();
-    kept
 }
 
 /// Key for selecting points when there are too many: those with the smallest keys stay. For one seed a bijection of the
@@ -154,7 +143,6 @@ impl ScaleRule {
         }
     }
 
-    /// Log of the first scale for a distance.
     pub fn log_scale(&self, distance: f64) -> f32 {
         let distance = if distance > 0.0 { distance } else { self.fallback };
         // max, then min: clamp would panic if the limits are swapped.
@@ -170,17 +158,11 @@ pub fn middle_rank(count: usize) -> usize {
 /// Log of the first scale of each point.
 fn log_scales(points: &[[f32; 3]], options: &InitOptions) -> Vec<f32> {
     let distances: Vec<f64> = nearest_dist2(points).par_iter().map(rms_distance).collect();
-    let rule = ScaleRule::new(options, median_above_zero(&distances));
-    distances.par_iter().map(|&distance| rule.log_scale(distance)).collect()
-}
-
-fn median_above_zero(values: &[f64]) -> Option<f64> {
-    let mut positive: Vec<f64> = values.iter().copied().filter(|&v| v > 0.0).collect();
-    if positive.is_empty() {
-        return None;
-    }
+    let mut positive: Vec<f64> = distances.iter().copied().filter(|&v| v > 0.0).collect();
     let middle = middle_rank(positive.len());
-    Some(*positive.select_nth_unstable_by(middle, f64::total_cmp).1)
+    let median = (!positive.is_empty()).then(|| *positive.select_nth_unstable_by(middle, f64::total_cmp).1);
+    let rule = ScaleRule::new(options, median);
+    distances.par_iter().map(|&distance| rule.log_scale(distance)).collect()
 }
 
 /// A rotation from the uniform distribution, w x y z (Marsaglia 1972, "Choosing a point from the surface of a sphere").
@@ -220,15 +202,11 @@ pub fn random_points_in_frusta(
         let z = s.range(f64::from(near), f64::from(far));
         let x = (u - f64::from(camera.cx)) / f64::from(camera.fx) * z;
         let y = (v - f64::from(camera.cy)) / f64::from(camera.fy) * z;
-        let position = unproject(camera, [x, y, z]);
-        (position, std::array::from_fn(|_| s.below(256) as u8))
+        // R^T (p - t)
+        let m = &camera.viewmat;
+        let moved: [f64; 3] = std::array::from_fn(|row| [x, y, z][row] - f64::from(m[row][3]));
+        let position = |i: usize| (0..3).map(|row| f64::from(m[row][i]) * moved[row]).sum::<f64>() as f32;
+        (std::array::from_fn(position), std::array::from_fn(|_| s.below(256) as u8))
     };
     (0..count).into_par_iter().map(point).unzip()
-}
-
-/// World position of a camera-space one: R^T (p - t).
-fn unproject(camera: &Camera, p: [f64; 3]) -> [f32; 3] {
-    let m = &camera.viewmat;
-    let moved: [f64; 3] = std::array::from_fn(|row| p[row] - f64::from(m[row][3]));
-    std::array::from_fn(|i| (0..3).map(|row| f64::from(m[row][i]) * moved[row]).sum::<f64>() as f32)
 }

@@ -12,7 +12,6 @@
 use super::point_box::{PointBox, norm2};
 use rayon::prelude::*;
 
-/// Neighbours per point.
 pub const NEIGHBOURS: usize = 3;
 
 const LEAF: usize = 12;
@@ -35,19 +34,14 @@ pub struct NeighbourTree {
 }
 
 /// Squared distances of every point to its three nearest other points, ascending; infinity if there are fewer. Other
-/// points at the same place count, with distance 0. Points with non-finite coordinates have no neighbours.
-///
-/// # Panics
-/// With 2^32 points or more.
+/// points at the same place count, with distance 0. Points with non-finite coordinates have no neighbours. Panics with 2^32
+/// points or more.
 pub fn nearest_dist2(points: &[[f32; 3]]) -> Vec<[f32; NEIGHBOURS]> {
     NeighbourTree::new(points).nearest_dist2()
 }
 
 impl NeighbourTree {
-    /// Builds the tree of some points.
-    ///
-    /// # Panics
-    /// With 2^32 points or more.
+    /// Builds the tree of some points; panics with 2^32 points or more.
     pub fn new(points: &[[f32; 3]]) -> NeighbourTree {
         assert!(u32::try_from(points.len()).is_ok(), "more than 2^32 points");
         let entries = points.iter().enumerate().map(|(i, &point)| Entry { point, index: i as u32 });
@@ -90,7 +84,6 @@ impl NeighbourTree {
         std::array::from_fn(|i| if best[i] < limit { best[i] } else { f32::INFINITY })
     }
 
-    /// The bounding box of all points.
     pub fn bounds(&self) -> PointBox {
         self.boxes[0]
     }
@@ -207,7 +200,7 @@ mod tests {
     }
 
     #[test]
-    fn equal_and_non_finite_points_are_handled() {
+    fn equal_and_non_finite_points_are_handled_and_threads_do_not_matter() {
         assert_eq!(nearest_dist2(&[[2.5; 3]; 500]), vec![[0.0; 3]; 500]);
         let mut points = cloud(200, 0);
         points[7] = [f32::NAN; 3];
@@ -216,10 +209,6 @@ mod tests {
         let found = nearest_dist2(&points);
         assert_eq!(found, brute_force(&points));
         assert_eq!(found[7], [f32::INFINITY; 3]);
-    }
-
-    #[test]
-    fn threads_do_not_matter() {
         let points = cloud(20_000, 1);
         let with = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();

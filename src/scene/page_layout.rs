@@ -9,7 +9,7 @@
 //! compile time.
 
 use super::columns::Column;
-use super::rows::{ColumnsMut, ColumnsRef, Rows, RowsMut};
+use super::rows::{ColumnsMut, ColumnsRef, RowTables, Rows, RowsMut};
 use super::state::SceneState;
 use bytemuck::{AnyBitPattern, NoUninit};
 
@@ -18,10 +18,8 @@ const _: () = assert!(cfg!(target_endian = "little"), "pages on disk are little-
 /// Alignment of every table within the payload, bytes: one vector register, one cache line.
 pub const TABLE_ALIGNMENT: usize = 64;
 
-/// The layout of a page's payload.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageLayout {
-    /// Rows in the page.
     pub rows: usize,
     /// SH degree of the stored page, 0 to 3.
     pub sh_degree: u8,
@@ -47,10 +45,10 @@ impl PageLayout {
             [ColumnsRef { sh_degree: self.sh_degree, ..ColumnsRef::default() }; 3];
         for column in Column::ALL {
             for table in [&mut columns, &mut exp_avg, &mut exp_avg_sq] {
-                *table.get_mut(column) = take(&mut rest, self.rows * column.width(self.sh_degree));
+                *table.column_mut(column) = take(&mut rest, self.rows * column.width(self.sh_degree));
             }
         }
-        Rows { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
+        RowTables { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
     }
 
     /// As [`PageLayout::rows`], mutable.
@@ -63,11 +61,11 @@ impl PageLayout {
         let mut tables = [0; 3].map(|_| ColumnsMut { sh_degree: self.sh_degree, ..ColumnsMut::default() });
         for column in Column::ALL {
             for table in &mut tables {
-                *table.get_mut(column) = take_mut(&mut rest, self.rows * column.width(self.sh_degree));
+                *table.column_mut(column) = take_mut(&mut rest, self.rows * column.width(self.sh_degree));
             }
         }
         let [columns, exp_avg, exp_avg_sq] = tables;
-        RowsMut { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
+        RowTables { first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count }
     }
 }
 

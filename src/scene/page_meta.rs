@@ -11,7 +11,6 @@ pub struct PageBounds {
     /// Lower corner of the box of the means, local frame. The box includes children of rows that may split before they
     /// are seen again. Greater than `hi` for a page without rows.
     pub lo: [f32; 3],
-    /// Upper corner.
     pub hi: [f32; 3],
     /// Largest standard deviation, for any rotation.
     pub sigma_max: f32,
@@ -21,27 +20,22 @@ impl PageBounds {
     /// Bounds without rows: no view sees them.
     pub const EMPTY: PageBounds = PageBounds { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3], sigma_max: 0.0 };
 
-    /// Centre of the box, local frame.
     pub fn centre(&self) -> [f32; 3] {
         std::array::from_fn(|i| 0.5 * (self.lo[i] + self.hi[i]))
     }
 
-    /// Whether the page has no rows.
     pub fn is_empty(&self) -> bool {
         self.lo[0] > self.hi[0]
     }
 }
 
-/// The index entry of one page.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PageMeta {
-    /// Id by lineage.
     pub id: PageId,
     pub rows: u32,
     /// SH degree of the stored page.
     pub sh_degree: u8,
     /// Number of events of the log that its rows have applied.
     pub events_applied: u32,
-    /// Bounds of its rows.
     pub bounds: PageBounds,
 }

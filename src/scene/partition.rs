@@ -38,7 +38,6 @@ impl Placed for PointRow {
     }
 }
 
-/// A position and its row number.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointRow {
     pub point: [f32; 3],
@@ -64,7 +63,6 @@ impl Partition {
         &self.rows[self.starts[page] as usize..self.starts[page + 1] as usize]
     }
 
-    /// The pages in order.
     pub fn iter(&self) -> impl ExactSizeIterator<Item = &[u32]> {
         (0..self.pages()).map(|page| self.rows_of(page))
     }
@@ -75,16 +73,12 @@ pub fn first_fill(page_rows: usize, is_growing: bool) -> usize {
     if is_growing { (page_rows * FILL_PERCENT / 100).max(1) } else { page_rows.max(1) }
 }
 
-/// Number of giants among `rows` rows.
 pub fn giants(rows: usize) -> usize {
     rows / ROWS_PER_GIANT
 }
 
 /// Divides rows into pages of at most `fill` rows (at least 1). `means` and `scales` (log) are `[rows][3]`. Takes 16
-/// bytes per row besides the result.
-///
-/// # Panics
-/// With 2^32 rows or more.
+/// bytes per row besides the result. Panics with 2^32 rows or more.
 pub fn partition(means: &[f32], scales: &[f32], fill: usize) -> Partition {
     let count = means.len() / 3;
     assert!(u32::try_from(count).is_ok(), "more than 2^32 rows");
@@ -144,13 +138,11 @@ impl GiantCut {
         u64::from(float_key(size)) << 32 | u64::from(!row)
     }
 
-    /// Whether a row is a giant.
     pub fn is_giant(self, size: f32, row: u32) -> bool {
         GiantCut::key(size, row) >= self.smallest
     }
 }
 
-/// Pages of nearly equal size for a number of rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Pages {
     pub rows: usize,
@@ -202,7 +194,6 @@ impl Pages {
     }
 }
 
-/// The box of all entries.
 pub fn box_of<E: Placed>(entries: &[E]) -> PointBox {
     if entries.len() >= 8 * SERIAL_BELOW {
         return entries.par_chunks(SERIAL_BELOW).map(box_of).reduce(|| PointBox::EMPTY, PointBox::union);
@@ -245,12 +236,7 @@ mod tests {
             let of = |pick: fn(f32, f32) -> f32, start: f32| rows.iter().fold(start, |a, &r| pick(a, means[r * 3 + i]));
             of(f32::max, f32::NEG_INFINITY) - of(f32::min, f32::INFINITY)
         };
-        let mut axis = 0;
-        (1..3).for_each(|i| {
-            if extent(i) > extent(axis) {
-                axis = i
-            }
-        });
+        let axis = (1..3).fold(0, |widest, i| if extent(i) > extent(widest) { i } else { widest });
         rows.sort_by(|&a, &b| means[a * 3 + axis].total_cmp(&means[b * 3 + axis]).then(a.cmp(&b)));
         let high = rows.split_off(share(first + pages / 2) - share(first));
         let mut all = plainly(means, rows, pages / 2, share, first);

@@ -1,34 +1,26 @@
-//! The bounding box of some points.
-//!
-//! Invariant: the distance to a box is computed as that to a point, so rounding never makes a box farther than a point
+//! The bounding box of some points. Invariant: the distance to a box is computed as that to a point, so rounding never makes a box farther than a point
 //! in it.
 
-/// The bounding box of some points.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointBox {
     /// Lower corner; greater than `hi` without points.
     pub lo: [f32; 3],
-    /// Upper corner.
     pub hi: [f32; 3],
 }
 
 impl PointBox {
-    /// The box of no points.
     pub const EMPTY: PointBox = PointBox { lo: [f32::INFINITY; 3], hi: [f32::NEG_INFINITY; 3] };
 
-    /// The box of all points.
     pub fn of(points: impl Iterator<Item = [f32; 3]>) -> PointBox {
         let mut all = PointBox::EMPTY;
         points.for_each(|point| all.add(point));
         all
     }
 
-    /// Extends the box to include a point.
     pub fn add(&mut self, point: [f32; 3]) {
         *self = self.union(PointBox { lo: point, hi: point });
     }
 
-    /// The smallest box that contains both.
     #[must_use]
     pub fn union(mut self, other: PointBox) -> PointBox {
         for i in 0..3 {

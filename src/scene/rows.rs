@@ -44,13 +44,11 @@ pub type ColumnsRef<'a> = ColumnSet<&'a [f32]>;
 pub type ColumnsMut<'a> = ColumnSet<&'a mut [f32]>;
 
 impl Columns {
-    /// A shared view of all rows.
     pub fn view(&self) -> ColumnsRef<'_> {
         let Columns { sh_degree, means, quats, scales, opacities, sh0, sh_n } = self;
         ColumnSet { sh_degree: *sh_degree, means, quats, scales, opacities, sh0, sh_n }
     }
 
-    /// A mutable view of all rows.
     pub fn view_mut(&mut self) -> ColumnsMut<'_> {
         self.each_mut().map(|_, values| values.as_mut_slice())
     }
@@ -59,11 +57,6 @@ impl Columns {
 impl<'a> ColumnsRef<'a> {
     pub fn rows(&self) -> usize {
         self.opacities.len()
-    }
-
-    /// The values of one column, `[rows][width]`.
-    pub fn column(&self, column: Column) -> &'a [f32] {
-        self.get(column)
     }
 
     /// The rows before `row`, and the rest.
@@ -118,7 +111,7 @@ impl<'a> ColumnsMut<'a> {
         let mut rest = ColumnsMut { sh_degree, ..ColumnsMut::default() };
         let front = self.map(|column, values| {
             let (front, back) = values.split_at_mut(row * column.width(sh_degree));
-            *rest.get_mut(column) = back;
+            *rest.column_mut(column) = back;
             front
         });
         (front, rest)
@@ -152,45 +145,31 @@ impl<'a> ColumnsMut<'a> {
     }
 }
 
-/// Shared view of rows with their whole training state.
+/// Rows with their whole training state, as slices.
 #[derive(Debug, Clone, Copy, Default)]
-pub struct Rows<'a> {
+pub struct RowTables<C, W, U, F> {
     /// Number of the first row in the table that the view was cut from.
     pub first_row: usize,
     /// Values after the last update of each row.
-    pub columns: ColumnsRef<'a>,
+    pub columns: C,
     /// First moments after the last update.
-    pub exp_avg: ColumnsRef<'a>,
+    pub exp_avg: C,
     /// Second moments after the last update.
-    pub exp_avg_sq: ColumnsRef<'a>,
+    pub exp_avg_sq: C,
     /// Optimizer steps contained in the row.
-    pub stamp: &'a [u32],
-    pub uid: &'a [u64],
+    pub stamp: W,
+    pub uid: U,
     /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
-    pub grad2d: &'a [f32],
+    pub grad2d: F,
     /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
-    pub count: &'a [u32],
+    pub count: W,
 }
 
-/// Mutable view of rows with their whole training state.
-#[derive(Debug)]
-pub struct RowsMut<'a> {
-    /// Number of the first row in the table that the view was cut from.
-    pub first_row: usize,
-    /// Values after the last update of each row.
-    pub columns: ColumnsMut<'a>,
-    /// First moments after the last update.
-    pub exp_avg: ColumnsMut<'a>,
-    /// Second moments after the last update.
-    pub exp_avg_sq: ColumnsMut<'a>,
-    /// Optimizer steps contained in the row.
-    pub stamp: &'a mut [u32],
-    pub uid: &'a mut [u64],
-    /// Sums of growth scores since the last round; for the strategy `default`, of gradient norms.
-    pub grad2d: &'a mut [f32],
-    /// Views that drew the row since the last round, and its blending weight in them ([`super::sightings`]).
-    pub count: &'a mut [u32],
-}
+/// Shared view of rows with their whole training state.
+pub type Rows<'a> = RowTables<ColumnsRef<'a>, &'a [u32], &'a [u64], &'a [f32]>;
+
+/// Exclusive view of rows with their whole training state.
+pub type RowsMut<'a> = RowTables<ColumnsMut<'a>, &'a mut [u32], &'a mut [u64], &'a mut [f32]>;
 
 /// Shared and exclusive views are split alike: only the method that splits their slices differs.
 macro_rules! impl_rows {
@@ -210,8 +189,8 @@ macro_rules! impl_rows {
                 let (grad2d, grad2d_b) = self.grad2d.$split(row);
                 let (count, count_b) = self.count.$split(row);
                 let front =
-                    $View { first_row: self.first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count };
-                let back = $View {
+                    RowTables { first_row: self.first_row, columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count };
+                let back = RowTables {
                     first_row: self.first_row + row,
                     columns: columns_b,
                     exp_avg: exp_avg_b,
@@ -233,7 +212,7 @@ impl_rows!(RowsMut, split_at_mut);
 impl RowsMut<'_> {
     /// A shared view of the same rows.
     pub fn as_ref(&self) -> Rows<'_> {
-        Rows {
+        RowTables {
             first_row: self.first_row,
             columns: self.columns.as_ref(),
             exp_avg: self.exp_avg.as_ref(),

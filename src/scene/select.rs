@@ -25,12 +25,10 @@ impl RankSearch {
         RankSearch { rank, prefix: 0, known: if exists { 0 } else { u64::BITS }, bins: vec![0; 1 << PASS_BITS], exists }
     }
 
-    /// Whether no further pass is needed.
     pub fn is_done(&self) -> bool {
         self.known == u64::BITS
     }
 
-    /// Counts one key of this pass.
     #[inline]
     pub fn count(&mut self, key: u64) {
         // In the first pass nothing is known, and a shift by 64 would be no shift.
@@ -40,7 +38,6 @@ impl RankSearch {
         }
     }
 
-    /// Ends a pass over all keys.
     pub fn next_pass(&mut self) {
         if self.is_done() {
             return;
@@ -79,11 +76,8 @@ mod tests {
         let mut draws = Stream::new(1, Purpose::Test, 5, 5);
         // Three values in the upper half, so that the lower half decides.
         let mut keys: Vec<u64> = (0..300).map(|i| draws.below(3) << 40 | i).collect();
-        let want = {
-            let mut k = keys.clone();
-            k.sort_unstable();
-            k
-        };
+        let mut want = keys.clone();
+        want.sort_unstable();
         draws.shuffle(&mut keys);
         for (rank, &want) in want.iter().enumerate() {
             let mut search = RankSearch::new(rank as u64, 300);

@@ -5,7 +5,7 @@
 //! rows are removed and appended in all vectors at once, and remaining rows keep their order.
 
 use super::columns::{Column, Columns, row_width};
-use super::rows::{Rows, RowsMut};
+use super::rows::{RowTables, Rows, RowsMut};
 use rayon::prelude::*;
 use std::collections::TryReserveError;
 
@@ -59,9 +59,8 @@ impl SceneState {
         self.columns.sh_degree
     }
 
-    /// A shared view of all rows.
     pub fn view(&self) -> Rows<'_> {
-        Rows {
+        RowTables {
             first_row: 0,
             columns: self.columns.view(),
             exp_avg: self.exp_avg.view(),
@@ -73,9 +72,8 @@ impl SceneState {
         }
     }
 
-    /// A mutable view of all rows.
     pub fn view_mut(&mut self) -> RowsMut<'_> {
-        RowsMut {
+        RowTables {
             first_row: 0,
             columns: self.columns.view_mut(),
             exp_avg: self.exp_avg.view_mut(),
@@ -114,7 +112,7 @@ impl SceneState {
         let sh_degree = self.sh_degree();
         for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {
             for column in Column::ALL {
-                table.get_mut(column).try_reserve_exact(more.saturating_mul(column.width(sh_degree)))?;
+                table.column_mut(column).try_reserve_exact(more.saturating_mul(column.width(sh_degree)))?;
             }
         }
         self.stamp.try_reserve_exact(more)?;
@@ -134,13 +132,11 @@ impl SceneState {
     #[must_use]
     pub fn select(&self, rows: &[u32]) -> SceneState {
         let of = |from: &Columns| {
-            let mut columns = Columns { sh_degree: from.sh_degree, ..Columns::default() };
-            for column in Column::ALL {
-                let values = columns.column_mut(column);
-                values.reserve_exact(rows.len() * column.width(from.sh_degree));
+            from.view().map(|column, _| {
+                let mut values = Vec::with_capacity(rows.len() * column.width(from.sh_degree));
                 rows.iter().for_each(|&row| values.extend_from_slice(from.row(column, row as usize)));
-            }
-            columns
+                values
+            })
         };
         SceneState {
             columns: of(&self.columns),
@@ -206,29 +202,27 @@ mod tests {
 
     #[test]
     fn removing_and_appending_keeps_all_vectors_consistent() {
-        (0..=3).for_each(removing_and_appending);
-    }
-
-    fn removing_and_appending(sh_degree: u8) {
-        let mut state = numbered(10, sh_degree);
-        state.remove(&[0, 3, 4, 9]);
-        let more = numbered(2, sh_degree);
-        state.append(&more);
-        let want = [1u64, 2, 5, 6, 7, 8, 0, 1];
-        assert_eq!(state.uid, want);
-        for column in Column::ALL {
-            for (row, &uid) in want.iter().enumerate() {
-                assert!(state.columns.row(column, row).iter().all(|&x| x == uid as f32), "{column:?} {row}");
-                assert_eq!(state.exp_avg.row(column, row).len(), column.width(sh_degree));
+        for sh_degree in 0..=3 {
+            let mut state = numbered(10, sh_degree);
+            state.remove(&[0, 3, 4, 9]);
+            let more = numbered(2, sh_degree);
+            state.append(&more);
+            let want = [1u64, 2, 5, 6, 7, 8, 0, 1];
+            assert_eq!(state.uid, want);
+            for column in Column::ALL {
+                for (row, &uid) in want.iter().enumerate() {
+                    assert!(state.columns.row(column, row).iter().all(|&x| x == uid as f32), "{column:?} {row}");
+                    assert_eq!(state.exp_avg.row(column, row).len(), column.width(sh_degree));
+                }
             }
+            assert_eq!(state.rows(), 8);
+            assert_eq!(state.grad2d.len(), 8);
+            assert_eq!(state.count.len(), 8);
+            state.remove(&[0, 2, 4, 6]);
+            assert_eq!(state.uid, [2, 6, 8, 1]);
+            state.remove(&[0, 1, 2, 3]);
+            assert_eq!(state.rows(), 0);
         }
-        assert_eq!(state.rows(), 8);
-        assert_eq!(state.grad2d.len(), 8);
-        assert_eq!(state.count.len(), 8);
-        state.remove(&[0, 2, 4, 6]);
-        assert_eq!(state.uid, [2, 6, 8, 1]);
-        state.remove(&[0, 1, 2, 3]);
-        assert_eq!(state.rows(), 0);
     }
 
     #[test]
