@@ -43,7 +43,7 @@ fn gaussians(content: PlyContent) -> (Columns, SceneMeta) {
 }
 
 fn parse(bytes: &[u8]) -> Result<PlyContent, InputError> {
-    parse_ply(bytes, bytes.len() as u64, Path::new("in.ply"))
+    parse_ply(std::io::Cursor::new(bytes), bytes.len() as u64, Path::new("in.ply"))
 }
 
 /// An error that names the place and a remedy.

@@ -19,7 +19,7 @@ use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::rotation::Rotation;
 use std::collections::TryReserveError;
 use std::fs::File;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Seek, SeekFrom};
 use std::path::Path;
 
 /// Reads `path`. See [`parse_ply`].
@@ -70,24 +70,7 @@ pub fn stated_rows(path: &Path) -> InputResult<u64> {
 pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>) -> InputResult<u64> {
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
-    let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
-    let colors = Colors::of(path, vertex)?;
-    let full = match colors.full {
-        Some(full) => full,
-        // A pass that only finds the range of floating-point colours.
-        None => {
-            let mut most = 0.0;
-            let (mut reader, total_bytes) = open(path)?;
-            let header = parse_header(&mut reader, path)?;
-            let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
-            stream_rows(&mut body, vertex, &colors, &mut |_, color| {
-                most = color.into_iter().fold(most, f64::max);
-                Ok(())
-            })?;
-            full_of_floats(most)
-        }
-    };
-    stream_rows(&mut body, vertex, &colors, &mut |position, color| take(position, color.map(|c| color_byte(c, full))))
+    stream_body(reader, &header, (total_bytes, path), take)
 }
 
 fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
@@ -113,14 +96,39 @@ fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
 /// # Errors
 /// The file is cut short, states more rows than it holds, lacks a property, has a number of `f_rest` properties other
 /// than 0, 9, 24 or 45, has no vertices, or more than 1 % of its rows have non-finite values.
-pub fn parse_ply<R: BufRead>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
+pub fn parse_ply<R: BufRead + Seek>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
     let header = parse_header(&mut reader, path)?;
-    let (mut body, vertex) = body_at_vertices(reader, &header, total_bytes, path)?;
+    let (mut body, vertex) = body_at_vertices(&mut reader, &header, total_bytes, path)?;
+    let rows = vertex.count as usize;
+    let no_memory = |_: TryReserveError| {
+        let problem = format!("no memory for {rows} rows");
+        InputError::new(path, problem, "thin the file out or use a larger machine")
+    };
     if vertex.find("f_dc_0").is_some() {
-        read_gaussians(&mut body, &header, vertex)
-    } else {
-        read_points(&mut body, vertex)
+        let sh_degree = sh_degree_of(path, vertex)?;
+        let mut columns = Columns { sh_degree, ..Columns::default() };
+        for column in Column::ALL {
+            let floats = rows.saturating_mul(column.width(sh_degree));
+            columns.column_mut(column).try_reserve_exact(floats).map_err(no_memory)?;
+        }
+        let mut take = |row: &[f32]| {
+            push_row(&mut columns, row);
+            Ok(())
+        };
+        let meta = stream_gaussian_rows(&mut body, &header, vertex, &mut take)?;
+        return Ok(PlyContent::Gaussians { columns, meta });
     }
+    drop(body);
+    let (mut positions, mut colors) = (Vec::new(), Vec::new());
+    positions.try_reserve_exact(rows).map_err(no_memory)?;
+    colors.try_reserve_exact(rows).map_err(no_memory)?;
+    reader.seek(SeekFrom::Start(header.bytes)).map_err(|e| InputError::io(path, "reading", &e))?;
+    let dropped = stream_body(reader, &header, (total_bytes, path), &mut |position, color| {
+        positions.push(position);
+        colors.push(color);
+        Ok(())
+    })?;
+    Ok(PlyContent::Points { positions, colors, dropped })
 }
 
 /// The body of a file, positioned at its vertices, whose presence is checked.
@@ -169,10 +177,6 @@ fn scalar_at(path: &Path, vertex: &Element, name: &str) -> InputResult<(usize, S
         None => Err((format!("the vertices have no property '{name}'"), "export the file again with all properties")),
     }
     .map_err(|(problem, remedy)| InputError::new(path, problem, remedy).at("header"))
-}
-
-fn no_memory(path: &Path, rows: u64) -> impl Fn(TryReserveError) -> InputError {
-    move |_| InputError::new(path, format!("no memory for {rows} rows"), "thin the file out or use a larger machine")
 }
 
 /// Number of dropped rows, and the first one.
@@ -233,21 +237,6 @@ pub fn gaussians_header(path: &Path) -> InputResult<(SceneMeta, u8)> {
     Ok((meta, sh_degree_of(path, vertex)?))
 }
 
-fn read_gaussians<R: BufRead>(body: &mut Body<'_, R>, header: &Header, vertex: &Element) -> InputResult<PlyContent> {
-    let path = body.path;
-    let sh_degree = sh_degree_of(path, vertex)?;
-    let mut columns = Columns { sh_degree, ..Columns::default() };
-    for column in Column::ALL {
-        let floats = (vertex.count as usize).saturating_mul(column.width(sh_degree));
-        columns.column_mut(column).try_reserve_exact(floats).map_err(no_memory(path, vertex.count))?;
-    }
-    let meta = stream_gaussian_rows(body, header, vertex, &mut |row| {
-        push_row(&mut columns, row);
-        Ok(())
-    })?;
-    Ok(PlyContent::Gaussians { columns, meta })
-}
-
 /// Appends a row in the layout of [`stream_gaussians`].
 pub fn push_row(columns: &mut Columns, row: &[f32]) {
     columns.means.extend_from_slice(&row[0..3]);
@@ -260,10 +249,9 @@ pub fn push_row(columns: &mut Columns, row: &[f32]) {
 
 /// Reads row `row` in the layout of [`push_row`].
 pub fn take_row(columns: &Columns, row: usize, values: &mut Vec<f32>) {
-    let of = |column| columns.row(column, row);
     values.clear();
     for column in [Column::Means, Column::Sh0, Column::Opacities, Column::Scales, Column::Quats, Column::ShN] {
-        values.extend_from_slice(of(column));
+        values.extend_from_slice(columns.row(column, row));
     }
 }
 
@@ -360,25 +348,37 @@ fn meta_from_comments(path: &Path, comments: &[String]) -> InputResult<SceneMeta
     Ok(meta)
 }
 
-fn read_points<R: BufRead>(body: &mut Body<'_, R>, vertex: &Element) -> InputResult<PlyContent> {
-    let rows = vertex.count as usize;
-    let (mut positions, mut colors, mut floats) = (Vec::new(), Vec::new(), Vec::new());
-    let of_file = Colors::of(body.path, vertex)?;
-    let (bytes, numbers) = if of_file.full.is_some() { (rows, 0) } else { (0, rows) };
-    positions.try_reserve_exact(rows).map_err(no_memory(body.path, vertex.count))?;
-    colors.try_reserve_exact(bytes).map_err(no_memory(body.path, vertex.count))?;
-    floats.try_reserve_exact(numbers).map_err(no_memory(body.path, vertex.count))?;
-    let dropped = stream_rows(body, vertex, &of_file, &mut |position, color| {
-        positions.push(position);
-        match of_file.full {
-            Some(full) => colors.push(color.map(|c| color_byte(c, full))),
-            None => floats.push(color.map(|c| c as f32)),
+/// As [`stream_points`], for a file that `reader` has read up to the end of its header.
+fn stream_body<R: BufRead + Seek>(
+    mut reader: R,
+    header: &Header,
+    (total_bytes, path): (u64, &Path),
+    take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>,
+) -> InputResult<u64> {
+    let colors = Colors::of(path, vertex_of(header, path)?.1)?;
+    let full = match colors.full {
+        Some(full) => full,
+        // A pass that only finds the range of floating-point colours. Fractions may exceed 1 a little; a file of bytes in which
+        // none exceeds 2 would be black.
+        None => {
+            let mut most = 0.0;
+            let (mut body, vertex) = body_at_vertices(&mut reader, header, total_bytes, path)?;
+            stream_rows(&mut body, vertex, &colors, &mut |_, color| {
+                most = color.into_iter().fold(most, f64::max);
+                Ok(())
+            })?;
+            reader.seek(SeekFrom::Start(header.bytes)).map_err(|e| InputError::io(path, "reading", &e))?;
+            match most {
+                ..=2.0 => 1.0,
+                ..=256.0 => 255.0,
+                _ => 65_535.0,
+            }
         }
-        Ok(())
-    })?;
-    let full = full_of_floats(floats.iter().flatten().fold(0.0, |most, &c| f64::from(c).max(most)));
-    colors.extend(floats.into_iter().map(|color| color.map(|c| color_byte(f64::from(c), full))));
-    Ok(PlyContent::Points { positions, colors, dropped })
+    };
+    let (mut body, vertex) = body_at_vertices(reader, header, total_bytes, path)?;
+    stream_rows(&mut body, vertex, &colors, &mut |position, color| {
+        take(position, color.map(|value| ((value / full).clamp(0.0, 1.0) * 255.0 + 0.5) as u8))
+    })
 }
 
 /// The properties of colours.
@@ -412,10 +412,8 @@ fn stream_rows<R: BufRead>(
     take: &mut dyn FnMut([f64; 3], [f64; 3]) -> InputResult<()>,
 ) -> InputResult<u64> {
     let path = body.path;
-    let mut slots = Vec::with_capacity(6);
-    for name in ["x", "y", "z"] {
-        slots.push(scalar_at(path, vertex, name)?.0);
-    }
+    let place = ["x", "y", "z"].map(|name| scalar_at(path, vertex, name));
+    let mut slots = place.into_iter().map(|found| Ok(found?.0)).collect::<InputResult<Vec<usize>>>()?;
     slots.extend(&colors.slots);
     let mut dropped = Dropped::default();
     read_rows(body, vertex, &slots, |row, raw| {
@@ -423,25 +421,9 @@ fn stream_rows<R: BufRead>(
             dropped.add(row);
             return Ok(());
         }
-        // As f32, so that colours that wait for their range take little memory.
         let color = |c: usize| raw.get(3 + c).map_or(128.0, |&v| f64::from(v as f32));
         take([raw[0], raw[1], raw[2]], [color(0), color(1), color(2)])
     })?;
     dropped.check(path, vertex.count)?;
     Ok(dropped.count)
-}
-
-/// The value of full brightness of floating-point colours of which this is the greatest. Fractions may exceed 1 a little; a file
-/// of bytes in which none exceeds 2 would be black.
-fn full_of_floats(most: f64) -> f64 {
-    match most {
-        ..=2.0 => 1.0,
-        ..=256.0 => 255.0,
-        _ => 65_535.0,
-    }
-}
-
-/// A finite colour as a byte.
-fn color_byte(value: f64, full: f64) -> u8 {
-    ((value / full).clamp(0.0, 1.0) * 255.0 + 0.5) as u8
 }

@@ -76,7 +76,7 @@ fn named(error: &InputError) {
 }
 
 fn run(input: &[u8]) {
-    let parsed = parse_ply(input, input.len() as u64, Path::new("in.ply"));
+    let parsed = parse_ply(std::io::Cursor::new(input), input.len() as u64, Path::new("in.ply"));
     let folder = scratch();
     let path = folder.path().join("in.ply");
     std::fs::write(&path, input).unwrap();

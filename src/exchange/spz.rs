@@ -1,22 +1,31 @@
-//! Writes Gaussians to an SPZ file.
+//! Writes SPZ, version 3: Gaussians in a tenth of a PLY's bytes (`github.com/nianticlabs/spz`).
 //!
-//! An array holds one attribute of all Gaussians, and rows arrive one after another. Rows therefore go to a temporary file
-//! beside the target first, [`pack`]ed but for their positions, whose number of fractional bits follows from the largest one. At
-//! the end the temporary file is read once for each attribute.
+//! Not here: reading it.
 //!
-//! Invariants: 1. memory beyond the given rows is a few buffers of 1 MiB; 2. the temporary file is removed, also after
-//! errors; 3. a row with a value that is not finite, or with a coordinate beyond 8 million, is left out and counted.
+//! A file is one gzip stream: a header of 16 bytes, then one array for each attribute, one element a Gaussian: positions,
+//! opacities, colours, scales, rotations, harmonics. The axes are x right, y up, z to the back, which is half a turn about x
+//! from those of a PLY.
+//!
+//! Written here and not by a crate: those that write SPZ (`spz` 0.0, `wgpu-3dgs-core` 0.7) take all Gaussians at once, and a city's do
+//! not fit in memory. Rows go to a temporary file beside the target first, packed but for their positions, whose number of
+//! fractional bits follows from the largest one. At the end the temporary file is read once for each attribute.
+//!
+//! Invariants: 1. the bytes depend on the rows, their order and the metadata alone; 2. the target is replaced as a whole or
+//! not at all; 3. memory beyond the given rows is a few buffers of 1 MiB; 4. the temporary file is removed, also after errors;
+//! 5. a row with a value that is not finite, or with a coordinate beyond 8 million, is left out and counted; values out of a byte's
+//! range become its nearest end.
 
-use super::pack::{self, POSITION_BYTES};
 use crate::base::error::{InputError, InputResult};
+use crate::base::math::exp32;
 use crate::base::whole_file::PartFile;
-use crate::exchange::frames::ExportRows;
+use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::sink::{GaussianSink, Written};
 use crate::scene::columns::Columns;
 use crate::scene::rotation::{Rotation, VIEWER_UP};
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use std::f32::consts::FRAC_1_SQRT_2;
 use std::fs::File;
 use std::io::{self, BufReader, BufWriter, Read, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -31,6 +40,16 @@ const BUFFER_BYTES: usize = 1 << 20;
 const HALF_TURN: Rotation = Rotation::HALF_TURN_ABOUT_X;
 /// Up in an upright file.
 pub const SPZ_UP: [f64; 3] = [0.0, -VIEWER_UP[1], 0.0];
+/// Bytes of a position.
+const POSITION_BYTES: usize = 9;
+/// Largest magnitude of a coordinate's 24 bits.
+const FIXED_MAX: f64 = 8_388_607.0;
+/// Most fractional bits of a coordinate. f32 holds no more of values beyond 1/2.
+const FRACTION_BITS_MAX: u8 = 22;
+/// Colours: a constant band of 0 is mid grey, and this much of it is the whole range.
+const COLOR_SCALE: f32 = 0.15;
+/// Largest magnitude of the small components of a quaternion, in 9 bits.
+const QUAT_MAX: f32 = 511.0;
 
 /// Writes a file in parts.
 pub struct SpzWriter {
@@ -86,17 +105,16 @@ impl SpzWriter {
     /// Writes header and arrays as one gzip stream; returns its length.
     fn compress(&mut self) -> io::Result<u64> {
         self.rows_file.flush()?;
-        let fraction_bits = pack::fraction_bits(self.reach);
+        let fraction_bits = fraction_bits(self.reach);
         let mut gzip = GzEncoder::new(BufWriter::with_capacity(BUFFER_BYTES, &self.out), Compression::default());
         gzip.write_all(&header(self.rows as u32, self.sh_degree, fraction_bits))?;
-        let attributes = pack::attribute_bytes(self.sh_degree);
+        let attributes = attribute_bytes(self.sh_degree);
         let row_bytes = RAW_POSITION_BYTES + attributes.iter().sum::<usize>();
         let rows = self.rows_file.get_mut();
         each_row(rows, (self.rows, row_bytes), |row| {
             let (numbers, _) = row[..RAW_POSITION_BYTES].as_chunks::<4>();
             let position = [0, 1, 2].map(|i| f32::from_le_bytes(numbers[i]));
-            let packed: [u8; POSITION_BYTES] = pack::position(position, fraction_bits);
-            gzip.write_all(&packed)
+            gzip.write_all(&packed_position(position, fraction_bits))
         })?;
         let mut start = RAW_POSITION_BYTES;
         for length in attributes {
@@ -120,7 +138,7 @@ impl GaussianSink for SpzWriter {
             self.given += 1;
             let Some(mut row) = self.to_file.row(columns, row) else { continue };
             let reach = row.position.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-            if reach > pack::coordinate_max() {
+            if reach > FIXED_MAX as f32 {
                 self.far += 1;
                 continue;
             }
@@ -128,7 +146,7 @@ impl GaussianSink for SpzWriter {
             self.reach = self.reach.max(reach);
             bytes.clear();
             bytes.extend(row.position.iter().flat_map(|x| x.to_le_bytes()));
-            pack::attributes(&row, self.sh_degree, &mut bytes);
+            push_attributes(&row, self.sh_degree, &mut bytes);
             self.rows_file.write_all(&bytes).map_err(|e| InputError::io(&self.rows_path, "writing", &e))?;
             self.rows += 1;
         }
@@ -138,7 +156,7 @@ impl GaussianSink for SpzWriter {
     fn finish(mut self: Box<Self>) -> InputResult<Written> {
         if self.rows == 0 {
             let given = self.given;
-            let far = format!("all {given} Gaussians lie beyond the {} units of this format", pack::coordinate_max());
+            let far = format!("all {given} Gaussians lie beyond the {} units of this format", FIXED_MAX as f32);
             let lost = format!("none of the {given} Gaussians is finite, so there is no row to write");
             let (problem, remedy) = match self.far == given {
                 true => (far, "export in local coordinates (--export-frame local), or as a PLY"),
@@ -188,4 +206,82 @@ fn each_row(
         take(&row)?;
     }
     Ok(())
+}
+
+/// Lengths of the attributes of a row that follow its position: opacity, colours, scales, rotation, harmonics.
+fn attribute_bytes(sh_degree: u8) -> [usize; 5] {
+    let n = usize::from(sh_degree) + 1;
+    [1, 3, 3, 4, 3 * (n * n - 1)]
+}
+
+/// The most fractional bits with which coordinates up to `reach` (file units) fit into 24 bits.
+fn fraction_bits(reach: f32) -> u8 {
+    let fits = |bits: &u8| f64::from(reach) * f64::from(1u32 << bits) <= FIXED_MAX - 0.5;
+    (0..=FRACTION_BITS_MAX).rev().find(fits).unwrap_or(0)
+}
+
+/// Position with this many fractional bits: three numbers of 24 bits, little endian.
+fn packed_position(position: [f32; 3], fraction_bits: u8) -> [u8; POSITION_BYTES] {
+    let mut out = [0; POSITION_BYTES];
+    for (bytes, x) in out.chunks_exact_mut(3).zip(position) {
+        let fixed = libm::rint(f64::from(x) * f64::from(1u32 << fraction_bits)).clamp(-FIXED_MAX, FIXED_MAX) as i32;
+        bytes.copy_from_slice(&fixed.to_le_bytes()[..3]);
+    }
+    out
+}
+
+/// The attributes that follow a position, in their order.
+fn push_attributes(row: &ExportRow, sh_degree: u8, out: &mut Vec<u8>) {
+    let alpha = 1.0 / (1.0 + exp32(-row.opacity));
+    out.push(byte(alpha * 255.0));
+    out.extend(row.sh0.map(|c| byte(c * (COLOR_SCALE * 255.0) + 0.5 * 255.0)));
+    out.extend(row.log_scales.map(|s| byte((s + 10.0) * 16.0)));
+    out.extend(rotation(row.quat));
+    // The linear band keeps five bits, the others four.
+    let [.., harmonics] = attribute_bytes(sh_degree);
+    out.extend(row.sh_n[..harmonics].iter().enumerate().map(|(i, &v)| harmonic(v, if i < 9 { 8 } else { 16 })));
+}
+
+fn byte(value: f32) -> u8 {
+    // The cast cuts to the range of a byte.
+    libm::rintf(value) as u8
+}
+
+/// A coefficient in [-1, 1) around 128, rounded to a multiple of `bucket`.
+fn harmonic(value: f32, bucket: i32) -> u8 {
+    let q = libm::rintf(value.clamp(-2.0, 2.0) * 128.0) as i32 + 128;
+    ((q + bucket / 2).div_euclid(bucket) * bucket).clamp(0, 255) as u8
+}
+
+/// A unit quaternion (w first) in 32 bits, little endian: number of the largest component among x, y, z, w, then the others in
+/// this order, each a sign and nine bits. The largest one is positive: a quaternion and its negative are one rotation.
+fn rotation([w, x, y, z]: [f32; 4]) -> [u8; 4] {
+    let q = [x, y, z, w];
+    let largest = (1..4).fold(0, |best, i| if q[i].abs() > q[best].abs() { i } else { best });
+    let turns = q[largest] < 0.0;
+    let mut bits = largest as u32;
+    for (i, value) in q.into_iter().enumerate() {
+        if i != largest {
+            let magnitude = libm::rintf(value.abs() / FRAC_1_SQRT_2 * QUAT_MAX).min(QUAT_MAX) as u32;
+            let is_negative = (value < 0.0) != turns;
+            bits = bits << 10 | u32::from(is_negative) << 9 | magnitude;
+        }
+    }
+    bits.to_le_bytes()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn coordinates_have_as_many_bits_as_fit() {
+        for (reach, bits) in [(0.0, 22), (1.0, 22), (2.0, 21), (2047.0, 12), (2048.0, 11), (8_388_606.0, 0), (1e9, 0)] {
+            assert_eq!(fraction_bits(reach), bits, "{reach}");
+        }
+        // -1.5 in units of 1/16 is -24.
+        assert_eq!(packed_position([1.0, -1.5, 0.0], 4), [16, 0, 0, 232, 255, 255, 0, 0, 0]);
+        // Beyond the range: its end.
+        assert_eq!(packed_position([1e9, 0.0, -1e9], 0), [255, 255, 127, 0, 0, 0, 1, 0, 128]);
+    }
 }
