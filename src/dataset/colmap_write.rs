@@ -19,7 +19,7 @@ const PINHOLE: i32 = 1;
 
 #[derive(Debug, Clone)]
 pub struct Model {
-    /// The cameras; pinholes.
+    /// Pinholes.
     pub cameras: Vec<Intrinsics>,
     pub images: Vec<ModelImage>,
     pub points: Vec<Point>,
@@ -62,8 +62,7 @@ pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     let folder = partial.join("0");
     make_folder(&folder)?;
     write_whole_with(&folder.join("cameras.bin"), |out| cameras(out, &model.cameras))?;
-    let order = observation_order(model);
-    write_whole_with(&folder.join("images.bin"), |out| images_bin(out, model, &order))?;
+    write_whole_with(&folder.join("images.bin"), |out| images_bin(out, model))?;
     write_whole_with(&folder.join("points3D.bin"), |out| points_bin(out, model))?;
     std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "renaming the model's folder", &e))
 }
@@ -89,24 +88,18 @@ fn floats(out: &mut dyn Write, values: &[f64]) -> std::io::Result<()> {
     values.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))
 }
 
-/// For each image its observations as (point, position), in the order of the points of its tile.
-fn observation_order(model: &Model) -> Vec<Vec<(u64, [f64; 2])>> {
-    let mut lists = vec![Vec::new(); model.images.len()];
-    for (k, point) in model.points.iter().enumerate() {
-        for o in &point.observations {
-            let before = tile_of(model, o.image) as u64 * model.points.len() as u64;
-            lists[o.image as usize].push((before + k as u64 + 1, o.at));
-        }
-    }
-    lists
-}
-
-/// Number of the tile that an image sees.
 fn tile_of(model: &Model, image: u32) -> usize {
     image as usize % model.tiles.len()
 }
 
-fn images_bin(out: &mut dyn Write, model: &Model, order: &[Vec<(u64, [f64; 2])>]) -> std::io::Result<()> {
+fn images_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
+    // For each image its observations, in the order of the points of its tile.
+    let mut order = vec![Vec::new(); model.images.len()];
+    for (k, point) in (1u64..).zip(&model.points) {
+        for o in &point.observations {
+            order[o.image as usize].push((tile_of(model, o.image) as u64 * model.points.len() as u64 + k, o.at));
+        }
+    }
     out.write_all(&(model.images.len() as u64).to_le_bytes())?;
     for (k, image) in model.images.iter().enumerate() {
         out.write_all(&(k as u32 + 1).to_le_bytes())?;

@@ -25,19 +25,11 @@ pub fn brightness(path: &Path, place: ExifPlace) -> Result<Option<f64>, String> 
     if place.bytes > MOST_BYTES {
         return Err(format!("{} bytes, more than {MOST_BYTES}", place.bytes));
     }
-    brightness_in(bytes_at(path, place).map_err(|e| e.to_string())?)
-}
-
-fn bytes_at(path: &Path, place: ExifPlace) -> std::io::Result<Vec<u8>> {
-    let mut file = File::open(path)?;
-    file.seek(SeekFrom::Start(place.at))?;
     let mut bytes = vec![0; place.bytes as usize];
-    file.read_exact(&mut bytes)?;
-    Ok(bytes)
-}
-
-/// As [`brightness`], from the bytes of the data. Damage elsewhere in the data, for example in a preview, is no error.
-fn brightness_in(bytes: Vec<u8>) -> Result<Option<f64>, String> {
+    let mut file = File::open(path).map_err(|e| e.to_string())?;
+    let read = file.seek(SeekFrom::Start(place.at)).and_then(|_| file.read_exact(&mut bytes));
+    read.map_err(|e| e.to_string())?;
+    // Damage elsewhere in the data, for example in a preview, is no error.
     let mut damage = None;
     let read = Reader::new().continue_on_error(true).read_raw(bytes);
     let read = read.or_else(|e| e.distill_partial_result(|errors| damage = errors.first().map(ToString::to_string)));

@@ -30,12 +30,10 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// Converts a world position to local coordinates.
     pub fn to_local(&self, world: DVec3) -> DVec3 {
         (world - self.origin) / self.scale
     }
 
-    /// Converts a local position to world coordinates.
     pub fn to_world(&self, local: DVec3) -> DVec3 {
         self.origin + local * self.scale
     }
@@ -73,10 +71,7 @@ impl Extent {
         Extent::of(centres, centre, median(points.map(|p| p.distance(centre)).collect()))
     }
 
-    /// As [`Extent::measure`], with `point_distance` giving the median distance of the usable points from a position.
-    ///
-    /// # Errors
-    /// Those of `point_distance`.
+    /// As [`Extent::measure`], with `point_distance` giving the median distance of the usable points from a position, or its error.
     pub fn measure_by<E>(centres: &[DVec3], point_distance: impl FnOnce(DVec3) -> Result<f64, E>) -> Result<Self, E> {
         let centre = median_position(centres);
         Ok(Extent::of(centres, centre, point_distance(centre)?))
@@ -151,8 +146,7 @@ fn median(mut values: Vec<f64>) -> f64 {
     if values.is_empty() {
         return 0.0;
     }
-    let middle = values.len() / 2;
-    let even = values.len().is_multiple_of(2);
+    let (middle, even) = (values.len() / 2, values.len().is_multiple_of(2));
     let (below, &mut upper, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
     if even { (below.iter().copied().fold(f64::NEG_INFINITY, f64::max) + upper) / 2.0 } else { upper }
 }
@@ -163,11 +157,9 @@ mod tests {
 
     #[test]
     fn medians_of_odd_and_even_counts() {
-        assert_eq!(median(vec![]), 0.0);
-        assert_eq!(median(vec![3.0]), 3.0);
-        assert_eq!(median(vec![5.0, 1.0]), 3.0);
-        assert_eq!(median(vec![9.0, 1.0, 2.0]), 2.0);
-        assert_eq!(median(vec![9.0, 1.0, 2.0, 4.0]), 3.0);
+        let medians =
+            [&[][..], &[3.0], &[5.0, 1.0], &[9.0, 1.0, 2.0], &[9.0, 1.0, 2.0, 4.0]].map(|v| median(v.to_vec()));
+        assert_eq!(medians, [0.0, 3.0, 3.0, 2.0, 3.0]);
     }
 
     #[test]

@@ -9,7 +9,6 @@ use super::transforms::{looks_like_matrix_city, looks_like_transforms};
 use crate::base::error::{InputError, InputResult};
 use std::path::{Path, PathBuf};
 
-/// A folder layout.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Layout {
     /// A COLMAP model and its photos.
@@ -32,7 +31,6 @@ impl Layout {
     pub const ALL: [Layout; 6] =
         [Layout::Colmap, Layout::Gauu, Layout::ColmapMerged, Layout::Transforms, Layout::MatrixCity, Layout::MegaNerf];
 
-    /// The name in configs and on the command line.
     pub fn name(self) -> &'static str {
         match self {
             Layout::Colmap => "colmap",
@@ -44,7 +42,6 @@ impl Layout {
         }
     }
 
-    /// The layout as a tree, for messages.
     pub fn tree(self) -> &'static str {
         match self {
             Layout::Colmap => {
@@ -159,7 +156,8 @@ pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> Inpu
     let remedy = |layouts: &[Layout]| {
         let trees: Vec<String> = layouts.iter().map(|l| format!("{}:\n{}", l.name(), l.tree())).collect();
         let fetch: String = fetch.iter().map(|f| format!("\n  {f}")).collect();
-        format!("fetch it and arrange the folder like this\n{}\npublished at{fetch}", indented(&trees.join("\nor\n")))
+        let trees: String = trees.join("\nor\n").lines().map(|line| format!("    {line}\n")).collect();
+        format!("fetch it and arrange the folder like this\n{trees}published at{fetch}")
     };
     if !folder.is_dir() {
         return Err(InputError::new(folder, "the dataset's folder does not exist", remedy(accepted)));
@@ -177,8 +175,4 @@ pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> Inpu
     near.sort_by_key(|lack| std::cmp::Reverse(has(lack)));
     let near: Vec<Layout> = near.into_iter().map(|(l, _)| l).collect();
     Err(InputError::new(folder, format!("the dataset is not complete\n{}", each.join("\n")), remedy(&near)))
-}
-
-fn indented(text: &str) -> String {
-    text.lines().map(|line| format!("    {line}")).collect::<Vec<_>>().join("\n")
 }

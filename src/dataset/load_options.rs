@@ -1,11 +1,8 @@
-//! What the user asks of the photos, the split and the frame of a dataset.
-//!
-//! Not here: applying it ([`super::loader`], `photo_checks`).
+//! What the user asks of the photos, the split and the frame of a dataset; [`super::loader`] and `photo_checks` apply it.
 
 use crate::base::error::{InputError, InputResult};
 use std::path::PathBuf;
 
-/// The user's options for photos, split and frame.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadOptions {
     /// Photos are downscaled by this factor, at least 1; each side is rounded to nearest.

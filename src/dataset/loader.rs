@@ -10,7 +10,7 @@
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
 use super::load_options::LoadOptions;
-use super::model::{RawScene, RawView, Split};
+use super::model::{PointCloud, RawScene, RawView, Split};
 use super::name_index::is_photo;
 use super::photo::{PhotoSource, intrinsics_at};
 use super::photo_checks::check_photos;
@@ -28,7 +28,6 @@ const NAMES_LISTED: usize = 20;
 /// Far plane, local units.
 const FAR_PLANE: f32 = 1e10;
 
-/// A scene ready for training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Dataset {
     /// Views, sorted by name.
@@ -37,7 +36,6 @@ pub struct Dataset {
     pub points: Vec<[f32; 3]>,
     /// sRGB, one per point.
     pub colors: Vec<[u8; 3]>,
-    /// The local frame.
     pub frame: Frame,
     /// 1.1 times the largest camera distance from the mean of the cameras, without outliers; local units, > 0.
     pub scene_scale: f32,
@@ -50,13 +48,10 @@ pub struct Dataset {
 /// One view: its camera and its photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
-    /// Name in the dataset.
     pub name: String,
-    /// Its set.
     pub split: Split,
     /// Pose and intrinsics in the local frame, without distortion, at training size.
     pub camera: Camera,
-    /// Source of its pixels.
     pub photo: PhotoSource,
 }
 
@@ -66,7 +61,6 @@ impl Dataset {
         self.views_of(Split::Train)
     }
 
-    /// Indices of the test views, ascending.
     pub fn test_views(&self) -> Vec<usize> {
         self.views_of(Split::Test)
     }
@@ -82,11 +76,20 @@ impl Dataset {
 /// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or whose shape does not match the
 /// camera.
 pub fn load_dataset(mut raw: RawScene, options: &LoadOptions) -> InputResult<Dataset> {
-    let points = std::mem::take(&mut raw.points);
-    let measure = |centres: &[DVec3]| Ok(Extent::measure(centres, &points.positions));
+    let PointCloud { positions, colors } = std::mem::take(&mut raw.points);
+    let measure = |centres: &[DVec3]| Ok(Extent::measure(centres, &positions));
     let (mut dataset, extent) = load_views(raw, options, measure)?;
-    let (kept, colors) = local_points(points.positions, points.colors, &extent, &dataset.frame, &mut dataset.warnings);
-    (dataset.points, dataset.colors) = (kept, colors);
+    dataset.points.reserve_exact(positions.len());
+    dataset.colors.reserve_exact(positions.len());
+    let mut dropped = BTreeMap::new();
+    for (position, color) in positions.into_iter().zip(colors) {
+        let position = DVec3::from_array(position);
+        if is_kept(position, &extent, &mut dropped) {
+            dataset.points.push(dataset.frame.to_local(position).as_vec3().to_array());
+            dataset.colors.push(color);
+        }
+    }
+    warn_about_dropped(dropped, &mut dataset.warnings);
     Ok(dataset)
 }
 
@@ -104,9 +107,7 @@ pub fn load_dataset_with_cloud<'c>(
     let local = LocalCloud { cloud, extent, frame: dataset.frame };
     let mut dropped = BTreeMap::new();
     cloud.for_each(|position, _| {
-        if !extent.is_plausible(position) {
-            *dropped.entry(drop_reason(position)).or_default() += 1;
-        }
+        is_kept(position, &extent, &mut dropped);
         Ok(())
     })?;
     warn_about_dropped(dropped, &mut dataset.warnings);
@@ -282,31 +283,15 @@ fn camera_of(view: &RawView, photo: &PhotoSource, frame: &Frame, options: &LoadO
     }
 }
 
-/// Points in the local frame; non-finite and implausibly far ones are dropped and counted.
-fn local_points(
-    positions: Vec<[f64; 3]>,
-    colors: Vec<[u8; 3]>,
-    extent: &Extent,
-    frame: &Frame,
-    warnings: &mut Vec<String>,
-) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
-    let mut dropped: BTreeMap<&str, usize> = BTreeMap::new();
-    let (mut points, mut kept_colors) = (Vec::with_capacity(positions.len()), Vec::with_capacity(positions.len()));
-    for (position, color) in positions.into_iter().zip(colors) {
-        let position = DVec3::from_array(position);
-        if extent.is_plausible(position) {
-            points.push(frame.to_local(position).as_vec3().to_array());
-            kept_colors.push(color);
-        } else {
-            *dropped.entry(drop_reason(position)).or_default() += 1;
-        }
+/// Whether a point is finite and not implausibly far; counts the others by reason.
+fn is_kept(position: DVec3, extent: &Extent, dropped: &mut BTreeMap<&'static str, usize>) -> bool {
+    let is_kept = extent.is_plausible(position);
+    if !is_kept {
+        let far = position.is_finite();
+        let why = if far { "are more than a million scene sizes away" } else { "are not finite" };
+        *dropped.entry(why).or_default() += 1;
     }
-    warn_about_dropped(dropped, warnings);
-    (points, kept_colors)
-}
-
-fn drop_reason(position: DVec3) -> &'static str {
-    if position.is_finite() { "are more than a million scene sizes away" } else { "are not finite" }
+    is_kept
 }
 
 fn warn_about_dropped(dropped: BTreeMap<&str, usize>, warnings: &mut Vec<String>) {

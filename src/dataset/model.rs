@@ -21,7 +21,6 @@ pub struct ReadOptions {
 /// Supported lens models, with COLMAP's parameter order in the comments.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Lens {
-    /// No distortion.
     Pinhole,
     /// k1, k2, p1, p2, k3, k4, k5, k6: radial (rational if k4..k6 are not 0) and tangential, as OpenCV's.
     /// SIMPLE_RADIAL, RADIAL, OPENCV and FULL_OPENCV are cases of it.
@@ -32,7 +31,6 @@ pub enum Lens {
 }
 
 impl Lens {
-    /// The parameters.
     pub fn coefficients(&self) -> &[f64] {
         match self {
             Lens::Pinhole => &[],
@@ -52,31 +50,25 @@ impl Lens {
 pub struct Intrinsics {
     /// Size that the other numbers refer to, pixels.
     pub width: u32,
-    /// Size that the other numbers refer to, pixels.
     pub height: u32,
     /// Focal lengths, pixels.
     pub fx: f64,
-    /// Focal lengths, pixels.
     pub fy: f64,
     /// Principal point, pixels; the centre of the first pixel is (0.5, 0.5).
     pub cx: f64,
-    /// Principal point, pixels.
     pub cy: f64,
-    /// Distortion.
     pub lens: Lens,
 }
 
 /// World to camera, OpenCV axes: `p_cam = rotation * p + translation`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pose {
-    /// Proper rotation.
     pub rotation: DMat3,
     /// Camera-space position of the world's origin.
     pub translation: DVec3,
 }
 
 impl Pose {
-    /// Position of the camera in the world.
     pub fn centre(&self) -> DVec3 {
         -(self.rotation.transpose() * self.translation)
     }
@@ -85,7 +77,6 @@ impl Pose {
 /// Which set a view belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
-    /// Used for training.
     Train,
     /// Held out: only evaluated.
     Test,
@@ -109,7 +100,6 @@ pub struct RawView {
 /// Receives points one by one: position in dataset coordinates, sRGB.
 pub type TakePoint<'a> = dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()> + 'a;
 
-/// Coloured points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct PointCloud {
     /// Positions, dataset coordinates.
@@ -118,14 +108,12 @@ pub struct PointCloud {
     pub colors: Vec<[u8; 3]>,
 }
 
-/// Everything that a reader found.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RawScene {
     /// The scene's own folder, which may contain `masks/`; empty if the scene was not read from files.
     pub root: PathBuf,
     /// Views sorted by name; names are unique.
     pub views: Vec<RawView>,
-    /// Points; may be empty.
     pub points: PointCloud,
     /// An existing file of points that the caller must read: a PLY that the dataset names, because this module does not
     /// read PLY; or, with [`ReadOptions::points_later`], the model's own points3D file

@@ -53,12 +53,11 @@ pub(super) fn split_folder(name: &str) -> (&str, &str) {
     name.rsplit_once('/').unwrap_or(("", name))
 }
 
-/// A file in the index.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Entry {
     /// Folders below the one that was added, folded.
     folder: String,
-    /// Its own name, folded.
+    /// Folded.
     base: String,
     pub path: PathBuf,
 }
@@ -118,7 +117,6 @@ impl NameIndex {
         }
     }
 
-    /// Whether there is nothing in it.
     pub fn is_empty(&self) -> bool {
         self.files.is_empty() && self.dangling.is_empty()
     }
@@ -149,14 +147,12 @@ impl NameIndex {
         self.files.get(stem).into_iter().flatten()
     }
 
-    /// Every file, in the order of their names.
     pub fn entries(&self) -> impl Iterator<Item = &Entry> {
         self.files.values().flatten()
     }
 }
 
 impl Entry {
-    /// Whether the file's ending is that of a picture that can be read.
     pub fn is_readable(&self) -> bool {
         is_photo(&self.path)
     }

@@ -41,10 +41,8 @@ pub struct PhotoSource {
     pub header: PhotoHeader,
     /// Intrinsics at the photo's true size, with the lens to undo.
     pub intrinsics: Intrinsics,
-    /// Size of the target, pixels.
     pub target: Size,
     pub mask: Option<MaskSource>,
-    /// What becomes of transparent pixels.
     pub alpha: Alpha,
 }
 
@@ -68,7 +66,6 @@ impl PhotoSource {
         self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole || self.is_masked_by_alpha()
     }
 
-    /// Whether transparent pixels are left out.
     pub fn is_masked_by_alpha(&self) -> bool {
         self.header.has_alpha && self.alpha == Alpha::Mask
     }

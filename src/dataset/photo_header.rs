@@ -25,10 +25,9 @@ pub const MOST_PIXELS: u64 = 500_000_000;
 /// Bytes at the end of a file that are searched for the end marker before the whole file is.
 const TAIL: u64 = 64 * 1024;
 
-/// File formats that can be decoded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PhotoFormat {
-    /// Baseline, extended or progressive JPEG.
+    /// Baseline, extended or progressive.
     Jpeg,
     Png,
 }
@@ -36,19 +35,16 @@ pub enum PhotoFormat {
 /// Place of the EXIF data of a photo in its file: a TIFF structure, without the marker before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ExifPlace {
-    /// First byte.
     pub at: u64,
-    /// Bytes, as the file states them.
+    /// As the file states them.
     pub bytes: u32,
 }
 
-/// Header of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoHeader {
     pub format: PhotoFormat,
-    /// Stored width, pixels.
+    /// Of the stored pixels.
     pub width: u32,
-    /// Stored height, pixels.
     pub height: u32,
     /// Peak memory of the decoder, bytes, including the 8-bit RGB result.
     pub decode_bytes: u64,
@@ -215,8 +211,12 @@ impl HeaderReader<'_> {
                     if (0xe0..=0xef).contains(&code) {
                         metadata += length;
                     }
-                    if code == 0xe1 && exif.is_none() {
-                        exif = self.jpeg_exif(at + 4, length - 2)?;
+                    let mut mark = [0u8; EXIF_MARK.len()];
+                    let after_mark = 2 + mark.len() as u64;
+                    if code == 0xe1 && exif.is_none() && length >= after_mark {
+                        self.read(&mut mark, "a segment of its header")?;
+                        let place = ExifPlace { at: at + 2 + after_mark, bytes: (length - after_mark) as u32 };
+                        exif = (mark == EXIF_MARK).then_some(place);
                     }
                     at += 2 + length;
                 }
@@ -236,14 +236,6 @@ impl HeaderReader<'_> {
         // search starts after the start of the scan. Anything may follow the marker.
         self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
         Ok(header)
-    }
-
-    /// The EXIF data in the `bytes` of an APP1 segment from `at` on, where the file is now.
-    fn jpeg_exif(&mut self, at: u64, bytes: u64) -> InputResult<Option<ExifPlace>> {
-        let Some(rest) = bytes.checked_sub(EXIF_MARK.len() as u64) else { return Ok(None) };
-        let mut mark = [0u8; EXIF_MARK.len()];
-        self.read(&mut mark, "a segment of its header")?;
-        Ok((mark == EXIF_MARK).then_some(ExifPlace { at: at + mark.len() as u64, bytes: rest as u32 }))
     }
 
     fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<JpegFrame> {
@@ -396,33 +388,23 @@ mod tests {
     }
 
     #[test]
-    fn complete_files_pass_even_with_data_appended() {
+    fn complete_files_pass_even_with_data_appended_and_every_cut_is_detected() {
         for (format, want) in
             [(image::ImageFormat::Jpeg, PhotoFormat::Jpeg), (image::ImageFormat::Png, PhotoFormat::Png)]
         {
             let mut bytes = encoded(format);
             let header = check(&bytes).unwrap();
             assert_eq!((header.format, header.width, header.height), (want, 40, 30));
+            for length in 0..bytes.len() {
+                let error = check(&bytes[..length]).unwrap_err();
+                assert!(!error.remedy.is_empty() && !error.problem.is_empty());
+            }
             for appended in [3, 100_000] {
                 bytes.resize(bytes.len() + appended, 0);
                 assert_eq!(check(&bytes).unwrap().width, 40);
             }
         }
-    }
-
-    #[test]
-    fn every_cut_is_detected() {
-        for format in [image::ImageFormat::Jpeg, image::ImageFormat::Png] {
-            let bytes = encoded(format);
-            for length in 0..bytes.len() {
-                let error = check(&bytes[..length]).unwrap_err();
-                assert!(!error.remedy.is_empty() && !error.problem.is_empty());
-            }
-        }
-    }
-
-    #[test]
-    fn an_end_marker_in_a_preview_does_not_count() {
+        // An end marker in a preview does not count.
         let bytes = encoded(image::ImageFormat::Jpeg);
         let mut with_preview = vec![0xff, 0xd8, 0xff, 0xe1, 0, 6, 0xff, 0xd8, 0xff, 0xd9];
         with_preview.extend(&bytes[2..]);

@@ -105,37 +105,3 @@ pub(super) fn make_readable(file: &Path, scene: &mut RawScene) -> InputResult<()
     }
     sort_views(file, &mut scene.views)
 }
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use crate::base::text::text_of;
-
-    #[test]
-    fn names_of_code_pages_find_their_files() {
-        let folder = tempfile::tempdir().unwrap();
-        let make = |name: &str| std::fs::write(folder.path().join(name), "").unwrap();
-        ["Straße_1.jpg", "é.jpg", "à.jpg", "写真_2.jpg", "アテネ_3.jpg"].into_iter().for_each(make);
-        std::fs::create_dir(folder.path().join("Fotos ü")).unwrap();
-        make("Fotos ü/x.jpg");
-        let found = |bytes: &[u8]| find(folder.path(), &text_of(bytes));
-        let path = |name: &str| Some(folder.path().join(name));
-        assert_eq!(found(b"Stra\xdfe_1.jpg"), path("Straße_1.jpg"));
-        // Code page 850.
-        assert_eq!(found(b"Stra\xe1e_1.jpg"), path("Straße_1.jpg"));
-        assert_eq!((found(b"\xe9.jpg"), found(b"\xe0.jpg")), (path("é.jpg"), path("à.jpg")));
-        assert_eq!(found(b"\x82.jpg"), None, "é or à");
-        // GBK, and Shift-JIS with second bytes in ASCII.
-        assert_eq!(found(b"\xd0\xb4\xd5\xe6_2.jpg"), path("写真_2.jpg"));
-        assert_eq!(found(b"\x83A\x83e\x83l_3.jpg"), path("アテネ_3.jpg"));
-        assert_eq!(found(b"Fotos \xfc/x.jpg"), path("Fotos ü/x.jpg"));
-        assert_eq!((found(b"Stra\xdfe_9.jpg"), found("é.jpg".as_bytes())), (None, None));
-        #[cfg(unix)]
-        {
-            let raw = folder.path().join(os_name(b"n\xe9.jpg".to_vec()).unwrap());
-            std::fs::write(&raw, "").unwrap();
-            assert_eq!(found(b"n\xe9.jpg"), Some(raw));
-        }
-    }
-}

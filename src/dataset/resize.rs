@@ -231,21 +231,17 @@ mod tests {
     }
 
     #[test]
-    fn fractional_bits_are_averaged_before_rounding() {
-        let mut resizer = AreaResizer::new(1, (2, 1), (1, 1), 256);
-        resizer.push_row(&[100u16 * 256 + 200, 101 * 256 + 60]);
+    fn fractional_bits_are_averaged_before_rounding_and_the_largest_sums_fit() {
+        let resized = |row: &[u16], to: u32| {
+            let mut resizer = AreaResizer::new(1, (row.len() as u32, 1), (to, 1), 256);
+            resizer.push_row(row);
+            resizer.finish()
+        };
         // (100.78 + 101.23) / 2 = 101.008; rounding first would give (101 + 101) / 2.
-        assert_eq!(resizer.finish(), [101]);
-    }
-
-    #[test]
-    fn the_largest_sums_fit() {
-        let mut resizer = AreaResizer::new(1, (LARGEST_SIDE, 1), (1, 1), 256);
-        resizer.push_row(&vec![255u16 * 256; LARGEST_SIDE as usize]);
-        assert_eq!(resizer.finish(), [255]);
-        let mut resizer = AreaResizer::new(1, (LARGEST_SIDE, 1), (LARGEST_SIDE - 1, 1), 256);
-        resizer.push_row(&vec![255u16 * 256; LARGEST_SIDE as usize]);
-        assert!(resizer.finish().iter().all(|&x| x == 255));
+        assert_eq!(resized(&[100 * 256 + 200, 101 * 256 + 60], 1), [101]);
+        for to in [1, LARGEST_SIDE - 1] {
+            assert!(resized(&vec![255 * 256; LARGEST_SIDE as usize], to).iter().all(|&x| x == 255));
+        }
     }
 
     #[test]

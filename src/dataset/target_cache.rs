@@ -28,14 +28,12 @@ pub struct TargetCache {
     workers: Vec<JoinHandle<()>>,
 }
 
-/// Statistics of a cache.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct CacheStats {
     /// Bytes in use now: targets and decodes in flight.
     pub bytes: u64,
-    /// The most bytes ever in use.
     pub peak_bytes: u64,
-    /// Finished decodes.
+    /// Finished ones.
     pub decodes: u64,
     /// Calls of `get` that found their target decoded.
     pub hits: u64,
@@ -107,7 +105,16 @@ impl TargetCache {
         let mut cache = TargetCache { shared, workers: Vec::new() };
         for i in 0..threads {
             let shared = Arc::clone(&cache.shared);
-            let worker = std::thread::Builder::new().name(format!("decode-{i}")).spawn(move || shared.run_worker());
+            let run = move || {
+                let mut state = shared.lock();
+                while !state.stop {
+                    state = match shared.start_next(&mut state) {
+                        Some(view) => shared.decode_unlocked(state, view),
+                        None => shared.work.wait(state).unwrap_or_else(PoisonError::into_inner),
+                    };
+                }
+            };
+            let worker = std::thread::Builder::new().name(format!("decode-{i}")).spawn(run);
             cache.workers.push(worker.map_err(|e| InputError::io("decode threads", "starting a thread", &e))?);
         }
         Ok(cache)
@@ -199,20 +206,14 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn run_worker(&self) {
-        let mut state = self.lock();
-        while !state.stop {
-            state = match self.start_next(&mut state) {
-                Some(view) => self.decode_unlocked(state, view),
-                None => self.work.wait(state).unwrap_or_else(PoisonError::into_inner),
-            };
-        }
-    }
-
     /// Decodes a view that [`Shared::start_next`] chose, without holding the lock.
     fn decode_unlocked<'a>(&'a self, state: MutexGuard<'a, State>, view: usize) -> MutexGuard<'a, State> {
         drop(state);
-        let result = decode_caught(&self.photos[view]);
+        let photo = &self.photos[view];
+        let result = catch_unwind(AssertUnwindSafe(|| decode(photo))).unwrap_or_else(|_| {
+            let remedy = "save the photo again, as PNG for example";
+            Err(InputError::new(&photo.image_path, "the decoder failed on this photo", remedy))
+        });
         let mut state = self.lock();
         self.finish(&mut state, view, result);
         self.done.notify_all();
@@ -306,11 +307,4 @@ impl State {
             self.slots[past].uses.pop_front();
         }
     }
-}
-
-fn decode_caught(photo: &PhotoSource) -> InputResult<Target> {
-    catch_unwind(AssertUnwindSafe(|| decode(photo))).unwrap_or_else(|_| {
-        let remedy = "save the photo again, as PNG for example";
-        Err(InputError::new(&photo.image_path, "the decoder failed on this photo", remedy))
-    })
 }

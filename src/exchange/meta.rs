@@ -23,7 +23,6 @@ pub enum ExportFrame {
 }
 
 impl ExportFrame {
-    /// The name on the command line and in the file's comment.
     pub fn name(self) -> &'static str {
         match self {
             ExportFrame::Dataset => "dataset",
@@ -31,7 +30,6 @@ impl ExportFrame {
         }
     }
 
-    /// The frame with this name.
     pub fn from_name(name: &str) -> Option<ExportFrame> {
         [ExportFrame::Dataset, ExportFrame::Local].into_iter().find(|f| f.name() == name)
     }

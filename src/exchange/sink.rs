@@ -3,8 +3,9 @@
 //! Not here: the formats, which rows are exported.
 
 use super::meta::ExportFrame;
-use crate::base::error::InputResult;
+use crate::base::error::{InputError, InputResult};
 use crate::scene::columns::Columns;
+use std::path::Path;
 
 /// Most levels of detail of a format.
 pub const LEVELS_MAX: usize = 4;
@@ -21,13 +22,11 @@ pub struct LevelCounts {
 /// Summary of what was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Written {
-    /// Frame of the values: `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
+    /// `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
     pub frame: ExportFrame,
-    /// Rows in the file.
     pub rows: u64,
     /// Number of rows left out because a value was not finite.
     pub skipped: u64,
-    /// Bytes written.
     pub bytes: u64,
     /// Rows by level, if the format has levels.
     pub levels: Option<LevelCounts>,
@@ -42,6 +41,12 @@ impl std::fmt::Display for LevelCounts {
         }
         Ok(())
     }
+}
+
+/// The error of a sink without rows, of the `given` ones.
+pub(super) fn no_finite_row(path: &Path, given: u64) -> InputError {
+    let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
+    InputError::new(path, problem, "the training diverged or lost all Gaussians: lower the rates")
 }
 
 /// A file of Gaussians that is being written. Dropping a sink leaves the target as it was.

@@ -20,7 +20,7 @@ use crate::base::math::exp32;
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::SceneMeta;
-use crate::exchange::sink::{GaussianSink, Written};
+use crate::exchange::sink::{GaussianSink, Written, no_finite_row};
 use crate::scene::columns::Columns;
 use crate::scene::rotation::{Rotation, VIEWER_UP};
 use flate2::Compression;
@@ -157,12 +157,11 @@ impl GaussianSink for SpzWriter {
         if self.rows == 0 {
             let given = self.given;
             let far = format!("all {given} Gaussians lie beyond the {} units of this format", FIXED_MAX as f32);
-            let lost = format!("none of the {given} Gaussians is finite, so there is no row to write");
-            let (problem, remedy) = match self.far == given {
-                true => (far, "export in local coordinates (--export-frame local), or as a PLY"),
-                false => (lost, "the training diverged or lost all Gaussians: lower the rates"),
-            };
-            return Err(InputError::new(&self.path, problem, remedy));
+            let remedy = "export in local coordinates (--export-frame local), or as a PLY";
+            return Err(match self.far == given {
+                true => InputError::new(&self.path, far, remedy),
+                false => no_finite_row(&self.path, given),
+            });
         }
         if u32::try_from(self.rows).is_err() {
             let problem = format!("an SPZ file holds at most {} Gaussians, and these are {}", u32::MAX, self.rows);

@@ -57,24 +57,3 @@ pub(super) fn moved(pose: Pose, deviation: f64, draws: &mut Stream) -> Pose {
     let by = DVec3::from(std::array::from_fn::<f64, 3, _>(|_| deviation * draws.normal()));
     Pose { translation: pose.translation - pose.rotation * by, ..pose }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use glam::DMat3;
-
-    #[test]
-    fn a_camera_moves_by_the_noise_and_keeps_its_direction() {
-        let rotation = DMat3::from_rotation_x(0.7) * DMat3::from_rotation_z(2.0);
-        let pose = Pose { rotation, translation: DVec3::new(1.0, -2.0, 3.0) };
-        let mut squares = 0.0;
-        for number in 0..400 {
-            let new = moved(pose, 0.1, &mut stream(1, Draw::Pose, number));
-            assert_eq!(new.rotation, rotation);
-            squares += (new.centre() - pose.centre()).length_squared();
-        }
-        // Three axes of variance .01; the mean of 400 has a standard deviation of 4 %.
-        assert!((squares / 400.0 - 0.03).abs() < 0.006, "{squares}");
-        assert_eq!(moved(pose, 0.0, &mut stream(1, Draw::Pose, 0)), pose);
-    }
-}

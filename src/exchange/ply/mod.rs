@@ -34,7 +34,6 @@ pub enum PlyContent {
     Gaussians {
         /// The rows, in the frame that `meta` names; quaternions are unit.
         columns: Columns,
-        /// Metadata from the comments.
         meta: SceneMeta,
     },
     /// Coloured points.

@@ -14,7 +14,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::sink::{GaussianSink, Written};
+use crate::exchange::sink::{GaussianSink, Written, no_finite_row};
 use crate::scene::columns::{Columns, sh_n_width};
 use std::fmt::Write as _;
 use std::fs::File;
@@ -121,9 +121,7 @@ impl GaussianSink for PlyWriter {
         let PlyWriter { path, part, out, meta, rows_at_most, given, rows, bytes, .. } = *self;
         let frame = self.to_file.frame();
         if rows == 0 {
-            let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
-            let remedy = "the training diverged or lost all Gaussians: lower the rates";
-            return Err(InputError::new(&path, problem, remedy));
+            return Err(no_finite_row(&path, given));
         }
         let failed = |doing: &str, e: &std::io::Error| InputError::io(&path, doing, e);
         let mut file = out.into_inner().map_err(|e| failed("writing", e.error()))?;
@@ -175,13 +173,8 @@ fn header_text(sh_degree: u8, rows: u64, rows_at_most: u64, meta: &SceneMeta, fr
 
 /// Names of a row's values in file order.
 fn property_names(sh_degree: u8) -> Vec<String> {
-    let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(String::from).into();
-    let mut numbered = |stem: &str, n: usize| names.extend((0..n).map(|i| format!("{stem}_{i}")));
-    numbered("f_dc", 3);
-    numbered("f_rest", sh_n_width(sh_degree));
-    names.push("opacity".into());
-    let mut numbered = |stem: &str, n: usize| names.extend((0..n).map(|i| format!("{stem}_{i}")));
-    numbered("scale", 3);
-    numbered("rot", 4);
-    names
+    let numbered = |stem: &str, n: usize| (0..n).map(|i| format!("{stem}_{i}")).collect::<Vec<_>>();
+    let place = ["x", "y", "z", "nx", "ny", "nz"].map(String::from).to_vec();
+    let (colours, opacity) = (numbered("f_rest", sh_n_width(sh_degree)), vec!["opacity".to_string()]);
+    [place, numbered("f_dc", 3), colours, opacity, numbered("scale", 3), numbered("rot", 4)].concat()
 }

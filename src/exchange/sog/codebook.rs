@@ -54,7 +54,6 @@ impl Codebook {
         (if off(below) <= off(above) { below } else { above }) as u8
     }
 
-    /// The value of each code, ascending.
     pub fn values(&self) -> &[f32] {
         &self.0
     }

@@ -31,7 +31,14 @@ pub const MERGE_ROW_BYTES: usize = 2 * size_of::<Blob>() + BUCKET_ROWS / 2 * 16 
 pub fn merged(rows: &[ExportRow], most: usize) -> Vec<ExportRow> {
     let most = most.max(1);
     let mut blobs: Vec<Blob> = rows.iter().map(Blob::of).collect();
-    let floor = thinnest(&blobs, most);
+    let side = |i: usize| {
+        let at = blobs.iter().map(|blob| blob.mean[i]);
+        let (low, high) = at.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
+        (high - low).max(0.0)
+    };
+    // The distance of rows on a surface.
+    let apart = side(0).max(side(1)).max(side(2)) / libm::sqrt(most as f64);
+    let floor = (THINNEST * apart).powi(2).max(f64::MIN_POSITIVE);
     while blobs.len() > most {
         let wanted = (blobs.len() - most).min(blobs.len().div_ceil(4));
         blobs = pass(blobs, wanted, floor);
@@ -76,19 +83,6 @@ fn cost(a: &Blob, b: &Blob, floor: f64) -> f64 {
     let colours = a.row.sh0.iter().zip(&b.row.sh0);
     let apart: f64 = colours.map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2)).sum();
     weight * covariance.plus(floor).log_det() + COLOUR_COST * a.weight * b.weight / weight * apart
-}
-
-/// Variance by which covariances are widened for the cost.
-fn thinnest(blobs: &[Blob], most: usize) -> f64 {
-    let side = |i: usize| {
-        let at = blobs.iter().map(|blob| blob.mean[i]);
-        let (low, high) = at.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), x| (a.min(x), b.max(x)));
-        (high - low).max(0.0)
-    };
-    let longest = side(0).max(side(1)).max(side(2));
-    // The distance of rows on a surface.
-    let apart = longest / libm::sqrt(most as f64);
-    (THINNEST * apart).powi(2).max(f64::MIN_POSITIVE)
 }
 
 /// A Gaussian with the values that merging needs.

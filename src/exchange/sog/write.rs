@@ -18,7 +18,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_folder::PartFolder;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::sink::{GaussianSink, LEVELS_MAX, LevelCounts, Written};
+use crate::exchange::sink::{GaussianSink, LEVELS_MAX, LevelCounts, Written, no_finite_row};
 use crate::exchange::transform::{TRANSFORM_ENDING, transform_text};
 use crate::scene::columns::Columns;
 use crate::scene::rotation::VIEWER_UP;
@@ -239,9 +239,7 @@ impl GaussianSink for SogWriter {
             self.group = std::mem::take(&mut self.giants);
         }
         if self.group.is_empty() && self.leaves.is_empty() {
-            let problem = format!("none of the {} Gaussians is finite, so there is no row to write", self.given);
-            let remedy = "the training diverged or lost all Gaussians: lower the rates";
-            return Err(InputError::new(&self.path, problem, remedy));
+            return Err(no_finite_row(&self.path, self.given));
         }
         self.close_group()?;
         for level in 1..LEVELS {

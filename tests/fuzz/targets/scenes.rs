@@ -3,7 +3,7 @@
 use super::{split_mode, with_mode};
 use crate::Target;
 use crate::scene_folder::{read_and_check, scratch, stays_in};
-use gsscale::dataset::paths::{MAX_NAME_BYTES, clean_name, read_name};
+use gsscale::dataset::paths::{MAX_NAME_BYTES, read_name};
 use std::path::Path;
 use tempfile::TempDir;
 
@@ -203,7 +203,7 @@ fn run_name(input: &[u8]) {
             assert!(stays_in(folder, &folder.join(tail)), "{tail:?}");
             assert!(tail.len() <= MAX_NAME_BYTES + base.len() + 1 && !tail.contains('\\'));
             assert!(!tail.chars().any(char::is_control));
-            assert_eq!(clean_name(tail).as_deref(), Ok(tail));
+            assert_eq!(read_name("", tail).map(|n| (n.name, n.outside)), Ok((tail.to_string(), None)));
         }
     }
     read_and_check(scene_of(&binary_files(input), "bin").path());
