@@ -31,7 +31,6 @@ pub struct LocalCloud<'a> {
     pub cloud: &'a Cloud,
     /// Decides which points are too far.
     pub extent: Extent,
-    /// The local frame.
     pub frame: Frame,
 }
 
@@ -46,7 +45,6 @@ impl Cloud {
         Ok(Cloud { points: points.finish()? })
     }
 
-    /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
     }

@@ -6,13 +6,12 @@
 //! that block's box is.
 
 use super::divide::Division;
-use super::spool::{Spool, SpoolSpace, SpoolWriter};
+use super::spool::{Spool, SpoolWriter};
 use super::{Budget, CloudPoint};
 use crate::base::error::InputResult;
 use crate::scene::init::rms_distance;
 use crate::scene::neighbours::{NEIGHBOURS, NeighbourTree, merged};
 use crate::scene::partition::Pages;
-use crate::scene::point_box::PointBox;
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -43,14 +42,6 @@ pub(super) struct Measured {
     pub distances: Spool<f64>,
 }
 
-struct Search<'a> {
-    space: SpoolSpace<'a>,
-    blocks: Vec<Range<usize>>,
-    points: Spool<CloudPoint>,
-    /// Distances within the own block.
-    own: Spool<[f32; NEIGHBOURS]>,
-}
-
 pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<Measured> {
     let pages = Pages::of(points.len(), budget.records(SEARCH_BYTES));
     let blocks: Vec<Range<usize>> = (0..pages.pages).map(|b| pages.start(b)..pages.start(b + 1)).collect();
@@ -58,88 +49,66 @@ pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputRe
     let mut sorted = SpoolWriter::new(space);
     let division = Division { space, pages, records_in_memory: pages.rows.div_ceil(pages.pages.max(1)) };
     division.run(points, &mut |_, entries| entries.into_iter().try_for_each(|e| sorted.push(e)))?;
-    let mut search = Search { space, blocks, points: sorted.finish()?, own: SpoolWriter::new(space).finish()? };
-    let bounds = search.search_own_blocks()?;
-    let queries = search.query_other_blocks(&bounds)?;
-    let answers = search.answer_queries(&queries)?;
-    let distances = search.merge_answers(&answers)?;
-    Ok(Measured { points: search.points, distances })
-}
+    let points = sorted.finish()?;
+    let positions = |block: &Range<usize>| -> InputResult<Vec<[f32; 3]>> {
+        Ok(points.range(block.clone())?.iter().map(|p| p.point).collect())
+    };
 
-impl Search<'_> {
-    fn positions(&self, block: &Range<usize>) -> InputResult<Vec<[f32; 3]>> {
-        Ok(self.points.range(block.clone())?.iter().map(|p| p.point).collect())
+    // Distances within each block.
+    let (mut own, mut bounds) = (SpoolWriter::new(space), Vec::with_capacity(blocks.len()));
+    for block in &blocks {
+        let tree = NeighbourTree::new(&positions(block)?);
+        bounds.push(tree.bounds());
+        tree.nearest_dist2().into_iter().try_for_each(|dist2| own.push(dist2))?;
     }
+    let own: Spool<[f32; NEIGHBOURS]> = own.finish()?;
 
-    fn search_own_blocks(&mut self) -> InputResult<Vec<PointBox>> {
-        let mut own = SpoolWriter::new(self.space);
-        let mut bounds = Vec::with_capacity(self.blocks.len());
-        for block in &self.blocks {
-            let tree = NeighbourTree::new(&self.positions(block)?);
-            bounds.push(tree.bounds());
-            tree.nearest_dist2().into_iter().try_for_each(|dist2| own.push(dist2))?;
-        }
-        self.own = own.finish()?;
-        Ok(bounds)
-    }
-
-    /// The queries of all points whose third neighbour is farther than another block's box.
-    fn query_other_blocks(&self, bounds: &[PointBox]) -> InputResult<Spool<Query>> {
-        let mut queries = SpoolWriter::new(self.space);
-        for (from, block) in self.blocks.iter().enumerate() {
-            let (points, own) = (self.positions(block)?, self.own.range(block.clone())?);
-            for (i, (&point, dist2)) in points.iter().zip(&own).enumerate() {
-                let limit = dist2[NEIGHBOURS - 1];
-                for (to, other) in bounds.iter().enumerate() {
-                    if to != from && other.dist2(point) < limit {
-                        let at = (block.start + i) as u32;
-                        queries.push(Query { point, limit, at, block: to as u32 })?;
-                    }
+    // The queries of all points whose third neighbour is farther than another block's box.
+    let mut queries = SpoolWriter::new(space);
+    for (from, block) in blocks.iter().enumerate() {
+        for (i, (point, dist2)) in positions(block)?.into_iter().zip(own.range(block.clone())?).enumerate() {
+            let limit = dist2[NEIGHBOURS - 1];
+            for (to, other) in bounds.iter().enumerate() {
+                if to != from && other.dist2(point) < limit {
+                    queries.push(Query { point, limit, at: (block.start + i) as u32, block: to as u32 })?;
                 }
             }
         }
-        queries.finish()
     }
+    let queries = queries.finish()?;
 
-    fn answer_queries(&self, queries: &Spool<Query>) -> InputResult<Spool<Answer>> {
-        let mut answers = SpoolWriter::new(self.space);
-        if queries.is_empty() {
-            return answers.finish();
-        }
-        for (number, block) in self.blocks.iter().enumerate() {
-            let tree = NeighbourTree::new(&self.positions(block)?);
-            // A batch has as many queries as a block has points: a query is smaller than a point's memory.
-            let mut batch = Vec::new();
-            let mut reply = |batch: &mut Vec<Query>| {
-                let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
-                let known: Vec<Answer> = known.collect();
-                batch.clear();
-                known.into_iter().filter(|a| a.dist2[0].is_finite()).try_for_each(|a| answers.push(a))
-            };
-            queries.for_each(|q| {
-                if q.block as usize == number {
-                    batch.push(*q);
-                }
-                if batch.len() >= block.len().max(64) { reply(&mut batch) } else { Ok(()) }
-            })?;
-            reply(&mut batch)?;
-        }
-        answers.finish()
+    // Answers, block by block. A batch has as many queries as a block has points: a query is smaller than a point's memory.
+    let mut answers = SpoolWriter::new(space);
+    for (number, block) in blocks.iter().enumerate().filter(|_| !queries.is_empty()) {
+        let tree = NeighbourTree::new(&positions(block)?);
+        let mut batch = Vec::new();
+        let mut reply = |batch: &mut Vec<Query>| {
+            let known = batch.par_iter().map(|q| Answer { at: q.at, dist2: tree.nearer(q.point, q.limit) });
+            let known: Vec<Answer> = known.collect();
+            batch.clear();
+            known.into_iter().filter(|a| a.dist2[0].is_finite()).try_for_each(|a| answers.push(a))
+        };
+        queries.for_each(|q| {
+            if q.block as usize == number {
+                batch.push(*q);
+            }
+            if batch.len() >= block.len().max(64) { reply(&mut batch) } else { Ok(()) }
+        })?;
+        reply(&mut batch)?;
     }
+    let answers = answers.finish()?;
 
-    fn merge_answers(&self, answers: &Spool<Answer>) -> InputResult<Spool<f64>> {
-        let mut distances = SpoolWriter::new(self.space);
-        for block in &self.blocks {
-            let mut dist2 = self.own.range(block.clone())?;
-            answers.for_each(|a| {
-                if block.contains(&(a.at as usize)) {
-                    let of_point = &mut dist2[a.at as usize - block.start];
-                    *of_point = merged(*of_point, a.dist2);
-                }
-                Ok(())
-            })?;
-            dist2.iter().try_for_each(|d| distances.push(rms_distance(d)))?;
-        }
-        distances.finish()
+    let mut distances = SpoolWriter::new(space);
+    for block in &blocks {
+        let mut dist2 = own.range(block.clone())?;
+        answers.for_each(|a| {
+            if block.contains(&(a.at as usize)) {
+                let of_point = &mut dist2[a.at as usize - block.start];
+                *of_point = merged(*of_point, a.dist2);
+            }
+            Ok(())
+        })?;
+        dist2.iter().try_for_each(|d| distances.push(rms_distance(d)))?;
     }
+    Ok(Measured { points, distances: distances.finish()? })
 }

@@ -1,10 +1,13 @@
-//! Median splits of records larger than memory: halves are written to lists of their own until they fit.
+//! Median splits of records larger than memory: halves are written to lists of their own until they fit; and pages of first
+//! Gaussians, giants separately.
 //!
-//! Invariant: the pages are those of [`Pages::divide`], for any memory budget.
+//! Invariant: the pages are those of [`Pages::divide`] and [`crate::scene::partition::partition`], in their order, for any memory
+//! budget.
 
 use super::spool::{Spool, SpoolSpace, SpoolWriter};
 use crate::base::error::InputResult;
-use crate::scene::partition::{Pages, Placed, axis_key};
+use crate::base::ids::PageId;
+use crate::scene::partition::{GiantCut, Pages, Placed, axis_key, giants};
 use crate::scene::point_box::PointBox;
 use crate::scene::select::RankSearch;
 use bytemuck::Pod;
@@ -80,4 +83,56 @@ impl Division<'_> {
         })?;
         Ok(((low.finish()?, low_box), (high.finish()?, high_box)))
     }
+}
+
+/// A record with a size.
+pub trait Grown: Placed + Pod {
+    /// Logarithm of the largest standard deviation, which determines the giants.
+    fn log_size(&self) -> f32;
+}
+
+/// Memory and folder for the division.
+#[derive(Debug, Clone, Copy)]
+pub struct PageSpace<'a> {
+    /// Space of each list.
+    pub list: SpoolSpace<'a>,
+    /// Most records divided in memory; one page always may be.
+    pub records: usize,
+}
+
+/// Receives the records of a page.
+pub type TakePage<'a, E> = dyn FnMut(PageId, &[E]) -> InputResult<()> + 'a;
+
+/// Divides records into pages, giants separately, of at most `fill` and passes them on in the order of their ids. Returns the number of
+/// pages.
+///
+/// # Errors
+/// The folder cannot be written, or `take` failed.
+pub fn paginate<E: Grown>(
+    records: Spool<E>,
+    fill: usize,
+    space: PageSpace<'_>,
+    take: &mut TakePage<'_, E>,
+) -> InputResult<usize> {
+    let search = GiantCut::search(records.len());
+    let cut = GiantCut::found(&records.search(search, |e| Some(GiantCut::key(e.log_size(), e.row())))?);
+    let (mut small, mut large) = (SpoolWriter::new(space.list), SpoolWriter::new(space.list));
+    records.for_each(|e| if cut.is_giant(e.log_size(), e.row()) { large.push(*e) } else { small.push(*e) })?;
+    debug_assert_eq!(large.len(), giants(records.len()));
+    let (small, large) = (small.finish()?, large.finish()?);
+    let mut pages_before = 0;
+    for part in [small, large] {
+        let pages = Pages::of(part.len(), fill);
+        let division = Division { space: space.list, pages, records_in_memory: space.records };
+        division.run(part, &mut |range, entries| {
+            let first = pages.start(range.start);
+            for page in range {
+                let entries = &entries[pages.start(page) - first..pages.start(page + 1) - first];
+                take(PageId::initial((pages_before + page) as u32), entries)?;
+            }
+            Ok(())
+        })?;
+        pages_before += pages.pages;
+    }
+    Ok(pages_before)
 }

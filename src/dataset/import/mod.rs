@@ -12,11 +12,10 @@
 mod cloud;
 mod distances;
 mod divide;
-mod paginate;
 mod spool;
 
 pub use cloud::{Cloud, LocalCloud};
-pub use paginate::{Grown, PageSpace, TakePage, paginate};
+pub use divide::{Grown, PageSpace, TakePage, paginate};
 pub use spool::{Spool, SpoolSpace, SpoolWriter};
 
 use crate::base::error::{InputError, InputResult};
@@ -45,7 +44,6 @@ impl PointSource for (&[[f32; 3]], &[[u8; 3]]) {
     }
 }
 
-/// The budget of an import.
 #[derive(Debug, Clone, Copy)]
 pub struct Budget<'a> {
     /// An existing folder for data larger than memory.
@@ -67,10 +65,8 @@ impl<'a> Budget<'a> {
     }
 }
 
-/// Options of an import.
 #[derive(Debug, Clone, Copy)]
 pub struct ImportOptions<'a> {
-    /// Options of the first Gaussians.
     pub init: &'a InitOptions,
     /// Most rows of a first page ([`crate::scene::partition::first_fill`]).
     pub fill: usize,
@@ -82,12 +78,10 @@ pub struct FirstPage {
     pub id: PageId,
     /// Numbers of its rows among all first rows, ascending: their uids.
     pub rows: Vec<u32>,
-    /// Its Gaussians.
     pub columns: Columns,
 }
 
 impl FirstPage {
-    /// Converts to rows of a scene, with their uids.
     pub fn into_state(self) -> SceneState {
         let mut state = SceneState::from_columns(self.columns);
         state.uid.iter_mut().zip(&self.rows).for_each(|(uid, &row)| *uid = u64::from(row));
@@ -98,11 +92,10 @@ impl FirstPage {
 /// Counts of an import.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ImportSummary {
-    /// Number of Gaussians.
     pub rows: u64,
-    /// Number of pages, including those of giants.
+    /// Including those of giants.
     pub pages: u64,
-    /// Number of points read.
+    /// Points read.
     pub points: u64,
 }
 
@@ -162,20 +155,15 @@ pub fn import_points(
     let measured = distances::measure(points, budget)?;
     let sized = size_points(measured, options)?;
     let space = PageSpace { list: budget.space(), records: budget.records(2 * size_of::<SizedPoint>()) };
-    let pages = paginate(sized, options.fill, space, &mut |id, entries| take(first_page(id, entries, options.init)))?;
+    let pages = paginate(sized, options.fill, space, &mut |id, entries: &[SizedPoint]| {
+        let point = |i: usize| {
+            let SizedPoint { point: CloudPoint { point, row, color: [r, g, b, _] }, log_scale } = entries[i];
+            FirstPoint { point, row, color: [r, g, b], log_scale }
+        };
+        let rows = entries.iter().map(|e| e.row()).collect();
+        take(FirstPage { id, rows, columns: first_gaussians(entries.len(), point, options.init) })
+    })?;
     Ok(ImportSummary { rows: rows as u64, pages: pages as u64, points: read })
-}
-
-fn first_page(id: PageId, entries: &[SizedPoint], init: &InitOptions) -> FirstPage {
-    let point = |i: usize| {
-        let SizedPoint { point: CloudPoint { point, row, color: [r, g, b, _] }, log_scale } = entries[i];
-        FirstPoint { point, row, color: [r, g, b], log_scale }
-    };
-    FirstPage {
-        id,
-        rows: entries.iter().map(|e| e.row()).collect(),
-        columns: first_gaussians(entries.len(), point, init),
-    }
 }
 
 /// The points that get a row, numbered; and the number of points read.
@@ -189,7 +177,10 @@ fn spool_points(source: &dyn PointSource, options: &ImportOptions<'_>) -> InputR
     source.read(&mut |point, [r, g, b]| {
         if is_finite(point) && first_gone.is_none_or(|key| subsample_key(options.init.seed, index) < key) {
             points.push(CloudPoint { point, row, color: [r, g, b, 0] })?;
-            row = row.checked_add(1).ok_or_else(too_many)?;
+            row = row.checked_add(1).ok_or_else(|| {
+                let remedy = "thin it out, or set --max-gaussians";
+                InputError::new("the point cloud", "has 2^32 points or more", remedy)
+            })?;
         }
         index += 1;
         Ok(())
@@ -224,10 +215,6 @@ fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputRe
         search.next_pass();
     }
     Ok(search.key())
-}
-
-fn too_many() -> InputError {
-    InputError::new("the point cloud", "has 2^32 points or more", "thin it out, or set --max-gaussians")
 }
 
 /// The first scale of every point.

@@ -78,14 +78,11 @@ impl Drop for SpoolFile {
 }
 
 impl<T: Pod> SpoolWriter<T> {
-    /// An empty list.
     pub fn new(space: SpoolSpace<'_>) -> SpoolWriter<T> {
         let folder = space.folder.to_path_buf();
         SpoolWriter { folder, memory: space.memory, waiting: Vec::new(), file: None, in_file: 0 }
     }
 
-    /// Appends a record.
-    ///
     /// # Errors
     /// The list outgrew memory, and the folder cannot be written.
     pub fn push(&mut self, record: T) -> InputResult<()> {
@@ -121,17 +118,11 @@ impl<T: Pod> SpoolWriter<T> {
     }
 
     /// Number of records so far.
+    #[allow(clippy::len_without_is_empty)] // nobody asks
     pub fn len(&self) -> usize {
         self.in_file + self.waiting.len()
     }
 
-    /// Whether the list is empty.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Completes the list.
-    ///
     /// # Errors
     /// The folder cannot be written.
     pub fn finish(mut self) -> InputResult<Spool<T>> {
@@ -149,7 +140,6 @@ impl<T: Pod> Spool<T> {
         self.len
     }
 
-    /// Whether the list is empty.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
@@ -171,8 +161,6 @@ impl<T: Pod> Spool<T> {
         Ok(())
     }
 
-    /// Reads some consecutive records.
-    ///
     /// # Errors
     /// The file cannot be read.
     pub fn range(&self, range: Range<usize>) -> InputResult<Vec<T>> {
@@ -180,8 +168,6 @@ impl<T: Pod> Spool<T> {
         self.read_into(range, &mut records).map(|()| records)
     }
 
-    /// Reads all records.
-    ///
     /// # Errors
     /// The file cannot be read.
     pub fn into_vec(self) -> InputResult<Vec<T>> {
