@@ -27,7 +27,6 @@ pub mod photo;
 mod photo_checks;
 mod photo_files;
 pub mod photo_header;
-mod photos_only;
 mod raw_names;
 pub mod read;
 pub mod reality_capture;

@@ -4,8 +4,9 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::text::head_of;
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::{colmap, mega_nerf, opensfm, photos_only, raw_names, reality_capture, transforms};
-use std::path::Path;
+use crate::dataset::name_index::photos_in;
+use crate::dataset::{colmap, mega_nerf, opensfm, raw_names, reality_capture, transforms};
+use std::path::{Path, PathBuf};
 
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
 /// MatrixCity's or in Mega-NeRF's layout, with OpenSfM's `reconstruction.json` or RealityCapture's CSV, or such a JSON or CSV
@@ -29,7 +30,10 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
             return Err(error);
         }
         return match () {
-            () if ends_with("json") && is_a_list(path) => opensfm::read_opensfm(path, options),
+            // OpenSfM's file holds a list, the others an object.
+            () if ends_with("json") && head_of(path, 4096).trim_start().starts_with('[') => {
+                opensfm::read_opensfm(path, options)
+            }
             () if ends_with("json") => transforms::read_transforms(path, options),
             () if ends_with("csv") => reality_capture::read_reality_capture(path, options),
             () => {
@@ -65,10 +69,16 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     {
         return Err(InputError::io(path, "reading the scene", &e));
     }
-    if let Some(error) = folder_of_results(path) {
-        return Err(error);
+    let has = |name: &str| path.join(name).is_file();
+    if has("config.toml") && ["metrics.jsonl", "summary.json", "point_cloud.ply"].into_iter().any(has) {
+        let folder = path.display();
+        let remedy = format!(
+            "to continue the run: gsscale-train --resume {folder}; to measure its result: gsscale-eval {folder}; its config.toml \
+             names the scene that it trained on"
+        );
+        return Err(InputError::new(path, "the output folder of a run, not a scene", remedy));
     }
-    if let Some((above, images)) = photos_only::scene_above(path) {
+    if let Some((above, images)) = scene_above(path) {
         let images = options.images.clone().or(Some(images));
         let mut scene = read_scene(&above, &ReadOptions { images, ..options.clone() })?;
         let (photos, above) = (path.display(), above.display());
@@ -78,7 +88,7 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
         );
         return Ok(scene);
     }
-    if let Some(error) = photos_only::error(path) {
+    if let Some(error) = without_poses(path) {
         return Err(error);
     }
     Err(InputError::new(
@@ -116,21 +126,36 @@ fn file_of_results(path: &Path) -> Option<InputError> {
     Some(InputError::new(path, "a result, not a scene with photos and poses", remedy))
 }
 
-/// The error for the output folder of a run in the place of a scene.
-fn folder_of_results(path: &Path) -> Option<InputError> {
-    let has = |name: &str| path.join(name).is_file();
-    if !has("config.toml") || !["metrics.jsonl", "summary.json", "point_cloud.ply"].into_iter().any(has) {
-        return None;
-    }
-    let folder = path.display();
-    let remedy = format!(
-        "to continue the run: gsscale-train --resume {folder}; to measure its result: gsscale-eval {folder}; its config.toml names \
-         the scene that it trained on"
-    );
-    Some(InputError::new(path, "the output folder of a run, not a scene", remedy))
+/// The folder above, if it holds poses, and the name in it of `folder`, if that holds photos.
+fn scene_above(folder: &Path) -> Option<(PathBuf, String)> {
+    // The name as it was given is kept where it says what is above.
+    let resolved = folder.canonicalize().ok()?;
+    let given = folder.parent().filter(|above| !above.as_os_str().is_empty() && folder.file_name().is_some());
+    let above = given.or(resolved.parent())?;
+    let name = folder.file_name().or(resolved.file_name())?.to_str()?.to_string();
+    let has_poses = colmap::looks_like_colmap(above)
+        || transforms::looks_like_transforms(above)
+        || opensfm::looks_like_opensfm(above)
+        || reality_capture::looks_like_reality_capture(above);
+    (has_poses && photos_in(folder) > 0).then(|| (above.to_path_buf(), name))
 }
 
-/// Whether a JSON file holds a list, as OpenSfM's does, and not an object.
-fn is_a_list(path: &Path) -> bool {
-    head_of(path, 4096).trim_start().starts_with('[')
+/// The error, which says how to get poses, for a folder of photos without a model that a reader knows.
+fn without_poses(folder: &Path) -> Option<InputError> {
+    let images = folder.join("images");
+    let (photos, count) = [images.as_path(), folder].into_iter().map(|f| (f, photos_in(f))).find(|(_, n)| *n > 0)?;
+    let (place, photos) = (folder.display(), photos.display());
+    let problem = format!("{count} photos, but no camera poses");
+    let remedy = format!(
+        "recover the poses first, and name this folder again:\n  \
+         COLMAP (free):  colmap feature_extractor --database_path {place}/colmap.db --image_path {photos}\n                  \
+         colmap exhaustive_matcher --database_path {place}/colmap.db\n                  \
+         mkdir -p {place}/sparse\n                  \
+         colmap mapper --database_path {place}/colmap.db --image_path {photos} --output_path {place}/sparse\n  \
+         OpenDroneMap:   its project folder (with opensfm/reconstruction.json and images/) is read as it is\n  \
+         RealityScan, RealityCapture:  export 'Internal/External camera parameters' (CSV) into {place}\n  \
+         Metashape:      File > Export > Export Cameras, as COLMAP, into {place}\n\
+         photos outside images/ need --images; tools/POSES.md says more"
+    );
+    Some(InputError::new(folder, problem, remedy))
 }

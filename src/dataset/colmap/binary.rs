@@ -137,7 +137,8 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
         let wrong = |problem: String, remedy: &str| {
             InputError::new(path, format!("camera {id} has {problem}"), remedy).at(format!("byte {at}"))
         };
-        let model = models::by_id(source.take("a camera").map(i32::from_le_bytes)?)
+        let number = source.take("a camera").map(i32::from_le_bytes)?;
+        let model = models::model_of(&format!("id {number}"), |m| m.id == number)
             .map_err(|p| InputError::new(path, p, models::UNDISTORT).at(format!("byte {at}, camera {id}")))?;
         let size = (source.u64("a camera")?, source.u64("a camera")?);
         let mut params = [0.0; 12];

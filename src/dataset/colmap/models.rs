@@ -42,24 +42,13 @@ static MODELS: [CameraModel; 18] = [
     model(17, "EQUIRECTANGULAR", 0),
 ];
 
-/// The supported model of this id, or the reason.
-pub(super) fn by_id(id: i32) -> Result<&'static CameraModel, String> {
-    match MODELS.iter().find(|m| m.id == id) {
-        Some(m) => usable(m),
-        None => Err(format!("camera model id {id} is unknown")),
+/// The supported model that `is_meant`, called `word` in the file, or the reason.
+pub(super) fn model_of(word: &str, is_meant: impl Fn(&CameraModel) -> bool) -> Result<&'static CameraModel, String> {
+    match MODELS.iter().find(|m| is_meant(m)) {
+        Some(m) if m.params > 0 => Ok(m),
+        Some(m) => Err(format!("camera model {} (id {}) is not supported", m.name, m.id)),
+        None => Err(format!("camera model {word} is unknown")),
     }
-}
-
-/// The supported model of this name, or the reason.
-pub(super) fn by_name(name: &str) -> Result<&'static CameraModel, String> {
-    match MODELS.iter().find(|m| m.name == name) {
-        Some(m) => usable(m),
-        None => Err(format!("camera model {name:?} is unknown")),
-    }
-}
-
-fn usable(m: &'static CameraModel) -> Result<&'static CameraModel, String> {
-    if m.params > 0 { Ok(m) } else { Err(format!("camera model {} (id {}) is not supported", m.name, m.id)) }
 }
 
 /// Intrinsics from COLMAP's parameters; `p` has `m.params` values.

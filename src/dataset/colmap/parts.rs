@@ -29,11 +29,6 @@ pub(in crate::dataset) fn photo_folder(part: &Path) -> Option<PathBuf> {
     PHOTOS.iter().map(|name| part.join(name)).find(|path| path.is_dir())
 }
 
-/// The existing photo folders of both parts.
-fn photo_folders(scene: &Path) -> Vec<PathBuf> {
-    ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect()
-}
-
 /// Folders of a training and a held-out part, each with a model.
 fn parts(scene: &Path) -> Option<[PathBuf; 2]> {
     let with_model = |name: &str| Some(scene.join(name)).filter(|part| super::looks_like_colmap(part));
@@ -57,7 +52,12 @@ pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> 
     let mut names = BTreeSet::new();
     let mut shared = false;
     for (folder, split) in folders.iter().zip([Split::Train, Split::Test]) {
-        let photos = vec![photos_of(folder, options)?];
+        let named = options.images.as_ref().map(|name| folder.join(name));
+        let photos = named.filter(|photos| photos.is_dir()).or_else(|| photo_folder(folder)).ok_or_else(|| {
+            let problem = format!("no photos here; looked for {}", PHOTOS.join(", "));
+            InputError::new(folder, problem, "put them into rgbs or images, or name their folder with --images")
+        })?;
+        let photos = vec![photos];
         let points = (split == Split::Train).then_some(options.points_later);
         let Model { views, points, points_path, warnings } = read_model((folder, options), photos, points)?;
         all.warnings.extend(warnings);
@@ -79,14 +79,6 @@ pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> 
     Ok(all)
 }
 
-fn photos_of(part: &Path, options: &ReadOptions) -> InputResult<PathBuf> {
-    let named = options.images.as_ref().map(|name| part.join(name));
-    named.filter(|folder| folder.is_dir()).or_else(|| photo_folder(part)).ok_or_else(|| {
-        let problem = format!("no photos here; looked for {}", PHOTOS.join(", "));
-        InputError::new(part, problem, "put them into rgbs or images, or name their folder with --images")
-    })
-}
-
 /// The folders of the photos of one model: the named one or `images`; otherwise those of the parts, a folder in the scene with
 /// another usual name, or the scene itself.
 pub(super) fn image_folders(
@@ -98,7 +90,8 @@ pub(super) fn image_folders(
     if stated.is_dir() {
         return Ok(vec![stated]);
     }
-    let apart = photo_folders(scene);
+    let apart: Vec<PathBuf> =
+        ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect();
     if !apart.is_empty() {
         return Ok(apart);
     }

@@ -140,7 +140,8 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
     while lines.next_record()? {
         let mut words = Words::of(&lines)?;
         let id: u32 = words.number("the camera's number")?;
-        let model = models::by_name(words.next("the camera model")?)
+        let name = words.next("the camera model")?;
+        let model = models::model_of(&format!("{name:?}"), |m| m.name == name)
             .map_err(|p| InputError::new(path, p, models::UNDISTORT).at(format!("line {}, camera {id}", lines.line)))?;
         let size = (words.number("the width")?, words.number("the height")?);
         let mut params = Vec::with_capacity(model.params);
@@ -186,27 +187,18 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
         }
         images.push(ImageRecord { position: lines.line, camera_id, quat, translation, name });
         if lines.advance()? {
-            check_observations(&lines)?;
+            // In a file without the lines of 2D points every second image would be lost.
+            let mut words = lines.text()?.split_whitespace();
+            let third_is_id = words.clone().nth(2).is_none_or(|w| w.parse::<i64>().is_ok());
+            if !third_is_id || !lines.cut && !words.by_ref().count().is_multiple_of(3) {
+                let problem = "the line after an image must hold its 2D points as 'x y point' triples, or be empty";
+                let remedy = "add an empty line after each image that has no 2D points";
+                return Err(InputError::new(path, problem, remedy).at(format!("line {}", lines.line)));
+            }
         }
     }
     lines.finish("images", images.len() as u64, warnings);
     Ok(images)
-}
-
-/// Checks that the line of 2D points looks like one: in a file without these lines every second image would be lost.
-fn check_observations(lines: &Lines) -> InputResult<()> {
-    let mut words = lines.text()?.split_whitespace();
-    let third_is_id = words.clone().nth(2).is_none_or(|w| w.parse::<i64>().is_ok());
-    let triples = lines.cut || words.by_ref().count().is_multiple_of(3);
-    if third_is_id && triples {
-        return Ok(());
-    }
-    Err(InputError::new(
-        &lines.path,
-        "the line after an image must hold its 2D points as 'x y point' triples, or be empty",
-        "add an empty line after each image that has no 2D points",
-    )
-    .at(format!("line {}", lines.line)))
 }
 
 /// Reads `points3D.txt`; skips tracks.

@@ -9,7 +9,6 @@
 //! read as a scene.
 
 mod photos;
-mod poses;
 
 use super::colmap_write::{Model, ModelImage, Point, make_folder, write_model};
 use super::loader::{Dataset, View};
@@ -19,7 +18,6 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::rng::{Purpose, Stream};
 use crate::base::whole_file::write_whole;
 use crate::scene::camera::Camera;
-use crate::scene::image::Target;
 use glam::{DMat3, DVec3};
 use photos::Encoded;
 use rayon::prelude::*;
@@ -87,6 +85,11 @@ pub struct Plan {
     /// Names of the training photos that are wrong: swapped or blurred.
     pub wrong: Vec<String>,
 }
+
+/// Points by which it is judged what views share, about.
+const POINTS: usize = 2000;
+/// Most of what one of two views sees that the other may see, for their photos to change places.
+const SHARED_MOST: f64 = 0.5;
 
 /// First letters of the names of photos.
 const TRAIN: char = 'a';
@@ -185,7 +188,7 @@ fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
 fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
     let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
     let shown = match disturbance {
-        Disturbance::Swapped { share, .. } => poses::swapped(dataset, &views, *share, seed),
+        Disturbance::Swapped { share, .. } => swapped(dataset, &views, *share, seed),
         _ => (0..views.len()).collect(),
     };
     let noise = match disturbance {
@@ -200,10 +203,55 @@ fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -
     let of_number = |number: usize| TrainView {
         view: views[number],
         shown: views[shown[number]],
-        pose: poses::moved(pose_of(&views[number].camera), noise, &mut stream(seed, Draw::Pose, number)),
+        pose: {
+            let pose = pose_of(&views[number].camera);
+            let mut draws = stream(seed, Draw::Pose, number);
+            let by = DVec3::from(std::array::from_fn::<f64, 3, _>(|_| noise * draws.normal()));
+            Pose { translation: pose.translation - pose.rotation * by, ..pose }
+        },
         number,
     };
     (0..views.len()).filter(|&number| is_kept(number)).map(of_number).collect()
+}
+
+/// For each view the view whose photo it shows: `share` of them have changed places in pairs, one pair at least. A pair
+/// shares less than half of what either sees; a view without such a partner stays.
+fn swapped(dataset: &Dataset, views: &[&View], share: f64, seed: u64) -> Vec<usize> {
+    let stride = dataset.points.len().div_ceil(POINTS).max(1);
+    let points: Vec<[f32; 3]> = dataset.points.iter().copied().step_by(stride).collect();
+    let seen: Vec<Vec<bool>> =
+        views.iter().map(|view| points.iter().map(|point| sees(&view.camera, *point)).collect()).collect();
+    let is_far = |a: usize, b: usize| {
+        let count = |of: &dyn Fn(usize) -> bool| (0..points.len()).filter(|&i| of(i)).count() as f64;
+        let both = count(&|i| seen[a][i] && seen[b][i]);
+        both < SHARED_MOST * count(&|i| seen[a][i]).min(count(&|i| seen[b][i]))
+    };
+    let mut order: Vec<usize> = (0..views.len()).collect();
+    stream(seed, Draw::Swaps, 0).shuffle(&mut order);
+    let mut shown: Vec<usize> = (0..views.len()).collect();
+    let mut pairs = (share * views.len() as f64 / 2.0).ceil() as usize;
+    for &a in &order {
+        // Photos of one size, so that the photo fits its camera.
+        let fits = |&b: &usize| {
+            let size = |view: usize| (views[view].camera.width, views[view].camera.height);
+            b != a && shown[b] == b && size(a) == size(b) && is_far(a, b)
+        };
+        if pairs == 0 || shown[a] != a {
+            continue;
+        }
+        if let Some(b) = order.iter().copied().find(fits) {
+            shown.swap(a, b);
+            pairs -= 1;
+        }
+    }
+    shown
+}
+
+/// Whether a point lies in the picture of a camera.
+fn sees(camera: &Camera, point: [f32; 3]) -> bool {
+    let [x, y, z] = camera.viewmat.map(|row| row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3]);
+    let (u, v) = (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy);
+    z > camera.near_plane && (0.0..camera.width as f32).contains(&u) && (0.0..camera.height as f32).contains(&v)
 }
 
 /// World to camera, in the local frame of the dataset.
@@ -269,10 +317,4 @@ fn quantile(dataset: &Dataset, axis: usize, share: f64) -> f32 {
     let mut values: Vec<f32> = dataset.points.iter().map(|point| point[axis]).collect();
     let at = ((values.len() - 1) as f64 * share) as usize;
     *values.select_nth_unstable_by(at, f32::total_cmp).1
-}
-
-/// The mask of a photo as a PNG, if it has one.
-fn mask_png(target: &Target) -> InputResult<Option<Vec<u8>>> {
-    let Some(mask) = &target.mask else { return Ok(None) };
-    photos::png(mask, target.width, target.height, image::ExtendedColorType::L8).map(Some)
 }

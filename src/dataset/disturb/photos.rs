@@ -1,6 +1,6 @@
 //! Disturbances of photos, and their files.
 
-use super::{Disturbance, Draw, is_chosen, mask_png, stream};
+use super::{Disturbance, Draw, is_chosen, stream};
 use crate::base::error::{InputError, InputResult};
 use crate::base::rng::Stream;
 use crate::scene::image::Target;
@@ -46,10 +46,18 @@ pub(super) fn disturbed(
         _ => {}
     }
     let bytes = match *disturbance {
-        Disturbance::Jpeg { quality } => jpeg(&photo, quality)?,
+        Disturbance::Jpeg { quality } => {
+            let mut bytes = Vec::new();
+            JpegEncoder::new_with_quality(&mut bytes, quality)
+                .encode(&photo.rgb, photo.width, photo.height, ExtendedColorType::Rgb8)
+                .map_err(|e| not_encoded(&e))?;
+            bytes
+        }
         _ => png(&photo.rgb, photo.width, photo.height, ExtendedColorType::Rgb8)?,
     };
-    Ok(Encoded { bytes, mask: mask_png(&photo)? })
+    let mask =
+        photo.mask.as_ref().map(|mask| png(mask, photo.width, photo.height, ExtendedColorType::L8)).transpose()?;
+    Ok(Encoded { bytes, mask })
 }
 
 /// Multiplies the channels, and clamps.
@@ -85,19 +93,8 @@ fn blur(photo: &mut Target) {
     }
 }
 
-fn jpeg(photo: &Target, quality: u8) -> InputResult<Vec<u8>> {
-    let mut bytes = Vec::new();
-    let encoded = JpegEncoder::new_with_quality(&mut bytes, quality).encode(
-        &photo.rgb,
-        photo.width,
-        photo.height,
-        ExtendedColorType::Rgb8,
-    );
-    encoded.map(|()| bytes).map_err(|e| not_encoded(&e))
-}
-
 /// A picture as a PNG.
-pub(super) fn png(pixels: &[u8], width: u32, height: u32, color: ExtendedColorType) -> InputResult<Vec<u8>> {
+fn png(pixels: &[u8], width: u32, height: u32, color: ExtendedColorType) -> InputResult<Vec<u8>> {
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes).write_image(pixels, width, height, color).map_err(|e| not_encoded(&e))?;
     Ok(bytes)
