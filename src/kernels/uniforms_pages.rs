@@ -93,15 +93,15 @@ crate::wgsl_struct! {
 impl GatherUniforms {
     /// Uniforms of a step on the pages of a batch; slab, rows and column are set for each dispatch.
     pub fn new(camera: &Camera, run: &RunNumbers, now: u32, splits: &SplitNumbers, page_count: u32) -> GatherUniforms {
-        let frustum = Frustum::new(camera).numbers();
+        let frustum = Frustum::new(camera);
         let rate = |column: Column| run.base_rates[column as usize];
         GatherUniforms {
             world_to_camera: frustum.viewmat,
             slopes: frustum.slopes,
             reach: frustum.reach,
             depth_range: frustum.depth_range,
-            slack: frustum.slack,
-            side_slack: frustum.side_slack,
+            slack: frustum.slack(),
+            side_slack: frustum.side_slack(),
             now,
             slab: 0,
             page_count,

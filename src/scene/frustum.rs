@@ -36,30 +36,15 @@ const PAGE_REACH: f32 = 1.0 + 1e-6;
 /// sides.
 #[derive(Debug, Clone, Copy)]
 pub struct Frustum {
-    viewmat: [[f32; 4]; 3],
+    pub viewmat: [[f32; 4]; 3],
     /// Sum of |t|: rounding errors of camera coordinates scale with it and with the position.
     translation: f32,
-    near: f32,
-    far: f32,
-    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
-    slopes: [f32; 4],
-    /// Reach of a footprint beyond its mean in x and y, in sigmas.
-    reach: [f32; 2],
-}
-
-/// The row test of a [`Frustum`] as numbers.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FrustumNumbers {
-    pub viewmat: [[f32; 4]; 3],
-    /// As in [`Frustum`], and so is `reach`.
-    pub slopes: [f32; 4],
-    pub reach: [f32; 2],
     /// Near and far plane.
     pub depth_range: [f32; 2],
-    /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
-    pub slack: [f32; 2],
-    /// Factor on the slack for the side planes.
-    pub side_slack: f32,
+    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
+    pub slopes: [f32; 4],
+    /// Reach of a footprint beyond its mean in x and y, in sigmas.
+    pub reach: [f32; 2],
 }
 
 impl Frustum {
@@ -80,31 +65,23 @@ impl Frustum {
         Frustum {
             viewmat: camera.viewmat,
             translation: m[0][3].abs() + m[1][3].abs() + m[2][3].abs(),
-            near: camera.near_plane,
-            far: camera.far_plane,
+            depth_range: [camera.near_plane, camera.far_plane],
             slopes: [x_low, x_high, y_low, y_high],
             reach: [reach_x, reach_y],
         }
     }
 
-    /// The steepest side plane: a camera coordinate's rounding error enters a side test multiplied by one plus this
-    /// slope.
-    #[inline(always)]
-    fn steepest(&self) -> f32 {
-        let slopes = &self.slopes;
-        slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs())
+    /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
+    pub fn slack(&self) -> [f32; 2] {
+        [POSITION_SLACK * self.translation, POSITION_SLACK]
     }
 
-    /// The numbers of the row test, for devices.
-    pub fn numbers(&self) -> FrustumNumbers {
-        FrustumNumbers {
-            viewmat: self.viewmat,
-            slopes: self.slopes,
-            reach: self.reach,
-            depth_range: [self.near, self.far],
-            slack: [POSITION_SLACK * self.translation, POSITION_SLACK],
-            side_slack: 1.0 + self.steepest(),
-        }
+    /// Factor on the slack for the side planes, one plus the steepest slope: by it a camera coordinate's rounding error enters a
+    /// side test.
+    #[inline(always)]
+    pub fn side_slack(&self) -> f32 {
+        let slopes = &self.slopes;
+        1.0 + slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs())
     }
 
     /// Whether a row at `p` with this largest sigma may be drawn. NaN counts as drawn.
@@ -116,10 +93,10 @@ impl Frustum {
         let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
         let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
         let slopes = &self.slopes;
-        let side = slack * (1.0 + self.steepest());
+        let side = slack * self.side_slack();
         let (reach_x, reach_y) = (self.reach[0] * sigma_max + side, self.reach[1] * sigma_max + side);
-        let outside = (z <= self.near - slack)
-            | (z >= self.far + slack)
+        let outside = (z <= self.depth_range[0] - slack)
+            | (z >= self.depth_range[1] + slack)
             | (-x > slopes[0] * z + reach_x)
             | (x > slopes[1] * z + reach_x)
             | (-y > slopes[2] * z + reach_y)
@@ -137,7 +114,7 @@ impl Frustum {
                 normal: [at(0), at(1), at(2)],
                 offset: at(3),
                 reach: self.reach[axis] * PAGE_REACH,
-                slack: PAGE_POSITION_SLACK * (1.0 + self.steepest()),
+                slack: PAGE_POSITION_SLACK * self.side_slack(),
             }
         };
         let depth = |sign: f32, edge: f32| PagePlane {
@@ -149,8 +126,8 @@ impl Frustum {
         let [x_low, x_high, y_low, y_high] = self.slopes;
         PagePlanes {
             planes: [
-                depth(-1.0, self.near),
-                depth(1.0, self.far),
+                depth(-1.0, self.depth_range[0]),
+                depth(1.0, self.depth_range[1]),
                 side(0, -1.0, x_low),
                 side(0, 1.0, x_high),
                 side(1, -1.0, y_low),

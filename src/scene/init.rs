@@ -21,6 +21,10 @@ const SUBSAMPLE: u64 = 0x7375_6273_616d_706c;
 /// Scale of the rows if all points coincide, in units of the scene scale.
 const LONE_POINT_SCALE: f64 = 0.01;
 
+/// Smallest and largest first scale, in scene scales.
+const MIN_SCALE: f32 = 1e-6;
+const MAX_SCALE: f32 = 10.0;
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct InitOptions {
     /// SH degree of the stored rows, 0 to 3. The higher bands start at zero.
@@ -31,26 +35,13 @@ pub struct InitOptions {
     pub scale_factor: f32,
     pub seed: u64,
     pub max_gaussians: Option<usize>,
-    /// Size of the scene, local units; the two limits below are multiples of it.
+    /// Size of the scene, local units.
     pub scene_scale: f32,
-    /// Smallest first scale, in scene scales.
-    pub min_scale: f32,
-    /// Largest first scale, in scene scales.
-    pub max_scale: f32,
 }
 
 impl Default for InitOptions {
     fn default() -> Self {
-        InitOptions {
-            sh_degree: 3,
-            opacity: 0.1,
-            scale_factor: 1.0,
-            seed: 0,
-            max_gaussians: None,
-            scene_scale: 1.0,
-            min_scale: 1e-6,
-            max_scale: 10.0,
-        }
+        InitOptions { sh_degree: 3, opacity: 0.1, scale_factor: 1.0, seed: 0, max_gaussians: None, scene_scale: 1.0 }
     }
 }
 
@@ -59,7 +50,7 @@ impl Default for InitOptions {
 ///
 /// Differences to gsplat concern clouds that it cannot start from: with fewer than four points the mean is over the
 /// existing neighbours; a point whose neighbours all coincide with it gets the median distance of the others (0.01
-/// scene scales if there are none); scales are limited by [`InitOptions`]; non-finite points get no row. Rotations are
+/// scene scales if there are none); scales are limited to 1e-6 to 10 scene scales; non-finite points get no row. Rotations are
 /// uniform on the sphere and of unit length, where gsplat's are uniform in [0, 1)^4; since the first Gaussians are
 /// round, no picture shows the difference.
 ///
@@ -138,14 +129,14 @@ impl ScaleRule {
         ScaleRule {
             factor: f64::from(options.scale_factor),
             fallback: typical.unwrap_or(LONE_POINT_SCALE * scene_scale),
-            low: f64::from(options.min_scale) * scene_scale,
-            high: f64::from(options.max_scale) * scene_scale,
+            low: f64::from(MIN_SCALE) * scene_scale,
+            high: f64::from(MAX_SCALE) * scene_scale,
         }
     }
 
     pub fn log_scale(&self, distance: f64) -> f32 {
         let distance = if distance > 0.0 { distance } else { self.fallback };
-        // max, then min: clamp would panic if the limits are swapped.
+        // max, then min: clamp would panic for a scene scale that is no number.
         libm::log((distance * self.factor).max(self.low).min(self.high)) as f32
     }
 }

@@ -10,7 +10,7 @@
 //! across (in the middle of the pictures), unless the user chose the number of blocks.
 
 use super::CityOptions;
-use super::solid::Ray;
+use super::trace::Ray;
 use super::world::PITCH;
 use crate::base::rng::{Purpose, Stream};
 use crate::dataset::model::{Intrinsics, Lens, Pose};

@@ -1,6 +1,6 @@
 //! Generates photos of a random city: for the demo, scaling runs and tests.
 //!
-//! [`write_city`] builds a world from a seed (`world`, `build`, `parts`, `solid`, `texture`), plans a flight over it
+//! [`write_city`] builds a world from a seed (`world`, `build`, `parts`, `texture`), plans a flight over it
 //! (`flight`), casts rays (`trace`, `shade`, `photo`), samples points (`points`) and writes a COLMAP scene:
 //! `images/view_0000.jpg ...` and `sparse/0/{cameras,images,points3D}.bin`.
 //!
@@ -14,7 +14,6 @@ mod parts;
 mod photo;
 mod points;
 mod shade;
-mod solid;
 mod texture;
 mod trace;
 mod world;

@@ -2,8 +2,8 @@
 //!
 //! Invariant: a part takes its random draws from the stream of its plot or street, in the order of construction.
 
-use super::solid::{Shape, Solid};
 use super::texture::{Kind, Skin, paint};
+use super::trace::{Shape, Solid};
 use crate::base::rng::Stream;
 use glam::{DVec3, Vec3};
 

@@ -3,9 +3,8 @@
 //!
 //! Invariant: light depends on (world, place, viewing direction, footprint) alone.
 
-use super::solid::{Entry, Face, Ray, Shape, Solid};
 use super::texture::{Look, Place};
-use super::trace::Grid;
+use super::trace::{Entry, Face, Grid, Ray, Shape, Solid};
 use super::world::World;
 use glam::{DVec3, Vec3};
 use std::sync::atomic::{AtomicU32, Ordering};

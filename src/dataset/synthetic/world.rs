@@ -4,8 +4,8 @@
 //! [-half, half]^2 with a road around it, surrounded by fields; 3. coordinates are metres, z up, without the dataset's
 //! offset.
 
-use super::solid::Solid;
 use super::texture::{Kind, Look, Noise, Place, Skin, asphalt, cell_draw, cover, lines, paint};
+use super::trace::Solid;
 use glam::{DVec3, Vec3};
 
 /// Distance between the centre lines of neighbouring roads, metres.
