@@ -13,7 +13,6 @@ const FOCAL_RANGE: (f64, f64) = (1e-3, 1e6);
 const MAX_CENTRE: f64 = 1e3;
 /// Largest coordinate of a pose that is accepted.
 pub(super) const MAX_COORDINATE: f64 = 1e15;
-/// Names listed in one warning.
 const LISTED: usize = 10;
 
 /// Checks that the numbers can be a camera's intrinsics, and returns them or the problem. A radial lens without

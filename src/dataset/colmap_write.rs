@@ -67,7 +67,6 @@ pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
     std::fs::rename(&partial, sparse).map_err(|e| InputError::io(sparse, "renaming the model's folder", &e))
 }
 
-/// Creates a folder and its parents.
 pub fn make_folder(folder: &Path) -> InputResult<()> {
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
 }

@@ -18,11 +18,9 @@ pub(super) struct Words {
     pub no_view: &'static str,
 }
 
-/// Remedy for missing photos.
 pub(super) const PUT_THEM_THERE: &str =
     "put them into images/, name their folder with --images, or leave them out with --allow-missing";
 
-/// Views of the photos of a scene.
 pub(super) struct Gathered<'a> {
     pub options: &'a ReadOptions,
     pub photos: PhotoFiles,

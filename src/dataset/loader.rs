@@ -22,7 +22,6 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Most names that a message lists.
 const NAMES_LISTED: usize = 20;
 
 /// Far plane, local units.
@@ -45,7 +44,6 @@ pub struct Dataset {
     pub image_folder: PathBuf,
 }
 
-/// One view: its camera and its photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct View {
     pub name: String,

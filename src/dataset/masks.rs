@@ -29,7 +29,6 @@ const FORMS: [(&str, &str, bool); 6] = [
     ("mask_", "", false),
     ("dynamic_mask_", "", true),
 ];
-/// Files that a message shows.
 const SHOWN: usize = 3;
 
 /// The mask of a photo.
@@ -41,7 +40,6 @@ pub struct MaskSource {
     pub invert: bool,
 }
 
-/// A mask that belongs to a photo.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct FoundMask {
     pub path: PathBuf,
@@ -49,7 +47,6 @@ pub(super) struct FoundMask {
     pub inverted: bool,
 }
 
-/// Mask files by name.
 #[derive(Debug, Default)]
 pub(super) struct MaskIndex {
     root: PathBuf,

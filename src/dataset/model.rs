@@ -74,7 +74,6 @@ impl Pose {
     }
 }
 
-/// Which set a view belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Split {
     Train,
@@ -82,7 +81,6 @@ pub enum Split {
     Test,
 }
 
-/// One registered photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct RawView {
     /// Name in the dataset, `/`-separated, relative to the image folder and checked to stay inside it.

@@ -15,9 +15,7 @@ const ENDINGS: [&str; 24] = [
     "jpg", "jpeg", "png", "tif", "tiff", "bmp", "webp", "gif", "heic", "heif", "avif", "jxl", "jp2", "exr", "dng",
     "arw", "cr2", "cr3", "nef", "raf", "rw2", "orf", "raw", "tga",
 ];
-/// Endings of pictures that can be read.
 const READABLE: [&str; 3] = ["jpg", "jpeg", "png"];
-/// Deepest folder that is listed.
 const DEEPEST: usize = 16;
 /// Most files that are listed, so that a link to a whole drive ends.
 const FILES_MAX: usize = 1 << 20;
@@ -42,7 +40,6 @@ pub(super) fn is_photo(path: &Path) -> bool {
     ending.is_some_and(|ending| READABLE.contains(&ending.as_str()))
 }
 
-/// Number of photos in a folder, by their endings.
 pub(super) fn photos_in(folder: &Path) -> usize {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     entries.take(FILES_MAX).filter(|entry| is_photo(&entry.path())).count()
@@ -73,7 +70,6 @@ pub(super) struct NameIndex {
     pub dangling: Vec<PathBuf>,
 }
 
-/// What an index holds for a name.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Found<'a> {
     Nothing,

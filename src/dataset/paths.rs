@@ -10,7 +10,6 @@
 /// Longest name accepted, bytes: the usual limit of a path.
 pub const MAX_NAME_BYTES: usize = 4096;
 
-/// A name from a file.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StatedName {
     /// Its components with `/` between them: relative, without root, drive letter, `.` and `..`.

@@ -33,7 +33,6 @@ pub(super) struct Photo {
     pub exists: bool,
 }
 
-/// The photos of a scene.
 pub(super) struct PhotoFiles {
     root: PathBuf,
     /// Folders that names are relative to.
@@ -137,7 +136,6 @@ impl PhotoFiles {
         }
     }
 
-    /// Where a name may lie.
     fn places(&self, name: &str, is_outside: bool) -> Vec<PathBuf> {
         let rest = name.split_once('/').map(|(_, rest)| rest).filter(|_| self.skips_folder);
         let bases = is_outside.then_some(&self.root).into_iter().chain(&self.bases);

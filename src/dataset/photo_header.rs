@@ -48,7 +48,6 @@ pub struct PhotoHeader {
     pub height: u32,
     /// Peak memory of the decoder, bytes, including the 8-bit RGB result.
     pub decode_bytes: u64,
-    /// Whether pixels may be transparent.
     pub has_alpha: bool,
     /// The first EXIF data before the pixels.
     pub exif: Option<ExifPlace>,
@@ -124,7 +123,6 @@ fn foreign_format(magic: &[u8; 16]) -> Option<&'static str> {
     })
 }
 
-/// The frame header of a JPEG.
 struct JpegFrame {
     code: u8,
     width: u32,

@@ -31,7 +31,6 @@ const MAX_BYTES: u64 = 128 << 20;
 const HEAD_BYTES: u64 = 4096;
 /// Columns that a line must have; the others are 0 where they are missing.
 const REQUIRED: [&str; 8] = ["name", "x", "y", "alt", "heading", "pitch", "roll", "f"];
-/// Characters that may separate cells.
 const SEPARATORS: [char; 3] = [',', ';', '\t'];
 /// The film to which `f` refers, millimetres.
 const FILM: f64 = 36.0;
@@ -111,7 +110,6 @@ fn cells_of(line: &str, separator: char) -> Vec<String> {
     cells.iter().map(|cell| cell.trim().to_string()).collect()
 }
 
-/// The names of the columns.
 struct Header {
     names: Vec<String>,
     separator: char,
@@ -140,7 +138,6 @@ impl Header {
     }
 }
 
-/// A line of the file.
 struct Line<'a> {
     file: &'a Path,
     number: usize,

@@ -6,7 +6,6 @@ use super::sog::is_tree;
 use crate::base::error::InputError;
 use std::path::Path;
 
-/// Endings of the formats.
 const ENDINGS: [&str; 4] = ["splat", "ksplat", "spz", "sog"];
 
 /// The error for a file of Gaussians in a format that no reader knows; `None` for others.

@@ -27,7 +27,6 @@ pub enum ExportFormat {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Exports {
     pub spz: bool,
-    /// A folder of SOGs.
     pub sog: bool,
 }
 

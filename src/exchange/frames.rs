@@ -51,7 +51,6 @@ impl ExportRows {
         ExportRows { frame, origin: meta.origin, scale: meta.scale, log_scale: libm::log(meta.scale), turning }
     }
 
-    /// The frame of the rows.
     pub fn frame(&self) -> ExportFrame {
         self.frame
     }
@@ -140,7 +139,6 @@ fn inverse_rotation(meta: &SceneMeta) -> GaussianRotation {
     GaussianRotation::new(meta.upright.map_or(Rotation::IDENTITY, |upright| upright.inverse()))
 }
 
-/// Turns quaternions and harmonics.
 fn rotate_quats_and_sh(columns: &mut Columns, turning: &GaussianRotation) {
     if turning.is_identity() {
         return;

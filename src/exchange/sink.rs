@@ -19,7 +19,6 @@ pub struct LevelCounts {
     pub always_shown: u64,
 }
 
-/// Summary of what was written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Written {
     /// `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.

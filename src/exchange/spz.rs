@@ -40,7 +40,6 @@ const BUFFER_BYTES: usize = 1 << 20;
 const HALF_TURN: Rotation = Rotation::HALF_TURN_ABOUT_X;
 /// Up in an upright file.
 pub const SPZ_UP: [f64; 3] = [0.0, -VIEWER_UP[1], 0.0];
-/// Bytes of a position.
 const POSITION_BYTES: usize = 9;
 /// Largest magnitude of a coordinate's 24 bits.
 const FIXED_MAX: f64 = 8_388_607.0;
@@ -51,7 +50,6 @@ const COLOR_SCALE: f32 = 0.15;
 /// Largest magnitude of the small components of a quaternion, in 9 bits.
 const QUAT_MAX: f32 = 511.0;
 
-/// Writes a file in parts.
 pub struct SpzWriter {
     path: PathBuf,
     part: PartFile,

@@ -19,7 +19,6 @@ use std::time::{SystemTime, UNIX_EPOCH};
 /// `SessionLog { status = 1: START }`.
 const SESSION_START: [u8; 2] = [0x08, 0x01];
 
-/// The colour space RGB.
 const RGB: u32 = 3;
 
 /// An event file that records are appended to.

@@ -22,7 +22,6 @@ const BYTES_MAX: u64 = 1 << 16;
 const REMEDY: &str =
     "copy the file again, export the Gaussians again, or remove it if they are in the dataset's coordinates";
 
-/// The content of a transform file.
 #[derive(Debug, Deserialize)]
 pub struct Transform {
     /// Name of the file of Gaussians.

@@ -6,7 +6,6 @@
 
 use crate::base::room;
 
-/// One attribute of a Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Column {
     /// Positions, local frame.
@@ -24,7 +23,6 @@ pub enum Column {
 }
 
 impl Column {
-    /// All columns, in storage order.
     pub const ALL: [Column; 6] =
         [Column::Means, Column::Quats, Column::Scales, Column::Opacities, Column::Sh0, Column::ShN];
 
@@ -178,7 +176,6 @@ impl Columns {
         (self.sh_n, self.sh_degree) = (sh_n, degree);
     }
 
-    /// Bytes allocated.
     pub fn bytes(&self) -> usize {
         Column::ALL.iter().map(|&column| 4 * self.column(column).capacity()).sum()
     }

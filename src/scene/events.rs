@@ -53,7 +53,6 @@ pub struct RelocationRound {
     pub dead_opacity: f32,
 }
 
-/// A kind of global change.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum EventKind {
     /// Opacities above the given one are lowered to it; the moments of all opacities become zero.
@@ -66,9 +65,7 @@ pub enum EventKind {
         degree: u8,
     },
     Densify(RoundThresholds),
-    /// A round of long-axis splits and removals.
     LongAxis(LongAxisRound),
-    /// A round of relocations.
     Relocate(RelocationRound),
 }
 

@@ -52,7 +52,6 @@ impl Target {
         self.width as usize * self.height as usize
     }
 
-    /// Whether any pixel is used.
     pub fn counts(&self) -> bool {
         self.mask.as_ref().is_none_or(|mask| mask.iter().any(|&byte| byte != 0))
     }

@@ -13,7 +13,6 @@ const LARGEST_IN_SCENE_SCALES: f64 = 1e4;
 /// Limit of the magnitude of log-scales in any scene: standard deviations of 1e-13 to 1e13 units.
 const LIMIT: f32 = 30.0;
 
-/// The least and the greatest log-scale.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LogScaleRange {
     pub low: f32,

@@ -9,7 +9,6 @@ use super::columns::Column;
 /// of the other columns.
 pub type SeriesSums = [f32; 8];
 
-/// Numbers of a run.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RunNumbers {
     /// `[stamp]`: sums of the movement to the limit; beyond the end as the last.
@@ -22,7 +21,6 @@ pub struct RunNumbers {
     pub decay_powers: Vec<[f32; 2]>,
     /// `[k]`: decay of the moments over k steps: factor of the first, factor of the second, share that the second loses.
     pub decays: Vec<[f32; 3]>,
-    /// Adam's epsilon.
     pub eps: f32,
     /// The series holds for second moments above this.
     pub floor: f32,
@@ -34,10 +32,8 @@ pub struct RunNumbers {
     pub log_scales: [f32; 2],
 }
 
-/// Numbers of one step.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StepNumbers {
-    /// Steps done.
     pub now: u32,
     /// `[k]`: sums of a row that missed k steps; a row that missed more has those of its limit.
     pub recent: Vec<SeriesSums>,

@@ -33,7 +33,6 @@ impl PageBounds {
 pub struct PageMeta {
     pub id: PageId,
     pub rows: u32,
-    /// SH degree of the stored page.
     pub sh_degree: u8,
     /// Number of events of the log that its rows have applied.
     pub events_applied: u32,

@@ -106,7 +106,6 @@ fn largest(scales: &[f32]) -> f32 {
 /// Selects the giants: the largest half percent of rows; equal sizes are ordered by row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GiantCut {
-    /// Key of the smallest giant.
     smallest: u64,
 }
 
@@ -128,7 +127,6 @@ impl GiantCut {
         RankSearch::new((rows - giants(rows)) as u64, rows as u64)
     }
 
-    /// The cut, after the last pass.
     pub fn found(search: &RankSearch) -> GiantCut {
         GiantCut { smallest: search.key().unwrap_or(u64::MAX) }
     }

@@ -43,7 +43,6 @@ impl PointBox {
     }
 }
 
-/// Squared length of a vector.
 #[inline]
 pub fn norm2(d: [f32; 3]) -> f32 {
     d[0] * d[0] + d[1] * d[1] + d[2] * d[2]

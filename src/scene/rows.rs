@@ -11,7 +11,6 @@ use super::sightings::views;
 /// Floats of a [`RowBlock`]: 16 for the narrow columns, those of fixed width (14 used), 48 for `sh_n` (45 used at
 /// degree 3).
 pub const BLOCK_LANES: usize = 64;
-/// First lane of `sh_n` in a [`RowBlock`].
 pub const SH_N_LANE: usize = 16;
 
 /// One row of any table with the shape of the columns: means 0..3, opacity 3, quats 4..8, scales 8..11, sh0 12..15,
@@ -31,7 +30,6 @@ pub const fn first_lane(column: Column) -> usize {
     }
 }
 
-/// The log-scales of a row.
 pub fn scales_of(block: &mut RowBlock) -> &mut [f32] {
     let first = first_lane(Column::Scales);
     &mut block[first..first + 3]
@@ -98,7 +96,6 @@ impl<'a> ColumnsMut<'a> {
         self.opacities.len()
     }
 
-    /// A shared view of the same rows.
     #[inline(always)]
     pub fn as_ref(&self) -> ColumnsRef<'_> {
         let ColumnSet { sh_degree, means, quats, scales, opacities, sh0, sh_n } = self;
@@ -210,7 +207,6 @@ impl_rows!(Rows, split_at);
 impl_rows!(RowsMut, split_at_mut);
 
 impl RowsMut<'_> {
-    /// A shared view of the same rows.
     pub fn as_ref(&self) -> Rows<'_> {
         RowTables {
             first_row: self.first_row,

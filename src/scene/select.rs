@@ -2,7 +2,6 @@
 //!
 //! Invariants: 1. the order of the keys does not matter; 2. at most four passes.
 
-/// Bits decided per pass.
 const PASS_BITS: u32 = 16;
 
 /// A search in passes: call [`RankSearch::count`] for every key, then [`RankSearch::next_pass`], until done.
@@ -12,7 +11,6 @@ pub struct RankSearch {
     rank: u64,
     /// The known leading bits, in place.
     prefix: u64,
-    /// Number of known bits.
     known: u32,
     bins: Vec<u64>,
     exists: bool,

@@ -9,7 +9,6 @@ use super::rows::{RowTables, Rows, RowsMut};
 use rayon::prelude::*;
 use std::collections::TryReserveError;
 
-/// Rows with their whole training state.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct SceneState {
     /// Values after the last update of each row.
@@ -54,7 +53,6 @@ impl SceneState {
         self.stamp.len()
     }
 
-    /// Degree that the rows are stored with.
     pub fn sh_degree(&self) -> u8 {
         self.columns.sh_degree
     }

@@ -22,7 +22,6 @@ const POINT_MIN: u64 = 8 + 3 * 8 + 3 + 8 + 8;
 const OBSERVATION: u64 = 24;
 const TRACK_ELEMENT: u64 = 8;
 
-/// A binary file with the read position.
 struct Source {
     path: PathBuf,
     reader: BufReader<File>,

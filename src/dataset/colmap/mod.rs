@@ -38,7 +38,6 @@ const MIN_QUAT: f64 = 1e-6;
 
 type Cameras = BTreeMap<u32, Intrinsics>;
 
-/// One entry of an images file.
 struct ImageRecord {
     /// Byte or line where the entry starts.
     position: u64,
@@ -99,7 +98,6 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     Ok(RawScene { views, points, points_path, warnings: said, ..RawScene::default() })
 }
 
-/// Content of a model.
 struct Model {
     views: Vec<RawView>,
     points: PointCloud,
@@ -150,7 +148,6 @@ fn read_model(
     Ok(Model { views, points, points_path, warnings })
 }
 
-/// Every model folder, in a fixed order.
 fn find_models(scene: &Path) -> Vec<ModelFolder> {
     let mut folders = Vec::new();
     for parent in ["sparse", "colmap/sparse"] {
@@ -266,7 +263,6 @@ struct PointTally {
 }
 
 impl PointTally {
-    /// Passes a finite point on.
     fn add(&mut self, position: [f64; 3], color: [u8; 3], place: u64, take: &mut TakePoint<'_>) -> InputResult<()> {
         self.total += 1;
         if position.iter().all(|x| x.is_finite()) {

@@ -5,7 +5,6 @@
 use crate::dataset::checks::checked_intrinsics;
 use crate::dataset::model::{Intrinsics, Lens};
 
-/// Remedy for an unsupported camera model.
 pub(super) const UNDISTORT: &str =
     "undistort the photos first, which writes PINHOLE cameras: colmap image_undistorter --output_type COLMAP";
 

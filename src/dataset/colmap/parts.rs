@@ -21,10 +21,8 @@ use std::path::{Path, PathBuf};
 
 /// Photo folders inside a part: CityGaussian's name, Mega-NeRF's, and that of COLMAP's scripts.
 const PHOTOS: [&str; 3] = ["images", "rgbs", "input"];
-/// Folders of held-out photos.
 const HELD_OUT: [&str; 2] = ["val", "test"];
 
-/// The photo folder of a part.
 pub(in crate::dataset) fn photo_folder(part: &Path) -> Option<PathBuf> {
     PHOTOS.iter().map(|name| part.join(name)).find(|path| path.is_dir())
 }

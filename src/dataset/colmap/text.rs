@@ -18,7 +18,6 @@ use std::str::FromStr;
 /// Bytes kept of a line; the longest record (with a name of 4,096 bytes) is shorter.
 const LINE_BYTES: usize = 8192;
 
-/// A text file with the read position.
 struct Lines {
     path: PathBuf,
     reader: BufReader<TextReader<File>>,

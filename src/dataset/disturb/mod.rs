@@ -28,15 +28,17 @@ use std::path::Path;
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename_all = "kebab-case", rename_all_fields = "kebab-case")]
 pub enum Disturbance {
-    /// Nothing.
     Nothing,
     /// Pixel values of each photo times 2^dt, dt uniform within so many stops.
-    Exposure { stops: f64 },
+    Exposure {
+        stops: f64,
+    },
     /// Red times 2^t and blue times 2^-t, t uniform within so many stops.
-    WhiteBalance { stops: f64 },
+    WhiteBalance {
+        stops: f64,
+    },
     /// This share of the photos have changed places in pairs that share less than half of what they see.
     Swapped {
-        /// Of the training photos.
         share: f64,
         /// Whether these photos are missing instead, as if a user had found them.
         are_removed: bool,
@@ -53,7 +55,6 @@ pub enum Disturbance {
     },
     /// Grey boxes at random places of each photo.
     Boxes {
-        /// Boxes on a photo.
         count: u32,
         /// Whether masks exclude them, as a user could by hand.
         are_masked: bool,
@@ -115,7 +116,6 @@ fn is_chosen(seed: u64, number: usize, one_in: u32) -> bool {
     stream(seed, Draw::Chosen, number).below(u64::from(one_in.max(1))) == 0
 }
 
-/// A training view on its way.
 struct TrainView<'a> {
     /// The view whose pose it has.
     view: &'a View,

@@ -94,7 +94,6 @@ pub trait Grown: Placed + Pod {
 /// Memory and folder for the division.
 #[derive(Debug, Clone, Copy)]
 pub struct PageSpace<'a> {
-    /// Space of each list.
     pub list: SpoolSpace<'a>,
     /// Most records divided in memory; one page always may be.
     pub records: usize,

@@ -48,7 +48,6 @@ impl PointSource for (&[[f32; 3]], &[[u8; 3]]) {
 pub struct Budget<'a> {
     /// An existing folder for data larger than memory.
     pub folder: &'a Path,
-    /// Bytes of memory.
     pub bytes: usize,
 }
 
@@ -89,7 +88,6 @@ impl FirstPage {
     }
 }
 
-/// Counts of an import.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ImportSummary {
     pub rows: u64,
@@ -99,7 +97,6 @@ pub struct ImportSummary {
     pub points: u64,
 }
 
-/// A point with its row.
 #[derive(Debug, Clone, Copy, PartialEq, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
 struct CloudPoint {
@@ -217,7 +214,6 @@ fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputRe
     Ok(search.key())
 }
 
-/// The first scale of every point.
 fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> InputResult<Spool<SizedPoint>> {
     let distances::Measured { points, distances } = measured;
     let mut positive = 0;

@@ -13,19 +13,16 @@ use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Bytes per read or write.
 const BUFFER_BYTES: usize = 1 << 20;
 
 /// Space for lists that exceed memory.
 #[derive(Debug, Clone, Copy)]
 pub struct SpoolSpace<'a> {
-    /// An existing folder.
     pub folder: &'a Path,
     /// Bytes that one list may keep in memory.
     pub memory: usize,
 }
 
-/// A list being written.
 #[derive(Debug)]
 pub struct SpoolWriter<T> {
     folder: PathBuf,
@@ -36,7 +33,6 @@ pub struct SpoolWriter<T> {
     in_file: usize,
 }
 
-/// A complete list.
 #[derive(Debug)]
 pub struct Spool<T> {
     records: Vec<T>,

@@ -9,7 +9,6 @@ use super::world::{HALF_ROAD, HALF_STREET, MARGIN, PITCH, Patch, Plot, World};
 use crate::base::rng::{Purpose, Stream};
 use glam::DVec3;
 
-/// Half the side of a plot, metres.
 const HALF_PLOT: f64 = 0.5 * PITCH - HALF_STREET;
 
 impl World {
@@ -117,7 +116,6 @@ fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: 
     }
 }
 
-/// Rows of flats around a courtyard.
 fn terraces(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     let court = skin(parts, Kind::Paving, paint(0.6, 0.56, 0.5), paint(0.54, 0.5, 0.45));
     let lawn = grass(parts);

@@ -66,7 +66,6 @@ pub(super) struct Flight {
 }
 
 impl Shot {
-    /// World to camera with the dataset's offset.
     pub(super) fn pose(&self, offset: DVec3) -> Pose {
         Pose { rotation: self.rotation, translation: -(self.rotation * (self.centre + offset)) }
     }

@@ -29,7 +29,6 @@ use shade::Scene;
 use std::path::{Path, PathBuf};
 use world::World;
 
-/// Quality of the JPEGs.
 const JPEG_QUALITY: u8 = 95;
 
 /// Options of the city and of its photos.
@@ -93,21 +92,16 @@ impl CityOptions {
     }
 }
 
-/// Summary of a written scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CitySummary {
     pub folder: PathBuf,
-    /// Photos written.
     pub views: u32,
-    /// Points written.
     pub points: u64,
     /// Total length of all tracks.
     pub observations: u64,
-    /// Side of the city in blocks.
     pub blocks: u32,
     /// Side of the city, metres.
     pub side: f64,
-    /// Number of solids of the city.
     pub solids: u32,
     /// Number of rays cast through pixels, without shadow rays.
     pub rays: u64,
@@ -170,7 +164,6 @@ pub fn write_city(
     })
 }
 
-/// Offsets of the copies of the city.
 fn tiles([across, along]: [u32; 2], side: f64) -> Vec<[f64; 3]> {
     (0..across * along).map(|k| [f64::from(k % across) * side, f64::from(k / across) * side, 0.0]).collect()
 }
@@ -218,7 +211,6 @@ fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
     make_folder(&images)
 }
 
-/// The names in a folder.
 fn list(folder: &Path) -> InputResult<Vec<String>> {
     let names = std::fs::read_dir(folder)
         .and_then(|entries| entries.map(|e| Ok(e?.file_name().to_string_lossy().into_owned())).collect());

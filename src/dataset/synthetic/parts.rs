@@ -18,7 +18,6 @@ pub(super) fn skin(parts: &mut Parts, kind: Kind, color: Vec3, accent: Vec3) -> 
     Skin { kind, color, accent, seed: parts.draws.next_u64() as u32 }
 }
 
-/// A lawn of a random green.
 pub(super) fn grass(parts: &mut Parts) -> Skin {
     let green = parts.draws.range(0.0, 0.06) as f32;
     skin(parts, Kind::Grass, paint(0.38 + green, 0.48, 0.25), paint(0.5 + green, 0.53, 0.3))
@@ -147,7 +146,6 @@ impl Parts {
         self.roof(above(at, 2.1), (1.7, 1.5), (0.8, 0.0), AXIS, wood, roof);
     }
 
-    /// A barn with a metal roof.
     pub(super) fn barn(&mut self, at: DVec3, turn: f64) {
         let turn = turn_by(turn);
         let wall = skin(self, Kind::Wood, paint(0.55, 0.36, 0.28), paint(0.5, 0.4, 0.3));

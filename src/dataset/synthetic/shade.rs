@@ -11,7 +11,6 @@ use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Side of a cell of the sky map, metres.
 const SKY_CELL: f64 = 1.0;
-/// Number of directions that sample the sky.
 const SKY_RAYS: usize = 32;
 /// Length of the rays that sample the sky, metres.
 const SKY_REACH: f64 = 45.0;
@@ -48,7 +47,6 @@ struct SkyMap {
 /// A NaN that no height and no share has.
 const UNKNOWN: u32 = u32::MAX;
 
-/// The first place on a ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Hit {
     pub(super) t: f64,
@@ -58,7 +56,6 @@ pub(super) struct Hit {
     solid: Option<(u32, Face)>,
 }
 
-/// Light along one ray.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Sample {
     pub(super) light: Vec3,
@@ -66,7 +63,6 @@ pub(super) struct Sample {
     pub(super) surface: u32,
 }
 
-/// Surface number of the sky.
 const SKY: Sample = Sample { light: Vec3::new(0.55, 0.68, 0.85), surface: u32::MAX };
 
 impl Scene {
@@ -175,7 +171,6 @@ impl Scene {
     }
 }
 
-/// The surface of a solid at a world point.
 fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> Look {
     let p = solid.rotate_to_local(point - solid.origin);
     let (half_x, half_y, height) = match solid.shape {

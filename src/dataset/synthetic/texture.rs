@@ -102,7 +102,6 @@ fn mix(a: Vec3, b: Vec3, t: f32) -> Vec3 {
     a + (b - a) * t
 }
 
-/// The material of a surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     /// Wall with a grid of windows.
@@ -117,13 +116,11 @@ pub(super) enum Kind {
     Tiles,
     /// Flat roof of bitumen sheets.
     Bitumen,
-    /// Flat roof of gravel.
     Gravel,
     /// Sheets with standing seams.
     Metal,
     Solar,
     Leaves,
-    /// Wood or bark.
     Wood,
     CarPaint,
     CarGlass,

@@ -31,15 +31,25 @@ impl Ray {
 #[derive(Debug, Clone, Copy)]
 pub(super) enum Shape {
     /// Box with half sides and a height.
-    Block { half_x: f64, half_y: f64, height: f64 },
+    Block {
+        half_x: f64,
+        half_y: f64,
+        height: f64,
+    },
     /// Roof over a rectangle with its ridge along x: slopes along y, and also along x if `run > 0` (hipped); cut off at
     /// the height `cap`.
-    Roof { half_x: f64, half_y: f64, height: f64, run: f64, cap: f64 },
-    /// Ellipsoid around the origin.
-    Ellipsoid { radii: DVec3 },
+    Roof {
+        half_x: f64,
+        half_y: f64,
+        height: f64,
+        run: f64,
+        cap: f64,
+    },
+    Ellipsoid {
+        radii: DVec3,
+    },
 }
 
-/// A part of a solid's surface.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Face {
     /// Vertical wall across x, or gable end.

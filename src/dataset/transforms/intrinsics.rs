@@ -10,7 +10,6 @@ use crate::dataset::model::{Intrinsics, Lens};
 
 const UNDISTORT: &str = "undistort the photos first, or export a PINHOLE, OPENCV or OPENCV_FISHEYE camera";
 
-/// A frame with its top level.
 #[derive(Clone, Copy)]
 pub(super) struct Levels<'a> {
     pub frame: Node<'a>,

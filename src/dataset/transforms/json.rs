@@ -38,14 +38,12 @@ fn is_known(key: &str) -> bool {
     KNOWN.split(' ').any(|known| known == key)
 }
 
-/// nerfstudio's lists of file names.
 pub(super) const LISTS: [&str; 3] = ["train_filenames", "val_filenames", "test_filenames"];
 
 #[derive(Debug, Default)]
 pub(super) enum Names {
     #[default]
     Absent,
-    /// The cleaned names.
     Listed(BTreeSet<String>),
     /// Unusable: the problem and the remedy.
     Bad(String, &'static str),
@@ -148,7 +146,6 @@ enum Part<'t> {
     Value(&'t mut usize),
     /// The top level: its known keys.
     Top(&'t mut Lists),
-    /// A list of names.
     Names(&'t mut Names),
     /// The top level, to pass on its frames until one is refused.
     TopOfFrames(&'t mut dyn FnMut(Value) -> bool),

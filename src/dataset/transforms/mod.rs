@@ -104,7 +104,6 @@ fn read_files(
     Ok(())
 }
 
-/// State of the reader.
 struct Reading<'a> {
     gathered: Gathered<'a>,
     /// Frames that none of the used lists of file names contains.

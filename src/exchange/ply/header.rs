@@ -107,7 +107,6 @@ pub struct Property {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Element {
     pub name: String,
-    /// Number of rows that the header states.
     pub count: u64,
     pub properties: Vec<Property>,
 }

@@ -26,7 +26,6 @@ pub use write::{PlyWriter, write_gaussians};
 use super::meta::SceneMeta;
 use crate::scene::columns::Columns;
 
-/// Content of a PLY file.
 #[allow(clippy::large_enum_variant)] // one value a file
 #[derive(Debug, Clone, PartialEq)]
 pub enum PlyContent {

@@ -381,7 +381,6 @@ fn stream_body<R: BufRead + Seek>(
     })
 }
 
-/// The properties of colours.
 struct Colors {
     slots: Vec<usize>,
     /// The value of full brightness; `None` for floating-point numbers, whose range is not stated.

@@ -72,7 +72,6 @@ pub fn write_chunk(folder: &mut PartFolder, inside: &Path, rows: &[ExportRow], s
     folder.write(&inside.join(META_FILE), meta.to_string().as_bytes())
 }
 
-/// A picture of RGBA pixels.
 struct Picture {
     width: usize,
     pixels: Vec<[u8; 4]>,

@@ -3,7 +3,6 @@
 //! Invariants: 1. the smallest and the largest value are kept, so no value is off by more than half the distance between its
 //! neighbours in the codebook; 2. the codebook depends on the values alone, not on their order.
 
-/// Values of a codebook.
 pub const CODES: usize = 256;
 /// Bins of the histogram that places the first codes.
 const BINS: usize = 4096;

@@ -166,7 +166,6 @@ fn read_transform(path: &Path, is_ours: bool) -> InputResult<SceneMeta> {
     }
 }
 
-/// Appends a part of a file.
 fn append(rows: &mut Columns, chunk: &Columns, part: &Part) {
     let end = part.first + part.rows;
     for column in Column::ALL {

@@ -220,7 +220,6 @@ fn coded(book: &[f32; CODES], pixel: [u8; 4]) -> [f32; 3] {
     [0, 1, 2].map(|i| book[usize::from(pixel[i])])
 }
 
-/// A decoded picture.
 struct Picture {
     path: PathBuf,
     width: usize,
@@ -287,7 +286,6 @@ pub(super) fn path_in_folder(from: &Path, name: &str) -> InputResult<PathBuf> {
     }
 }
 
-/// The bytes of a regular file.
 fn read_file(path: &Path) -> InputResult<Vec<u8>> {
     let io = |e: std::io::Error| match InputError::io(path, "reading", &e) {
         missing if e.kind() == ErrorKind::NotFound => {

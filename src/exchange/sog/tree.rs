@@ -5,7 +5,6 @@
 use serde_json::{Map, Value, json};
 use std::path::Path;
 
-/// Name of the file.
 pub const TREE_FILE: &str = "lod-meta.json";
 
 /// Whether `path` is named like the tree of a folder.
@@ -13,10 +12,8 @@ pub fn is_tree(path: &Path) -> bool {
     path.file_name().is_some_and(|name| name == TREE_FILE)
 }
 
-/// Rows of a leaf in one level.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Part {
-    /// Number of the file.
     pub file: usize,
     /// Its first row in the file.
     pub first: usize,

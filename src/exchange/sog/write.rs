@@ -31,7 +31,6 @@ const LEVELS: usize = LEVELS_MAX;
 const COARSER: usize = 4;
 /// Rows of a group, which is a file of the finest level.
 const GROUP_ROWS: usize = 1 << 16;
-/// Most rows of a leaf.
 const LEAF_ROWS: usize = 1 << 13;
 /// Rows at which the open file of a coarser level is full.
 const FULL_ROWS: usize = 1 << 15;
@@ -41,7 +40,6 @@ const GIANTS_MAX: usize = 1 << 16;
 const GIANT_RADII: f64 = 0.25;
 /// Sigmas of a Gaussian inside the box of its leaf.
 const BOX_SIGMAS: f64 = 2.0;
-/// Folder of the giants.
 const GIANTS_FOLDER: &str = "env";
 
 /// Most memory of a writer of `rows` rows beside its input, bytes.
@@ -92,7 +90,6 @@ struct OpenFile {
     number: usize,
 }
 
-/// Writes a folder in parts.
 pub struct SogWriter {
     folder: PartFolder,
     path: PathBuf,
@@ -143,7 +140,6 @@ impl SogWriter {
         f64::from(longest) > self.giant_log_scale
     }
 
-    /// The number of a new file of a level.
     fn new_file(&mut self, level: usize) -> usize {
         self.files.push(format!("{level}_{}/{META_FILE}", self.files_of[level]));
         self.files_of[level] += 1;
