@@ -18,9 +18,7 @@ use std::path::Path;
 pub const MOST_BYTES: u32 = 1 << 20;
 
 /// log2 of exposure time (seconds) times ISO over the squared f-number, stops; `None` if the data lack one of the three.
-///
-/// # Errors
-/// The reason why the data cannot be read, for a message that names the file.
+/// Errors: the reason why the data cannot be read, for a message that names the file.
 pub fn brightness(path: &Path, place: ExifPlace) -> Result<Option<f64>, String> {
     if place.bytes > MOST_BYTES {
         return Err(format!("{} bytes, more than {MOST_BYTES}", place.bytes));

@@ -48,9 +48,7 @@ impl<'a> Gathered<'a> {
     }
 
     /// The views, sorted by name; warns about those that `file` names and that are left out.
-    ///
-    /// # Errors
-    /// A photo is missing, and missing photos are not allowed; no view is left; two views have one name or photo.
+    /// Errors: a photo is missing, and missing photos are not allowed; no view is left; two views have one name or photo.
     pub fn finish(mut self, file: &Path, words: &Words, warnings: &mut Vec<String>) -> InputResult<Vec<RawView>> {
         self.photos.finish(&mut self.views, warnings);
         if !self.missing.is_empty() && !self.options.allow_missing {

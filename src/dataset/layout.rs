@@ -148,9 +148,7 @@ impl std::str::FromStr for Layout {
 }
 
 /// The first layout of `accepted` (not empty) of which the folder lacks nothing.
-///
-/// # Errors
-/// The folder does not exist or has none of the layouts: the error names what each lacks, shows the expected trees, and
+/// Errors: the folder does not exist or has none of the layouts: the error names what each lacks, shows the expected trees, and
 /// `fetch`, where to get the data.
 pub fn find_layout(folder: &Path, accepted: &[Layout], fetch: &[String]) -> InputResult<Layout> {
     let remedy = |layouts: &[Layout]| {

@@ -69,7 +69,6 @@ impl Dataset {
 }
 
 /// Checks photos and converts a scene to the local frame.
-///
 /// Errors: options out of range, no usable view, no training view; missing photos (listed by name) unless
 /// `allow_missing`; photos or masks that are empty, cut short, not JPEG or PNG, or whose shape does not match the
 /// camera.
@@ -92,9 +91,7 @@ pub fn load_dataset(mut raw: RawScene, options: &LoadOptions) -> InputResult<Dat
 }
 
 /// As [`load_dataset`], for points that may exceed memory: the dataset has no points, the source streams them.
-///
-/// # Errors
-/// As [`load_dataset`]; or the cloud's file cannot be read.
+/// Errors: as [`load_dataset`]; or the cloud's file cannot be read.
 pub fn load_dataset_with_cloud<'c>(
     raw: RawScene,
     cloud: &'c Cloud,

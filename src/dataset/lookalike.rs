@@ -23,9 +23,7 @@ const MATRIX_CITY_UNIT: f64 = 100.0;
 
 /// Generates a city and writes it to `folder` in a layout. Layouts with a held-out folder put every `test_every`th
 /// photo there. `progress(done, views)` is called after each photo.
-///
-/// # Errors
-/// As [`write_city`]; also if the folder is not empty, or the layout cannot be written.
+/// Errors: as [`write_city`]; also if the folder is not empty, or the layout cannot be written.
 pub fn write_lookalike(
     folder: &Path,
     options: &CityOptions,

@@ -92,7 +92,6 @@ pub fn intrinsics_at(intrinsics: &Intrinsics, size: Size) -> Intrinsics {
 }
 
 /// Decodes a view's target.
-///
 /// Errors: the photo or its mask cannot be read or decoded, or changed its size since load.
 pub fn decode(source: &PhotoSource) -> InputResult<Target> {
     let (rgb, mut mask) = match read_colors(&source.image_path, &source.header, source.alpha)? {

@@ -61,7 +61,6 @@ impl PhotoHeader {
 }
 
 /// Reads and checks the header and the end of a photo file.
-///
 /// Errors: unreadable, empty, neither JPEG nor PNG, damaged header, cut short, or too large.
 pub fn read_header(path: &Path) -> InputResult<PhotoHeader> {
     let file = File::open(path).map_err(|e| InputError::io(path, "opening the photo", &e))?;

@@ -75,9 +75,7 @@ fn os_name(_: Vec<u8>) -> Option<OsString> {
 }
 
 /// Gives the views whose names have bytes of a code page names to show, and says which they are.
-///
-/// # Errors
-/// Two views have the same name then.
+/// Errors: two views have the same name then.
 pub(super) fn make_readable(file: &Path, scene: &mut RawScene) -> InputResult<()> {
     let (mut found, mut lost) = (Vec::new(), Vec::new());
     for view in scene.views.iter_mut().filter(|view| has_raw_bytes(&view.name)) {

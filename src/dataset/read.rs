@@ -11,9 +11,7 @@ use std::path::{Path, PathBuf};
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
 /// MatrixCity's or in Mega-NeRF's layout, with OpenSfM's `reconstruction.json` or RealityCapture's CSV, or such a JSON or CSV
 /// file. If a folder matches several, the first of these applies.
-///
-/// # Errors
-/// Any problem with the files; if nothing matches, the error lists what was searched for.
+/// Errors: any problem with the files; if nothing matches, the error lists what was searched for.
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };

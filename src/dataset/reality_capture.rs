@@ -42,9 +42,7 @@ pub fn looks_like_reality_capture(folder: &Path) -> bool {
 }
 
 /// Reads a folder with such a CSV, or the CSV.
-///
-/// # Errors
-/// No such file or several, columns that are missing or not numbers, impossible cameras, a lens with `k4`, a photo that is
+/// Errors: no such file or several, columns that are missing or not numbers, impossible cameras, a lens with `k4`, a photo that is
 /// missing (unless allowed), no view left.
 pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let file = if path.is_file() { path.to_path_buf() } else { only_file(path)? };

@@ -90,7 +90,6 @@ const NEVER: u64 = u64::MAX;
 impl TargetCache {
     /// A cache for these views that uses at most `budget_bytes` and decodes on `threads` threads of its own. With 0
     /// threads, callers of `get` decode, and nothing is prefetched.
-    ///
     /// Errors: the system refuses to start a thread.
     pub fn new(views: &[View], budget_bytes: u64, threads: usize) -> InputResult<Self> {
         let photos: Vec<PhotoSource> = views.iter().map(|v| v.photo.clone()).collect();
@@ -138,7 +137,6 @@ impl TargetCache {
 
     /// The target of a view; waits until it is decoded. Views of the plan up to and including this one's first position
     /// count as past.
-    ///
     /// Errors: the photo or mask cannot be decoded (the same error every time).
     pub fn get(&self, view: usize) -> InputResult<Arc<Target>> {
         let shared = &self.shared;

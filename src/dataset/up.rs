@@ -75,9 +75,7 @@ fn outer(v: DVec3) -> DMat3 {
 
 /// The unit vector that is up, in the axes of the dataset; `None` without cameras. `points` passes the positions of the
 /// points, local frame, to its argument.
-///
-/// # Errors
-/// Those of `points`.
+/// Errors: those of `points`.
 pub fn estimate_up<'a>(
     cameras: impl Iterator<Item = &'a Camera>,
     points: impl FnOnce(&mut dyn FnMut([f32; 3])) -> InputResult<()>,

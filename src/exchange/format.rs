@@ -48,9 +48,7 @@ impl ExportFormat {
     pub const NAMES: &str = ".ply, .spz, or lod-meta.json in a folder of its own (SOG with levels of detail)";
 
     /// The format of a file, by the ending of its name or the whole name.
-    ///
-    /// # Errors
-    /// No format has this name.
+    /// Errors: no format has this name.
     pub fn of_path(path: &Path) -> InputResult<ExportFormat> {
         let ending = path.extension().and_then(|ending| ending.to_str()).unwrap_or_default();
         let is = |word: &str| ending.eq_ignore_ascii_case(word);
@@ -84,9 +82,7 @@ impl ExportFormat {
     }
 
     /// Checks that [`ExportFormat::remove`] may remove the export `file`.
-    ///
-    /// # Errors
-    /// A folder has the name of the file, or the folder of the export holds files that no export wrote, or cannot be listed.
+    /// Errors: a folder has the name of the file, or the folder of the export holds files that no export wrote, or cannot be listed.
     pub fn check_removable(self, file: &Path) -> InputResult<()> {
         match self {
             ExportFormat::Ply | ExportFormat::Spz if file.is_dir() => Err(InputError::new(
@@ -100,9 +96,7 @@ impl ExportFormat {
     }
 
     /// Removes the export `file` and its transform, if they exist.
-    ///
-    /// # Errors
-    /// As [`ExportFormat::check_removable`], or the drive fails.
+    /// Errors: as [`ExportFormat::check_removable`], or the drive fails.
     pub fn remove(self, file: &Path) -> InputResult<()> {
         let remove_file = |path: &Path| match std::fs::remove_file(path) {
             Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
@@ -118,9 +112,7 @@ impl ExportFormat {
     }
 
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`.
-    ///
-    /// # Errors
-    /// The disk fails, or `path` names no file.
+    /// Errors: the disk fails, or `path` names no file.
     pub fn create(
         self,
         path: &Path,
@@ -137,9 +129,7 @@ impl ExportFormat {
 
     /// Writes the transform from a file of this format to the dataset's coordinates, beside the file. `meta` is that of a PLY. A folder of
     /// SOGs holds its own already.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn write_transform(self, path: &Path, meta: &SceneMeta, frame: ExportFrame) -> InputResult<()> {
         match self {
             ExportFormat::Ply => write_transform(path, meta, frame, meta.upright.map(|_| VIEWER_UP)),

@@ -51,14 +51,10 @@ pub(super) fn no_finite_row(path: &Path, given: u64) -> InputError {
 /// A file of Gaussians that is being written. Dropping a sink leaves the target as it was.
 pub trait GaussianSink {
     /// Appends rows of the local frame; ones with values that are not finite are left out and counted.
-    ///
-    /// # Errors
-    /// The disk fails, or there are more rows or bands than were announced.
+    /// Errors: the disk fails, or there are more rows or bands than were announced.
     fn write(&mut self, columns: &Columns) -> InputResult<()>;
 
     /// Makes the file appear at its target, complete and synced.
-    ///
-    /// # Errors
-    /// The disk fails, or no row is finite. The target then stays unchanged.
+    /// Errors: the disk fails, or no row is finite. The target then stays unchanged.
     fn finish(self: Box<Self>) -> InputResult<Written>;
 }

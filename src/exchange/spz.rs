@@ -74,9 +74,7 @@ impl SpzWriter {
     }
 
     /// Starts a file of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows.
-    ///
-    /// # Errors
-    /// The disk fails, or `path` names no file.
+    /// Errors: the disk fails, or `path` names no file.
     pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SpzWriter> {
         let (part, out) = PartFile::create(path)?;
         let rows_path = path.with_extension("spz.rows");

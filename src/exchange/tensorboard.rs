@@ -32,8 +32,7 @@ pub struct EventFile {
 impl EventFile {
     /// Creates an event file in `folder`, under a name that TensorBoard recognises. For a resumed run `first_step` is
     /// its first step: what earlier files say of this step and later ones becomes void.
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn create(folder: &Path, first_step: Option<u32>) -> InputResult<EventFile> {
         std::fs::create_dir_all(folder)
             .map_err(|e| InputError::io(folder, "creating the folder of event files", &e))?;
@@ -52,9 +51,7 @@ impl EventFile {
     }
 
     /// Appends the scalars of a step: (tag, value), a tag like `loss/train`.
-    ///
-    /// # Errors
-    /// The disk fails.
+    /// Errors: the disk fails.
     pub fn write(&mut self, step: u32, scalars: &[(&str, f64)]) -> InputResult<()> {
         let mut summary = Vec::new();
         for (tag, value) in scalars.iter().filter(|(_, value)| value.is_finite()) {
@@ -70,9 +67,7 @@ impl EventFile {
     }
 
     /// Appends a picture to a step: the bytes of a PNG of `width` times `height` pixels in RGB.
-    ///
-    /// # Errors
-    /// The disk fails.
+    /// Errors: the disk fails.
     pub fn write_picture(&mut self, step: u32, tag: &str, (width, height): (u32, u32), png: &[u8]) -> InputResult<()> {
         let mut image = Vec::with_capacity(png.len() + 32);
         for (field, value) in [(1, height), (2, width), (3, RGB)] {

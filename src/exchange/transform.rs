@@ -33,9 +33,7 @@ pub struct Transform {
 
 impl Transform {
     /// Frame and axes of Gaussians with this transform, which was read from `path`.
-    ///
-    /// # Errors
-    /// It is not what this program writes.
+    /// Errors: it is not what this program writes.
     pub fn meta(&self, path: &Path) -> InputResult<SceneMeta> {
         let matrix = self.file_to_dataset;
         let upright = self.up_in_dataset.and_then(Rotation::upright);
@@ -55,9 +53,7 @@ impl Transform {
 
 /// Frame and axes of a PLY that does not state them, from the transform file beside it; `None` without one. An editor may have
 /// saved the PLY under another name: then the transform of the only other PLY in the folder counts.
-///
-/// # Errors
-/// The file cannot be read, or is not what this program writes.
+/// Errors: the file cannot be read, or is not what this program writes.
 pub fn meta_beside(ply: &Path) -> InputResult<Option<SceneMeta>> {
     let own = transform_path(ply);
     let found = if own.is_file() { Some((own.clone(), read(&own)?)) } else { only_one_beside(ply) };
@@ -99,17 +95,13 @@ pub fn transform_path(file: &Path) -> PathBuf {
 
 /// Writes the transform of Gaussians that were written to `file` in `frame` with `meta`, beside the file. `up` is the direction that
 /// points up in the file; `None` if the Gaussians were not turned.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Errors: the folder cannot be written.
 pub fn write_transform(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Option<[f64; 3]>) -> InputResult<()> {
     write_whole(&transform_path(file), transform_text(file, meta, frame, up)?.as_bytes())
 }
 
 /// The text of the transform: two 4x4 matrices, row-major, for column vectors.
-///
-/// # Errors
-/// A number is not finite.
+/// Errors: a number is not finite.
 pub fn transform_text(file: &Path, meta: &SceneMeta, frame: ExportFrame, up: Option<[f64; 3]>) -> InputResult<String> {
     let turned = meta.upright.unwrap_or(Rotation::IDENTITY);
     let (origin, scale) = match frame {

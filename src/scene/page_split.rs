@@ -20,9 +20,7 @@ pub struct SplitTooDeep {
 
 /// Splits the rows of page `id` into pages of at most `page_rows` rows (at least 1). `means` (`[rows][3]`) are the
 /// positions to cut by: the current ones, not the stored ones.
-///
-/// # Errors
-/// The lineage has no more ids.
+/// Errors: the lineage has no more ids.
 pub fn split_page(
     id: PageId,
     state: SceneState,

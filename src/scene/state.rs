@@ -103,9 +103,7 @@ impl SceneState {
 
     /// Reserves memory for exactly `more` further rows, so that a scene's memory is determined by its rows and not by
     /// the doubling of vectors. Grows one vector at a time.
-    ///
-    /// # Errors
-    /// Not enough memory; some of the vectors may have grown.
+    /// Errors: not enough memory; some of the vectors may have grown.
     pub fn try_reserve_exact(&mut self, more: usize) -> Result<(), TryReserveError> {
         let sh_degree = self.sh_degree();
         for table in [&mut self.columns, &mut self.exp_avg, &mut self.exp_avg_sq] {

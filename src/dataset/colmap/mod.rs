@@ -82,9 +82,7 @@ pub fn looks_like_colmap(scene: &Path) -> bool {
 /// Reads the COLMAP model of a scene folder. Views are sorted by name; `image_path` is `scene/<images>/<name>`.
 /// Non-finite points are dropped and counted. If there is no image folder, other places are
 /// searched ([`parts`]).
-///
-/// # Errors
-/// No model, no image folder, files that are truncated, contradict themselves or have more than 1 % non-finite points,
+/// Errors: no model, no image folder, files that are truncated, contradict themselves or have more than 1 % non-finite points,
 /// names that would leave the image folder or occur twice, unsupported cameras.
 pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     if !looks_like_colmap(scene) {
@@ -215,9 +213,7 @@ fn make_pose(quat: [f64; 4], translation: [f64; 3]) -> Option<Pose> {
 
 /// Streams every point of a `points3D.bin` or `points3D.txt` to `take`, in file order; skips tracks, drops non-finite
 /// points and counts them in a warning.
-///
-/// # Errors
-/// The file is damaged or has more than 1 % non-finite points; or `take` failed.
+/// Errors: the file is damaged or has more than 1 % non-finite points; or `take` failed.
 pub fn stream_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
     let is_text = file.extension().is_some_and(|e| e.eq_ignore_ascii_case("txt"));
     if is_text { text::read_points(file, warnings, take) } else { binary::read_points(file, warnings, take) }

@@ -39,9 +39,7 @@ pub fn looks_like_parts(scene: &Path) -> bool {
 }
 
 /// Reads both parts; the points are those of the training part.
-///
-/// # Errors
-/// As [`super::read_colmap`] for either part; or a part has no photos.
+/// Errors: as [`super::read_colmap`] for either part; or a part has no photos.
 pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let Some(folders) = parts(scene) else {
         return Err(InputError::new(scene, "no models in train/sparse and val/sparse", "put them there"));

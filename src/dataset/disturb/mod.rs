@@ -127,9 +127,7 @@ struct TrainView<'a> {
 }
 
 /// The training photos of a disturbed scene.
-///
-/// # Errors
-/// Nothing is left to train on.
+/// Errors: nothing is left to train on.
 pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<Plan> {
     let train = train_views(dataset, disturbance, seed);
     if train.is_empty() || dataset.points.is_empty() {
@@ -149,9 +147,7 @@ pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputRes
 }
 
 /// Writes the scene of `dataset` to `folder`, which must be new, with a disturbance.
-///
-/// # Errors
-/// As [`plan`]; the folder exists, a photo cannot be decoded, or a file cannot be written.
+/// Errors: as [`plan`]; the folder exists, a photo cannot be decoded, or a file cannot be written.
 pub fn write_disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<()> {
     if folder.exists() {
         return Err(InputError::new(folder, "the folder exists", "choose another folder"));

@@ -36,9 +36,7 @@ pub struct LocalCloud<'a> {
 
 impl Cloud {
     /// Spools all points that `read` produces.
-    ///
-    /// # Errors
-    /// `read` failed, or the budget's folder cannot be written.
+    /// Errors: `read` failed, or the budget's folder cannot be written.
     pub fn gather(budget: &Budget<'_>, read: impl FnOnce(&mut TakePoint<'_>) -> InputResult<()>) -> InputResult<Cloud> {
         let mut points = SpoolWriter::new(budget.space());
         read(&mut |position, [r, g, b]| points.push(RawPoint { position, color: [r, g, b, 0, 0, 0, 0, 0] }))?;
@@ -50,18 +48,14 @@ impl Cloud {
     }
 
     /// Calls `take` with every point in order.
-    ///
-    /// # Errors
-    /// The file cannot be read, or `take` failed.
+    /// Errors: the file cannot be read, or `take` failed.
     pub fn for_each(&self, mut take: impl FnMut(DVec3, [u8; 3]) -> InputResult<()>) -> InputResult<()> {
         self.points.for_each(|p| take(DVec3::from_array(p.position), [p.color[0], p.color[1], p.color[2]]))
     }
 
     /// Median distance of the usable points from a position (for an even number the mean of the middle two); 0 without
     /// points.
-    ///
-    /// # Errors
-    /// The file cannot be read.
+    /// Errors: the file cannot be read.
     pub fn median_distance(&self, from: DVec3) -> InputResult<f64> {
         let mut count = 0u64;
         self.for_each(|p, _| {

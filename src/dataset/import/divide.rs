@@ -104,9 +104,7 @@ pub type TakePage<'a, E> = dyn FnMut(PageId, &[E]) -> InputResult<()> + 'a;
 
 /// Divides records into pages, giants separately, of at most `fill` and passes them on in the order of their ids. Returns the number of
 /// pages.
-///
-/// # Errors
-/// The folder cannot be written, or `take` failed.
+/// Errors: the folder cannot be written, or `take` failed.
 pub fn paginate<E: Grown>(
     records: Spool<E>,
     fill: usize,

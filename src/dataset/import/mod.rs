@@ -30,9 +30,7 @@ use std::path::Path;
 /// Points that can be read repeatedly, in the same order.
 pub trait PointSource {
     /// Passes every point to `take`: position in the local frame, sRGB.
-    ///
-    /// # Errors
-    /// The points cannot be read, or `take` failed.
+    /// Errors: the points cannot be read, or `take` failed.
     fn read(&self, take: &mut dyn FnMut([f32; 3], [u8; 3]) -> InputResult<()>) -> InputResult<()>;
 }
 
@@ -138,9 +136,7 @@ impl Grown for SizedPoint {
 }
 
 /// Makes the first Gaussians of all points and passes them on page by page, in the order of the pages' ids.
-///
-/// # Errors
-/// The points cannot be read, the folder cannot be written, there are 2^32 points or more, or `take` failed.
+/// Errors: the points cannot be read, the folder cannot be written, there are 2^32 points or more, or `take` failed.
 pub fn import_points(
     source: &dyn PointSource,
     options: &ImportOptions<'_>,

@@ -79,8 +79,7 @@ impl<T: Pod> SpoolWriter<T> {
         SpoolWriter { folder, memory: space.memory, waiting: Vec::new(), file: None, in_file: 0 }
     }
 
-    /// # Errors
-    /// The list outgrew memory, and the folder cannot be written.
+    /// Errors: the list outgrew memory, and the folder cannot be written.
     pub fn push(&mut self, record: T) -> InputResult<()> {
         if self.waiting.len() >= self.limit() {
             self.flush()?;
@@ -119,8 +118,7 @@ impl<T: Pod> SpoolWriter<T> {
         self.in_file + self.waiting.len()
     }
 
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn finish(mut self) -> InputResult<Spool<T>> {
         let len = self.len();
         if self.file.is_some() {
@@ -141,9 +139,7 @@ impl<T: Pod> Spool<T> {
     }
 
     /// Calls `take` with every record in order.
-    ///
-    /// # Errors
-    /// The file cannot be read, or `take` failed.
+    /// Errors: the file cannot be read, or `take` failed.
     pub fn for_each(&self, mut take: impl FnMut(&T) -> InputResult<()>) -> InputResult<()> {
         if self.file.is_none() {
             return self.records.iter().try_for_each(take);
@@ -157,23 +153,19 @@ impl<T: Pod> Spool<T> {
         Ok(())
     }
 
-    /// # Errors
-    /// The file cannot be read.
+    /// Errors: the file cannot be read.
     pub fn range(&self, range: Range<usize>) -> InputResult<Vec<T>> {
         let mut records = Vec::new();
         self.read_into(range, &mut records).map(|()| records)
     }
 
-    /// # Errors
-    /// The file cannot be read.
+    /// Errors: the file cannot be read.
     pub fn into_vec(self) -> InputResult<Vec<T>> {
         if self.file.is_some() { self.range(0..self.len) } else { Ok(self.records) }
     }
 
     /// Completes a search among the records' keys; records without a key do not count.
-    ///
-    /// # Errors
-    /// The file cannot be read.
+    /// Errors: the file cannot be read.
     pub fn search(&self, mut search: RankSearch, key: impl Fn(&T) -> Option<u64>) -> InputResult<RankSearch> {
         while !search.is_done() {
             self.for_each(|record| {

@@ -35,9 +35,7 @@ pub fn looks_like_mega_nerf(folder: &Path) -> bool {
 }
 
 /// Reads a scene in Mega-NeRF's layout. `train` prescribes the training views, `val` the held-out ones.
-///
-/// # Errors
-/// A file is missing, broken or holds impossible numbers; a photo is missing (unless allowed); no view is left.
+/// Errors: a file is missing, broken or holds impossible numbers; a photo is missing (unless allowed); no view is left.
 pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let coordinates = TorchFile::open(&folder.join("coordinates.pt"))?;
     let origin = coordinates.numbers("origin_drb", &[&[3]])?;

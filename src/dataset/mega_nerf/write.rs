@@ -24,9 +24,7 @@ pub(super) enum Entry {
 }
 
 /// Writes the views of `scene` to `folder`, every `test_every`th one into `val`; photos are moved there.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Errors: the folder cannot be written.
 pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> InputResult<()> {
     let centres: Vec<_> = scene.views.iter().map(|view| view.pose.centre()).collect();
     let (mut low, mut high) = (centres[0], centres[0]);

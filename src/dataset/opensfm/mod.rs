@@ -40,9 +40,7 @@ pub fn looks_like_opensfm(folder: &Path) -> bool {
 }
 
 /// Reads a project folder, or a `reconstruction.json`.
-///
-/// # Errors
-/// The file is missing, broken or holds impossible numbers or an unsupported lens; a photo is missing (unless allowed); no
+/// Errors: the file is missing, broken or holds impossible numbers or an unsupported lens; a photo is missing (unless allowed); no
 /// view is left.
 pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let file = match path.is_file() {

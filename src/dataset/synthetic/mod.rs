@@ -129,9 +129,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
 }
 
 /// Generates a city and writes it to `folder` as a COLMAP scene. `progress(done, views)` is called after each photo.
-///
-/// # Errors
-/// An option is out of range, the folder is not empty and `overwrite` is off, or a file cannot be written.
+/// Errors: an option is out of range, the folder is not empty and `overwrite` is off, or a file cannot be written.
 pub fn write_city(
     folder: &Path,
     options: &CityOptions,

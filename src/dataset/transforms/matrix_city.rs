@@ -48,9 +48,7 @@ fn block_files(folder: &Path, set: &str) -> Vec<PathBuf> {
 }
 
 /// Reads MatrixCity's folders. `train` and `test` prescribe the split.
-///
-/// # Errors
-/// As [`super::read_transforms`]; or a path leaves `folder`.
+/// Errors: as [`super::read_transforms`]; or a path leaves `folder`.
 pub fn read_matrix_city(folder: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let mut files = Vec::new();
     for (set, split) in [("train", Split::Train), ("test", Split::Test)] {

@@ -43,9 +43,7 @@ pub fn looks_like_transforms(folder: &Path) -> bool {
 
 /// Reads a folder with `transforms*.json` or one such file. Paths in it are relative to its folder and must stay
 /// inside. `points_path` is set if `ply_file_path` names an existing file.
-///
-/// # Errors
-/// No JSON, broken JSON, keys of the wrong kind, unsupported cameras, names that leave the folder or occur twice, no
+/// Errors: no JSON, broken JSON, keys of the wrong kind, unsupported cameras, names that leave the folder or occur twice, no
 /// view left, missing photos whose size is needed.
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };

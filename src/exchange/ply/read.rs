@@ -45,18 +45,14 @@ fn read_transform_beside(path: &Path, meta: &mut SceneMeta) -> InputResult<()> {
 }
 
 /// Whether `path` holds Gaussians; otherwise it holds points.
-///
-/// # Errors
-/// The file cannot be opened, or its header cannot be read.
+/// Errors: the file cannot be opened, or its header cannot be read.
 pub fn holds_gaussians(path: &Path) -> InputResult<bool> {
     let header = parse_header(&mut open(path)?.0, path)?;
     Ok(vertex_of(&header, path)?.1.find("f_dc_0").is_some())
 }
 
 /// Number of Gaussians or points that the header of `path` states.
-///
-/// # Errors
-/// The file cannot be opened, or its header cannot be read.
+/// Errors: the file cannot be opened, or its header cannot be read.
 pub fn stated_rows(path: &Path) -> InputResult<u64> {
     let header = parse_header(&mut open(path)?.0, path)?;
     Ok(vertex_of(&header, path)?.1.count)
@@ -64,9 +60,7 @@ pub fn stated_rows(path: &Path) -> InputResult<u64> {
 
 /// Streams the coloured points of `path` to `take` in file order, without storing them; returns the number dropped
 /// because they are not finite. Gaussians count as points of the default colour.
-///
-/// # Errors
-/// As [`parse_ply`], and those of `take`.
+/// Errors: as [`parse_ply`], and those of `take`.
 pub fn stream_points(path: &Path, take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>) -> InputResult<u64> {
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
@@ -92,9 +86,7 @@ fn open(path: &Path) -> InputResult<(BufReader<File>, u64)> {
 /// Accepts ascii and both binary formats, with properties in any order; other properties and elements, including lists,
 /// are skipped. Colours are `red green blue`, integers of 0 to 255 (16 bits: to 65,535), or floating-point numbers in one of these
 /// ranges or from 0 to 1, whichever the largest of them says. `path` only names the file in errors.
-///
-/// # Errors
-/// The file is cut short, states more rows than it holds, lacks a property, has a number of `f_rest` properties other
+/// Errors: the file is cut short, states more rows than it holds, lacks a property, has a number of `f_rest` properties other
 /// than 0, 9, 24 or 45, has no vertices, or more than 1 % of its rows have non-finite values.
 pub fn parse_ply<R: BufRead + Seek>(mut reader: R, total_bytes: u64, path: &Path) -> InputResult<PlyContent> {
     let header = parse_header(&mut reader, path)?;
@@ -213,9 +205,7 @@ pub const ROW_HEAD: usize = 14;
 /// Streams the Gaussians of `path` to `take` one by one in file order, without storing them: means (3), sh0 (3),
 /// opacity, scales (3), quaternion (4), then the higher bands, coefficient by coefficient. Returns the metadata from
 /// the comments.
-///
-/// # Errors
-/// As [`parse_ply`], and those of `take`; also if the file holds points.
+/// Errors: as [`parse_ply`], and those of `take`; also if the file holds points.
 pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult<()>) -> InputResult<SceneMeta> {
     let (mut reader, total_bytes) = open(path)?;
     let header = parse_header(&mut reader, path)?;
@@ -226,9 +216,7 @@ pub fn stream_gaussians(path: &Path, take: &mut dyn FnMut(&[f32]) -> InputResult
 }
 
 /// Metadata in the header of a file of Gaussians, and its SH degree. `dropped` is still 0.
-///
-/// # Errors
-/// As [`parse_ply`], for the header.
+/// Errors: as [`parse_ply`], for the header.
 pub fn gaussians_header(path: &Path) -> InputResult<(SceneMeta, u8)> {
     let header = parse_header(&mut open(path)?.0, path)?;
     let (_, vertex) = vertex_of(&header, path)?;

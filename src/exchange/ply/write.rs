@@ -23,9 +23,7 @@ use std::path::{Path, PathBuf};
 
 /// Writes rows of the local frame to `path`, in the frame that `meta` requests if f32 can hold it. For rows that are
 /// not all in memory use [`PlyWriter`].
-///
-/// # Errors
-/// The disk fails, `path` names no file, or no row is finite. The target then stays unchanged.
+/// Errors: the disk fails, `path` names no file, or no row is finite. The target then stays unchanged.
 pub fn write_gaussians(path: &Path, columns: &Columns, meta: &SceneMeta) -> InputResult<Written> {
     let mut writer = PlyWriter::create(path, columns.sh_degree, columns.rows() as u64, meta)?;
     writer.write(columns)?;
@@ -53,9 +51,7 @@ pub struct PlyWriter {
 
 impl PlyWriter {
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`, beside its target.
-    ///
-    /// # Errors
-    /// The disk fails, or `path` names no file.
+    /// Errors: the disk fails, or `path` names no file.
     pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &SceneMeta) -> InputResult<PlyWriter> {
         let to_file = ExportRows::new(meta);
         let (part, file) = PartFile::create(path)?;

@@ -35,9 +35,7 @@ const ROWS_PER_ENTRY: usize = 16;
 pub const ENTRIES_PER_LINE: usize = 64;
 
 /// Writes the files of `rows` into the folder `inside` of `folder`.
-///
-/// # Errors
-/// The disk fails.
+/// Errors: the disk fails.
 pub fn write_chunk(folder: &mut PartFolder, inside: &Path, rows: &[ExportRow], sh_degree: u8) -> InputResult<()> {
     let bands = usize::from(sh_degree);
     let coefficients = (bands + 1) * (bands + 1) - 1;

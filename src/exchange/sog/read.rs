@@ -66,9 +66,7 @@ pub struct SogReader {
 
 impl SogReader {
     /// Opens the folder of the `lod-meta.json` at `path`, and reads everything but the pictures.
-    ///
-    /// # Errors
-    /// A file cannot be read, or is not as the format says.
+    /// Errors: a file cannot be read, or is not as the format says.
     pub fn open(path: &Path) -> InputResult<SogReader> {
         let text: TreeText = read_json(path)?;
         if let Some(version) = text.version.filter(|version| *version > 1) {
@@ -100,9 +98,7 @@ impl SogReader {
 
     /// The rows of the level at `index` in [`SogReader::levels`], with the rows that are always shown, in the coordinates of the
     /// files.
-    ///
-    /// # Errors
-    /// A picture cannot be read, or is not as the format says.
+    /// Errors: a picture cannot be read, or is not as the format says.
     pub fn rows(&self, index: usize) -> InputResult<Columns> {
         let mut rows = match &self.always_shown {
             Some(file) => file.read()?,

@@ -72,9 +72,7 @@ pub struct Chunk {
 
 impl Chunk {
     /// Reads the `meta.json` at `path`.
-    ///
-    /// # Errors
-    /// The file cannot be read, or describes no SOG that [`Chunk::read`] could read.
+    /// Errors: the file cannot be read, or describes no SOG that [`Chunk::read`] could read.
     pub fn open(path: &Path) -> InputResult<Chunk> {
         let meta: Meta = read_json(path)?;
         if meta.version != 2 {
@@ -104,9 +102,7 @@ impl Chunk {
     }
 
     /// Reads the rows.
-    ///
-    /// # Errors
-    /// A picture cannot be read, or is not as `meta.json` says.
+    /// Errors: a picture cannot be read, or is not as `meta.json` says.
     pub fn read(&self) -> InputResult<Columns> {
         let Meta { count, means, quats, scales, sh0, sh_n, .. } = &self.meta;
         let picture = |name: &str| Picture::read(&path_in_folder(&self.path, name)?, *count);
@@ -264,17 +260,13 @@ pub(super) fn unsupported(path: &Path, problem: impl Into<String>) -> InputError
 }
 
 /// Reads a JSON file.
-///
-/// # Errors
-/// The file cannot be read, or lacks a part.
+/// Errors: the file cannot be read, or lacks a part.
 pub(super) fn read_json<T: DeserializeOwned>(path: &Path) -> InputResult<T> {
     serde_json::from_slice(&read_file(path)?).map_err(|e| malformed(path, format!("cannot be parsed: {e}")))
 }
 
 /// The file that `name`, a path in `from`, names in the folder of `from`.
-///
-/// # Errors
-/// The path leads out of the folder.
+/// Errors: the path leads out of the folder.
 pub(super) fn path_in_folder(from: &Path, name: &str) -> InputResult<PathBuf> {
     let is_inside = |part: Component<'_>| matches!(part, Component::Normal(_) | Component::CurDir);
     let path = Path::new(name);

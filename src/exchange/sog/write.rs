@@ -55,9 +55,7 @@ pub fn memory_bytes(rows: u64) -> u64 {
 }
 
 /// The folder that a path of a `lod-meta.json` names.
-///
-/// # Errors
-/// The path names no folder.
+/// Errors: the path names no folder.
 pub fn folder_of_tree(path: &Path) -> InputResult<&Path> {
     let folder = path.parent().unwrap_or(Path::new(""));
     match folder.components().next_back() {
@@ -111,9 +109,7 @@ pub struct SogWriter {
 impl SogWriter {
     /// Starts the folder `path` of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows:
     /// both have the same axes.
-    ///
-    /// # Errors
-    /// The disk fails, or the folder `path` holds files that are not of an export.
+    /// Errors: the disk fails, or the folder `path` holds files that are not of an export.
     pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SogWriter> {
         let to_file = ExportRows::new(meta);
         let unit = if to_file.frame() == ExportFrame::Local { meta.scale } else { 1.0 };
