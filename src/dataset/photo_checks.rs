@@ -6,7 +6,7 @@ use super::load_options::LoadOptions;
 use super::masks::{FoundMask, MaskIndex, MaskSource};
 use super::model::{Intrinsics, RawView, Split};
 use super::photo::{Alpha, PhotoSource, holds_0_and_1, intrinsics_at};
-use super::photo_header::{PhotoHeader, read_header};
+use super::photo_header::read_header;
 use super::resize::{Size, divided_size, same_shape};
 use crate::base::error::{InputError, InputResult};
 use rayon::prelude::*;
@@ -76,7 +76,18 @@ fn check_photo(view: &RawView, found: Option<FoundMask>, options: &LoadOptions) 
     check_shape(view, size)?;
     let stated = view.mask_path.clone().filter(|_| options.masks).map(|path| FoundMask { path, inverted: false });
     let mask = stated.or(found);
-    let mask = mask.map(|m| check_mask(&m.path, size, m.inverted != options.invert_masks)).transpose()?;
+    let checked_mask = |FoundMask { path, inverted }: FoundMask| {
+        let header = read_header(&path)?;
+        if same_shape((header.width, header.height), size) {
+            return Ok(MaskSource { path, header, invert: inverted != options.invert_masks });
+        }
+        let problem = format!(
+            "the mask is {} x {}, its photo {} x {}: their shapes differ",
+            header.width, header.height, size.0, size.1
+        );
+        Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"))
+    };
+    let mask = mask.map(checked_mask).transpose()?;
     let stated = Intrinsics { lens: view.intrinsics.lens.simplified(), ..view.intrinsics };
     Ok(PhotoSource {
         image_path: view.image_path.clone(),
@@ -86,18 +97,6 @@ fn check_photo(view: &RawView, found: Option<FoundMask>, options: &LoadOptions) 
         mask,
         alpha: if options.masks { Alpha::Mask } else { Alpha::Over(options.background) },
     })
-}
-
-fn check_mask(path: &Path, photo: Size, invert: bool) -> InputResult<MaskSource> {
-    let header: PhotoHeader = read_header(path)?;
-    if !same_shape((header.width, header.height), photo) {
-        let problem = format!(
-            "the mask is {} x {}, its photo {} x {}: their shapes differ",
-            header.width, header.height, photo.0, photo.1
-        );
-        return Err(InputError::new(path, problem, "make the mask again for this photo, or remove it"));
-    }
-    Ok(MaskSource { path: path.to_path_buf(), header, invert })
 }
 
 /// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the

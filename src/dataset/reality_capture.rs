@@ -45,7 +45,15 @@ pub fn looks_like_reality_capture(folder: &Path) -> bool {
 /// Errors: no such file or several, columns that are missing or not numbers, impossible cameras, a lens with `k4`, a photo that is
 /// missing (unless allowed), no view left.
 pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let file = if path.is_file() { path.to_path_buf() } else { only_file(path)? };
+    let found = if path.is_file() { vec![path.to_path_buf()] } else { files_in(path) };
+    let file = match &found[..] {
+        [file] => file.clone(),
+        [] => return Err(InputError::new(path, "no CSV of RealityCapture here", EXPORT)),
+        [.., other, file] => {
+            let problem = format!("two CSV files with camera poses: {} and {}", other.display(), file.display());
+            return Err(InputError::new(path, problem, "name the CSV itself instead of its folder"));
+        }
+    };
     let folder = file.parent().unwrap_or(Path::new(""));
     let text = read_text(&file, MAX_BYTES, EXPORT)?;
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
@@ -76,20 +84,6 @@ fn files_in(folder: &Path) -> Vec<PathBuf> {
     let mut files: Vec<PathBuf> = entries.filter(is_csv).filter(has_header).collect();
     files.sort();
     files
-}
-
-fn only_file(folder: &Path) -> InputResult<PathBuf> {
-    let mut files = files_in(folder);
-    let Some(file) = files.pop() else {
-        return Err(InputError::new(folder, "no CSV of RealityCapture here", EXPORT));
-    };
-    match files.pop() {
-        None => Ok(file),
-        Some(other) => {
-            let problem = format!("two CSV files with camera poses: {} and {}", other.display(), file.display());
-            Err(InputError::new(folder, problem, "name the CSV itself instead of its folder"))
-        }
-    }
 }
 
 /// The cells of a line, without the quotes around them.

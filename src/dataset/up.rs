@@ -102,13 +102,8 @@ pub fn estimate_up<'a>(
     let up = smallest_direction(level * (1.0 / count) + observed);
     // The back of a camera that looks down is up.
     let up = if up.dot(tops + backs) < 0.0 { -up } else { up };
-    Ok(Some(snapped(up).to_array()))
-}
-
-/// The axis within 2 degrees of `direction`, or the direction itself.
-fn snapped(direction: DVec3) -> DVec3 {
-    let axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]);
-    axes.into_iter().find(|axis| axis.dot(direction) >= COS_OF_AXIS).unwrap_or(direction)
+    let mut axes = [DVec3::X, DVec3::Y, DVec3::Z].into_iter().flat_map(|axis| [axis, -axis]);
+    Ok(Some(axes.find(|axis| axis.dot(up) >= COS_OF_AXIS).unwrap_or(up).to_array()))
 }
 
 /// The eigenvector of the smallest eigenvalue of a symmetric matrix, by Jacobi's method (Golub and Van Loan, "Matrix

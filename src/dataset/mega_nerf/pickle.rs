@@ -51,6 +51,11 @@ impl Value {
         entries.iter().find(|(k, _)| matches!(k, Value::Text(text) if &**text == key)).map(|(_, v)| v)
     }
 
+    /// The first item of a list.
+    fn first(&self) -> Option<&Value> {
+        if let Value::List(items) = self { items.first() } else { None }
+    }
+
     fn depth(&self) -> usize {
         match self {
             Value::List(items) => 1 + items.iter().map(Value::depth).max().unwrap_or(0),
@@ -60,7 +65,7 @@ impl Value {
     }
 }
 
-/// Reads a pickle. The error is one sentence without the file's name.
+/// The error is one sentence without the file's name.
 pub(super) fn read(text: &[u8]) -> Result<Value, String> {
     let mut machine = Machine { rest: text, stack: Vec::new(), marks: Vec::new(), memo: Vec::new(), made: 0 };
     loop {
@@ -128,14 +133,22 @@ impl<'a> Machine<'a> {
                     Some(Memo::Unused) | None => return Err("refers to a value that was never made".into()),
                 }
             }
-            0x85..=0x87 => self.tuple_of(usize::from(code - 0x84))?,
+            0x85..=0x87 => {
+                let mut items = (0..code - 0x84).map(|_| self.pop()).collect::<Result<Vec<_>, _>>()?;
+                items.reverse();
+                self.push(Value::List(Rc::new(items)))?;
+            }
             b't' => {
                 let items = self.since_mark()?;
                 self.push(Value::List(Rc::new(items)))?;
             }
             b'a' | b'e' | b's' | b'u' => self.extend(code)?,
             b'c' => self.name()?,
-            b'Q' => self.storage()?,
+            // A persistent id: the storage of a tensor, kept as a list.
+            b'Q' => match self.pop()? {
+                id if matches!(id.first(), Some(Value::Text(text)) if &**text == "storage") => self.push(id)?,
+                _ => return Err("refers to something that is not the storage of a tensor".into()),
+            },
             b'R' => self.call()?,
             // The attributes of an ordered dictionary: they contain no numbers of interest.
             b'b' => _ = self.pop()?,
@@ -218,12 +231,6 @@ impl<'a> Machine<'a> {
         Ok(())
     }
 
-    fn tuple_of(&mut self, count: usize) -> Result<(), String> {
-        let mut items = (0..count).map(|_| self.pop()).collect::<Result<Vec<_>, _>>()?;
-        items.reverse();
-        self.push(Value::List(Rc::new(items)))
-    }
-
     /// Appends items to the list, or entries to the dictionary, below them on the stack.
     fn extend(&mut self, code: u8) -> Result<(), String> {
         let items = match code {
@@ -267,17 +274,6 @@ impl<'a> Machine<'a> {
             return Err(format!("calls '{name}'; only dictionaries of numbers and tensors are read"));
         }
         self.push(Value::Name(name.into()))
-    }
-
-    /// A persistent id: the storage of a tensor, kept as a list.
-    fn storage(&mut self) -> Result<(), String> {
-        let id = self.pop()?;
-        let is_storage =
-            matches!(&id, Value::List(items) if matches!(items.first(), Some(Value::Text(t)) if &**t == "storage"));
-        if !is_storage {
-            return Err("refers to something that is not the storage of a tensor".into());
-        }
-        self.push(id)
     }
 
     fn call(&mut self) -> Result<(), String> {

@@ -24,8 +24,16 @@ impl World {
                 let centre = [(f64::from(i) + 0.5) * PITCH - half, (f64::from(j) + 0.5) * PITCH - half];
                 let (a, b) = (f64::from(i) + 0.5 - middle, f64::from(j) + 0.5 - middle);
                 let from_middle = (a * a + b * b).sqrt() / middle.max(1.0);
-                let plot = fill_plot(&mut parts, centre, from_middle, (i + 2 * j) % 5);
-                world.plots.push(plot);
+                let tall = parts.draws.uniform() > 0.25 + 0.8 * from_middle;
+                // The slot gives neighbours different kinds.
+                world.plots.push(match (i + 2 * j) % 5 {
+                    slot if tall && slot != 3 => offices(&mut parts, centre),
+                    0 | 4 => terraces(&mut parts, centre),
+                    1 => houses(&mut parts, centre),
+                    2 if parts.draws.uniform() < 0.5 => offices(&mut parts, centre),
+                    2 => houses(&mut parts, centre),
+                    _ => park(&mut parts, centre),
+                });
                 world.solids.append(&mut parts.solids);
             }
         }
@@ -38,19 +46,6 @@ impl World {
         }
         plant_countryside(&mut world);
         world
-    }
-}
-
-/// Chooses the kind of a plot and builds it. `slot` gives neighbours different kinds.
-fn fill_plot(parts: &mut Parts, centre: [f64; 2], from_middle: f64, slot: u32) -> Plot {
-    let tall = parts.draws.uniform() > 0.25 + 0.8 * from_middle;
-    match slot {
-        _ if tall && slot != 3 => offices(parts, centre),
-        0 | 4 => terraces(parts, centre),
-        1 => houses(parts, centre),
-        2 if parts.draws.uniform() < 0.5 => offices(parts, centre),
-        2 => houses(parts, centre),
-        _ => park(parts, centre),
     }
 }
 
@@ -161,7 +156,14 @@ fn offices(parts: &mut Parts, centre: [f64; 2]) -> Plot {
             continue;
         }
         if parts.draws.uniform() < 0.12 {
-            green_corner(parts, &mut plot, at, quarter - 1.5);
+            let (half, lawn) = (quarter - 1.5, grass(parts));
+            plot.patches.push(rectangle([at.x, at.y], [half, half], lawn));
+            for _ in 0..5 {
+                let d = &mut parts.draws;
+                let tree = at + DVec3::new(d.range(-0.8, 0.8) * half, d.range(-0.8, 0.8) * half, 0.0);
+                let size = d.range(0.8, 1.3);
+                parts.tree(tree, size);
+            }
             continue;
         }
         let d = &mut parts.draws;
@@ -188,17 +190,6 @@ fn car_park(parts: &mut Parts, plot: &mut Plot, at: DVec3, half: f64) {
                 parts.car(DVec3::new(x, at.y - half + y + wobble, 0.0), true);
             }
         }
-    }
-}
-
-fn green_corner(parts: &mut Parts, plot: &mut Plot, at: DVec3, half: f64) {
-    let lawn = grass(parts);
-    plot.patches.push(rectangle([at.x, at.y], [half, half], lawn));
-    for _ in 0..5 {
-        let d = &mut parts.draws;
-        let tree = at + DVec3::new(d.range(-0.8, 0.8) * half, d.range(-0.8, 0.8) * half, 0.0);
-        let size = d.range(0.8, 1.3);
-        parts.tree(tree, size);
     }
 }
 

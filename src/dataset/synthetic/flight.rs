@@ -89,11 +89,6 @@ impl Shot {
     }
 }
 
-/// Angle to the vertical, radians; smaller for tall pictures, so that the horizon stays outside.
-fn tilt_of(half_height: f64) -> f64 {
-    (40.0f64).min(66.0 - half_height.to_degrees()).max(0.0).to_radians()
-}
-
 pub(super) fn plan(options: &CityOptions) -> Flight {
     let (width, height) = (f64::from(options.width), f64::from(options.height));
     let focal = FOCAL * width;
@@ -107,7 +102,8 @@ pub(super) fn plan(options: &CityOptions) -> Flight {
         lens: Lens::Pinhole,
     };
     let half_height = libm::atan(0.5 * height / focal);
-    let tilt = tilt_of(half_height);
+    // The angle to the vertical is smaller for tall pictures, so that the horizon stays outside.
+    let tilt = (40.0f64).min(66.0 - half_height.to_degrees()).max(0.0).to_radians();
     let length = ALTITUDE * (libm::tan(tilt + half_height) - libm::tan(tilt - half_height));
     let breadth = ALTITUDE / libm::cos(tilt) * width / focal;
     let (step, spacing) = ((1.0 - FORWARD_OVERLAP) * length, (1.0 - SIDE_OVERLAP) * breadth);

@@ -240,7 +240,7 @@ impl Skin {
         if shop {
             let sign = cover(cv, head + 0.1, floor_height - 0.15, w);
             let tone = cell_draw(i / 2, 5, self.seed);
-            albedo = mix(albedo, shop_sign(tone), sign);
+            albedo = mix(albedo, SHOP_SIGNS[((tone * 5.0) as usize).min(4)], sign);
         }
         let frame = cover(cu, -half - 0.12, half + 0.12, w) * cover(cv, sill - 0.2, head + 0.12, w);
         albedo = mix(albedo, mix(self.accent, Vec3::splat(0.75), 0.5), frame);
@@ -362,16 +362,13 @@ fn wall_stains(noise: &Noise, u: f64, v: f64, w: f64) -> f32 {
     streaks + noise.layers(u, v, w, &[(6.0, 0.08), (1.7, 0.06), (0.35, 0.07), (0.14, 0.06)])
 }
 
-fn shop_sign(tone: f32) -> Vec3 {
-    const SIGNS: [Vec3; 5] = [
-        paint(0.66, 0.18, 0.16),
-        paint(0.16, 0.32, 0.55),
-        paint(0.15, 0.42, 0.28),
-        paint(0.82, 0.66, 0.22),
-        paint(0.82, 0.8, 0.76),
-    ];
-    SIGNS[((tone * 5.0) as usize).min(4)]
-}
+const SHOP_SIGNS: [Vec3; 5] = [
+    paint(0.66, 0.18, 0.16),
+    paint(0.16, 0.32, 0.55),
+    paint(0.15, 0.42, 0.28),
+    paint(0.82, 0.66, 0.22),
+    paint(0.82, 0.8, 0.76),
+];
 
 fn solar(u: f64, v: f64, w: f64) -> Look {
     let frame = lines(u, 1.05, 0.09, w).max(lines(v, 1.7, 0.09, w));

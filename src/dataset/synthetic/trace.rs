@@ -287,7 +287,10 @@ impl Grid {
         let mut grid = Grid { low, cells, top, starts, items: Vec::new(), highest };
         let mut listed = Vec::new();
         for (k, s) in solids.iter().enumerate() {
-            grid.for_cells_of(s, |c| listed.push((c as u32, k as u32)));
+            let at = |v: f64, k: usize| (((v - low[k]) / CELL) as usize).min(cells[k] - 1);
+            for j in at(s.low.y, 1)..=at(s.high.y, 1) {
+                listed.extend((at(s.low.x, 0)..=at(s.high.x, 0)).map(|i| ((j * cells[0] + i) as u32, k as u32)));
+            }
         }
         listed.sort_unstable();
         for &(c, k) in &listed {
@@ -300,15 +303,6 @@ impl Grid {
             grid.starts[c + 1] += grid.starts[c];
         }
         grid
-    }
-
-    fn for_cells_of(&self, s: &Solid, mut each: impl FnMut(usize)) {
-        let at = |v: f64, k: usize| (((v - self.low[k]) / CELL) as usize).min(self.cells[k] - 1);
-        for j in at(s.low.y, 1)..=at(s.high.y, 1) {
-            for i in at(s.low.x, 0)..=at(s.high.x, 0) {
-                each(j * self.cells[0] + i);
-            }
-        }
     }
 
     /// The part of the ray before `limit` that can meet a solid.

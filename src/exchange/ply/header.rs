@@ -176,7 +176,14 @@ pub fn parse_header(reader: &mut impl BufRead, path: &Path) -> InputResult<Heade
         }
         let (word, rest) = text.split_once(char::is_whitespace).unwrap_or((text, ""));
         match word {
-            "format" => format = Some(parse_format(rest).map_err(bad)?),
+            "format" => {
+                format = match rest.split_whitespace().collect::<Vec<_>>()[..] {
+                    ["ascii", "1.0"] => Some(Format::Ascii),
+                    ["binary_little_endian", "1.0"] => Some(Format::LittleEndian),
+                    ["binary_big_endian", "1.0"] => Some(Format::BigEndian),
+                    _ => return Err(bad(format!("unknown format '{}'", shorten(rest)))),
+                }
+            }
             "comment" => header.comments.push(rest.trim().to_string()),
             "obj_info" | "" => {}
             "element" => header.elements.push(parse_element(rest, &header.elements).map_err(bad)?),
@@ -191,15 +198,6 @@ pub fn parse_header(reader: &mut impl BufRead, path: &Path) -> InputResult<Heade
     header.format =
         format.ok_or_else(|| InputError::new(path, "the header has no format line", REMEDY).at("header"))?;
     Ok(header)
-}
-
-fn parse_format(rest: &str) -> Result<Format, String> {
-    match rest.split_whitespace().collect::<Vec<_>>()[..] {
-        ["ascii", "1.0"] => Ok(Format::Ascii),
-        ["binary_little_endian", "1.0"] => Ok(Format::LittleEndian),
-        ["binary_big_endian", "1.0"] => Ok(Format::BigEndian),
-        _ => Err(format!("unknown format '{}'", shorten(rest))),
-    }
 }
 
 fn parse_element(rest: &str, before: &[Element]) -> Result<Element, String> {

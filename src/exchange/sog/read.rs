@@ -87,7 +87,13 @@ impl SogReader {
         let levels = levels_of(path, text.tree, &files)?;
         let is_ours = text.asset.and_then(|asset| asset.generator).is_some_and(|name| name.starts_with("gsscale"));
         let antialiased = files.iter().chain(&always_shown).any(Chunk::is_antialiased);
-        let meta = SceneMeta { antialiased, ..read_transform(path, is_ours)? };
+        // A folder of gsscale has a transform.
+        let transform = folder_of(path).join(TRANSFORM_ENDING);
+        let meta = match read_json::<Transform>(&transform) {
+            Err(e) if e.kind == Some(ErrorKind::NotFound) && !is_ours => SceneMeta::default(),
+            read => read?.meta(&transform)?,
+        };
+        let meta = SceneMeta { antialiased, ..meta };
         Ok(SogReader { files, always_shown, levels, meta })
     }
 
@@ -151,15 +157,6 @@ fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>
         }
     }
     Ok(levels)
-}
-
-/// Reads the transform beside the `lod-meta.json` at `path`. A folder of gsscale has one.
-fn read_transform(path: &Path, is_ours: bool) -> InputResult<SceneMeta> {
-    let path = folder_of(path).join(TRANSFORM_ENDING);
-    match read_json::<Transform>(&path) {
-        Err(e) if e.kind == Some(ErrorKind::NotFound) && !is_ours => Ok(SceneMeta::default()),
-        read => read?.meta(&path),
-    }
 }
 
 fn append(rows: &mut Columns, chunk: &Columns, part: &Part) {

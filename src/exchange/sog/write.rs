@@ -162,8 +162,15 @@ impl SogWriter {
         self.group = Vec::new();
         let file = self.new_file(0);
         let ranges = leaves(ordered.len(), LEAF_ROWS);
-        let coarser: Vec<Vec<Vec<ExportRow>>> =
-            ranges.par_iter().map(|range| coarser_levels(&ordered[range.clone()])).collect();
+        let coarser_levels = |range: &std::ops::Range<usize>| {
+            let mut levels: Vec<Vec<ExportRow>> = Vec::with_capacity(LEVELS - 1);
+            for _ in 1..LEVELS {
+                let finer = levels.last().map_or(&ordered[range.clone()], Vec::as_slice);
+                levels.push(merged(finer, finer.len().div_ceil(COARSER)));
+            }
+            levels
+        };
+        let coarser: Vec<Vec<Vec<ExportRow>>> = ranges.par_iter().map(coarser_levels).collect();
         for (range, coarser) in ranges.into_iter().zip(coarser) {
             let mut parts = vec![Part { file, first: range.start, rows: range.len() }];
             for (level, rows) in (1..).zip(coarser) {
@@ -257,16 +264,6 @@ impl GaussianSink for SogWriter {
             levels: Some(LevelCounts { rows: self.rows, always_shown: giants }),
         })
     }
-}
-
-/// The rows of a leaf in the levels after the finest.
-fn coarser_levels(rows: &[ExportRow]) -> Vec<Vec<ExportRow>> {
-    let mut levels: Vec<Vec<ExportRow>> = Vec::with_capacity(LEVELS - 1);
-    for _ in 1..LEVELS {
-        let finer = levels.last().map_or(rows, Vec::as_slice);
-        levels.push(merged(finer, finer.len().div_ceil(COARSER)));
-    }
-    levels
 }
 
 fn box_of(rows: &[ExportRow]) -> ([f64; 3], [f64; 3]) {
