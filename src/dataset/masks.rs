@@ -11,7 +11,7 @@
 //! photo's, its shape may not; 3. nothing is listed outside of the scene, except through links in it; 4. a picture is the mask of
 //! one photo at most, unless it has the plain name for several.
 
-use super::name_index::{Entry, Found, NameIndex, folded, split_ending, split_folder};
+use super::name_index::{Entry, NameIndex, folded, split_ending, split_folder};
 use super::photo_header::PhotoHeader;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -160,18 +160,9 @@ impl MaskIndex {
                 for own in [stem, base] {
                     let key = format!("{before}{own}{after}");
                     let indexes = [Some(&self.in_folders), is_marked.then_some(&self.beside_photos)];
-                    for entry in indexes.into_iter().flatten().flat_map(|index| match index.find_stem(folder, &key) {
-                        Found::Nothing => Vec::new(),
-                        Found::One(entry) => vec![entry],
-                        Found::Several(entries) => entries,
-                    }) {
-                        let form = form(
-                            entry,
-                            before,
-                            &base[if own == stem { base.len() } else { stem.len() }..],
-                            after,
-                            inverted,
-                        );
+                    let ending = if own == stem { "" } else { &base[stem.len()..] };
+                    for entry in indexes.into_iter().flatten().flat_map(|index| index.find_stem(folder, &key)) {
+                        let form = form(entry, before, ending, after, inverted);
                         found.entry(FoundMask { path: entry.path.clone(), inverted }).or_insert(form);
                     }
                 }

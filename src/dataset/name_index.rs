@@ -70,14 +70,6 @@ pub(super) struct NameIndex {
     pub dangling: Vec<PathBuf>,
 }
 
-#[derive(Debug, PartialEq, Eq)]
-pub(super) enum Found<'a> {
-    Nothing,
-    One(&'a Entry),
-    /// Equally good files.
-    Several(Vec<&'a Entry>),
-}
-
 impl NameIndex {
     /// Adds the pictures in `folder` and in those below it, as far as `wants` accepts the folded names of pictures and folders.
     /// `prefix` is the folder by which the index knows it, empty or with a `/` at its end.
@@ -117,20 +109,18 @@ impl NameIndex {
         self.files.is_empty() && self.dangling.is_empty()
     }
 
-    /// The file for a name: with the same ending, otherwise with any ending that can be read. The folders of one must be the last
-    /// folders of the other; those with the fewest other folders in front are taken.
-    pub fn find(&self, name: &str) -> Found<'_> {
+    /// The files that fit a name equally well: with the same ending, otherwise with any ending that can be read. The folders of one
+    /// must be the last folders of the other; those with the fewest other folders in front are taken.
+    pub fn find(&self, name: &str) -> Vec<&Entry> {
         let name = folded(name);
         let (folder, base) = split_folder(&name);
-        let same_ending = best(self.all(split_ending(base).0).filter(|entry| entry.base == base), folder);
-        match same_ending {
-            Found::Nothing => best(self.with_stem(split_ending(base).0), folder),
-            found => found,
-        }
+        let stem = split_ending(base).0;
+        let same_ending = best(self.all(stem).filter(|entry| entry.base == base), folder);
+        if same_ending.is_empty() { self.find_stem(folder, stem) } else { same_ending }
     }
 
     /// As [`NameIndex::find`], for a folded stem and its folded folder.
-    pub fn find_stem(&self, folder: &str, stem: &str) -> Found<'_> {
+    pub fn find_stem(&self, folder: &str, stem: &str) -> Vec<&Entry> {
         best(self.with_stem(stem), folder)
     }
 
@@ -154,17 +144,12 @@ impl Entry {
     }
 }
 
-fn best<'a>(entries: impl Iterator<Item = &'a Entry>, folder: &str) -> Found<'a> {
+fn best<'a>(entries: impl Iterator<Item = &'a Entry>, folder: &str) -> Vec<&'a Entry> {
     let mut nearest: Vec<(usize, &Entry)> =
         entries.filter_map(|entry| Some((folders_apart(&entry.folder, folder)?, entry))).collect();
     nearest.sort();
     let least = nearest.first().map_or(0, |(apart, _)| *apart);
-    nearest.retain(|(apart, _)| *apart == least);
-    match nearest[..] {
-        [] => Found::Nothing,
-        [(_, one)] => Found::One(one),
-        _ => Found::Several(nearest.into_iter().map(|(_, entry)| entry).collect()),
-    }
+    nearest.into_iter().filter(|(apart, _)| *apart == least).map(|(_, entry)| entry).collect()
 }
 
 /// By how many folders one differs from the other, if it ends with it.
@@ -190,15 +175,6 @@ mod tests {
         index
     }
 
-    fn found<'a>(index: &'a NameIndex, name: &str) -> Vec<&'a str> {
-        let path = |entry: &'a Entry| entry.path.to_str().unwrap_or_default();
-        match index.find(name) {
-            Found::Nothing => Vec::new(),
-            Found::One(entry) => vec![path(entry)],
-            Found::Several(entries) => entries.into_iter().map(path).collect(),
-        }
-    }
-
     #[test]
     fn names_are_found_under_other_cases_forms_endings_and_folders() {
         let files =
@@ -218,7 +194,8 @@ mod tests {
             ("v1.2", &["v1.2.png"]),
             ("c.jpg", &[]),
         ] {
-            assert_eq!(found(&files, name), files_found, "{name}");
+            let found: Vec<&str> = files.find(name).into_iter().filter_map(|entry| entry.path.to_str()).collect();
+            assert_eq!(found, files_found, "{name}");
         }
     }
 }

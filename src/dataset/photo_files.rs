@@ -8,7 +8,7 @@
 //! silent; 3. folders are listed only if a name is not found as it is written; 4. a view keeps the name that its model states.
 
 use super::model::{RawView, ReadOptions};
-use super::name_index::{Found, NameIndex, folded, split_ending, split_folder};
+use super::name_index::{NameIndex, folded, split_ending, split_folder};
 use super::paths::{StatedName, read_name};
 use super::raw_names;
 use rayon::prelude::*;
@@ -98,8 +98,8 @@ impl PhotoFiles {
             self.outside.borrow_mut().insert(name.clone(), stated.to_string());
         }
         let is_near = is_outside || found.is_none();
-        let path = found.map(|(path, _)| path).or_else(|| match self.index(&read.name).find(&read.name) {
-            Found::One(entry) => Some(entry.path.clone()),
+        let path = found.map(|(path, _)| path).or_else(|| match self.index(&read.name).find(&read.name)[..] {
+            [entry] => Some(entry.path.clone()),
             _ => None,
         });
         match (path, read.outside) {

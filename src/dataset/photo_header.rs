@@ -132,21 +132,6 @@ struct JpegFrame {
     coefficients: u64,
 }
 
-impl JpegFrame {
-    /// The header for a file of `bytes`, with `metadata` bytes before the first scan, which has `in_first_scan`
-    /// components.
-    fn header(&self, bytes: u64, metadata: u64, in_first_scan: u8) -> PhotoHeader {
-        // The result, plus the RGB made from it if it is gray.
-        let result = if self.components == 1 { 4 } else { 3 } * self.pixels;
-        // All coefficients are kept until the last scan.
-        let has_scans = self.code == 0xc2 || in_first_scan != self.components;
-        let of_scans = if has_scans { 2 * self.coefficients } else { 0 };
-        let decode_bytes = 2 * bytes + metadata + result + of_scans;
-        let (width, height) = (self.width, self.height);
-        PhotoHeader { format: PhotoFormat::Jpeg, width, height, decode_bytes, has_alpha: false, exif: None }
-    }
-}
-
 struct HeaderReader<'a> {
     path: &'a Path,
     file: BufReader<File>,
@@ -223,16 +208,20 @@ impl HeaderReader<'_> {
                 _ => at += 2,
             }
         }
-        let Some(frame) = frame else {
+        let Some(JpegFrame { code, width, height, pixels, components, coefficients }) = frame else {
             return Err(self.damaged(at, "its pixels begin before its size is stated"));
         };
         let mut scan = [0u8; 3];
         self.read(&mut scan, "the header of its first scan")?;
-        let header = PhotoHeader { exif, ..frame.header(self.bytes, metadata, scan[2]) };
+        // The result, plus the RGB made from it if it is gray.
+        let result = if components == 1 { 4 } else { 3 } * pixels;
+        // All coefficients are kept until the last scan, if there are several.
+        let of_scans = if code == 0xc2 || scan[2] != components { 2 * coefficients } else { 0 };
+        let decode_bytes = 2 * self.bytes + metadata + result + of_scans;
         // Pixel data cannot contain this pair (a 255 in it is followed by 0), but a preview in the header can: so the
         // search starts after the start of the scan. Anything may follow the marker.
         self.require_end(at, &[0xff, 0xd9], "the end marker (FF D9)")?;
-        Ok(header)
+        Ok(PhotoHeader { format: PhotoFormat::Jpeg, width, height, decode_bytes, has_alpha: false, exif })
     }
 
     fn jpeg_frame(&mut self, code: u8, at: u64) -> InputResult<JpegFrame> {

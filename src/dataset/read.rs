@@ -21,6 +21,19 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     Ok(if is_above { scene } else { RawScene { root: root.to_path_buf(), ..scene } })
 }
 
+type Reader = (fn(&Path) -> bool, fn(&Path, &ReadOptions) -> InputResult<RawScene>);
+
+/// Whether a reader would find something in a folder, and the reader; the first one applies.
+const READERS: [Reader; 7] = [
+    (colmap::looks_like_colmap, colmap::read_colmap),
+    (colmap::parts::looks_like_parts, colmap::parts::read_parts),
+    (transforms::looks_like_transforms, transforms::read_transforms),
+    (transforms::looks_like_matrix_city, transforms::read_matrix_city),
+    (mega_nerf::looks_like_mega_nerf, mega_nerf::read_mega_nerf),
+    (opensfm::looks_like_opensfm, opensfm::read_opensfm),
+    (reality_capture::looks_like_reality_capture, reality_capture::read_reality_capture),
+];
+
 fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<RawScene> {
     if is_file {
         let ends_with = |ending: &str| path.extension().is_some_and(|e| e.eq_ignore_ascii_case(ending));
@@ -41,26 +54,8 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
             }
         };
     }
-    if colmap::looks_like_colmap(path) {
-        return colmap::read_colmap(path, options);
-    }
-    if colmap::parts::looks_like_parts(path) {
-        return colmap::parts::read_parts(path, options);
-    }
-    if transforms::looks_like_transforms(path) {
-        return transforms::read_transforms(path, options);
-    }
-    if transforms::looks_like_matrix_city(path) {
-        return transforms::read_matrix_city(path, options);
-    }
-    if mega_nerf::looks_like_mega_nerf(path) {
-        return mega_nerf::read_mega_nerf(path, options);
-    }
-    if opensfm::looks_like_opensfm(path) {
-        return opensfm::read_opensfm(path, options);
-    }
-    if reality_capture::looks_like_reality_capture(path) {
-        return reality_capture::read_reality_capture(path, options);
+    if let Some((_, read)) = READERS.iter().find(|(knows, _)| knows(path)) {
+        return read(path, options);
     }
     if let Err(e) = std::fs::metadata(path)
         .and_then(|found| if found.is_dir() { std::fs::read_dir(path).map(|_| ()) } else { Ok(()) })

@@ -220,19 +220,4 @@ mod tests {
             assert_eq!(state.rows(), 0);
         }
     }
-
-    #[test]
-    fn blocks_round_trip() {
-        let mut state = numbered(11, 1);
-        let copy = state.clone();
-        let mut rows = state.view_mut();
-        for row in 0..rows.rows() {
-            let mut block = [0.0; super::super::rows::BLOCK_LANES];
-            rows.columns.as_ref().load_row_any(row, &mut block);
-            assert_eq!(block[0], row as f32);
-            rows.columns.store_row_any(row, &block);
-        }
-        assert_eq!(state, copy);
-        assert_eq!(row_bytes(3), 728);
-    }
 }
