@@ -98,7 +98,14 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
         Colors::Rgb(rgb) => at_target_size::<3>(rgb, source),
         Colors::RgbOverBlack(rgba) => {
             let (rgba, valid) = at_target_size::<4>(rgba, source);
-            let (rgb, mut opaque) = opaque_colors(&rgba);
+            let pixels = rgba.as_chunks::<4>().0;
+            // Colours of the opaque parts of pixels over black, and which pixels are at least half opaque.
+            let mut rgb = Vec::with_capacity(3 * pixels.len());
+            for &[r, g, b, a] in pixels {
+                let (half, a) = (u32::from(a) / 2, u32::from(a.max(1)));
+                rgb.extend([r, g, b].map(|c| ((255 * u32::from(c) + half) / a).min(255) as u8));
+            }
+            let mut opaque = thresholded(pixels.iter().map(|pixel| pixel[3]).collect());
             if let Some(valid) = valid {
                 opaque.iter_mut().zip(valid).for_each(|(k, v)| *k &= v);
             }
@@ -125,18 +132,6 @@ fn at_target_size<const C: usize>(photo: Vec<u8>, source: &PhotoSource) -> (Vec<
     let mut shares = AreaResizer::new(1, full, source.target, 1);
     let colors = undistort::<C>(&photo, source.intrinsics, source.target, |valid| shares.push_row(valid));
     (colors, Some(thresholded(shares.finish())))
-}
-
-/// Colours of the opaque parts of pixels over black, and which pixels are at least half opaque (255, else 0).
-fn opaque_colors(rgba: &[u8]) -> (Vec<u8>, Vec<u8>) {
-    let pixels = rgba.as_chunks::<4>().0;
-    let (mut rgb, mut opaque) = (Vec::with_capacity(3 * pixels.len()), Vec::with_capacity(pixels.len()));
-    for &[r, g, b, a] in pixels {
-        let of_opaque_part = |c: u8| ((255 * u32::from(c) + u32::from(a) / 2) / u32::from(a.max(1))).min(255) as u8;
-        rgb.extend([r, g, b].map(of_opaque_part));
-        opaque.push(if a >= 128 { 255 } else { 0 });
-    }
-    (rgb, opaque)
 }
 
 /// The undistorted picture at target size. `take` receives the validity of each row at full size, 255 or 0 per pixel.

@@ -36,7 +36,16 @@ impl EventFile {
     pub fn create(folder: &Path, first_step: Option<u32>) -> InputResult<EventFile> {
         std::fs::create_dir_all(folder)
             .map_err(|e| InputError::io(folder, "creating the folder of event files", &e))?;
-        let (path, file) = new_file(folder)?;
+        // A run may be resumed within one second. Names sort by time, which is the order in which TensorBoard reads them.
+        let (seconds, mut number) = (seconds_now() as u64, 0);
+        let (path, file) = loop {
+            let path = folder.join(format!("events.out.tfevents.{seconds:010}.gsscale.{number:03}"));
+            match File::create_new(&path) {
+                Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
+                Err(error) => return Err(InputError::io(&path, "creating the event file", &error)),
+                Ok(file) => break (path, file),
+            }
+        };
         let mut events = EventFile { path, file, end: 0 };
         let mut message = Vec::new();
         double(&mut message, 1, seconds_now());
@@ -112,21 +121,6 @@ fn append_whole<W: Write>(
         let _ = cut(file);
     }
     written
-}
-
-/// Creates a file of a new name: a run may be resumed within one second. Names sort by time, which is the
-/// order in which TensorBoard reads them.
-fn new_file(folder: &Path) -> InputResult<(PathBuf, File)> {
-    let seconds = seconds_now() as u64;
-    let mut number = 0;
-    loop {
-        let path = folder.join(format!("events.out.tfevents.{seconds:010}.gsscale.{number:03}"));
-        match File::create_new(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => number += 1,
-            Err(error) => return Err(InputError::io(&path, "creating the event file", &error)),
-            Ok(file) => return Ok((path, file)),
-        }
-    }
 }
 
 /// Whether a file has a name as [`EventFile::create`] gives them.

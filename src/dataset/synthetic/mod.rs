@@ -142,7 +142,10 @@ pub fn write_city(
     let rays = write_photos(folder, options, &flight, &scene, progress)?;
     let points = points::sample(&scene, &flight, options);
     let offset = DVec3::from(options.offset);
-    let tiles = tiles(options.tiles, 2.0 * scene.world.half());
+    // Offsets of the copies of the city.
+    let ([across, along], side) = (options.tiles, 2.0 * scene.world.half());
+    let copy = |k: u32| [f64::from(k % across) * side, f64::from(k / across) * side, 0.0];
+    let tiles: Vec<[f64; 3]> = (0..across * along).map(copy).collect();
     // Overview photos have their place among all copies.
     let tile = |k: usize| if k < options.views as usize { tiles[k % tiles.len()] } else { [0.0; 3] };
     let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tile(k)));
@@ -156,14 +159,10 @@ pub fn write_city(
         points: (model.points.len() * model.tiles.len()) as u64,
         observations: model.points.iter().map(|p| p.observations.len() as u64).sum(),
         blocks: flight.blocks,
-        side: 2.0 * scene.world.half(),
+        side,
         solids: scene.world.solids.len() as u32,
         rays,
     })
-}
-
-fn tiles([across, along]: [u32; 2], side: f64) -> Vec<[f64; 3]> {
-    (0..across * along).map(|k| [f64::from(k % across) * side, f64::from(k / across) * side, 0.0]).collect()
 }
 
 /// Name of photo `k`; names sort in the order of the flight.

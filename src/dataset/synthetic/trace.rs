@@ -260,17 +260,6 @@ fn single(ray: &Ray) -> ([f32; 3], [f32; 3]) {
     (ray.from.as_vec3().into(), ray.inverse.as_vec3().into())
 }
 
-/// A walk over the cells below a ray.
-struct Walk {
-    cell: [isize; 2],
-    step: [isize; 2],
-    /// Ray parameter at which the next cell border across x and across y is met.
-    next: [f64; 2],
-    delta: [f64; 2],
-    t: f64,
-    end: f64,
-}
-
 impl Grid {
     pub(super) fn new(solids: &[Solid]) -> Grid {
         let mut low = [0.0f64; 2];
@@ -305,10 +294,13 @@ impl Grid {
         grid
     }
 
-    /// The part of the ray before `limit` that can meet a solid.
-    fn walk(&self, ray: &Ray, limit: f64) -> Option<Walk> {
+    /// Calls `visit` with the solids of each cell that the ray may meet and the distance at which it leaves the
+    /// cell, until `visit` returns true or the ray ends.
+    #[inline(always)]
+    fn visit(&self, ray: &Ray, limit: f64, mut visit: impl FnMut(&[Item], f64) -> bool) {
+        // The part of the ray before `limit` that can meet a solid.
         let high = [0, 1].map(|k| self.low[k] + self.cells[k] as f64 * CELL);
-        let (mut t0, mut t1) = (0.0f64, limit);
+        let (mut t, mut end) = (0.0f64, limit);
         let slabs = [
             (ray.from.x, ray.inverse.x, self.low[0], high[0]),
             (ray.from.y, ray.inverse.y, self.low[1], high[1]),
@@ -317,48 +309,35 @@ impl Grid {
         for (from, inverse, low, high) in slabs {
             let (a, b) = ((low - from) * inverse, (high - from) * inverse);
             // min and max drop the NaN of 0 * infinity: a ray along a border counts as inside.
-            t0 = t0.max(a.min(b));
-            t1 = t1.min(a.max(b));
+            t = t.max(a.min(b));
+            end = end.min(a.max(b));
         }
-        if t0 >= t1 {
-            return None;
+        if t >= end {
+            return;
         }
-        let p = ray.at(t0);
+        let p = ray.at(t);
         let from = [p.x - self.low[0], p.y - self.low[1]];
         let along = [ray.along.x, ray.along.y];
-        let cell = [0, 1].map(|k| ((from[k] / CELL) as isize).clamp(0, self.cells[k] as isize - 1));
-        let step = [0, 1].map(|k| if along[k] < 0.0 { -1 } else { 1 });
-        let next = [0, 1].map(|k| {
+        let mut cell = [0, 1].map(|k| ((from[k] / CELL) as isize).clamp(0, self.cells[k] as isize - 1));
+        // Where the ray crosses the next border of cells across x and across y, and from border to border.
+        let mut next = [0, 1].map(|k| {
             let border = (cell[k] + isize::from(along[k] >= 0.0)) as f64 * CELL;
-            if along[k] == 0.0 { f64::INFINITY } else { t0 + (border - from[k]) / along[k] }
+            if along[k] == 0.0 { f64::INFINITY } else { t + (border - from[k]) / along[k] }
         });
         let delta = [0, 1].map(|k| if along[k] == 0.0 { f64::INFINITY } else { CELL / along[k].abs() });
-        Some(Walk { cell, step, next, delta, t: t0, end: t1 })
-    }
-
-    /// Calls `visit` with the solids of each cell that the ray may meet and the distance at which it leaves the
-    /// cell, until `visit` returns true or the ray ends.
-    #[inline(always)]
-    fn visit(&self, ray: &Ray, limit: f64, mut visit: impl FnMut(&[Item], f64) -> bool) {
-        let Some(mut w) = self.walk(ray, limit) else { return };
         loop {
-            let out = w.next[0].min(w.next[1]).min(w.end);
-            let c = w.cell[1] as usize * self.cells[0] + w.cell[0] as usize;
-            let lowest = ray.from.z + ray.along.z * if ray.along.z < 0.0 { out } else { w.t };
-            if lowest <= self.top[c] {
-                let items = &self.items[self.starts[c] as usize..self.starts[c + 1] as usize];
-                if visit(items, out) {
-                    return;
-                }
-            }
-            if out >= w.end {
+            let out = next[0].min(next[1]).min(end);
+            let c = cell[1] as usize * self.cells[0] + cell[0] as usize;
+            let lowest = ray.from.z + ray.along.z * if ray.along.z < 0.0 { out } else { t };
+            let items = &self.items[self.starts[c] as usize..self.starts[c + 1] as usize];
+            if (lowest <= self.top[c] && visit(items, out)) || out >= end {
                 return;
             }
-            let k = usize::from(w.next[1] < w.next[0]);
-            w.t = out;
-            w.cell[k] += w.step[k];
-            w.next[k] += w.delta[k];
-            if w.cell[k] < 0 || w.cell[k] >= self.cells[k] as isize {
+            let k = usize::from(next[1] < next[0]);
+            t = out;
+            cell[k] += if along[k] < 0.0 { -1 } else { 1 };
+            next[k] += delta[k];
+            if cell[k] < 0 || cell[k] >= self.cells[k] as isize {
                 return;
             }
         }

@@ -85,15 +85,15 @@ impl World {
     fn street(&self, x: f64, y: f64, dx: f64, dy: f64, in_town: bool, w: f64) -> (Look, u32) {
         let on_road = dx.abs() < HALF_ROAD || dy.abs() < HALF_ROAD;
         let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
-        if !on_road {
-            if in_town {
-                let mut look = PAVEMENT.look(&self.noise, place);
-                // The kerb is light stone.
-                let nearest = (dx.abs() - HALF_ROAD).min(dy.abs() - HALF_ROAD);
-                look.albedo += (Vec3::splat(0.45) - look.albedo) * (0.7 * cover(nearest, -0.1, 0.28, w));
-                return (look, 1);
-            }
+        if !on_road && !in_town {
             return (VERGE.look(&self.noise, place), 2);
+        }
+        if !on_road {
+            let mut look = PAVEMENT.look(&self.noise, place);
+            // The kerb is light stone.
+            let nearest = (dx.abs() - HALF_ROAD).min(dy.abs() - HALF_ROAD);
+            look.albedo += (Vec3::splat(0.45) - look.albedo) * (0.7 * cover(nearest, -0.1, 0.28, w));
+            return (look, 1);
         }
         let mut albedo = asphalt(&self.noise, &ROAD, x, y, w);
         let crossing = dx.abs() < HALF_ROAD && dy.abs() < HALF_ROAD;
@@ -143,7 +143,9 @@ impl World {
         let shift = f64::from(cell_draw(j as i64, 9, self.seed as u32)) * FIELD;
         let i = ((x + shift) / FIELD).floor();
         let (u, v) = (x + shift - i * FIELD, y - j * FIELD);
-        let skin = field_skin(i as i64, j as i64, self.seed as u32);
+        let pick = cell_draw(i as i64, j as i64, self.seed as u32 ^ 0x7a);
+        let (kind, color, accent) = FIELDS[((pick * 6.0) as usize).min(5)];
+        let skin = Skin { kind, color, accent, seed: (pick * 65_536.0) as u32 };
         let edge = u.min(FIELD - u).min(v).min(FIELD - v);
         let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
         let mut look = skin.look(&self.noise, place);
@@ -184,16 +186,11 @@ fn parking_lines(p: Place) -> f32 {
     row * inside * lines(p.u, 2.6, 0.14, p.w)
 }
 
-fn field_skin(i: i64, j: i64, seed: u32) -> Skin {
-    const FIELDS: [(Kind, Vec3, Vec3); 6] = [
-        (Kind::Crop, paint(0.42, 0.5, 0.24), paint(0.44, 0.4, 0.27)),
-        (Kind::Crop, paint(0.66, 0.6, 0.36), paint(0.56, 0.49, 0.32)),
-        (Kind::Crop, paint(0.52, 0.43, 0.33), paint(0.45, 0.36, 0.27)),
-        (Kind::Grass, paint(0.42, 0.5, 0.26), paint(0.56, 0.56, 0.32)),
-        (Kind::Crop, paint(0.34, 0.43, 0.2), paint(0.4, 0.4, 0.24)),
-        (Kind::Grass, paint(0.47, 0.52, 0.29), paint(0.6, 0.57, 0.36)),
-    ];
-    let pick = cell_draw(i, j, seed ^ 0x7a);
-    let (kind, color, accent) = FIELDS[((pick * 6.0) as usize).min(5)];
-    Skin { kind, color, accent, seed: (pick * 65_536.0) as u32 }
-}
+const FIELDS: [(Kind, Vec3, Vec3); 6] = [
+    (Kind::Crop, paint(0.42, 0.5, 0.24), paint(0.44, 0.4, 0.27)),
+    (Kind::Crop, paint(0.66, 0.6, 0.36), paint(0.56, 0.49, 0.32)),
+    (Kind::Crop, paint(0.52, 0.43, 0.33), paint(0.45, 0.36, 0.27)),
+    (Kind::Grass, paint(0.42, 0.5, 0.26), paint(0.56, 0.56, 0.32)),
+    (Kind::Crop, paint(0.34, 0.43, 0.2), paint(0.4, 0.4, 0.24)),
+    (Kind::Grass, paint(0.47, 0.52, 0.29), paint(0.6, 0.57, 0.36)),
+];
