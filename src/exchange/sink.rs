@@ -2,10 +2,11 @@
 //!
 //! Not here: the formats, which rows are exported.
 
+use super::frames::{ExportRow, ExportRows};
 use super::meta::ExportFrame;
 use crate::base::error::{InputError, InputResult};
 use crate::scene::columns::Columns;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Most levels of detail of a format.
 pub const LEVELS_MAX: usize = 4;
@@ -42,12 +43,6 @@ impl std::fmt::Display for LevelCounts {
     }
 }
 
-/// The error of a sink without rows, of the `given` ones.
-pub(super) fn no_finite_row(path: &Path, given: u64) -> InputError {
-    let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
-    InputError::new(path, problem, "the training diverged or lost all Gaussians: lower the rates")
-}
-
 /// A file of Gaussians that is being written. Dropping a sink leaves the target as it was.
 pub trait GaussianSink {
     /// Appends rows of the local frame; ones with values that are not finite are left out and counted.
@@ -57,4 +52,61 @@ pub trait GaussianSink {
     /// Makes the file appear at its target, complete and synced.
     /// Errors: the disk fails, or no row is finite. The target then stays unchanged.
     fn finish(self: Box<Self>) -> InputResult<Written>;
+}
+
+/// What a format does with the rows of a sink.
+pub(super) trait Format {
+    /// Takes a row in the frame of the file; false if no file of this format can hold it.
+    fn put(&mut self, row: &ExportRow) -> InputResult<bool>;
+
+    /// Completes the file of `rows` rows, at least one; returns its bytes, and the rows of its levels.
+    fn complete(self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)>;
+
+    /// The error, if the format could hold none of the `given` rows.
+    fn holds_none(&self, _given: u64) -> Option<InputError> {
+        None
+    }
+}
+
+/// The sink of a format: [`ExportRows`] says how values change on the way.
+pub struct FormatSink<F> {
+    path: PathBuf,
+    sh_degree: u8,
+    to_file: ExportRows,
+    given: u64,
+    rows: u64,
+    format: F,
+}
+
+impl<F> FormatSink<F> {
+    pub(super) fn new(path: &Path, sh_degree: u8, to_file: ExportRows, format: F) -> FormatSink<F> {
+        FormatSink { path: path.to_path_buf(), sh_degree, to_file, given: 0, rows: 0, format }
+    }
+}
+
+impl<F: Format> GaussianSink for FormatSink<F> {
+    fn write(&mut self, columns: &Columns) -> InputResult<()> {
+        if columns.sh_degree > self.sh_degree {
+            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
+        }
+        for row in 0..columns.rows() {
+            self.given += 1;
+            if let Some(row) = self.to_file.row(columns, row) {
+                self.rows += u64::from(self.format.put(&row)?);
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(self: Box<Self>) -> InputResult<Written> {
+        let FormatSink { path, to_file, given, rows, format, .. } = *self;
+        if rows == 0 {
+            return Err(format.holds_none(given).unwrap_or_else(|| {
+                let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
+                InputError::new(path, problem, "the training diverged or lost all Gaussians: lower the rates")
+            }));
+        }
+        let (bytes, levels) = format.complete(rows)?;
+        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels })
+    }
 }

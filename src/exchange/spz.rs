@@ -20,8 +20,7 @@ use crate::base::math::exp32;
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::SceneMeta;
-use crate::exchange::sink::{GaussianSink, Written, no_finite_row};
-use crate::scene::columns::Columns;
+use crate::exchange::sink::{Format, FormatSink, LevelCounts};
 use crate::scene::rotation::{Rotation, VIEWER_UP};
 use flate2::Compression;
 use flate2::write::GzEncoder;
@@ -57,9 +56,7 @@ pub struct SpzWriter {
     rows_path: PathBuf,
     rows_part: PartFile,
     rows_file: BufWriter<File>,
-    to_file: ExportRows,
     sh_degree: u8,
-    given: u64,
     rows: u64,
     reach: f32,
     /// Rows left out because a coordinate is too large for the format.
@@ -75,27 +72,26 @@ impl SpzWriter {
 
     /// Starts a file of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows.
     /// Errors: the disk fails, or `path` names no file.
-    pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SpzWriter> {
+    pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<FormatSink<SpzWriter>> {
         let (part, out) = PartFile::create(path)?;
         let rows_path = path.with_extension("spz.rows");
         let (rows_part, rows_file) = PartFile::create(&rows_path)?;
         // Read again at the end.
         drop(rows_file);
         let rows_file = rows_part.reopen()?;
-        Ok(SpzWriter {
+        let writer = SpzWriter {
             path: path.to_path_buf(),
             part,
             out,
             rows_path,
             rows_part,
             rows_file: BufWriter::with_capacity(BUFFER_BYTES, rows_file),
-            to_file: ExportRows::new(&Self::spz_meta(meta)),
             sh_degree,
-            given: 0,
             rows: 0,
             reach: 0.0,
             far: 0,
-        })
+        };
+        Ok(FormatSink::new(path, sh_degree, ExportRows::new(&Self::spz_meta(meta)), writer))
     }
 
     /// Writes header and arrays as one gzip stream; returns its length.
@@ -124,50 +120,36 @@ impl SpzWriter {
     }
 }
 
-impl GaussianSink for SpzWriter {
-    fn write(&mut self, columns: &Columns) -> InputResult<()> {
-        if columns.sh_degree > self.sh_degree {
-            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
+impl Format for SpzWriter {
+    fn put(&mut self, row: &ExportRow) -> InputResult<bool> {
+        let reach = row.position.iter().fold(0.0f32, |most, x| most.max(x.abs()));
+        if reach > FIXED_MAX as f32 {
+            self.far += 1;
+            return Ok(false);
         }
-        let mut bytes = Vec::new();
-        for row in 0..columns.rows() {
-            self.given += 1;
-            let Some(mut row) = self.to_file.row(columns, row) else { continue };
-            let reach = row.position.iter().fold(0.0f32, |most, x| most.max(x.abs()));
-            if reach > FIXED_MAX as f32 {
-                self.far += 1;
-                continue;
-            }
-            row.quat = half_turn_of_own_axes(row.quat);
-            self.reach = self.reach.max(reach);
-            bytes.clear();
-            bytes.extend(row.position.iter().flat_map(|x| x.to_le_bytes()));
-            push_attributes(&row, self.sh_degree, &mut bytes);
-            self.rows_file.write_all(&bytes).map_err(|e| InputError::io(&self.rows_path, "writing", &e))?;
-            self.rows += 1;
-        }
-        Ok(())
+        self.reach = self.reach.max(reach);
+        let mut bytes: Vec<u8> = row.position.iter().flat_map(|x| x.to_le_bytes()).collect();
+        push_attributes(&ExportRow { quat: half_turn_of_own_axes(row.quat), ..*row }, self.sh_degree, &mut bytes);
+        self.rows_file.write_all(&bytes).map_err(|e| InputError::io(&self.rows_path, "writing", &e))?;
+        self.rows += 1;
+        Ok(true)
     }
 
-    fn finish(mut self: Box<Self>) -> InputResult<Written> {
-        if self.rows == 0 {
-            let given = self.given;
-            let far = format!("all {given} Gaussians lie beyond the {} units of this format", FIXED_MAX as f32);
-            let remedy = "export in local coordinates (--export-frame local), or as a PLY";
-            return Err(match self.far == given {
-                true => InputError::new(&self.path, far, remedy),
-                false => no_finite_row(&self.path, given),
-            });
-        }
-        if u32::try_from(self.rows).is_err() {
-            let problem = format!("an SPZ file holds at most {} Gaussians, and these are {}", u32::MAX, self.rows);
+    fn complete(mut self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)> {
+        if u32::try_from(rows).is_err() {
+            let problem = format!("an SPZ file holds at most {} Gaussians, and these are {rows}", u32::MAX);
             return Err(InputError::new(&self.path, problem, "export a part of the scene"));
         }
         let bytes = self.compress().map_err(|e| InputError::io(&self.path, "writing", &e))?;
-        let SpzWriter { part, out, rows_part, to_file, given, rows, .. } = *self;
-        part.finish(out)?;
-        drop(rows_part);
-        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels: None })
+        self.part.finish(self.out)?;
+        drop(self.rows_part);
+        Ok((bytes, None))
+    }
+
+    fn holds_none(&self, given: u64) -> Option<InputError> {
+        let problem = format!("all {given} Gaussians lie beyond the {} units of this format", FIXED_MAX as f32);
+        let remedy = "export in local coordinates (--export-frame local), or as a PLY";
+        (self.far == given).then(|| InputError::new(&self.path, problem, remedy))
     }
 }
 

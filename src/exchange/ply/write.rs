@@ -14,7 +14,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::sink::{GaussianSink, Written, no_finite_row};
+use crate::exchange::sink::{Format, FormatSink, GaussianSink, LevelCounts, Written};
 use crate::scene::columns::{Columns, sh_n_width};
 use std::fmt::Write as _;
 use std::fs::File;
@@ -32,7 +32,7 @@ pub fn write_gaussians(path: &Path, columns: &Columns, meta: &SceneMeta) -> Inpu
 
 /// Writes a file in parts.
 ///
-/// [`ExportRows`] says how values change on the way. Bands above those of the rows are zeros.
+/// Bands above those of the rows are zeros.
 ///
 /// The header contains the number of rows, which is known only at the end: the header is then rewritten at the same
 /// length. If the number has fewer digits than reserved, a comment is padded with spaces.
@@ -42,92 +42,64 @@ pub struct PlyWriter {
     out: BufWriter<File>,
     sh_degree: u8,
     meta: SceneMeta,
-    to_file: ExportRows,
+    frame: ExportFrame,
     rows_at_most: u64,
-    given: u64,
     rows: u64,
     bytes: u64,
+    row: Vec<u8>,
 }
 
 impl PlyWriter {
     /// Starts a file of at most `rows_at_most` rows with the bands of `sh_degree`, beside its target.
     /// Errors: the disk fails, or `path` names no file.
-    pub fn create(path: &Path, sh_degree: u8, rows_at_most: u64, meta: &SceneMeta) -> InputResult<PlyWriter> {
+    pub fn create(
+        path: &Path,
+        sh_degree: u8,
+        rows_at_most: u64,
+        meta: &SceneMeta,
+    ) -> InputResult<FormatSink<PlyWriter>> {
         let to_file = ExportRows::new(meta);
+        let frame = to_file.frame();
         let (part, file) = PartFile::create(path)?;
         let mut out = BufWriter::with_capacity(1 << 20, file);
-        let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, to_file.frame());
+        let header = header_text(sh_degree, rows_at_most, rows_at_most, meta, frame);
         out.write_all(header.as_bytes()).map_err(|e| InputError::io(path, "writing", &e))?;
-        Ok(PlyWriter {
-            path: path.to_path_buf(),
-            part,
-            out,
-            sh_degree,
-            meta: meta.clone(),
-            to_file,
-            rows_at_most,
-            given: 0,
-            rows: 0,
-            bytes: header.len() as u64,
-        })
-    }
-
-    /// The values of a row in file order.
-    fn fill(row: &ExportRow, out: &mut [f32]) {
-        let (geometry, rest) = out.split_at_mut(9);
-        let (f_rest, tail) = rest.split_at_mut(rest.len() - 8);
-        let coefficients = f_rest.len() / 3;
-        geometry[..3].copy_from_slice(&row.position);
-        geometry[3..6].fill(0.0);
-        geometry[6..].copy_from_slice(&row.sh0);
-        for (k, coefficient) in row.sh_n.chunks_exact(3).take(coefficients).enumerate() {
-            for channel in 0..3 {
-                f_rest[channel * coefficients + k] = coefficient[channel];
-            }
-        }
-        tail[0] = row.opacity;
-        tail[1..4].copy_from_slice(&row.log_scales);
-        tail[4..].copy_from_slice(&row.quat);
+        let (path, meta, bytes) = (path.to_path_buf(), meta.clone(), header.len() as u64);
+        let (rows, row) = (0, Vec::new());
+        let writer = PlyWriter { path, part, out, sh_degree, meta, frame, rows_at_most, rows, bytes, row };
+        Ok(FormatSink::new(&writer.path.clone(), sh_degree, to_file, writer))
     }
 }
 
-impl GaussianSink for PlyWriter {
-    fn write(&mut self, columns: &Columns) -> InputResult<()> {
-        let rows = columns.rows();
-        self.given += rows as u64;
-        if self.given > self.rows_at_most || columns.sh_degree > self.sh_degree {
-            let problem = format!("{} rows were given, but at most {} were announced", self.given, self.rows_at_most);
+impl Format for PlyWriter {
+    fn put(&mut self, row: &ExportRow) -> InputResult<bool> {
+        if self.rows == self.rows_at_most {
+            let problem = format!("more rows were given than the {} that were announced", self.rows_at_most);
             return Err(InputError::new(&self.path, problem, "report this as a bug"));
         }
-        let (mut values, mut bytes) = (vec![0.0; 17 + sh_n_width(self.sh_degree)], Vec::new());
-        for row in 0..rows {
-            if let Some(row) = self.to_file.row(columns, row) {
-                Self::fill(&row, &mut values);
-                bytes.clear();
-                bytes.extend(values.iter().flat_map(|v| v.to_le_bytes()));
-                self.out.write_all(&bytes).map_err(|e| InputError::io(&self.path, "writing", &e))?;
-                self.bytes += bytes.len() as u64;
-                self.rows += 1;
-            }
-        }
-        Ok(())
+        // Channel by channel.
+        let coefficients = sh_n_width(self.sh_degree) / 3;
+        let rest = (0..3).flat_map(|channel| row.sh_n.iter().skip(channel).step_by(3).take(coefficients));
+        let head = row.position.iter().chain(&[0.0; 3]).chain(&row.sh0);
+        let values = head.chain(rest).chain([&row.opacity]).chain(&row.log_scales).chain(&row.quat);
+        self.row.clear();
+        self.row.extend(values.flat_map(|v| v.to_le_bytes()));
+        self.out.write_all(&self.row).map_err(|e| InputError::io(&self.path, "writing", &e))?;
+        self.bytes += self.row.len() as u64;
+        self.rows += 1;
+        Ok(true)
     }
 
-    fn finish(self: Box<Self>) -> InputResult<Written> {
-        let PlyWriter { path, part, out, meta, rows_at_most, given, rows, bytes, .. } = *self;
-        let frame = self.to_file.frame();
-        if rows == 0 {
-            return Err(no_finite_row(&path, given));
-        }
-        let failed = |doing: &str, e: &std::io::Error| InputError::io(&path, doing, e);
-        let mut file = out.into_inner().map_err(|e| failed("writing", e.error()))?;
-        if rows < rows_at_most {
-            let header = header_text(self.sh_degree, rows, rows_at_most, &meta, frame);
+    fn complete(self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)> {
+        let failed = |doing: &str, e: &std::io::Error| InputError::io(&self.path, doing, e);
+        let mut file = self.out.into_inner().map_err(|e| failed("writing", e.error()))?;
+        if rows < self.rows_at_most {
+            let header = header_text(self.sh_degree, rows, self.rows_at_most, &self.meta, self.frame);
             let written = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(header.as_bytes()));
             written.map_err(|e| failed("writing", &e))?;
         }
-        part.finish(file)?;
-        Ok(Written { frame, rows, skipped: given - rows, bytes, levels: None })
+        self.part.finish(file)?;
+        Ok((self.bytes, None))
     }
 }
 

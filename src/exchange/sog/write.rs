@@ -18,12 +18,11 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_folder::PartFolder;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::sink::{GaussianSink, LEVELS_MAX, LevelCounts, Written, no_finite_row};
+use crate::exchange::sink::{Format, FormatSink, LEVELS_MAX, LevelCounts};
 use crate::exchange::transform::{TRANSFORM_ENDING, transform_text};
-use crate::scene::columns::Columns;
 use crate::scene::rotation::VIEWER_UP;
 use rayon::prelude::*;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Component, Path};
 
 /// Number of levels, including the finest.
 const LEVELS: usize = LEVELS_MAX;
@@ -90,8 +89,7 @@ struct OpenFile {
 
 pub struct SogWriter {
     folder: PartFolder,
-    path: PathBuf,
-    to_file: ExportRows,
+    frame: ExportFrame,
     meta: SceneMeta,
     sh_degree: u8,
     giant_log_scale: f64,
@@ -103,21 +101,19 @@ pub struct SogWriter {
     files: Vec<String>,
     leaves: Vec<Leaf>,
     rows: [u64; LEVELS],
-    given: u64,
 }
 
 impl SogWriter {
     /// Starts the folder `path` of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows:
     /// both have the same axes.
     /// Errors: the disk fails, or the folder `path` holds files that are not of an export.
-    pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<SogWriter> {
+    pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<FormatSink<SogWriter>> {
         let to_file = ExportRows::new(meta);
         let unit = if to_file.frame() == ExportFrame::Local { meta.scale } else { 1.0 };
-        Ok(SogWriter {
+        let writer = SogWriter {
             folder: PartFolder::create(path, is_of_sog)?,
-            path: path.to_path_buf(),
+            frame: to_file.frame(),
             giant_log_scale: libm::log(GIANT_RADII * meta.scene_radius / unit),
-            to_file,
             meta: meta.clone(),
             sh_degree,
             group: Vec::new(),
@@ -127,13 +123,8 @@ impl SogWriter {
             files: Vec::new(),
             leaves: Vec::new(),
             rows: [0; LEVELS],
-            given: 0,
-        })
-    }
-
-    fn is_giant(&self, row: &ExportRow) -> bool {
-        let longest = row.log_scales.iter().fold(f32::NEG_INFINITY, |most, &s| most.max(s));
-        f64::from(longest) > self.giant_log_scale
+        };
+        Ok(FormatSink::new(path, sh_degree, to_file, writer))
     }
 
     fn new_file(&mut self, level: usize) -> usize {
@@ -208,37 +199,28 @@ impl SogWriter {
     }
 }
 
-impl GaussianSink for SogWriter {
-    fn write(&mut self, columns: &Columns) -> InputResult<()> {
-        if columns.sh_degree > self.sh_degree {
-            return Err(InputError::new(&self.path, "rows have more SH bands than announced", "report this as a bug"));
+impl Format for SogWriter {
+    fn put(&mut self, row: &ExportRow) -> InputResult<bool> {
+        let longest = row.log_scales.iter().fold(f32::NEG_INFINITY, |most, &s| most.max(s));
+        if self.giants.len() < GIANTS_MAX && f64::from(longest) > self.giant_log_scale {
+            self.giants.push(*row);
+            return Ok(true);
         }
-        for row in 0..columns.rows() {
-            self.given += 1;
-            let Some(row) = self.to_file.row(columns, row) else { continue };
-            if self.giants.len() < GIANTS_MAX && self.is_giant(&row) {
-                self.giants.push(row);
-                continue;
-            }
-            // Doubling would end at up to twice as many.
-            if self.group.is_empty() {
-                self.group.reserve_exact(GROUP_ROWS);
-            }
-            self.group.push(row);
-            if self.group.len() == GROUP_ROWS {
-                self.close_group()?;
-            }
+        // Doubling would end at up to twice as many.
+        if self.group.is_empty() {
+            self.group.reserve_exact(GROUP_ROWS);
         }
-        Ok(())
+        self.group.push(*row);
+        if self.group.len() == GROUP_ROWS {
+            self.close_group()?;
+        }
+        Ok(true)
     }
 
-    fn finish(mut self: Box<Self>) -> InputResult<Written> {
+    fn complete(mut self, _: u64) -> InputResult<(u64, Option<LevelCounts>)> {
         // A viewer needs a leaf.
         if self.group.is_empty() && self.leaves.is_empty() {
             self.group = std::mem::take(&mut self.giants);
-        }
-        if self.group.is_empty() && self.leaves.is_empty() {
-            return Err(no_finite_row(&self.path, self.given));
         }
         self.close_group()?;
         for level in 1..LEVELS {
@@ -251,18 +233,12 @@ impl GaussianSink for SogWriter {
         let environment = format!("{GIANTS_FOLDER}/{META_FILE}");
         let tree = text(&mut self.leaves, &self.files, (giants > 0).then_some(&environment), LEVELS);
         let up = self.meta.upright.map(|_| VIEWER_UP);
-        let transform = transform_text(Path::new(TREE_FILE), &self.meta, self.to_file.frame(), up)?;
+        let transform = transform_text(Path::new(TREE_FILE), &self.meta, self.frame, up)?;
         self.folder.write(Path::new(TRANSFORM_ENDING), transform.as_bytes())?;
         self.folder.write(Path::new(TREE_FILE), tree.as_bytes())?;
-        let (bytes, rows) = (self.folder.bytes(), self.rows[0] + giants);
+        let bytes = self.folder.bytes();
         self.folder.finish()?;
-        Ok(Written {
-            frame: self.to_file.frame(),
-            rows,
-            skipped: self.given - rows,
-            bytes,
-            levels: Some(LevelCounts { rows: self.rows, always_shown: giants }),
-        })
+        Ok((bytes, Some(LevelCounts { rows: self.rows, always_shown: giants })))
     }
 }
 
