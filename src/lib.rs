@@ -95,7 +95,8 @@
 //! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
 //! **An output format**
-//! 1. `exchange/` gets a file with the format's [`exchange::sink::GaussianSink`]; `exchange/ply/write.rs` is the example.
+//! 1. `exchange/` gets a file with the format's `Format` (`exchange/sink.rs`), of which a [`exchange::sink::GaussianSink`] is made;
+//!    `exchange/ply/write.rs` is the example.
 //!    [`exchange::frames::ExportRows`] gives rows as files hold them, [`base::whole_file::PartFile`] makes the file appear as a
 //!    whole, [`base::whole_folder::PartFolder`] a folder. `exchange/mod.rs` names the file.
 //! 2. `exchange/format.rs`: the ending, the sink, the transform, the name in a run's folder, and how `--overwrite` removes it.
