@@ -118,8 +118,8 @@ fn load_views(
     let mut warnings = raw.warnings;
     let image_folder = options.image_folder.clone().unwrap_or_else(|| image_folder_of(&raw.views));
     let root = match raw.root.as_os_str().is_empty() {
-        true => image_folder.parent().unwrap_or(&image_folder).to_path_buf(),
-        false => raw.root.clone(),
+        true => image_folder.parent().unwrap_or(&image_folder),
+        false => &raw.root,
     };
     if raw.views.is_empty() {
         return Err(InputError::new(image_folder, "the scene has no registered view", "give a model with photos"));
@@ -137,11 +137,22 @@ fn load_views(
         warnings
             .push(format!("{count} cameras are far from all others and do not count for the scene's size: {names}"));
     }
-    let present = drop_missing(posed, options, (&root, &image_folder), &mut warnings)?;
-    let photos = check_photos(&present, options, (&root, &image_folder), &mut warnings)?;
+    let present = drop_missing(posed, options, (root, &image_folder), &mut warnings)?;
+    let photos = check_photos(&present, options, (root, &image_folder), &mut warnings)?;
     warn_about_extra_photos(&photos, &mut warnings);
     let view = |((raw, split), photo): ((RawView, Split), PhotoSource)| {
-        let camera = camera_of(&raw, &photo, &frame, options);
+        let k = intrinsics_at(&photo.intrinsics, photo.target);
+        let camera = Camera {
+            viewmat: frame.viewmat(&raw.pose),
+            fx: k.fx as f32,
+            fy: k.fy as f32,
+            cx: k.cx as f32,
+            cy: k.cy as f32,
+            width: k.width,
+            height: k.height,
+            near_plane: options.near_plane as f32,
+            far_plane: FAR_PLANE,
+        };
         View { name: raw.name, split, camera, photo }
     };
     let views: Vec<View> = present.into_iter().zip(photos).map(view).collect();
@@ -261,21 +272,6 @@ fn drop_missing(
     }
     warnings.push(problem);
     Ok(present)
-}
-
-fn camera_of(view: &RawView, photo: &PhotoSource, frame: &Frame, options: &LoadOptions) -> Camera {
-    let k = intrinsics_at(&photo.intrinsics, photo.target);
-    Camera {
-        viewmat: frame.viewmat(&view.pose),
-        fx: k.fx as f32,
-        fy: k.fy as f32,
-        cx: k.cx as f32,
-        cy: k.cy as f32,
-        width: k.width,
-        height: k.height,
-        near_plane: options.near_plane as f32,
-        far_plane: FAR_PLANE,
-    }
 }
 
 /// Whether a point is finite and not implausibly far; counts the others by reason.

@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn a_wall_is_no_ground() {
+    fn a_wall_is_no_ground_and_without_evidence_nothing_is_made_up() {
         // Photos of a facade from some places along it: the points form an upright plane.
         let wall: Vec<DVec3> =
             (0..400).map(|i| DVec3::new(f64::from(i % 20) / 5.0 - 2.0, 2.0, f64::from(i / 20) / 10.0 - 0.5)).collect();
@@ -221,19 +221,13 @@ mod tests {
         for up in UPS {
             assert!(error_of(up, facade, &wall) < 2.0);
         }
-    }
-
-    #[test]
-    fn without_evidence_nothing_is_made_up() {
-        let none = estimate_up([].iter(), |_| Ok(()));
-        assert_eq!(none.unwrap(), None);
+        assert_eq!(estimate_up([].iter(), |_| Ok(())).unwrap(), None);
         let one = camera(DVec3::ZERO, DVec3::Y, (DVec3::Z, DVec3::Y), 0.0);
         let up = estimate_up([one].iter(), |take| {
             take([f32::NAN; 3]);
             Ok(())
         });
-        let up = DVec3::from_array(up.unwrap().unwrap());
         // One photo: its own top.
-        assert_eq!(up, DVec3::Z);
+        assert_eq!(up.unwrap(), Some([0.0, 0.0, 1.0]));
     }
 }

@@ -126,7 +126,6 @@ mod tests {
             let kind = EventKind::RaiseShDegree { degree: i as u8 };
             assert_eq!(log.push(Event { step, kind }), i);
         }
-        assert_eq!(log.events()[2].now(), 3001);
         assert_eq!(EventLog::from_events(log.events().to_vec()), Some(log.clone()));
         let mut wrong = log.events().to_vec();
         wrong.reverse();

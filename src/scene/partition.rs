@@ -44,30 +44,6 @@ pub struct PointRow {
     pub row: u32,
 }
 
-/// The rows of every page, numbered as [`crate::base::ids::PageId::initial`] numbers pages.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Partition {
-    /// Rows, page after page.
-    rows: Vec<u32>,
-    /// Start of each page in `rows`, and the end.
-    starts: Vec<u32>,
-}
-
-impl Partition {
-    pub fn pages(&self) -> usize {
-        self.starts.len() - 1
-    }
-
-    /// The rows of a page, ascending.
-    pub fn rows_of(&self, page: usize) -> &[u32] {
-        &self.rows[self.starts[page] as usize..self.starts[page + 1] as usize]
-    }
-
-    pub fn iter(&self) -> impl ExactSizeIterator<Item = &[u32]> {
-        (0..self.pages()).map(|page| self.rows_of(page))
-    }
-}
-
 /// Most rows of a first page: its capacity, or less if pages will grow.
 pub fn first_fill(page_rows: usize, is_growing: bool) -> usize {
     if is_growing { (page_rows * FILL_PERCENT / 100).max(1) } else { page_rows.max(1) }
@@ -77,49 +53,48 @@ pub fn giants(rows: usize) -> usize {
     rows / ROWS_PER_GIANT
 }
 
-/// Divides rows into pages of at most `fill` rows (at least 1). `means` and `scales` (log) are `[rows][3]`. Takes 16
-/// bytes per row besides the result. Panics with 2^32 rows or more.
-pub fn partition(means: &[f32], scales: &[f32], fill: usize) -> Partition {
+/// Divides rows into pages of at most `fill` rows (at least 1): the rows of every page, ascending, numbered as
+/// [`crate::base::ids::PageId::initial`] numbers pages. `means` and `scales` (log) are `[rows][3]`. Takes 16 bytes per row besides
+/// the result. Panics with 2^32 rows or more.
+pub fn partition(means: &[f32], scales: &[f32], fill: usize) -> Vec<Vec<u32>> {
     let count = means.len() / 3;
     assert!(u32::try_from(count).is_ok(), "more than 2^32 rows");
     assert_eq!(means.len(), scales.len(), "one size per position");
-    let cut = GiantCut::find(count, |row| largest(&scales[row * 3..row * 3 + 3]));
+    let size = |row: usize| largest(&scales[row * 3..row * 3 + 3]);
+    let mut search = GiantCut::search(count);
+    while !search.is_done() {
+        (0..count).for_each(|row| search.count(GiantCut::key(size(row), row as u32)));
+        search.next_pass();
+    }
+    let cut = GiantCut::found(&search);
     let entry = |row: usize| PointRow { point: std::array::from_fn(|i| means[row * 3 + i]), row: row as u32 };
-    let is_giant = |row: usize| cut.is_giant(largest(&scales[row * 3..row * 3 + 3]), row as u32);
+    let is_giant = |row: usize| cut.is_giant(size(row), row as u32);
     let mut entries = Vec::with_capacity(count);
     entries.extend((0..count).filter(|&row| !is_giant(row)).map(entry));
     let small = entries.len();
     entries.extend((0..count).filter(|&row| is_giant(row)).map(entry));
-    let mut starts = vec![0];
-    for range in [0..small, small..count] {
-        let pages = Pages::of(range.len(), fill);
-        pages.divide(&mut entries[range.clone()]);
-        starts.extend((1..=pages.pages).map(|page| (range.start + pages.start(page)) as u32));
+    let mut pages = Vec::new();
+    for part in [0..small, small..count] {
+        let (division, entries) = (Pages::of(part.len(), fill), &mut entries[part]);
+        division.divide(entries);
+        let rows = |page| entries[division.start(page)..division.start(page + 1)].iter().map(|e| e.row).collect();
+        pages.extend((0..division.pages).map(rows));
     }
-    Partition { rows: entries.into_par_iter().map(|e| e.row).collect(), starts }
+    pages
 }
 
 fn largest(scales: &[f32]) -> f32 {
     scales[0].max(scales[1]).max(scales[2])
 }
 
-/// Selects the giants: the largest half percent of rows; equal sizes are ordered by row.
+/// Selects the giants: the largest half percent of rows, by a size that is any number that increases with theirs; equal sizes are
+/// ordered by row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct GiantCut {
     smallest: u64,
 }
 
 impl GiantCut {
-    /// From the size of every row: any number that increases with it, used consistently with [`GiantCut::is_giant`].
-    pub fn find(rows: usize, size: impl Fn(usize) -> f32) -> GiantCut {
-        let mut search = GiantCut::search(rows);
-        while !search.is_done() {
-            (0..rows).for_each(|row| search.count(GiantCut::key(size(row), row as u32)));
-            search.next_pass();
-        }
-        GiantCut::found(&search)
-    }
-
     /// A search for the cut among `rows` rows whose sizes are streamed: count [`GiantCut::key`] of every row in every
     /// pass.
     pub fn search(rows: usize) -> RankSearch {
@@ -259,12 +234,11 @@ mod tests {
             for threads in [1, 3] {
                 let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
                 let got = pool.map(|pool| pool.install(|| partition(&means, &scales, fill)));
-                let got: Vec<Vec<u32>> = got.iter().flat_map(|p| p.iter().map(<[u32]>::to_vec)).collect();
-                assert!(got == want, "{rows} rows, {fill} a page, {threads} threads");
+                assert!(got.is_ok_and(|got| got == want), "{rows} rows, {fill} a page, {threads} threads");
             }
             assert!(want.iter().all(|page| page.len() <= fill && !page.is_empty()));
         }
-        assert_eq!(partition(&[], &[], 5).pages(), 0);
+        assert!(partition(&[], &[], 5).is_empty());
     }
 
     #[test]

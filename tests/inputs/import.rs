@@ -96,9 +96,9 @@ fn files_give_the_pages_of_points_in_memory() {
                 Ok(())
             })
             .unwrap();
-            assert_eq!(pages.len(), parts.pages());
+            assert_eq!(pages.len(), parts.len());
             for (page, rows) in pages.iter().zip(parts.iter()) {
-                assert!(page.rows == rows && page.columns == state.select(rows).columns, "{} of {bytes}", page.id);
+                assert!(page.rows == *rows && page.columns == state.select(rows).columns, "{} of {bytes}", page.id);
             }
         }
     }
@@ -149,9 +149,9 @@ fn small_clouds_and_points_that_are_not_finite_give_the_pages_of_points_in_memor
                 Ok(())
             });
             let summary = summary.unwrap();
-            assert_eq!((summary.rows, summary.points, pages.len()), (state.rows() as u64, count, parts.pages()));
+            assert_eq!((summary.rows, summary.points, pages.len()), (state.rows() as u64, count, parts.len()));
             for (page, rows) in pages.iter().zip(parts.iter()) {
-                assert!(page.rows == rows && page.columns == state.select(rows).columns, "{} of {bytes}", page.id);
+                assert!(page.rows == *rows && page.columns == state.select(rows).columns, "{} of {bytes}", page.id);
             }
             if count > 0 && most != Some(0) {
                 let full = || InputError::new("disk", "full", "free some");

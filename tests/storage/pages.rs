@@ -321,7 +321,7 @@ fn in_pages<'a>(
     first_rows: usize,
 ) -> InPages<'a> {
     let parts = partition(&start.columns.means, &start.columns.scales, first_rows);
-    let page = |(index, rows): (usize, &[u32])| {
+    let page = |(index, rows): (usize, &Vec<u32>)| {
         let id = PageId::initial(index as u32);
         (id, Page::new(&start.select(rows), page_rows, 0))
     };

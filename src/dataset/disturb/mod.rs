@@ -43,14 +43,12 @@ pub enum Disturbance {
         /// Whether these photos are missing instead, as if a user had found them.
         are_removed: bool,
     },
-    /// Normal noise on the places of cameras, along each axis.
+    /// Normal noise on the places of cameras, along each axis; its standard deviation is a share of the scene's size.
     PoseNoise {
-        /// Standard deviation, as a share of the scene's size.
         share: f64,
     },
-    /// Photos compressed as JPEG.
+    /// Photos compressed as JPEG, with a quality of 1 to 100.
     Jpeg {
-        /// 1 to 100.
         quality: u8,
     },
     /// Grey boxes at random places of each photo.
@@ -59,21 +57,17 @@ pub enum Disturbance {
         /// Whether masks exclude them, as a user could by hand.
         are_masked: bool,
     },
-    /// One photo in so many.
+    /// One photo in so many, at least 1; so it is with points.
     FewPhotos {
-        /// At least 1.
         one_in: u32,
     },
-    /// One point in so many.
     FewPoints {
-        /// At least 1.
         one_in: u32,
     },
     /// As many points, at random places of their box, of random colours.
     RandomPoints,
-    /// One photo in so many is blurred, by a normal distribution of a hundredth of its width.
+    /// One photo in so many, at least 1, is blurred by a normal distribution of a hundredth of its width.
     Blurred {
-        /// At least 1.
         one_in: u32,
     },
 }

@@ -63,14 +63,13 @@ impl TorchFile {
     }
 
     fn tensor(&self, tensor: &TensorRef) -> Result<Vec<f64>, String> {
-        let decode: (usize, fn(&[u8]) -> f64) = match &*tensor.storage {
+        let (width, decode): (usize, fn(&[u8]) -> f64) = match &*tensor.storage {
             "FloatStorage" => (4, |b| f64::from(f32::from_le_bytes(std::array::from_fn(|i| b[i])))),
             "DoubleStorage" => (8, |b| f64::from_le_bytes(std::array::from_fn(|i| b[i]))),
             "LongStorage" => (8, |b| i64::from_le_bytes(std::array::from_fn(|i| b[i])) as f64),
             "IntStorage" => (4, |b| f64::from(i32::from_le_bytes(std::array::from_fn(|i| b[i])))),
             other => return Err(format!("is stored as {other}, which is not supported")),
         };
-        let (width, decode) = decode;
         let bytes = entry(&mut self.archive.borrow_mut(), &format!("{}data/{}", self.prefix, tensor.key))?;
         // The shape equals one of a short list of known ones: the product is small.
         let count: usize = tensor.sizes.iter().product();

@@ -36,27 +36,20 @@ pub enum Scalar {
 }
 
 impl Scalar {
-    fn from_name(name: &str) -> Option<Scalar> {
-        Some(match name {
-            "char" | "int8" => Scalar::I8,
-            "uchar" | "uint8" => Scalar::U8,
-            "short" | "int16" => Scalar::I16,
-            "ushort" | "uint16" => Scalar::U16,
-            "int" | "int32" => Scalar::I32,
-            "uint" | "uint32" => Scalar::U32,
-            "float" | "float32" => Scalar::F32,
-            "double" | "float64" => Scalar::F64,
-            _ => return None,
-        })
-    }
+    /// The types with their names and bytes.
+    const ALL: [(Scalar, [&str; 2], usize); 8] = [
+        (Scalar::I8, ["char", "int8"], 1),
+        (Scalar::U8, ["uchar", "uint8"], 1),
+        (Scalar::I16, ["short", "int16"], 2),
+        (Scalar::U16, ["ushort", "uint16"], 2),
+        (Scalar::I32, ["int", "int32"], 4),
+        (Scalar::U32, ["uint", "uint32"], 4),
+        (Scalar::F32, ["float", "float32"], 4),
+        (Scalar::F64, ["double", "float64"], 8),
+    ];
 
     pub fn size(self) -> usize {
-        match self {
-            Scalar::I8 | Scalar::U8 => 1,
-            Scalar::I16 | Scalar::U16 => 2,
-            Scalar::I32 | Scalar::U32 | Scalar::F32 => 4,
-            Scalar::F64 => 8,
-        }
+        Scalar::ALL[self as usize].2
     }
 
     pub fn is_float(self) -> bool {
@@ -214,7 +207,10 @@ fn parse_element(rest: &str, before: &[Element]) -> Result<Element, String> {
 }
 
 fn parse_property(rest: &str, element: &Element) -> Result<Property, String> {
-    let scalar = |name: &str| Scalar::from_name(name).ok_or_else(|| format!("unknown type '{}'", shorten(name)));
+    let scalar = |name: &str| {
+        let known = Scalar::ALL.into_iter().find(|(_, names, _)| names.contains(&name));
+        known.map(|(scalar, ..)| scalar).ok_or_else(|| format!("unknown type '{}'", shorten(name)))
+    };
     let (kind, name) = match rest.split_whitespace().collect::<Vec<_>>()[..] {
         ["list", count, item, name] => {
             let (count, item) = (scalar(count)?, scalar(item)?);
