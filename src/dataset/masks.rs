@@ -176,23 +176,20 @@ impl MaskIndex {
         let unused = |entry: &&Entry| !used.contains(entry.path.as_path());
         let all: Vec<&Entry> = self.in_folders.entries().chain(self.beside_photos.entries()).filter(unused).collect();
         let (unread, others): (Vec<&Entry>, Vec<&Entry>) = all.into_iter().partition(|entry| !entry.is_readable());
-        if !unread.is_empty() {
-            let (count, some) = (unread.len(), self.shown(unread.iter().map(|entry| &*entry.path)));
-            warnings
-                .push(format!("{count} masks are neither PNG nor JPEG and are not used: {some}; convert them to PNG"));
-        }
-        let links: Vec<&Path> =
+        let [unread, others] = [unread, others].map(|entries| entries.into_iter().map(|entry| &*entry.path).collect());
+        let links =
             [&self.in_folders, &self.beside_photos].into_iter().flat_map(|i| &i.dangling).map(|p| &**p).collect();
-        if !links.is_empty() {
-            let (count, some) = (links.len(), self.shown(links.into_iter()));
-            warnings.push(format!(
-                "{count} masks are links whose target is not on this machine, and are not used: {some}; fetch it first (git annex \
-                 get, dvc pull)"
-            ));
-        }
-        if !others.is_empty() && !used.is_empty() && masks.contains(&None) {
-            let (count, some) = (others.len(), self.shown(others.iter().map(|entry| &*entry.path)));
-            warnings.push(format!("{count} masks belong to no photo: {some}"));
+        let mut say = |paths: Vec<&Path>, what: &str, remedy: &str| {
+            if !paths.is_empty() {
+                let (count, some) = (paths.len(), self.shown(paths.into_iter()));
+                warnings.push(format!("{count} masks {what}: {some}{remedy}"));
+            }
+        };
+        say(unread, "are neither PNG nor JPEG and are not used", "; convert them to PNG");
+        let fetch = "; fetch it first (git annex get, dvc pull)";
+        say(links, "are links whose target is not on this machine, and are not used", fetch);
+        if !used.is_empty() && masks.contains(&None) {
+            say(others, "belong to no photo", "");
         }
     }
 

@@ -17,10 +17,8 @@ use zip::write::{SimpleFileOptions, ZipWriter};
 pub(super) enum Entry {
     Int(i32),
     Float(f64),
-    /// Row-major numbers with their shape, stored as f32.
-    Floats(Vec<f32>, Vec<u8>),
-    /// The same as f64.
-    Doubles(Vec<f64>),
+    /// The type of the storage, the bytes of row-major numbers, and their shape.
+    Tensor(&'static str, Vec<u8>, Vec<u8>),
 }
 
 /// Writes the views of `scene` to `folder`, every `test_every`th one into `val`; photos are moved there.
@@ -37,7 +35,10 @@ pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> In
     let scale = (high - low).length().max(1.0) * 0.5;
     write_torch(
         &folder.join("coordinates.pt"),
-        &[("origin_drb", Entry::Doubles(origin.to_array().to_vec())), ("pose_scale_factor", Entry::Float(scale))],
+        &[
+            ("origin_drb", Entry::Tensor("DoubleStorage", origin.to_array().map(f64::to_le_bytes).concat(), vec![3])),
+            ("pose_scale_factor", Entry::Float(scale)),
+        ],
     )?;
     for (i, view) in scene.views.iter().enumerate() {
         let split = if i.is_multiple_of(test_every) { Split::Test } else { Split::Train };
@@ -61,17 +62,17 @@ fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, 
     for row in 0..3 {
         // Converts the camera's axes from right-down-forward to right-up-back.
         let r = rotation.row(row);
-        c2w.extend([r.x as f32, -r.y as f32, -r.z as f32, centre[row] as f32]);
+        c2w.extend([r.x as f32, -r.y as f32, -r.z as f32, centre[row] as f32].map(f32::to_le_bytes));
     }
     let k = view.intrinsics;
-    let intrinsics = [k.fx, k.fy, k.cx, k.cy].map(|x| x as f32).to_vec();
+    let intrinsics = [k.fx, k.fy, k.cx, k.cy].map(|x| (x as f32).to_le_bytes()).concat();
     write_torch(
         path,
         &[
             ("W", Entry::Int(k.width as i32)),
             ("H", Entry::Int(k.height as i32)),
-            ("intrinsics", Entry::Floats(intrinsics, vec![4])),
-            ("c2w", Entry::Floats(c2w, vec![3, 4])),
+            ("intrinsics", Entry::Tensor("FloatStorage", intrinsics, vec![4])),
+            ("c2w", Entry::Tensor("FloatStorage", c2w.concat(), vec![3, 4])),
         ],
     )
 }
@@ -95,13 +96,9 @@ pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult
                 pickle.push(b'G');
                 pickle.extend_from_slice(&x.to_be_bytes());
             }
-            Entry::Floats(values, shape) => {
-                tensor(&mut pickle, "FloatStorage", data.len(), values.len(), shape);
-                data.push(values.iter().flat_map(|x| x.to_le_bytes()).collect::<Vec<u8>>());
-            }
-            Entry::Doubles(values) => {
-                tensor(&mut pickle, "DoubleStorage", data.len(), values.len(), &[values.len() as u8]);
-                data.push(values.iter().flat_map(|x| x.to_le_bytes()).collect());
+            Entry::Tensor(storage, bytes, shape) => {
+                tensor(&mut pickle, storage, data.len(), shape);
+                data.push(bytes);
             }
         }
     }
@@ -126,13 +123,13 @@ fn text(pickle: &mut Vec<u8>, value: &str) {
 }
 
 /// A call of the function that rebuilds a contiguous tensor.
-fn tensor(pickle: &mut Vec<u8>, storage: &str, key: usize, count: usize, shape: &[u8]) {
+fn tensor(pickle: &mut Vec<u8>, storage: &str, key: usize, shape: &[u8]) {
     pickle.extend_from_slice(b"ctorch._utils\n_rebuild_tensor_v2\n((");
     text(pickle, "storage");
     pickle.extend_from_slice(format!("ctorch\n{storage}\n").as_bytes());
     text(pickle, &key.to_string());
     text(pickle, "cpu");
-    pickle.extend_from_slice(&[b'K', count as u8, b't', b'Q', b'K', 0, b'(']);
+    pickle.extend_from_slice(&[b'K', shape.iter().product(), b't', b'Q', b'K', 0, b'(']);
     shape.iter().for_each(|&n| pickle.extend_from_slice(&[b'K', n]));
     pickle.extend_from_slice(b"t(");
     for axis in 0..shape.len() {
