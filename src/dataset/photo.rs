@@ -4,10 +4,9 @@
 //! ([`Alpha`]) are left out as a mask leaves pixels out, or show a background colour. EXIF orientation is ignored: COLMAP
 //! poses refer to the stored pixels.
 //!
-//! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone, never on budgets or threads; 2.
-//! [`decode`] never uses more memory than [`PhotoSource::decode_bytes`], whatever the files contain besides pixels:
-//! colour profiles, texts and previews are skipped or counted; 3. distorted photos are undistorted at full size, row by
-//! row into the area average: the full-size result never exists in memory; 4. a target pixel is kept if at least half of its
+//! Invariants: 1. a target depends on its [`PhotoSource`] and the files alone; 2. [`decode`] never uses more memory than
+//! [`PhotoSource::decode_bytes`], whatever the files contain besides pixels; 3. distorted photos are undistorted at full size, row
+//! by row into the area average: the full-size result never exists in memory; 4. a target pixel is kept if at least half of its
 //! area is inside the photo, at least half of it is kept by the mask, and it is at least half opaque.
 
 use super::masks::MaskSource;

@@ -66,7 +66,6 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
     let mut gathered = Gathered::new(photos, options);
     for (number, line) in lines.filter(|(_, line)| !line.starts_with('#')) {
         let line = Line { file: &file, number: number + 1, header: &header, cells: cells_of(line, header.separator) };
-        line.check_count()?;
         line.add_view(&mut gathered)?;
     }
     let mut scene = RawScene::default();
@@ -142,24 +141,6 @@ impl Line<'_> {
         InputError::new(self.file, problem, remedy).at(format!("line {}", self.number))
     }
 
-    /// Refuses a line whose cells are not those of the header: numbers would stand in wrong columns. An empty cell at the end is
-    /// none.
-    fn check_count(&self) -> InputResult<()> {
-        let count = |cells: &[String]| cells.len() - usize::from(cells.last().is_some_and(String::is_empty));
-        let (cells, names) = (count(&self.cells), count(&self.header.names));
-        if cells == names || self.cells.len() == self.header.names.len() {
-            return Ok(());
-        }
-        let (problem, remedy) = (format!("the line has {cells} cells, the header names {names} columns"), EXPORT);
-        let is_comma = self.header.separator == ',' && cells > names;
-        let remedy = if is_comma {
-            "if the numbers have a decimal comma, export them with a point, or with ';' between the cells"
-        } else {
-            remedy
-        };
-        Err(self.error(problem, remedy))
-    }
-
     /// The number in a column, 0 if the header has no such column.
     fn number(&self, name: &str) -> InputResult<f64> {
         let Some(place) = self.header.place(name) else { return Ok(0.0) };
@@ -177,6 +158,15 @@ impl Line<'_> {
     }
 
     fn add_view(&self, gathered: &mut Gathered<'_>) -> InputResult<()> {
+        // With other cells than those of the header, numbers would stand in wrong columns. An empty cell at the end is none.
+        let count = |cells: &[String]| cells.len() - usize::from(cells.last().is_some_and(String::is_empty));
+        let (cells, names) = (count(&self.cells), count(&self.header.names));
+        if cells != names && self.cells.len() != self.header.names.len() {
+            let problem = format!("the line has {cells} cells, the header names {names} columns");
+            let comma = "if the numbers have a decimal comma, export them with a point, or with ';' between the cells";
+            let is_comma = self.header.separator == ',' && cells > names;
+            return Err(self.error(problem, if is_comma { comma } else { EXPORT }));
+        }
         let stated = self.header.place("name").and_then(|place| self.cells.get(place)).map_or("", |name| name.trim());
         let stays = "names must stay in the folder of the photos: export with plain file names";
         let photo = gathered.photos.find(stated).map_err(|problem| self.error(problem, stays))?;

@@ -4,12 +4,10 @@
 //! Eviction order: first targets that no coming step needs, least recently used first; then those needed last. A view
 //! is never evicted for one that is needed later.
 //!
-//! Invariants: 1. the bytes of decoded targets (including those that a caller still holds) plus the peak bytes of
-//! decodes in flight, computed from the files' headers, never exceed the budget, except: 2. a view that a caller waits
-//! for is decoded even if it does not fit, but alone, and after evicting everything that nobody holds. So the least
-//! memory used under any budget is one decode plus the targets that callers hold; 3. targets that fit the budget
-//! together, with room for the decodes in flight, are decoded once; 4. the bits of a target never depend on budget,
-//! threads or order.
+//! Invariants: 1. the bytes of decoded targets (also those that a caller still holds) plus the peak bytes of decodes in flight,
+//! from the files' headers, never exceed the budget, except: 2. a view that a caller waits for is decoded even if it does not fit,
+//! but alone, and after evicting everything that nobody holds; 3. targets that fit the budget together, with room for the decodes
+//! in flight, are decoded once; 4. the bits of a target never depend on budget, threads or order.
 
 use super::loader::View;
 use super::photo::{PhotoSource, decode};

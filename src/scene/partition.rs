@@ -4,8 +4,7 @@
 //! of pages the halves differ by one page. The largest rows are divided the same way among themselves: one giant in a
 //! page of small rows would make every view need that page.
 //!
-//! Not here: the stored form of a page, and pages that outgrow their capacity ([`super::page_split`]). A cloud larger
-//! than memory is divided through files, with the same result.
+//! Not here: pages that outgrow their capacity ([`super::page_split`]), and clouds larger than memory.
 //!
 //! Invariants: 1. every row is in exactly one page; 2. pages differ by one row at most (pages of giants among
 //! themselves); 3. the result is a function of positions and sizes, not of threads: equal coordinates are ordered by

@@ -104,10 +104,7 @@ mod tests {
             assert!(got <= mean && got >= mean * (1.0 - 1.0 / 2048.0), "{mean}: {got}");
         }
         assert!(mean_weight(of_mean_weight(0.0)).is_some() && mean_weight(of_mean_weight(f32::INFINITY)).is_some());
-    }
-
-    #[test]
-    fn extreme_weights_stay_numbers() {
+        // Extreme weights stay numbers.
         for (added, least, most) in [(0.0, 1e-31, 1e-29), (f32::NAN, 1e-31, 1e-29), (f32::INFINITY, 9e29, 1.1e30)] {
             let word = with_view(with_view(0, Some(added)), Some(added));
             assert_eq!(views(word), 2);

@@ -5,11 +5,9 @@
 //! Invariants: 1. for any JSON content the result is a scene or an [`InputError`] that names file and key; 2. only a
 //! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
 //!
-//! Files: a folder with `transforms_train.json` is read as a split scene, and `transforms_test.json` is the test set.
-//! `transforms_val.json` is the test set only if there is no test file; otherwise its views are dropped, with a
-//! warning. Any other folder is read from `transforms.json`, whose `train_filenames`, `val_filenames` and
-//! `test_filenames`, if present, apply in the same way. A JSON given by its path is read alone, and its name prescribes
-//! no split.
+//! Files: a folder with `transforms_train.json` is a split scene. Its test set is `transforms_test.json`, or without it
+//! `transforms_val.json`, whose views are dropped otherwise, with a warning. Any other folder is read from `transforms.json`, whose
+//! `train_filenames`, `val_filenames` and `test_filenames` apply in the same way. A JSON given by its path prescribes no split.
 //!
 //! Poses are used as they are: `applied_transform` and `applied_scale` only document their origin, and `ply_file_path`
 //! is in the same frame.

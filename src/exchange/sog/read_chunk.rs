@@ -109,10 +109,18 @@ impl Chunk {
         let (low, high) = (picture(&means.files[0])?, picture(&means.files[1])?);
         let (turns, sizes, colours) = (picture(&quats.files[0])?, picture(&scales.files[0])?, picture(&sh0.files[0])?);
         let harmonics = match sh_n.as_ref().filter(|sh| sh.bands > 0) {
-            Some(sh) => Some((sh, HarmonicCodes::read(&self.path, sh, *count)?)),
+            Some(sh) => {
+                let line = ENTRIES_PER_LINE * sh_n_width(sh.bands) / 3;
+                let path = path_in_folder(&self.path, &sh.files[0])?;
+                let palette = Picture::read(&path, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
+                if palette.width != line {
+                    return Err(malformed(&path, format!("{} pixels wide; a palette has {line}", palette.width)));
+                }
+                Some((sh, palette, picture(&sh.files[1])?))
+            }
             None => None,
         };
-        let mut columns = Columns::zeros(*count, harmonics.as_ref().map_or(0, |(sh, _)| sh.bands));
+        let mut columns = Columns::zeros(*count, harmonics.as_ref().map_or(0, |(sh, ..)| sh.bands));
         for (row, mean) in columns.means.as_chunks_mut::<3>().0.iter_mut().enumerate() {
             *mean = [0, 1, 2].map(|i| position(low.pixels[row][i], high.pixels[row][i], means.mins[i], means.maxs[i]));
         }
@@ -131,8 +139,22 @@ impl Chunk {
             columns.row_mut(Column::Sh0, row).copy_from_slice(&coded(&book, *pixel));
             columns.opacities[row] = logit((f32::from(pixel[3]) / 255.0).clamp(OPACITY_MIN, 1.0 - OPACITY_MIN));
         }
-        if let Some((sh, codes)) = harmonics {
-            codes.decode(&self.codebook("shN.codebook", &sh.codebook)?, sh.bands, &mut columns)?;
+        if let Some((sh, palette, labels)) = harmonics {
+            let book = self.codebook("shN.codebook", &sh.codebook)?;
+            let width = sh_n_width(sh.bands);
+            for (row, sh_n) in columns.sh_n.chunks_exact_mut(width).enumerate() {
+                let [low, high, ..] = labels.pixels[row];
+                let label = usize::from(u16::from_le_bytes([low, high]));
+                if label >= sh.count {
+                    let problem = format!("label {label} of a palette of {} entries", sh.count);
+                    return Err(malformed(&labels.path, problem).at(format!("pixel {row}")));
+                }
+                // Lines hold whole entries, so the entries follow each other.
+                let entry = &palette.pixels[label * (width / 3)..][..width / 3];
+                for (values, pixel) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(entry) {
+                    *values = coded(&book, *pixel);
+                }
+            }
         }
         Ok(columns)
     }
@@ -149,47 +171,6 @@ impl Chunk {
             book[i] = value.or_else(extrapolated).ok_or_else(wrong)?;
         }
         if book.iter().all(|v| v.is_finite()) { Ok(book) } else { Err(wrong()) }
-    }
-}
-
-/// The pictures of the bands above the constant one.
-struct HarmonicCodes {
-    palette: Picture,
-    labels: Picture,
-    entries: usize,
-}
-
-impl HarmonicCodes {
-    fn read(path: &Path, sh: &Harmonics, rows: usize) -> InputResult<HarmonicCodes> {
-        let line = ENTRIES_PER_LINE * sh_n_width(sh.bands) / 3;
-        let palette = Picture::read(&path_in_folder(path, &sh.files[0])?, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
-        if palette.width != line {
-            return Err(malformed(&palette.path, format!("{} pixels wide; a palette has {line}", palette.width)));
-        }
-        Ok(HarmonicCodes {
-            palette,
-            labels: Picture::read(&path_in_folder(path, &sh.files[1])?, rows)?,
-            entries: sh.count,
-        })
-    }
-
-    fn decode(&self, book: &[f32; CODES], bands: u8, columns: &mut Columns) -> InputResult<()> {
-        let width = sh_n_width(bands);
-        let coefficients = width / 3;
-        for (row, sh_n) in columns.sh_n.chunks_exact_mut(width).enumerate() {
-            let label = self.labels.pixels[row];
-            let label = usize::from(u16::from_le_bytes([label[0], label[1]]));
-            if label >= self.entries {
-                let problem = format!("label {label} of a palette of {} entries", self.entries);
-                return Err(malformed(&self.labels.path, problem).at(format!("pixel {row}")));
-            }
-            // Lines hold whole entries, so the entries follow each other.
-            let entry = &self.palette.pixels[label * coefficients..][..coefficients];
-            for (values, pixel) in sh_n.as_chunks_mut::<3>().0.iter_mut().zip(entry) {
-                *values = coded(book, *pixel);
-            }
-        }
-        Ok(())
     }
 }
 
