@@ -177,9 +177,7 @@ impl Checkpoint {
     }
 
     /// Called between two steps: begins a commit if one is due, and completes one whose pages are written.
-    ///
-    /// # Errors
-    /// As [`Checkpoint::commit`].
+    /// Errors: as [`Checkpoint::commit`].
     pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         if self.is_optional {
             self.interval.limit_bytes(trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64);
@@ -274,17 +272,13 @@ impl Checkpoint {
 
     /// Completes the commit in progress after a step that failed half-way, so that the run loses no more than that step.
     /// The step changed no page of the cut before the page was written.
-    ///
-    /// # Errors
-    /// A page of the cut cannot be written; earlier commits are intact.
+    /// Errors: a page of the cut cannot be written; earlier commits are intact.
     pub(crate) fn finish_cut(&mut self, trainer: &mut Trainer) -> Result<(), TrainError> {
         if trainer.scene.pager.is_frozen() { self.finish(trainer) } else { Ok(()) }
     }
 
     /// Commits the current state at once and abandons a commit in progress.
-    ///
-    /// # Errors
-    /// The commit failed; earlier commits are intact.
+    /// Errors: the commit failed; earlier commits are intact.
     pub fn commit(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         if self.origin.is_none() {
             return Ok(());
@@ -309,9 +303,7 @@ impl Checkpoint {
     }
 
     /// As [`Checkpoint::commit`], but a lack of space is only a warning.
-    ///
-    /// # Errors
-    /// As [`Checkpoint::commit`], except for space.
+    /// Errors: as [`Checkpoint::commit`], except for space.
     pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         match self.commit(trainer, metrics) {
             Err(error) if error.is_out_of_space() => {
@@ -362,9 +354,7 @@ fn bytes_of(state: &RunState) -> Result<Vec<u8>, CommitError> {
 }
 
 /// The run state between two steps, without the pages.
-///
-/// # Errors
-/// A value cannot be encoded; none of a valid state.
+/// Errors: a value cannot be encoded; none of a valid state.
 fn run_state(trainer: &Trainer, origin: &Origin, metrics_bytes: u64) -> Result<RunState, CommitError> {
     let scene = &trainer.scene;
     Ok(RunState {
@@ -383,9 +373,7 @@ fn run_state(trainer: &Trainer, origin: &Origin, metrics_bytes: u64) -> Result<R
 
 /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
 /// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
-///
-/// # Errors
-/// No run can have written the values of photos; those of a decoded state are checked.
+/// Errors: no run can have written the values of photos; those of a decoded state are checked.
 pub fn restore(trainer: &mut Trainer, state: &RunState) -> Result<(), CommitError> {
     photos::restore(&mut trainer.photos, &state.photos).map_err(invalid)?;
     trainer.state = state.trainer.clone();

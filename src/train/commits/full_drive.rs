@@ -42,9 +42,7 @@ pub(crate) fn reserve_bytes(segment_bytes: u64) -> u64 {
 
 impl Checkpoint {
     /// Fills the reserve if the drive has much more free space.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn fill_reserve(&mut self) -> Result<(), TrainError> {
         let Some(commits) = &mut self.commits else { return Ok(()) };
         let reserve = commits.config().reserve_bytes;
@@ -56,9 +54,7 @@ impl Checkpoint {
     }
 
     /// Frees space after `why`, or waits for space. Training can continue afterwards, unless a stop was requested.
-    ///
-    /// # Errors
-    /// No space was freed in time, or an error other than a lack of space.
+    /// Errors: no space was freed in time, or an error other than a lack of space.
     pub fn make_space(
         &mut self,
         trainer: &mut Trainer,

@@ -37,9 +37,7 @@ pub(crate) struct Results<'a> {
 
 impl Results<'_> {
     /// Writes a result with `write`, again and again while the drive is full.
-    ///
-    /// # Errors
-    /// No space was freed in time, or an error other than a lack of space.
+    /// Errors: no space was freed in time, or an error other than a lack of space.
     pub fn write<T>(&mut self, mut write: impl FnMut(&mut Self) -> Result<T, TrainError>) -> Result<T, TrainError> {
         let mut paused = None;
         loop {
@@ -72,9 +70,7 @@ impl Results<'_> {
     }
 
     /// Commits the last step at once.
-    ///
-    /// # Errors
-    /// As [`Checkpoint::commit`].
+    /// Errors: as [`Checkpoint::commit`].
     pub fn commit(&mut self) -> Result<(), TrainError> {
         let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
         checkpoint.commit(self.trainer, self.metrics)

@@ -15,17 +15,13 @@ use crate::train::state::trainer::Trainer;
 use std::path::Path;
 
 /// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
-///
-/// # Errors
-/// The folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
+/// Errors: the folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
 pub fn save(trainer: &mut Trainer, dataset: &Dataset, path: &Path) -> Result<Written, TrainError> {
     export(trainer, dataset, path, ExportFormat::Ply)
 }
 
 /// Like [`save`], in another format.
-///
-/// # Errors
-/// As [`save`].
+/// Errors: as [`save`].
 pub(crate) fn export(
     trainer: &mut Trainer,
     dataset: &Dataset,

@@ -64,9 +64,7 @@ fn add_file(digest: &mut Xxh3, path: &Path) -> InputResult<()> {
 }
 
 /// Digest and number of the points from which the first Gaussians are made.
-///
-/// # Errors
-/// The points cannot be read.
+/// Errors: the points cannot be read.
 pub(crate) fn points_print(points: &dyn PointSource) -> InputResult<(u64, u64)> {
     let (mut digest, mut count) = (Xxh3::new(), 0);
     points.read(&mut |position, color| {

@@ -50,7 +50,6 @@ impl Grown for Row {
 pub(crate) struct GaussianFile {
     path: PathBuf,
     meta: SceneMeta,
-    /// SH degree of the file.
     sh_degree: u8,
     sh_degree_most: u8,
     origin: [f64; 3],
@@ -71,9 +70,7 @@ pub(crate) struct GaussiansRead {
 impl GaussianFile {
     /// Opens the file for a run of at most `sh_degree_most` in the local frame of `origin` and `scale`, with this range of
     /// log-scales.
-    ///
-    /// # Errors
-    /// The header is invalid.
+    /// Errors: the header is invalid.
     pub fn open(
         path: &Path,
         sh_degree_most: u8,
@@ -84,7 +81,6 @@ impl GaussianFile {
         Ok(GaussianFile { path: path.to_path_buf(), meta, sh_degree, sh_degree_most, origin, scale, log_scales })
     }
 
-    /// Degree of the file.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
@@ -94,9 +90,7 @@ impl GaussianFile {
     }
 
     /// Passes the Gaussians to `take` in batches, in the file's order, without those that are too far away or too large.
-    ///
-    /// # Errors
-    /// The file cannot be read, or `take` failed.
+    /// Errors: the file cannot be read, or `take` failed.
     pub fn read(&self, take: &mut dyn FnMut(&Columns) -> InputResult<()>) -> InputResult<GaussiansRead> {
         let none = || Columns::zeros(0, self.sh_degree);
         let (mut some, mut far, mut giants) = (none(), 0, 0);
@@ -149,9 +143,7 @@ impl<'a> GaussianWriter<'a> {
     }
 
     /// Adds the rows of `columns`.
-    ///
-    /// # Errors
-    /// As [`GaussianWriter::push`].
+    /// Errors: as [`GaussianWriter::push`].
     pub fn push_all(&mut self, columns: &Columns) -> InputResult<()> {
         let mut values = Vec::new();
         (0..columns.rows()).try_for_each(|row| {
@@ -161,9 +153,7 @@ impl<'a> GaussianWriter<'a> {
     }
 
     /// Adds one Gaussian; all must have the same SH degree.
-    ///
-    /// # Errors
-    /// The folder cannot be written, or there are 2^32 rows.
+    /// Errors: the folder cannot be written, or there are 2^32 rows.
     pub fn push(&mut self, values: &[f32]) -> InputResult<()> {
         let mut row = Row { head: [0.0; ROW_HEAD], sh_n: [[0.0; 15]; 3], row: self.next };
         row.head.copy_from_slice(&values[..ROW_HEAD]);
@@ -176,9 +166,7 @@ impl<'a> GaussianWriter<'a> {
     }
 
     /// Ends the input.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn finish(self) -> InputResult<GaussianSpool<'a>> {
         let sh_degree = (0..=3).find(|&d| sh_n_width(d) == self.width - ROW_HEAD).unwrap_or(0);
         Ok(GaussianSpool { space: self.space, rows: self.rows.finish()?, sh_degree })
@@ -198,16 +186,13 @@ impl GaussianSpool<'_> {
         self.rows.len()
     }
 
-    /// SH degree of the Gaussians.
     pub fn sh_degree(&self) -> u8 {
         self.sh_degree
     }
 
     /// Partitions the Gaussians into pages of at most `fill` rows and passes the pages to `take` in the order of their
     /// ids.
-    ///
-    /// # Errors
-    /// The folder cannot be written, or `take` failed.
+    /// Errors: the folder cannot be written, or `take` failed.
     pub fn for_each_page(
         self,
         fill: usize,

@@ -17,9 +17,7 @@ const THREADS_PER_CORE: usize = 4;
 const THREADS_LEAST_BOUND: usize = 32;
 
 /// Starts the worker threads of `config`, checks its instruction path, and makes a file size limit an ordinary error.
-///
-/// # Errors
-/// This machine lacks the instructions.
+/// Errors: this machine lacks the instructions.
 pub fn set_up(config: &TrainConfig) -> InputResult<()> {
     super::signals::survive_file_size_limit();
     if config.threads > 0 {
@@ -44,9 +42,7 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
 
 /// The renderer of `--device`, and a message about the choice. `auto` uses a working hardware GPU, else the CPU; it
 /// never uses a software adapter, since the CPU renderer is faster.
-///
-/// # Errors
-/// The named device does not exist or cannot be used.
+/// Errors: the named device does not exist or cannot be used.
 pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
     match &config.device {
         Device::Cpu => Ok((Box::new(CpuRenderer::new()), None)),

@@ -22,9 +22,7 @@ pub struct StopFlag {
 
 impl StopFlag {
     /// Installs the handlers. A second signal ends the process with exit code 129, 130 or 143.
-    ///
-    /// # Errors
-    /// The system refused a handler.
+    /// Errors: the system refused a handler.
     pub fn listen() -> std::io::Result<StopFlag> {
         let flag = StopFlag::default();
         let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];

@@ -41,7 +41,6 @@ pub struct TierTraffic {
 }
 
 impl TierTraffic {
-    /// The traffic of a pager.
     pub fn of(pager: &Pager) -> TierTraffic {
         TierTraffic { stats: pager.stats(), frames: pager.frames() as u64, pages: pager.index().len() as u64 }
     }
@@ -269,9 +268,7 @@ struct CpuClock {
 
 impl MetricsLog {
     /// Creates the file.
-    ///
-    /// # Errors
-    /// The file cannot be created.
+    /// Errors: the file cannot be created.
     pub fn create(path: &Path) -> InputResult<Self> {
         let file = File::create(path).map_err(|e| InputError::io(path, "creating the metrics file", &e))?;
         Ok(MetricsLog::of(path, file, None))
@@ -298,26 +295,20 @@ impl MetricsLog {
     }
 
     /// Writes TensorBoard's event files to `folder` as well; `first_step` as for [`EventFile::create`].
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn with_events(self, folder: &Path, first_step: Option<u32>) -> InputResult<Self> {
         Ok(MetricsLog { events: Some(EventFile::create(folder, first_step)?), ..self })
     }
 
     /// Opens the file of a new run, or of a run that resumes after the first `bytes` bytes.
-    ///
-    /// # Errors
-    /// As [`MetricsLog::create`] and [`MetricsLog::resume`].
+    /// Errors: as [`MetricsLog::create`] and [`MetricsLog::resume`].
     pub fn open(path: &Path, bytes: Option<u64>) -> InputResult<Self> {
         bytes.map_or_else(|| MetricsLog::create(path), |bytes| MetricsLog::resume(path, bytes))
     }
 
     /// Appends after the first `bytes` bytes of the file; later bytes belong to steps that are repeated. If bytes are
     /// missing, appends after the last whole line and warns: no step depends on the log.
-    ///
-    /// # Errors
-    /// The file cannot be read or written.
+    /// Errors: the file cannot be read or written.
     pub fn resume(path: &Path, bytes: u64) -> InputResult<Self> {
         let io = |e: std::io::Error| InputError::io(path, "continuing the metrics file", &e);
         let mut options = OpenOptions::new();
@@ -336,9 +327,7 @@ impl MetricsLog {
     }
 
     /// Makes the file durable; returns its length in bytes.
-    ///
-    /// # Errors
-    /// The file cannot be written.
+    /// Errors: the file cannot be written.
     pub fn sync(&mut self) -> InputResult<u64> {
         let io = |e: std::io::Error| InputError::io(&self.path, "writing metrics", &e);
         self.file.flush().map_err(io)?;
@@ -347,9 +336,7 @@ impl MetricsLog {
     }
 
     /// Writes one line unbuffered, so that a crash of the process loses no written line.
-    ///
-    /// # Errors
-    /// The file cannot be written.
+    /// Errors: the file cannot be written.
     pub fn write(&mut self, line: StepLine) -> InputResult<()> {
         self.append(&line)?;
         if let Some(events) = &mut self.events {
@@ -362,9 +349,7 @@ impl MetricsLog {
 
     /// Writes the evaluation after the last step, `step`: that step's line again, with the evaluation. A log without a line
     /// stays as it is. TensorBoard gets some of the pictures in `pictures` as well.
-    ///
-    /// # Errors
-    /// The file cannot be written.
+    /// Errors: the file cannot be written.
     pub fn write_evaluation(&mut self, step: u32, test: TestMetrics, pictures: &Path) -> InputResult<()> {
         let Some(last) = self.last.clone() else { return Ok(()) };
         self.append(&StepLine { step, test: Some(test), ..last })?;
@@ -448,9 +433,7 @@ fn scalars_of_test(test: &TestMetrics) -> Vec<(&'static str, f64)> {
 }
 
 /// Writes summary.json.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Errors: the folder cannot be written.
 pub fn write_summary(path: &Path, summary: &Summary) -> InputResult<()> {
     let text = serde_json::to_string_pretty(summary).map_err(|e| InputError::io(path, "writing", &e.into()))?;
     write_whole(path, (text + "\n").as_bytes())

@@ -95,9 +95,7 @@ pub(crate) fn list_bytes(host_mem: u64) -> u64 {
 
 /// Refuses photos that cannot be decoded within `host_mem`, judging by their headers
 /// ([`crate::dataset::photo_header`]).
-///
-/// # Errors
-/// Decoding the largest photo takes more than `host_mem`.
+/// Errors: decoding the largest photo takes more than `host_mem`.
 pub(crate) fn check_photos_fit(dataset: &Dataset, host_mem: Option<u64>) -> InputResult<()> {
     let (bytes, Some(view)) = largest_decode(dataset) else { return Ok(()) };
     let Some(budget) = host_mem.filter(|budget| bytes > *budget) else { return Ok(()) };

@@ -18,9 +18,7 @@ const PIXEL_BYTES: u64 = 36;
 
 /// Refuses an evaluation of these Gaussians on the held-out photos of a scene that may take more than `budget` bytes, with a cache of
 /// `image_cache` bytes for photos.
-///
-/// # Errors
-/// The memory is too little; the error names `file`.
+/// Errors: the memory is too little; the error names `file`.
 pub(crate) fn check_evaluation_fits(
     file: &Path,
     columns: &Columns,

@@ -14,7 +14,6 @@ use crate::schedule::visibility::visible_pages;
 pub(crate) struct LargestView {
     /// Its index in `dataset.views`; `None` if no view sees a page.
     pub view: Option<usize>,
-    /// Its name.
     pub name: String,
     /// Pages that it needs.
     pub pages: u64,
@@ -47,7 +46,6 @@ pub(crate) fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, page
     batches::cut_views(pages, frames as usize, pages_most)
 }
 
-/// Cameras of the training views.
 pub(crate) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
     dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }

@@ -53,9 +53,7 @@ fn whole_of(config: &TrainConfig, needs: &DeviceNeeds) -> u64 {
 }
 
 /// Refuses a `--device-mem` below the least that the largest view takes, now or grown to the cap on Gaussians.
-///
-/// # Errors
-/// The budget is too small.
+/// Errors: the budget is too small.
 pub(crate) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 3]) -> InputResult<()> {
     let [Some(now), Some(grown)] = [&memory[0], &memory[1]].map(|memory| needs(config, memory)) else { return Ok(()) };
     let (budget, least) = (config.device_mem.0, least_of(config, &now).max(least_of(config, &grown)));
@@ -114,7 +112,6 @@ pub(crate) fn refusal(
     InputError::new("--device-mem", problem, remedy).into()
 }
 
-/// Bytes of a slot.
 fn slot_bytes(config: &TrainConfig) -> u64 {
     capacity_bytes(config.page_rows as usize, config.sh_degree) as u64
 }

@@ -12,7 +12,6 @@ pub(crate) fn check(_: &TrainConfig, _: &[MemoryEstimate; 3]) -> InputResult<()>
     Ok(())
 }
 
-/// The error as it is.
 pub(crate) fn refusal(error: TrainError, _: &TrainConfig, _: &Dataset, _: &PagedScene, _: &[usize]) -> TrainError {
     error
 }

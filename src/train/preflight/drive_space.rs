@@ -32,9 +32,7 @@ const SLOTS_IN_FLIGHT: u64 = 64;
 
 /// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
 /// free space passes.
-///
-/// # Errors
-/// The drive has too little free space.
+/// Errors: the drive has too little free space.
 pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
     let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
     let free = free_bytes(&drive_of(spill_dir)).ok().flatten();

@@ -44,7 +44,6 @@ pub struct FirstLook {
     pub step: Option<StepTime>,
 }
 
-/// Time of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepTime {
     /// Seconds at the SH degree of the last step, on the view of median page count among those that see pages.
@@ -64,9 +63,7 @@ pub struct LookFor {
 
 /// Reads the scene with which a run of `scene` would begin. `folder` holds unnamed temporary files for data that
 /// exceeds memory.
-///
-/// # Errors
-/// As [`Start::look`]; the budget does not hold a view, a view cannot be rendered, or the device does not exist.
+/// Errors: as [`Start::look`]; the budget does not hold a view, a view cannot be rendered, or the device does not exist.
 pub fn first_look(
     scene: &Path,
     config: &TrainConfig,

@@ -111,7 +111,6 @@ pub struct Forecast {
     pub reach: Reach,
     /// The forecast of the same run without growth, if the run will decide how far it grows.
     pub if_kept: Option<Box<Forecast>>,
-    /// Steps to do.
     pub steps: u32,
     /// Memory now, at the cap on Gaussians, and at the number that will be reached.
     pub memory: [MemoryEstimate; 3],
@@ -126,7 +125,6 @@ pub struct Forecast {
     /// Expected peak bytes on the drive, all files counted: the pages with their versions of the commits that are kept, or the checkpoint
     /// of a run in memory.
     pub drive_bytes_peak: u64,
-    /// Bytes of the PLY.
     pub ply_bytes: u64,
     /// Bytes that import and steps write to the drive; 0 for a run in memory.
     pub bytes_written: f64,
@@ -301,11 +299,9 @@ pub(super) fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
 
 /// The steps to do, by what the number of Gaussians does meanwhile.
 struct GrowingSteps {
-    /// Steps before it grows.
     before: f64,
     /// Steps in which it grows, evenly.
     growing: f64,
-    /// Steps after that.
     after: f64,
 }
 

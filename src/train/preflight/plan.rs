@@ -63,9 +63,7 @@ pub struct TierPlan {
 }
 
 /// Chooses the number of frames and completes the estimates of [`super::probe::estimate`] with it.
-///
-/// # Errors
-/// The budget or the drive is too small.
+/// Errors: the budget or the drive is too small.
 pub fn plan_tiers(
     config: &TrainConfig,
     dataset: &Dataset,
@@ -159,7 +157,6 @@ fn plan_frames(
 /// What the largest view needs.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct LargestNeed {
-    /// Bytes of a frame.
     pub frame_bytes: u64,
     /// Pages of the view.
     pub pages: u64,
@@ -372,9 +369,7 @@ fn auto_order(
 
 /// Number of frames within `host_mem`, as [`plan_tiers`] chooses it. For planning without a run: `trainer` holds the
 /// `view_pages` pages of the largest view.
-///
-/// # Errors
-/// The budget does not hold that view, or the view cannot be rendered.
+/// Errors: the budget does not hold that view, or the view cannot be rendered.
 pub(super) fn frames_within(
     config: &TrainConfig,
     dataset: &Dataset,

@@ -60,9 +60,7 @@ pub struct ViewTimes {
 /// Estimates the memory of a run with all pages in memory: without growth, grown to its cap, and with `last` Gaussians. The trainer renders
 /// the views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed
 /// the estimate. Also returns how long views take.
-///
-/// # Errors
-/// A view cannot be rendered.
+/// Errors: a view cannot be rendered.
 pub fn estimate(
     config: &TrainConfig,
     dataset: &Dataset,

@@ -27,9 +27,7 @@ fn export_percent(format: ExportFormat) -> u64 {
 /// Refuses a drive that cannot hold a PLY of the first Gaussians, unless the run is resumed. Warns if the drive may not hold the results of
 /// the end: the PLY, the files for viewers and, where they lie on the same drive, the pages of the store or the checkpoint beyond the
 /// `stored` bytes of now. A drive that does not report its free space passes.
-///
-/// # Errors
-/// The drive has too little free space.
+/// Errors: the drive has too little free space.
 pub(crate) fn check_drive_of_results(
     config: &TrainConfig,
     out: &Path,

@@ -47,9 +47,7 @@ use crate::train::step::soundness::no_view_sees;
 use std::path::{Path, PathBuf};
 
 /// Runs a request from beginning to end.
-///
-/// # Errors
-/// Bad input (leaves no files), or a failure while training (the last good step is written).
+/// Errors: bad input (leaves no files), or a failure while training (the last good step is written).
 pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
@@ -123,9 +121,7 @@ pub(super) struct FirstTrainer {
 }
 
 /// Makes the first pages of a scene, and their trainer.
-///
-/// # Errors
-/// The drive or the device cannot be used, or the source of the Gaussians cannot be read again.
+/// Errors: the drive or the device cannot be used, or the source of the Gaussians cannot be read again.
 pub(super) fn first_trainer(
     request: &RunRequest,
     start: Start,
@@ -196,9 +192,7 @@ pub(crate) fn begin(
 }
 
 /// The forecast of a run on a drive of this rate, as its dry run makes it: nothing is written. `None` if a dry run cannot hold the scene.
-///
-/// # Errors
-/// Those of a dry run.
+/// Errors: those of a dry run.
 pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Result<Option<Forecast>, TrainError> {
     let (scene, config) = (scene.to_path_buf(), config.clone());
     let request = RunRequest {

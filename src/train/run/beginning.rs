@@ -39,9 +39,7 @@ struct Facts {
 
 impl Beginning {
     /// Marks the output folder of a request, if it is new, empty, or marked already.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn mark(request: &RunRequest) -> InputResult<Option<Beginning>> {
         let out = request.out.clone();
         if request.dry_run || (out.exists() && !is_empty(&out) && !is_marked(&out)) {
@@ -72,9 +70,7 @@ pub(super) fn is_marked(out: &Path) -> bool {
 }
 
 /// Writes the mark into an existing folder.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Errors: the folder cannot be written.
 pub(super) fn write_mark(request: &RunRequest) -> InputResult<()> {
     let path = request.out.join(BEGUN_FILE);
     let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
@@ -89,9 +85,7 @@ pub(super) fn remove_mark(out: &Path) {
 }
 
 /// The settings and the scene of a run that has only a mark, with those that are given now; `None` without a mark.
-///
-/// # Errors
-/// The file is not such a mark, or the settings do not fit together.
+/// Errors: the file is not such a mark, or the settings do not fit together.
 pub(super) fn settings_of_mark(
     out: &Path,
     keys: &TrainOverrides,

@@ -16,9 +16,7 @@ use std::path::Path;
 
 /// The config that a run keeps when it resumes with `config`: that of its file, with the lasting keys of `config`
 /// (numbers, length, place of the checkpoint).
-///
-/// # Errors
-/// None for a valid config.
+/// Errors: none for a valid config.
 pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConfig) -> InputResult<TrainConfig> {
     let broken = |e: String| InputError::new(file, e, "report this as a bug");
     let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
@@ -30,7 +28,6 @@ pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConf
     Ok(with_absolute_paths(kept))
 }
 
-/// The config with absolute paths.
 pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     let absolute = |path: &String| match path.as_str() {
         "" => String::new(),
@@ -52,9 +49,7 @@ pub(super) struct Changes {
 
 impl Changes {
     /// Compares the keys of `config` with those of the last commit.
-    ///
-    /// # Errors
-    /// The config of the commit cannot be read.
+    /// Errors: the config of the commit cannot be read.
     pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
         let broken = |e: String| InputError::new(file, e, "start the run again");
         let written: toml::Table = state.origin.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
@@ -109,9 +104,7 @@ impl Changes {
     }
 
     /// Refuses differences that exclude a resume, and differences in numbers without `accept`.
-    ///
-    /// # Errors
-    /// There is such a difference.
+    /// Errors: there is such a difference.
     pub fn check(&self, place: &Path, accept: bool) -> InputResult<()> {
         let list = |lines: &[String]| lines.iter().map(|line| format!("\n    {line}")).collect::<String>();
         if !self.fixed.is_empty() {

@@ -81,9 +81,7 @@ pub struct EvalExtras<'a> {
 
 /// Evaluates the Gaussians of `file`, a PLY or a `lod-meta.json`, on the held-out views of the scene in the folder `scene`. All rows of a
 /// PLY, or of one level at a time, are in memory.
-///
-/// # Errors
-/// The file, the scene or the weights cannot be used, or a picture cannot be written.
+/// Errors: the file, the scene or the weights cannot be used, or a picture cannot be written.
 pub fn evaluate_file(
     file: &Path,
     scene: &Path,

@@ -101,9 +101,7 @@ fn picture<'a>(trainer: &'a mut Trainer, dataset: &Dataset, orbit: Orbit) -> Res
 
 /// Refuses a picture for which the renderer would need too much memory ([`PICTURE_SHARE`]). Batches bound the memory of gathered rows,
 /// not that of the splats, which the renderer keeps for every visible row.
-///
-/// # Errors
-/// The camera may see too many Gaussians.
+/// Errors: the camera may see too many Gaussians.
 fn check_picture(trainer: &Trainer, camera: &Camera) -> InputResult<()> {
     let Some(budget) = trainer.fitting.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
     let pager = &trainer.scene.pager;

@@ -64,9 +64,7 @@ pub(super) struct Finished<'a> {
 
 impl Finished<'_> {
     /// Trains from the PLY to the new number of steps.
-    ///
-    /// # Errors
-    /// The scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
+    /// Errors: the scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
     pub fn go_on(self) -> Result<RunOutcome, TrainError> {
         let Finished { out, scene, file, run, summary, quiet, live, .. } = self;
         machine::set_up(&self.config)?;

@@ -45,9 +45,7 @@ const PROBE: &str = ".gsscale-probe";
 pub(crate) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
 
 /// Locks an existing output folder. On file systems without locks this does nothing.
-///
-/// # Errors
-/// Another process trains into the folder.
+/// Errors: another process trains into the folder.
 pub(crate) fn lock(out: &Path) -> InputResult<OutLock> {
     let file = OpenOptions::new().write(true).create(true).truncate(false).open(out.join(LOCK));
     let Ok(file) = file else { return Ok(OutLock(None)) };
@@ -61,9 +59,7 @@ pub(crate) fn lock(out: &Path) -> InputResult<OutLock> {
 }
 
 /// Refuses an output folder in use, without making its lock file.
-///
-/// # Errors
-/// Another process trains into the folder.
+/// Errors: another process trains into the folder.
 pub(super) fn refuse_in_use(out: &Path) -> InputResult<()> {
     if out.join(LOCK).is_file() { lock(out).map(drop) } else { Ok(()) }
 }
@@ -96,9 +92,7 @@ pub fn default_out(scene: Option<&Path>) -> PathBuf {
 }
 
 /// Refuses an output folder in which a run may not begin. Changes nothing, so a dry run asks the same.
-///
-/// # Errors
-/// The folder cannot be made, is not empty and `existing` refuses it, is in use, or its checkpoint belongs to another run.
+/// Errors: the folder cannot be made, is not empty and `existing` refuses it, is in use, or its checkpoint belongs to another run.
 pub(crate) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
     check_above(out)?;
     refuse_in_use(out)?;
@@ -163,9 +157,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
 }
 
 /// Creates the folder durably.
-///
-/// # Errors
-/// The folder cannot be created.
+/// Errors: the folder cannot be created.
 pub(super) fn make_folder(out: &Path) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     let is_new = !out.exists();
@@ -175,9 +167,7 @@ pub(super) fn make_folder(out: &Path) -> InputResult<()> {
 }
 
 /// Creates the folder, checks that it is writable, and removes an earlier run's files.
-///
-/// # Errors
-/// The folder cannot be written, or its checkpoint belongs to another run.
+/// Errors: the folder cannot be written, or its checkpoint belongs to another run.
 pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     make_folder(out)?;
@@ -220,9 +210,7 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
 }
 
 /// Refuses an output folder in which the PLY or the export `format` of a run cannot be replaced.
-///
-/// # Errors
-/// As [`ExportFormat::check_removable`].
+/// Errors: as [`ExportFormat::check_removable`].
 pub(super) fn check_results(out: &Path, format: ExportFormat) -> InputResult<()> {
     let ply = out.join(PLY_FILE);
     ExportFormat::Ply.check_removable(&ply)?;
@@ -275,9 +263,7 @@ pub(super) fn has_results(out: &Path) -> bool {
 }
 
 /// Refuses to begin a run again that left results.
-///
-/// # Errors
-/// There are results, which would be replaced.
+/// Errors: there are results, which would be replaced.
 pub(super) fn check_restart(out: &Path) -> InputResult<()> {
     if !has_results(out) {
         return Ok(());

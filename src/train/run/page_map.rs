@@ -10,9 +10,7 @@ use crate::train::state::trainer::Trainer;
 use std::path::Path;
 
 /// Writes the page map of a run as it is now.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Errors: the folder cannot be written.
 pub fn write_page_map(path: &Path, dataset: &Dataset, trainer: &Trainer) -> InputResult<()> {
     let text = serde_json::to_vec(&page_tiles(dataset, trainer))
         .map_err(|e| InputError::new(path, format!("writing failed: {e}"), "report this as a bug"))?;

@@ -23,9 +23,7 @@ fn can_continue(out: &Path) -> bool {
 
 /// Goes on with the run of `request` for as long as it ends with the loss of its device, at most `most` times. `ended` is how the run
 /// has ended so far.
-///
-/// # Errors
-/// The error that ended the run last.
+/// Errors: the error that ended the run last.
 pub fn go_on(
     mut ended: Result<RunOutcome, TrainError>,
     request: &ResumeRequest,

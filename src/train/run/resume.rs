@@ -69,9 +69,7 @@ pub struct ResumeRequest {
 }
 
 /// Resumes a run and trains to its end.
-///
-/// # Errors
-/// No run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
+/// Errors: no run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // Do not read or remove files of an active run.
     let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
@@ -201,9 +199,7 @@ pub(super) fn read_summary(out: &Path) -> Option<Summary> {
 }
 
 /// Restarts a run that was cut off before its first commit, from its config.
-///
-/// # Errors
-/// The run left results that would be replaced; else as [`run`].
+/// Errors: the run left results that would be replaced; else as [`run`].
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
     check_restart(&request.out)?;
     crate::tell!("{} was cut off before its first commit: it begins again", request.out.display());
@@ -230,9 +226,7 @@ pub(super) struct Goal {
 }
 
 /// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Changes no file.
-///
-/// # Errors
-/// The run has done more steps, its settings or its dataset changed, or its scene is not there.
+/// Errors: the run has done more steps, its settings or its dataset changed, or its scene is not there.
 pub(super) fn goal(
     request: &ResumeRequest,
     earlier: &Earlier,

@@ -20,9 +20,7 @@ use crate::train::stores::ownership::read_own;
 use std::path::Path;
 
 /// Says what a resume with this request would do.
-///
-/// # Errors
-/// Those of the resume before its first step, but for memory and drives.
+/// Errors: those of the resume before its first step, but for memory and drives.
 pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
     out_folder::refuse_in_use(&request.out)?;
     let out = request.out.display();

@@ -154,9 +154,7 @@ fn begin_files(
 }
 
 /// Trains to the end, and writes the results. `stop` asks for an early end.
-///
-/// # Errors
-/// A failure while training, after the last good step was written, or the folder cannot be written.
+/// Errors: a failure while training, after the last good step was written, or the folder cannot be written.
 pub(super) fn train_into(
     request: &RunRequest,
     dataset: &Dataset,
@@ -236,9 +234,7 @@ pub(super) fn train_into(
 
 /// Writes what follows the PLY: the file for viewers, the evaluation, the last commit, the summary and the report. The run has ended its
 /// loop with `looped`.
-///
-/// # Errors
-/// That of the loop, or a result cannot be written.
+/// Errors: that of the loop, or a result cannot be written.
 fn write_results(
     request: &RunRequest,
     dataset: &Dataset,

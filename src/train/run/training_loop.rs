@@ -51,9 +51,7 @@ pub struct TrainingLoop<'a> {
 
 impl TrainingLoop<'_> {
     /// Runs until the last step or a stop request.
-    ///
-    /// # Errors
-    /// As [`Trainer::step`], or an output cannot be written.
+    /// Errors: as [`Trainer::step`], or an output cannot be written.
     pub fn run(&mut self) -> Result<(), TrainError> {
         let (steps, eval_every, save_every, log_every) = {
             let options = self.trainer.options();
@@ -222,9 +220,7 @@ impl TrainingLoop<'_> {
     /// Starts paging in a run in memory whose pages no longer fit, between steps: commits all pages, so that they can
     /// be evicted and read again. If paging left too few frames for a view and the user set no budget, all pages stay
     /// in memory while the machine has it.
-    ///
-    /// # Errors
-    /// The commit failed for a reason other than space.
+    /// Errors: the commit failed for a reason other than space.
     fn start_paging_if_outgrown(&mut self) -> Result<(), TrainError> {
         let trainer = &mut *self.trainer;
         if !trainer.fit().is_outgrown() {

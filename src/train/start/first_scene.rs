@@ -121,9 +121,7 @@ enum FirstRows {
 
 impl Start {
     /// Reads the scene. Points that can be streamed take no more memory than `host_mem` allows.
-    ///
-    /// # Errors
-    /// As [`prepare`].
+    /// Errors: as [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
         let options = FirstOptions::new(config);
         if !options.spills && options.store().is_none() {
@@ -134,9 +132,7 @@ impl Start {
 
     /// As [`Start::read`], for inspection of a run's start: avoids creating Gaussians. `folder` holds unnamed temporary
     /// files for data that exceeds memory.
-    ///
-    /// # Errors
-    /// As [`prepare`].
+    /// Errors: as [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         Start::with(scene, &FirstOptions::new(config), folder, host_mem)
     }
@@ -239,9 +235,7 @@ impl Start {
 
     /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
     /// whole input.
-    ///
-    /// # Errors
-    /// The points cannot be read.
+    /// Errors: the points cannot be read.
     pub(crate) fn up(&self) -> InputResult<Option<[f64; 3]>> {
         let cameras = self.dataset.views.iter().map(|view| &view.camera);
         estimate_up(cameras, |take| match &self.from {
@@ -266,9 +260,7 @@ impl Start {
     }
 
     /// The dataset, and the first Gaussians as pages in `pager`.
-    ///
-    /// # Errors
-    /// The source cannot be read again, or a page could not be stored.
+    /// Errors: the source cannot be read again, or a page could not be stored.
     pub fn into_pages(
         mut self,
         pager: Pager,
@@ -300,9 +292,7 @@ impl Start {
     /// Passes the first pages to `take` in the order of their ids, with the SH degree of the first step and log-scales
     /// within the range of the scene. Returns how many log-scales were moved into it. `folder` holds temporary files for
     /// data that exceeds memory. May be called repeatedly.
-    ///
-    /// # Errors
-    /// The source cannot be read again, or `take` failed.
+    /// Errors: the source cannot be read again, or `take` failed.
     pub(crate) fn for_each_page(
         &mut self,
         options: &RunOptions,
@@ -367,9 +357,7 @@ pub struct Prepared {
 }
 
 /// Reads the scene and creates the first Gaussians.
-///
-/// # Errors
-/// The scene or the PLY is invalid.
+/// Errors: the scene or the PLY is invalid.
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
     prepare_with(scene, &FirstOptions::new(config))
 }
@@ -484,9 +472,7 @@ fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>
 }
 
 /// The dataset print of a run's start.
-///
-/// # Errors
-/// A photo or a mask cannot be read.
+/// Errors: a photo or a mask cannot be read.
 pub fn dataset_print(start: &Start) -> InputResult<DatasetPrint> {
     let dataset = &start.dataset;
     let views: InputResult<Vec<ViewPrint>> = dataset.views.par_iter().map(view_print).collect();

@@ -127,9 +127,7 @@ pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
 /// Opens the tiers for a scene of about `pages` pages, within `host_mem` bytes. If the number of frames follows from
 /// the budget, the pager has few frames at first ([`Pager::allow_frames`]). With `dry`, pages of the drive are kept in
 /// memory and must fit there (`plan_text::too_large_for_a_dry_run`).
-///
-/// # Errors
-/// The spill directory cannot be used, or the I/O engine does not work here.
+/// Errors: the spill directory cannot be used, or the I/O engine does not work here.
 pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Result<(Pager, Tiers), TrainError> {
     let (page_rows, sh_degree) = (config.page_rows as usize, config.sh_degree);
     let residence = config.residence();
@@ -164,9 +162,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
 
 impl Tiers {
     /// The pager and tiers of a run that resumes from `stored`.
-    ///
-    /// # Errors
-    /// The I/O engine does not work here, or the store is inconsistent. The directory stays unchanged.
+    /// Errors: the I/O engine does not work here, or the store is inconsistent. The directory stays unchanged.
     pub fn resume(stored: Stored, config: &TrainConfig, host_mem: u64) -> Result<(Pager, Tiers), TrainError> {
         let Stored { spill, opened, run_state } = stored;
         let mut pager = pager_config(config, host_mem);
@@ -253,9 +249,7 @@ impl Tiers {
 
     /// Bytes that pages may take on the drive: free bytes plus bytes of existing segments (of the import or a resumed
     /// run); `None` without a drive or if the system does not report them.
-    ///
-    /// # Errors
-    /// The folder does not exist.
+    /// Errors: the folder does not exist.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
         if let Some(folder) = &self.planned_on {
             return Ok(free_bytes(folder).ok().flatten());

@@ -47,9 +47,7 @@ pub struct EvalRequest<'a> {
 /// Evaluates the scene on the requested views. Fully masked views have no
 /// metrics and do not count in the means. Nor do photos that cannot be decoded, which a warning names: a photo must not cost the
 /// figures of all others. `None` if no view has metrics, with a warning.
-///
-/// # Errors
-/// Pages could not be pinned, the renderer failed, or a picture cannot be written.
+/// Errors: pages could not be pinned, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
     now: &mut Now<'_>,
     dataset: &Dataset,

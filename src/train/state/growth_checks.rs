@@ -37,9 +37,7 @@ pub(super) struct Comparing<'a> {
 
 /// What a check measures of the views that are held out and of those that were trained on, as indices in `dataset.views` with their
 /// cameras; `None` if all of either are masked as a whole.
-///
-/// # Errors
-/// A photo cannot be decoded, pages could not be had, or the renderer failed.
+/// Errors: a photo cannot be decoded, pages could not be had, or the renderer failed.
 pub(super) fn growth_values(
     now: &mut Now<'_>,
     comparing: &Comparing<'_>,

@@ -45,7 +45,6 @@ impl HeldOut {
         HeldOut { positions: (stride / 2..views).step_by(stride).filter(|_| is_wanted).collect(), views, strategy }
     }
 
-    /// The held-out positions.
     pub fn positions(&self) -> &[usize] {
         &self.positions
     }

@@ -120,9 +120,7 @@ pub struct Probed {
 impl Trainer {
     /// A trainer for the first Gaussians `columns` and the training views of `dataset` (at least one), with all pages
     /// in memory.
-    ///
-    /// # Errors
-    /// As [`Trainer::with_pager`].
+    /// Errors: as [`Trainer::with_pager`].
     pub fn new(
         columns: Columns,
         dataset: &Dataset,
@@ -134,9 +132,7 @@ impl Trainer {
     }
 
     /// A trainer whose pages are stored in `pager`, which must be empty.
-    ///
-    /// # Errors
-    /// A page could not be stored.
+    /// Errors: a page could not be stored.
     pub fn with_pager(
         columns: Columns,
         pager: Pager,
@@ -199,9 +195,7 @@ impl Trainer {
 
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
     /// the pixels of the largest view, the most rows that a view draws, and how long a view takes.
-    ///
-    /// # Errors
-    /// A view cannot be rendered.
+    /// Errors: a view cannot be rendered.
     pub fn probe_views(&mut self, dataset: &Dataset, views: &[usize]) -> Result<Probed, TrainError> {
         self.drain()?;
         let render = self.render_options();
@@ -290,9 +284,7 @@ impl Trainer {
     }
 
     /// Logs the events that follow the last step, and runs one step.
-    ///
-    /// # Errors
-    /// A photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
+    /// Errors: a photo cannot be decoded, pages could not be pinned, the renderer failed, the run diverged, or nothing counts in it
     /// (`soundness`).
     pub fn step(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<StepOutcome, TrainError> {
         trace::set_step(self.state.step);
@@ -465,9 +457,7 @@ impl Trainer {
 
     /// Copies back the pages that are newer on a device than in memory, so that the pages and their histogram are those
     /// of the last step. Nothing for a run that updates in host memory.
-    ///
-    /// # Errors
-    /// The device failed: the run can go on from its last commit only.
+    /// Errors: the device failed: the run can go on from its last commit only.
     pub fn drain(&mut self) -> Result<(), TrainError> {
         let _span = trace::span("drain all");
         match &mut self.device {
@@ -477,9 +467,7 @@ impl Trainer {
     }
 
     /// Decides and logs the events of the last step, unless that is done. They act on values after that step's update.
-    ///
-    /// # Errors
-    /// As [`Trainer::check_growth`].
+    /// Errors: as [`Trainer::check_growth`].
     pub(crate) fn log_due_events(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let Some(step) = self.state.step.checked_sub(1) else { return Ok(()) };
         // A failed attempt of the coming step has logged them already.
@@ -519,9 +507,7 @@ impl Trainer {
     }
 
     /// Evaluates the held-out views at the current step. `progress` is called with the number of views done.
-    ///
-    /// # Errors
-    /// As [`evaluate`].
+    /// Errors: as [`evaluate`].
     pub fn evaluate(
         &mut self,
         dataset: &Dataset,
@@ -605,9 +591,7 @@ impl Trainer {
     }
 
     /// Decides how many Gaussians the run allows from the round after the last step on, if that is due.
-    ///
-    /// # Errors
-    /// A photo cannot be decoded, pages could not be had, or the renderer failed. The decision is still due then.
+    /// Errors: a photo cannot be decoded, pages could not be had, or the renderer failed. The decision is still due then.
     fn check_growth(&mut self, step: u32, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let strategy = self.options.strategy.clone();
         let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };

@@ -57,9 +57,7 @@ pub trait RowBackend {
     }
 
     /// Pins the pages of a batch; again if `is_again`, on the way out.
-    ///
-    /// # Errors
-    /// As [`crate::paging::pager::Pager::pin_batch`].
+    /// Errors: as [`crate::paging::pager::Pager::pin_batch`].
     fn pin(
         &mut self,
         scene: &mut PagedScene,
@@ -74,16 +72,12 @@ pub trait RowBackend {
     }
 
     /// Brings the pinned frames up to date that events are about to change.
-    ///
-    /// # Errors
-    /// The device failed.
+    /// Errors: the device failed.
     fn before_events(&mut self, scene: &PagedScene, pinned: &mut [PinnedPage]) -> Result<(), TrainError>;
 
     /// Gathers the rows of the pages that the view may draw, as they are at the step, and hands them to the renderer. The pages
     /// must have applied all events. Returns how many.
-    ///
-    /// # Errors
-    /// The renderer failed.
+    /// Errors: the renderer failed.
     fn rows_in(
         &mut self,
         scene: &mut PagedScene,
@@ -94,9 +88,7 @@ pub trait RowBackend {
 
     /// Takes the gradients of the splats back to the rows of a batch, by its number; where its pages were pinned again, the
     /// rows are gathered again.
-    ///
-    /// # Errors
-    /// The renderer failed.
+    /// Errors: the renderer failed.
     fn rows_out(
         &mut self,
         scene: &mut PagedScene,
@@ -112,9 +104,7 @@ pub trait RowBackend {
     }
 
     /// Applies the gradients to the pages: optimizer, bounds and, if `collects`, densification statistics.
-    ///
-    /// # Errors
-    /// The device failed; the pages in memory belong to no step then ([`TrainError::Torn`]).
+    /// Errors: the device failed; the pages in memory belong to no step then ([`TrainError::Torn`]).
     fn update(
         &mut self,
         scene: &mut PagedScene,

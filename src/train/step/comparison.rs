@@ -30,9 +30,7 @@ impl<'a> Comparison<'a> {
     }
 
     /// Corrects the picture that `renderer` has drawn, compares it with the photo, and takes the loss back to the splats.
-    ///
-    /// # Errors
-    /// Photo and picture differ in size, or the renderer failed.
+    /// Errors: photo and picture differ in size, or the renderer failed.
     pub(super) fn loss_and_back(&mut self, renderer: &mut dyn Renderer) -> Result<(), RenderError> {
         let corrects = self.photos.iter().any(|parameter| parameter.corrects());
         if corrects {
@@ -56,9 +54,7 @@ impl<'a> Comparison<'a> {
     }
 
     /// Waits for the loss of the step, and adds the terms of the parameters.
-    ///
-    /// # Errors
-    /// No loss was computed, or the renderer failed.
+    /// Errors: no loss was computed, or the renderer failed.
     pub(super) fn loss_value(&self, renderer: &mut dyn Renderer) -> Result<LossValue, RenderError> {
         let value = renderer.loss_value()?;
         let added: f64 = self.photos.iter().map(|parameter| parameter.loss()).sum();

@@ -128,9 +128,7 @@ impl PageRules {
 
 impl PagedScene {
     /// Creates the pages of the first Gaussians. The uid of a row is its row number in `columns`.
-    ///
-    /// # Errors
-    /// A page could not be stored.
+    /// Errors: a page could not be stored.
     pub fn new(columns: &Columns, pager: Pager, options: &RunOptions) -> Result<PagedScene, PagingError> {
         let mut scene = PagedScene::empty(pager, options);
         let fill = first_fill(options.page_rows, options.strategy.grows());
@@ -165,9 +163,7 @@ impl PagedScene {
     }
 
     /// Adds a page of first Gaussians.
-    ///
-    /// # Errors
-    /// The page could not be stored.
+    /// Errors: the page could not be stored.
     pub fn insert_first_page(&mut self, id: PageId, state: &SceneState) -> Result<(), PagingError> {
         let meta = self.rules.meta(id, state);
         self.pager.insert(meta, |payload| {
@@ -213,9 +209,7 @@ impl PagedScene {
 
     /// Applies pending events to the pinned pages. A page that outgrows its capacity splits and takes a frame per new
     /// page; the list stays ascending by id.
-    ///
-    /// # Errors
-    /// No frame is free for a split, or a page cannot be split; the page keeps its rows then.
+    /// Errors: no frame is free for a split, or a page cannot be split; the page keeps its rows then.
     pub fn apply_pending(&mut self, pages: &mut Vec<PinnedPage>) -> Result<(), TrainError> {
         if pages.iter().all(|p| !self.rules.is_behind(&p.meta)) {
             return Ok(());
@@ -302,9 +296,7 @@ impl PagedScene {
     /// Switches to the rules of `options` after `now` steps. Every page applies its pending events and missed steps at
     /// the old rates and gets new bounds, so every page is read and rewritten once. The histogram is recounted; returns
     /// whether the recount differs, as it does after a salvage that left statistics out.
-    ///
-    /// # Errors
-    /// Pages could not be pinned.
+    /// Errors: pages could not be pinned.
     pub(crate) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<bool, TrainError> {
         let mut rules = PageRules::new(options);
         rules.events = self.rules.events.clone();
@@ -323,9 +315,7 @@ impl PagedScene {
     /// Stores every row as evaluated after `now` steps: the step of the dense optimizer, for comparison with deferred Adam, since each
     /// step costs the whole scene in memory and on the drive. A page applies an event at the next step, on values of the event's own step,
     /// so rows and decisions equal those of the deferred run up to roundings.
-    ///
-    /// # Errors
-    /// Pages could not be pinned, or no frame was free for a split.
+    /// Errors: pages could not be pinned, or no frame was free for a split.
     pub(crate) fn settle_all(&mut self, now: u32) -> Result<(), TrainError> {
         let pages = self.pages_with_rows();
         self.settle(&pages, now, Pager::acquire_in_step, None, &mut |_| {})
@@ -373,9 +363,7 @@ impl PagedScene {
 
     /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
     /// copies. Begins to read the pages `next`. Stored pages stay unchanged.
-    ///
-    /// # Errors
-    /// Pages could not be pinned.
+    /// Errors: pages could not be pinned.
     pub fn gather_pages(
         &mut self,
         pages: &[PageNo],
@@ -403,9 +391,7 @@ impl PagedScene {
 
     /// Passes all rows, evaluated after `now` steps, to `each` in batches, in the order of page ids. Stored pages stay
     /// unchanged.
-    ///
-    /// # Errors
-    /// Pages could not be pinned, or `each` failed.
+    /// Errors: pages could not be pinned, or `each` failed.
     pub fn for_all_rows<E: From<PagingError>>(
         &mut self,
         now: u32,
@@ -415,9 +401,7 @@ impl PagedScene {
     }
 
     /// As [`PagedScene::for_all_rows`], for `pages` only.
-    ///
-    /// # Errors
-    /// Pages could not be pinned, or `each` failed.
+    /// Errors: pages could not be pinned, or `each` failed.
     pub fn for_rows_of<E: From<PagingError>>(
         &mut self,
         pages: &[PageNo],
@@ -497,9 +481,7 @@ pub fn row_tables(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
 
 /// Partitions Gaussians in memory into first pages of at most `fill` rows, stored with `sh_degree`, and passes each to
 /// `take`. The uid of a row is its row number in `columns`.
-///
-/// # Errors
-/// Those of `take`.
+/// Errors: those of `take`.
 pub(crate) fn first_pages<E>(
     columns: &Columns,
     fill: usize,

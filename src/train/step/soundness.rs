@@ -97,9 +97,7 @@ impl Idle {
     }
 
     /// Counts steps that change no row.
-    ///
-    /// # Errors
-    /// No Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
+    /// Errors: no Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
     /// masked completely, no view sees a Gaussian, or no Gaussian is opaque enough to be drawn.
     pub fn note(
         &mut self,

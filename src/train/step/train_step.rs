@@ -89,9 +89,7 @@ pub struct StepView<'a> {
 
 /// Trains on one view: pins its pages batch by batch, applies the events that are due, gathers the rows,
 /// renders them forward and backward, updates the rows, and releases the pages.
-///
-/// # Errors
-/// A page could not be read, or the renderer failed. The rows are as they were before the step, except under
+/// Errors: a page could not be read, or the renderer failed. The rows are as they were before the step, except under
 /// [`TrainError::Torn`].
 pub fn train_step(
     scene: &mut PagedScene,

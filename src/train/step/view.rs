@@ -53,9 +53,7 @@ impl<'a> ViewPass<'a> {
 
     /// The pass in: hands the rows to the renderer, each batch as `edit` leaves it; [`Renderer::picture`] is next. Returns the rows of
     /// the view before they were edited.
-    ///
-    /// # Errors
-    /// Pages could not be had, or the renderer failed.
+    /// Errors: pages could not be had, or the renderer failed.
     pub fn rows_in(&self, now: &mut Now<'_>, mut edit: impl FnMut(&mut Columns)) -> Result<usize, TrainError> {
         let batches = self.batches();
         let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
@@ -72,9 +70,7 @@ impl<'a> ViewPass<'a> {
 
     /// The pass out, from the last batch to the first, after a pass in with the same working set that edited no row; `each` gets the
     /// gradients of a batch.
-    ///
-    /// # Errors
-    /// As [`ViewPass::rows_in`].
+    /// Errors: as [`ViewPass::rows_in`].
     pub fn rows_out(&self, now: &mut Now<'_>, mut each: impl FnMut(&Gradients)) -> Result<(), TrainError> {
         let mut batches = self.batches();
         // The pass in has left the rows of the last batch in the working set.
@@ -108,9 +104,7 @@ impl Batches<'_> {
 }
 
 /// Renders the picture that `camera` has; [`Renderer::image`] gives it.
-///
-/// # Errors
-/// Pages could not be had, or the renderer failed.
+/// Errors: pages could not be had, or the renderer failed.
 pub fn draw(now: &mut Now<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
     ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |_| {})?;
     Ok(now.renderer.picture()?)
@@ -118,9 +112,7 @@ pub fn draw(now: &mut Now<'_>, camera: &Camera, options: &RenderOptions) -> Resu
 
 /// Renders the view forwards and back, as a step does whose batches have at most `pages_most` pages, so that the memory of
 /// the step is allocated. Returns the rows of the view.
-///
-/// # Errors
-/// As [`draw`].
+/// Errors: as [`draw`].
 pub fn rehearse(
     now: &mut Now<'_>,
     camera: &Camera,
