@@ -5,6 +5,9 @@
 mod bars;
 #[path = "bench/compare.rs"]
 mod compare;
+#[cfg(feature = "gpu")]
+#[path = "bench/doctor.rs"]
+mod doctor;
 #[path = "bench/facts.rs"]
 mod facts;
 #[path = "bench/figures.rs"]
@@ -51,6 +54,7 @@ Measures training.
 
   gsscale-bench SCENE                  trains a scene (the same as run SCENE)
   gsscale-bench run NAME --data DIR    trains a published scene; prints our figures beside the published figures
+  gsscale-bench doctor                 checks your GPU against the CPU, and says which flags to use
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
   gsscale-bench sweep LIST SCENE... --out DIR
                                        trains the runs of a list and compares them: pareto, ladder, ladder-gpu, stability,
@@ -79,6 +83,8 @@ fn main() -> ExitCode {
         Ok(())
     } else if named("sweep") {
         sweep::start(&parse_arguments(&arguments), &mut print)
+    } else if named("doctor") {
+        doctor(&arguments, &mut print)
     } else if named("compare") {
         compare::start(&compare::Args::parse_from(&arguments))
     } else if named("run") && published::is_published_run(&arguments) {
@@ -96,6 +102,16 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+#[cfg(feature = "gpu")]
+fn doctor(arguments: &[OsString], print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    doctor::start(&doctor::Args::parse_from(arguments), print)
+}
+
+#[cfg(not(feature = "gpu"))]
+fn doctor(_: &[OsString], _: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    Err(InputError::new("doctor", "this program was built without GPU support", "build with the feature gpu").into())
 }
 
 /// The checked config of a measurement; starts the worker threads.

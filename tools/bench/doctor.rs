@@ -1,0 +1,578 @@
+//! `gsscale-bench doctor`: whether a GPU computes what the CPU computes, and how fast, in some minutes.
+//!
+//! Every check stands for itself: one that fails says what is wrong in plain words, and the others go on. The verdict names the flags to
+//! use. Views are compared as a whole, and the first wrong output names the stage in which the fault lies.
+//!
+//! Not here: the stages one by one, which the tests compare (`tests/numerics/parity`), and timings against the floor of each stage
+//! (`cargo bench --bench gpu`).
+//!
+//! Invariant: the doctor writes into its own folder only, and its scenes are generated.
+
+use clap::Parser;
+use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::machine::cpu_model;
+use gsscale::base::rng::{Purpose, Stream};
+use gsscale::base::whole_file::write_whole;
+use gsscale::config::choice::Chosen;
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::dataset::target_cache::TargetCache;
+use gsscale::densify::strategy::StrategyName;
+use gsscale::gpu::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions};
+use gsscale::optim::method::OptimizerPlace;
+use gsscale::render::cpu::CpuRenderer;
+use gsscale::render::gpu::GpuRenderer;
+use gsscale::render::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
+use gsscale::report::html::{Cell, Page};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::image::{Image, Target};
+use gsscale::train::error::TrainError;
+use gsscale::train::start::first_scene::{Prepared, prepare};
+use gsscale::train::state::trainer::Trainer;
+use serde::Serialize;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+const EXAMPLES: &str = "\
+Examples:
+  gsscale-bench doctor                        the best GPU; some three minutes
+  gsscale-bench doctor --quick                the comparison with the CPU alone
+  gsscale-bench doctor --device radeon --out doctor-radeon
+
+doctor.json and doctor.html in --out hold all figures: please attach doctor.json to a report about a GPU.";
+
+/// Checks a GPU: same pictures and gradients as the CPU, same bytes twice, rates, times of steps, a short training.
+#[derive(Parser)]
+#[command(name = "gsscale-bench doctor", bin_name = "gsscale-bench doctor", version, after_help = EXAMPLES)]
+pub struct Args {
+    /// The GPU: a part of its name; default: the best one, software drivers last
+    #[arg(long, value_name = "NAME")]
+    device: Option<String>,
+    /// Folder of doctor.json and doctor.html
+    #[arg(long, default_value = "doctor", value_name = "FOLDER")]
+    out: PathBuf,
+    /// Only compare with the CPU
+    #[arg(long)]
+    quick: bool,
+    /// Most device memory of the checks, as --device-mem of gsscale-train
+    #[arg(long, value_name = "SIZE", default_value = "0")]
+    device_mem: gsscale::config::values::ByteSize,
+}
+
+/// Error of a value of a picture without a flipped decision: some hundred roundings of 6e-8.
+const PIXEL: f32 = 5e-5;
+/// A rounding that flips a decision (a tile more, a stop one Gaussian later) moves a value by less than this.
+const FLIPPED: f32 = 1.0 / 255.0;
+/// One value in so many may be such a one.
+const FLIPPED_ONE_OF: usize = 1000;
+/// Difference of a loss: the small variances of SSIM, and a few flipped decisions.
+const LOSS: f64 = 2e-5;
+/// Relative L2 of a column of gradients: a thousand roundings, for sums whose terms cancel.
+const GRADIENT: f64 = 2e-4;
+/// One half extent in so many may be another: it is rounded up.
+const RADIUS_ONE_OF: usize = 500;
+/// Difference of the PSNR after a short training, dB: roundings grow over the steps as seeds do.
+const TRAINED: f64 = 0.1;
+/// Steps of the short training.
+const STEPS: u32 = 200;
+/// Gaussians of the timed steps; software drivers get the first.
+const SIZES: [usize; 3] = [100_000, 1_000_000, 3_000_000];
+/// Steps that are timed after as many that are not.
+const TIMED: usize = 6;
+/// Bytes of a copy.
+const COPY: usize = 64 << 20;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+enum Verdict {
+    Good,
+    Failed,
+}
+
+/// What a check found.
+#[derive(Debug, Serialize)]
+struct Check {
+    name: &'static str,
+    verdict: Verdict,
+    /// In plain words.
+    found: String,
+    figures: Value,
+}
+
+impl Check {
+    fn of(name: &'static str, found: Result<(String, Value), String>) -> Check {
+        let (verdict, (found, figures)) = match found {
+            Ok(good) => (Verdict::Good, good),
+            Err(why) => (Verdict::Failed, (why, Value::Null)),
+        };
+        Check { name, verdict, found, figures }
+    }
+}
+
+/// Examines a GPU; fails if it computes something else than the CPU.
+///
+/// Errors: there is no such GPU, or the folder cannot be written.
+pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
+    let doctor = Doctor { args, choice: args.device.clone().map_or(DeviceChoice::Gpu, DeviceChoice::Named) };
+    let gpu = doctor.open(false).map_err(|e| InputError::new("--device", e, "see gsscale-train --list-devices"))?;
+    let about = gpu.summary().clone();
+    drop(gpu);
+    gsscale::tell!("examining {about}");
+    let mut checks =
+        vec![doctor.told("same as the CPU", Doctor::parity), doctor.told("same bytes twice", Doctor::same_bytes)];
+    if !args.quick {
+        checks.push(doctor.told("rates", Doctor::rates));
+        checks.push(doctor.told("steps", |doctor| doctor.steps(&about)));
+        checks.push(doctor.told("short training", Doctor::training));
+    }
+    let advice = advice(&checks, about.kind);
+    let all = json!({
+        "version": env!("CARGO_PKG_VERSION"), "device": about.to_string(), "kind": format!("{:?}", about.kind),
+        "cpu": cpu_model(), "cores": std::thread::available_parallelism().map_or(0, usize::from), "checks": checks,
+        "advice": advice,
+    });
+    write(&args.out, &about, &checks, &advice, &all)?;
+    print(&all);
+    gsscale::tell!("{advice}\n{} has all figures", args.out.join("doctor.html").display());
+    let failed: Vec<&str> = checks.iter().filter(|c| c.verdict == Verdict::Failed).map(|c| c.name).collect();
+    match failed.is_empty() {
+        true => Ok(()),
+        false => Err(InputError::new("doctor", format!("failed: {}", failed.join(", ")), advice).into()),
+    }
+}
+
+/// Which flags to use, by what was found.
+fn advice(checks: &[Check], kind: DeviceKind) -> String {
+    let failed = |name: &str| checks.iter().any(|c| c.name == name && c.verdict == Verdict::Failed);
+    if failed("same as the CPU") || failed("same bytes twice") || failed("short training") {
+        return "train with --device cpu: this GPU or its driver computes something else; an update of the driver may help".into();
+    }
+    if kind == DeviceKind::Software {
+        return "it computes what the CPU computes, but it is a driver in software: train with --device cpu, which is faster".into();
+    }
+    let seconds = |of: &str| {
+        let steps = checks.iter().find(|c| c.name == "steps")?;
+        steps.figures.as_array()?.last()?[of].as_f64()
+    };
+    match (seconds("cpu_seconds"), seconds("host_form_seconds"), seconds("device_form_seconds")) {
+        (Some(cpu), Some(host), device) if cpu < host.min(device.unwrap_or(f64::INFINITY)) => {
+            "train with --device cpu: the processor is faster than this GPU".into()
+        }
+        (_, Some(host), Some(device)) if device < host => {
+            "train with --device gpu --optimizer-on device: pages on the device make steps faster".into()
+        }
+        (_, Some(_), _) => "train with --device gpu".into(),
+        _ => "this GPU computes what the CPU computes: train with --device gpu".into(),
+    }
+}
+
+/// Outputs of a view.
+struct View {
+    image: Image,
+    loss: LossValue,
+    grads: Gradients,
+}
+
+struct Doctor<'a> {
+    args: &'a Args,
+    choice: DeviceChoice,
+}
+
+impl Doctor<'_> {
+    /// Runs a check, and says how it ended.
+    fn told(&self, name: &'static str, check: impl FnOnce(&Self) -> Result<(String, Value), String>) -> Check {
+        let check = Check::of(name, check(self));
+        gsscale::tell!("{name}: {}", check.found);
+        check
+    }
+
+    fn open(&self, profile: bool) -> Result<Gpu, String> {
+        let budget = Some(self.args.device_mem.0).filter(|bytes| *bytes > 0);
+        let options = GpuOptions { profile, budget, ..GpuOptions::default() };
+        Gpu::open_with(&self.choice, &options).map_err(|e| e.to_string())
+    }
+
+    fn renderer(&self, profile: bool) -> Result<GpuRenderer, String> {
+        GpuRenderer::new(self.open(profile)?).map_err(|e| format!("its shaders cannot be used: {e}"))
+    }
+
+    /// Views of generated Gaussians, clean and with one in a hundred broken, in every SH degree, from one to several workgroups.
+    fn parity(&self) -> Result<(String, Value), String> {
+        let (mut gpu, mut cpu) = (self.renderer(false)?, CpuRenderer::new());
+        let mut figures = Vec::new();
+        for (rows, [width, height], sh_degree) in
+            [(4000, [160, 112], 3), (3, [65, 47], 2), (20_000, [123, 77], 1), (900, [40, 9], 0)]
+        {
+            for broken in [false, true] {
+                let (columns, camera) = scene(rows, width, height, broken);
+                let options = RenderOptions { sh_degree, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
+                let what = format!("{rows} Gaussians at {width}x{height}, degree {sh_degree}{}", broken_text(broken));
+                let want = view(&mut cpu, &columns, &camera, &options).map_err(|e| format!("{what}: the CPU: {e}"))?;
+                let got = view(&mut gpu, &columns, &camera, &options).map_err(|e| format!("{what}: {e}"))?;
+                let differences = compare(&got, &want).map_err(|why| format!("{what}: {why}"))?;
+                figures.push(json!({ "view": what, "differences": differences }));
+            }
+        }
+        Ok((format!("{} views agree with the CPU", figures.len()), Value::from(figures)))
+    }
+
+    fn same_bytes(&self) -> Result<(String, Value), String> {
+        let (columns, camera) = scene(20_000, 320, 200, false);
+        let mut hashes = Vec::new();
+        for _ in 0..2 {
+            let mut gpu = self.renderer(false)?;
+            for _ in 0..2 {
+                let view = view(&mut gpu, &columns, &camera, &RenderOptions::default())?;
+                hashes.push(xxhash_rust::xxh3::xxh3_64(bytemuck::cast_slice(&bits(&view))));
+            }
+        }
+        hashes.dedup();
+        match hashes.len() {
+            1 => Ok(("four times the same bits".into(), Value::Null)),
+            _ => Err(
+                "the same view has other bits when it is drawn again: a stage reads what another has not written yet"
+                    .into(),
+            ),
+        }
+    }
+
+    /// Rates of copies in GB/s: on the device, up, down, and how much of a copy up hides behind a copy on the device.
+    fn rates(&self) -> Result<(String, Value), String> {
+        let gpu = self.open(false)?;
+        let data = vec![7u32; COPY / 4];
+        let on_device = || -> gsscale::gpu::GpuResult<[f64; 4]> {
+            let (from, to) = (gpu.buffer("copied", COPY as u64)?, gpu.buffer("copy", COPY as u64)?);
+            let mut best = [f64::INFINITY; 4];
+            for _ in 0..5 {
+                for (i, best) in best.iter_mut().enumerate() {
+                    let began = Instant::now();
+                    let mut recorder = gpu.begin("doctor");
+                    let _up = if i % 2 == 1 { Some(recorder.buffer_with("up", &data)?) } else { None };
+                    if i == 0 || i == 3 {
+                        (0..4).try_for_each(|_| recorder.copy(&from.view(), &to.view()))?;
+                    }
+                    let down = if i == 2 { Some(recorder.read_back("down", &from.view())?) } else { None };
+                    let submission = gpu.submit(recorder)?;
+                    match down {
+                        Some(down) => drop(down.to_vec::<u32>()?),
+                        None => gpu.wait(&submission)?,
+                    }
+                    *best = best.min(began.elapsed().as_secs_f64());
+                }
+            }
+            Ok(best)
+        };
+        let [copy, up, down, both] = on_device().map_err(|e| format!("copies failed: {e}"))?;
+        let rate = |seconds: f64, times: f64| times * COPY as f64 / seconds / 1e9;
+        let hidden = ((copy + up - both) / copy.min(up)).clamp(0.0, 1.0);
+        let (copy, up, down) = (rate(copy, 8.0), rate(up, 1.0), rate(down, 1.0));
+        let found = format!(
+            "{copy:.1} GB/s on the device, {up:.1} up, {down:.1} down; {:.0} % of a copy up hides behind one on the device",
+            100.0 * hidden
+        );
+        Ok((found, json!({ "device_gb_s": copy, "up_gb_s": up, "down_gb_s": down, "hidden": hidden })))
+    }
+
+    /// Steps of growing scenes: on the CPU, with the optimizer on the host, and with it on the device.
+    fn steps(&self, about: &AdapterSummary) -> Result<(String, Value), String> {
+        let sizes = if about.kind == DeviceKind::Software { &SIZES[..1] } else { &SIZES[..] };
+        let mut figures: Vec<Value> = Vec::new();
+        let (mut found, mut small) = (String::new(), None);
+        for &rows in sizes {
+            match self.steps_of(rows) {
+                Ok(of_size) => {
+                    let ms =
+                        |name: &str| of_size[name].as_f64().map_or(String::from("-"), |s| format!("{:.1}", 1e3 * s));
+                    let [cpu, host, device] = ["cpu_seconds", "host_form_seconds", "device_form_seconds"].map(ms);
+                    found += &format!(
+                        "{rows} Gaussians: {cpu} ms on the CPU, {host} on the GPU, {device} with pages on it. "
+                    );
+                    figures.push(of_size);
+                }
+                // A size that does not fit says something about the next ones, and nothing about those before.
+                Err(why) => {
+                    small = Some(format!("{rows} Gaussians: {why}"));
+                    break;
+                }
+            }
+        }
+        match (figures.is_empty(), small) {
+            (true, why) => Err(why.unwrap_or_default()),
+            (false, why) => Ok((found + &why.unwrap_or_default(), Value::from(figures))),
+        }
+    }
+
+    fn steps_of(&self, rows: usize) -> Result<Value, String> {
+        let folder = tempdir()?;
+        let city = CityOptions { views: 8, width: 640, height: 480, points: rows as u32, ..CityOptions::default() };
+        let config = TrainConfig {
+            strategy: StrategyName::None,
+            sh_every: 0,
+            test_every: 0,
+            steps: 10_000,
+            ..TrainConfig::default()
+        };
+        let scene = CityScene::new(&folder.0, &city, config)?;
+        let cpu = scene.step_seconds(Box::new(CpuRenderer::new()), OptimizerPlace::Host)?;
+        let host = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Host)?;
+        let device = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Device).ok();
+        let mut profiled = self.renderer(true)?;
+        let stages = scene.stage_seconds(&mut profiled)?;
+        Ok(json!({
+            "gaussians": scene.columns.rows(), "cpu_seconds": cpu, "host_form_seconds": host, "device_form_seconds": device,
+            "stage_seconds": stages, "device_bytes_peak": profiled.traffic().device_bytes_peak,
+        }))
+    }
+
+    fn training(&self) -> Result<(String, Value), String> {
+        let folder = tempdir()?;
+        let city = CityOptions { views: 24, width: 160, height: 112, points: 6000, ..CityOptions::default() };
+        let config = TrainConfig { steps: STEPS, ..TrainConfig::default() };
+        let scene = CityScene::new(&folder.0, &city, config)?;
+        let cpu = scene.psnr(Box::new(CpuRenderer::new()))?;
+        let gpu = scene.psnr(Box::new(self.renderer(false)?))?;
+        let figures = json!({ "steps": STEPS, "cpu_psnr": cpu, "gpu_psnr": gpu });
+        match (cpu - gpu).abs() <= TRAINED {
+            true => Ok((format!("{gpu:.2} dB after {STEPS} steps, {cpu:.2} on the CPU"), figures)),
+            false => Err(format!("{gpu:.2} dB after {STEPS} steps, but {cpu:.2} on the CPU")),
+        }
+    }
+}
+
+/// A generated city in a folder, and what is done with it.
+struct CityScene {
+    prepared: Prepared,
+    columns: Columns,
+    config: TrainConfig,
+}
+
+impl CityScene {
+    fn new(folder: &Path, city: &CityOptions, config: TrainConfig) -> Result<CityScene, String> {
+        let city = CityOptions { supersample: 1, overwrite: true, ..city.clone() };
+        write_city(folder, &city, &|_, _| {}).map_err(|e| e.to_string())?;
+        let prepared = prepare(folder, &config).map_err(|e| e.to_string())?;
+        Ok(CityScene { columns: prepared.columns.clone(), prepared, config })
+    }
+
+    fn trainer(&self, renderer: Box<dyn Renderer>, optimizer_on: OptimizerPlace) -> Result<Trainer, String> {
+        let config = TrainConfig { optimizer_on: Chosen(Some(optimizer_on)), ..self.config.clone() };
+        let dataset = &self.prepared.dataset;
+        let options = RunOptions {
+            sh_degree_start: self.prepared.sh_degree_start,
+            ..RunOptions::new(&config, dataset.scene_scale)
+        };
+        Trainer::new(self.columns.clone(), dataset, renderer, options).map_err(|e| e.to_string())
+    }
+
+    /// Median seconds of a step.
+    fn step_seconds(&self, renderer: Box<dyn Renderer>, optimizer_on: OptimizerPlace) -> Result<f64, String> {
+        let mut trainer = self.trainer(renderer, optimizer_on)?;
+        let dataset = &self.prepared.dataset;
+        let targets = TargetCache::new(&dataset.views, u64::MAX, 1).map_err(|e| e.to_string())?;
+        let mut seconds = Vec::new();
+        for _ in 0..2 * TIMED {
+            let began = Instant::now();
+            trainer.step(dataset, &targets).map_err(|e| e.to_string())?;
+            seconds.push(began.elapsed().as_secs_f64());
+        }
+        let timed = &mut seconds[TIMED..];
+        timed.sort_unstable_by(f64::total_cmp);
+        Ok(timed[TIMED / 2])
+    }
+
+    /// Seconds of each stage of a view, by the clock of the device; empty without timestamps.
+    fn stage_seconds(&self, renderer: &mut GpuRenderer) -> Result<Value, String> {
+        let camera = &self.prepared.dataset.views[0].camera;
+        for _ in 0..TIMED {
+            view(renderer, &self.columns, camera, &RenderOptions::default())?;
+        }
+        let times = renderer.gpu().stage_times().map_err(|e| e.to_string())?;
+        Ok(times.iter().map(|t| (t.stage.to_string(), Value::from(t.seconds / TIMED as f64))).collect())
+    }
+
+    /// PSNR on the held-out photos after the steps of the config, dB.
+    fn psnr(&self, renderer: Box<dyn Renderer>) -> Result<f64, String> {
+        let mut trainer = self.trainer(renderer, OptimizerPlace::Host)?;
+        let dataset = &self.prepared.dataset;
+        let targets = TargetCache::new(&dataset.views, u64::MAX, 1).map_err(|e| e.to_string())?;
+        while trainer.steps_done() < self.config.steps {
+            trainer.step(dataset, &targets).map_err(|e| e.to_string())?;
+        }
+        let test = trainer.evaluate(dataset, &targets, None, &|_| {}).map_err(|e| e.to_string())?;
+        test.map(|test| test.psnr).ok_or_else(|| "no photo is held out".to_string())
+    }
+}
+
+/// Gaussians in front of a camera; some are large, opaque, behind it or off the picture, and if `broken` one in a hundred is not finite.
+fn scene(rows: usize, width: u32, height: u32, broken: bool) -> (Columns, Camera) {
+    let mut draws = Stream::new(41, Purpose::Test, rows as u64, u64::from(width));
+    let mut c = Columns::zeros(rows, 3);
+    let mut fill = |values: &mut [f32], draw: &mut dyn FnMut(&mut Stream) -> f64| {
+        values.iter_mut().for_each(|x| *x = draw(&mut draws) as f32);
+    };
+    fill(&mut c.means, &mut |d| d.range(-2.0, 2.0));
+    fill(&mut c.quats, &mut |d| d.normal());
+    fill(&mut c.scales, &mut |d| d.range(-5.0, -1.0));
+    fill(&mut c.opacities, &mut |d| d.range(-6.0, 7.0));
+    fill(&mut c.sh0, &mut |d| 0.5 * d.normal());
+    fill(&mut c.sh_n, &mut |d| 0.5 * d.normal());
+    if broken {
+        for row in (0..rows).step_by(100) {
+            let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38][row / 100 % 4];
+            match row / 400 % 4 {
+                0 => c.means[3 * row] = value,
+                1 => c.quats[4 * row + 1] = value,
+                2 => c.scales[3 * row + 2] = value,
+                _ => c.opacities[row] = value,
+            }
+        }
+    }
+    let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
+    let (fx, fy, cx, cy) = (60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32);
+    (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
+}
+
+fn broken_text(broken: bool) -> &'static str {
+    if broken { ", one in a hundred broken" } else { "" }
+}
+
+/// Draws a view, compares it with a smooth photo that has a hole in its mask, and takes the loss back to the rows.
+fn view(
+    renderer: &mut dyn Renderer,
+    columns: &Columns,
+    camera: &Camera,
+    options: &RenderOptions,
+) -> Result<View, String> {
+    let (width, height) = (camera.width, camera.height);
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
+    let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
+    let target = Target { width, height, rgb, mask };
+    let mut grads = Gradients::default();
+    let drawn = renderer.draw(columns, camera, options).and_then(|()| renderer.loss(&target, &LossOptions::default()));
+    drawn.and_then(|()| renderer.backpropagate(columns, &mut grads)).map_err(|e| e.to_string())?;
+    let loss = renderer.loss_value().map_err(|e| e.to_string())?;
+    let image = renderer.image().map_err(|e| e.to_string())?.clone();
+    Ok(View { image, loss, grads })
+}
+
+/// The largest differences by output; the first output that is wrong names the stage.
+fn compare(got: &View, want: &View) -> Result<Value, String> {
+    let radii = got.grads.radii.iter().zip(&want.grads.radii).filter(|(g, w)| g != w).count();
+    if radii * RADIUS_ONE_OF > want.grads.radii.len() {
+        return Err(format!("{radii} footprints have another size: stage project_fwd, or the sort"));
+    }
+    let apart = got.image.rgb.iter().zip(&want.image.rgb).map(|(g, w)| (g - w).abs());
+    let worst = apart.clone().fold(0.0f32, |most, d| if d <= most { most } else { d });
+    let off = apart.filter(|d| !(*d <= PIXEL)).count();
+    if !(worst < FLIPPED) || off * FLIPPED_ONE_OF > want.image.rgb.len() {
+        return Err(format!(
+            "the picture is another (a value by {worst:.1e}; {off} of {} values): colours (sh_fwd), lists (isect_emit, radix_sort), or \
+             blending (rasterize_fwd)",
+            want.image.rgb.len()
+        ));
+    }
+    let loss = (got.loss.loss - want.loss.loss).abs();
+    if !(loss < LOSS) {
+        return Err(format!("the loss is {}, but {} on the CPU: stage image_loss", got.loss.loss, want.loss.loss));
+    }
+    let means2d = l2(got.grads.means2d.as_flattened(), want.grads.means2d.as_flattened());
+    if !(means2d < GRADIENT) {
+        return Err(format!("gradients of footprints are others ({means2d:.1e} relative): stage rasterize_bwd"));
+    }
+    let mut columns = serde_json::Map::new();
+    for column in Column::ALL {
+        let error = l2(got.grads.columns.column(column), want.grads.columns.column(column));
+        if !(error < GRADIENT) {
+            let stage = if matches!(column, Column::Sh0 | Column::ShN) { "sh_bwd" } else { "project_bwd" };
+            return Err(format!("gradients of {column:?} are others ({error:.1e} relative): stage {stage}"));
+        }
+        columns.insert(format!("{column:?}"), error.into());
+    }
+    Ok(json!({ "pixel": worst, "loss": loss, "means2d": means2d, "gradients": columns }))
+}
+
+/// Relative L2 distance.
+fn l2(got: &[f32], want: &[f32]) -> f64 {
+    let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
+    let error = norm(&mut got.iter().zip(want).map(|(g, w)| f64::from(*g) - f64::from(*w)));
+    error / norm(&mut want.iter().map(|w| f64::from(*w))).max(1e-30)
+}
+
+fn bits(view: &View) -> Vec<u32> {
+    let columns = Column::ALL.into_iter().flat_map(|c| view.grads.columns.column(c));
+    let floats = view.image.rgb.iter().chain(columns).chain(view.grads.means2d.as_flattened());
+    let loss = view.loss.loss.to_bits();
+    floats.map(|x| x.to_bits()).chain([loss as u32, (loss >> 32) as u32]).collect()
+}
+
+/// A folder for a scene; removed when dropped.
+struct Scratch(PathBuf);
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        // Made by this process, under a name of its own.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+fn tempdir() -> Result<Scratch, String> {
+    let name = format!("gsscale-doctor-{}-{:?}", std::process::id(), Instant::now());
+    let folder = std::env::temp_dir().join(name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '-', ""));
+    std::fs::create_dir(&folder).map_err(|e| format!("{}: {e}", folder.display()))?;
+    Ok(Scratch(folder))
+}
+
+/// Writes doctor.json and doctor.html.
+fn write(out: &Path, about: &AdapterSummary, checks: &[Check], advice: &str, all: &Value) -> InputResult<()> {
+    std::fs::create_dir_all(out).map_err(|e| InputError::io(out, "making the folder", &e))?;
+    let text = serde_json::to_string_pretty(all).unwrap_or_default();
+    write_whole(&out.join("doctor.json"), text.as_bytes())?;
+    let mut page = Page::new(&format!("Doctor: {}", about.name), &about.to_string());
+    page.paragraph(advice);
+    let word = |check: &Check| match check.verdict {
+        Verdict::Good => "good",
+        Verdict::Failed => "FAILED",
+    };
+    page.table(
+        checks,
+        &[
+            ("check", &|c| Cell::text(c.name)),
+            ("", &|c| Cell::text(word(c))),
+            ("found", &|c| Cell::text(c.found.clone())),
+        ],
+    );
+    let steps = checks.iter().find(|c| c.name == "steps").and_then(|c| c.figures.as_array());
+    if let Some(sizes) = steps {
+        page.heading("Time of a step");
+        let ms = |of: &Value, name: &str| Cell::number(of[name].as_f64().map(|s| 1e3 * s), 1);
+        page.table(
+            sizes,
+            &[
+                ("Gaussians", &|s| Cell::number(s["gaussians"].as_f64(), 0)),
+                ("CPU, ms", &|s| ms(s, "cpu_seconds")),
+                ("GPU, ms", &|s| ms(s, "host_form_seconds")),
+                ("pages on the GPU, ms", &|s| ms(s, "device_form_seconds")),
+            ],
+        );
+        let stages: Vec<(String, f64)> =
+            sizes.last().and_then(|s| s["stage_seconds"].as_object()).map_or(Vec::new(), |s| {
+                s.iter().filter_map(|(name, seconds)| Some((name.clone(), seconds.as_f64()?))).collect()
+            });
+        if !stages.is_empty() {
+            page.heading("Stages of a view, the largest size");
+            page.table(
+                &stages,
+                &[
+                    ("stage", &|(name, _)| Cell::text(name.clone())),
+                    ("ms", &|(_, seconds)| Cell::number(Some(1e3 * seconds), 3)),
+                ],
+            );
+        }
+    }
+    page.folded("doctor.json", &text);
+    write_whole(&out.join("doctor.html"), page.finish().as_bytes())
+}
