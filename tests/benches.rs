@@ -17,12 +17,12 @@ mod gpu;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/image_loss.rs"]
 mod image_loss;
+#[allow(dead_code)] // the tests of programs use all of it
+#[path = "support/bench.rs"]
+mod lines_of_a_bench;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/render.rs"]
 mod render;
-#[allow(dead_code)] // the tests of programs use all of it
-#[path = "support/bench.rs"]
-mod scene_of_a_bench;
 #[allow(dead_code)] // the tests of programs use all of it
 #[path = "support/scenes.rs"]
 mod scenes;
@@ -42,7 +42,7 @@ mod view_memory;
 use clap::Parser;
 use gsscale::config::command_line::parse_arguments;
 use gsscale::train::error::TrainError;
-use scene_of_a_bench::{large_city, number};
+use lines_of_a_bench::number;
 use scenes::{city, text};
 use serde_json::Value;
 use std::ffi::OsString;
@@ -102,28 +102,11 @@ fn buses_slow_steps_and_change_no_loss() {
 }
 
 #[test]
-fn commit_runs() {
-    assert!(commit::tiny());
-}
-
-#[test]
-fn gpu_runs() {
+fn benchmarks_of_parts_run() {
+    assert!(commit::tiny() && view_memory::tiny() != 0);
     assert_eq!(gpu::tiny(), gpu::tiny());
-}
-
-#[test]
-fn image_loss_runs() {
     assert_eq!(image_loss::tiny(), image_loss::tiny());
-}
-
-#[test]
-fn render_runs() {
     assert_eq!(render::tiny(), render::tiny());
-}
-
-#[test]
-fn view_memory_runs() {
-    assert!(view_memory::tiny() != 0);
 }
 
 #[test]
@@ -151,7 +134,7 @@ fn touched_rows_are_timed_beside_a_copy() {
 #[test]
 fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
     let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
+    let scene = city(folder.path(), 150, 48, 32, 8000);
     let spill = folder.path().join("spill");
     let sizes = ["--steps", "100", "--turn", "7", "--warm-up", "60", "--page-rows", "16", "--strategy", "none"];
     let more = ["--spill-dir", text(&spill), "--shares", "70,0.1", "--view-order", "groups:9"];
@@ -176,7 +159,7 @@ fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
 #[test]
 fn sizes_see_the_same_rows_whatever_lies_behind_them() {
     let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
+    let scene = city(folder.path(), 150, 48, 32, 8000);
     let spill = folder.path().join("spill");
     let options = ["--steps", "60", "--turn", "7", "--page-rows", "16", "--strategy", "none", "--copies", "1,3"];
     let lines = sizes(&[&[text(&scene), "--spill-dir", text(&spill)][..], &options].concat()).unwrap();

@@ -1,23 +1,22 @@
 //! Input files that decompress to more than the memory budget: a run stays within `--host-mem` or refuses the file by
 //! name.
 
-use crate::support::scenes::{TextModel, city, stderr, text};
+use crate::support::scenes::{TextModel, stderr, text};
+use crate::support::workdir::{TRAIN, Workdir, says};
 use flate2::write::ZlibEncoder;
 use flate2::{Compression, Crc};
 use image::{DynamicImage, ImageFormat};
 use std::io::{Cursor, Read, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
-use tempfile::TempDir;
+use std::process::{Output, Stdio};
 
 const BUDGET: u64 = 200 << 20;
 /// Decompressed size of the bombs: three times the budget.
 const HELD: usize = 600 << 20;
 
 /// Runs the trainer; returns its output and its peak memory, bytes.
-fn measured(args: &[&str]) -> (Output, u64) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    command.args(args).args(["--device", "cpu", "--quiet"]).stdout(Stdio::null()).stderr(Stdio::piped());
+fn measured(work: &Workdir, flags: &str) -> (Output, u64) {
+    let mut command = work.command(TRAIN, &format!("{flags} --device cpu --quiet"));
+    command.stdout(Stdio::null()).stderr(Stdio::piped());
     let mut child = command.spawn().unwrap();
     let status = format!("/proc/{}/status", child.id());
     let mut peak = 0;
@@ -44,13 +43,6 @@ fn chunk(kind: &[u8; 4], data: &[u8]) -> Vec<u8> {
     [&(data.len() as u32).to_be_bytes()[..], kind, data, &crc.sum().to_be_bytes()].concat()
 }
 
-fn deflated_zeros(bytes: usize) -> Vec<u8> {
-    let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
-    let block = vec![0u8; 1 << 20];
-    (0..bytes >> 20).for_each(|_| encoder.write_all(&block).unwrap());
-    encoder.finish().unwrap()
-}
-
 fn deflated(bytes: &[u8]) -> Vec<u8> {
     let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
     encoder.write_all(bytes).unwrap();
@@ -67,7 +59,7 @@ fn png_with(picture: &DynamicImage, chunks: &[u8]) -> Vec<u8> {
 }
 
 fn profile_bomb() -> Vec<u8> {
-    chunk(b"iCCP", &[b"all zeros\0\0", &deflated_zeros(HELD)[..]].concat())
+    chunk(b"iCCP", &[b"all zeros\0\0", &deflated(&vec![0; HELD])[..]].concat())
 }
 
 /// Chunks that cameras and programs write beside pixels: a colour profile that is not all zeros, texts of all kinds,
@@ -86,74 +78,63 @@ fn ordinary_chunks() -> Vec<u8> {
     .concat()
 }
 
-fn photos(scene: &Path) -> Vec<PathBuf> {
-    let mut photos: Vec<PathBuf> =
-        std::fs::read_dir(scene.join("images")).unwrap().map(|entry| entry.unwrap().path()).collect();
-    photos.sort();
-    photos
-}
-
 /// Rewrites all photos as PNGs of the same pixels with these chunks; readers detect the format by the bytes, not by the
 /// name.
-fn make_png(scene: &Path, chunks: &[u8]) {
-    for path in photos(scene) {
+fn make_png(work: &Workdir, chunks: &[u8]) {
+    for path in work.photos() {
         let picture = image::load_from_memory(&std::fs::read(&path).unwrap()).unwrap();
         std::fs::write(&path, png_with(&picture, chunks)).unwrap();
     }
 }
 
 /// A short run within the budget; returns its Gaussians.
-fn trained(scene: &Path, out: &Path) -> Vec<u8> {
-    let args = [text(scene), "--out", text(out), "--steps", "8", "--threads", "2", "--host-mem", "200MiB"];
-    let (output, peak) = measured(&args);
+fn trained(work: &Workdir) -> Vec<u8> {
+    let flags = "scene --out out --overwrite --steps 8 --threads 2 --host-mem 200MiB";
+    let (output, peak) = measured(work, flags);
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(peak <= BUDGET, "{} MiB were taken", peak >> 20);
-    std::fs::read(out.join("point_cloud.ply")).unwrap()
+    work.ply("out")
 }
 
 #[test]
 fn photos_with_profiles_and_texts_train_as_without_them_and_within_the_budget() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 5, 64, 48, 500);
-    make_png(&scene, &[]);
-    let plain = trained(&scene, &folder.path().join("plain"));
-    make_png(&scene, &ordinary_chunks());
-    assert!(trained(&scene, &folder.path().join("ordinary")) == plain, "texts and profiles changed the result");
-    make_png(&scene, &profile_bomb());
-    assert!(trained(&scene, &folder.path().join("bomb")) == plain, "the pixels are the same, the result is not");
+    let work = Workdir::city(5, 64, 48, 500);
+    make_png(&work, &[]);
+    let plain = trained(&work);
+    make_png(&work, &ordinary_chunks());
+    assert!(trained(&work) == plain, "texts and profiles changed the result");
+    make_png(&work, &profile_bomb());
+    assert!(trained(&work) == plain, "the pixels are the same, the result is not");
 }
 
 #[test]
 fn masks_with_huge_profiles_stay_within_the_budget() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 4, 64, 48, 500);
-    std::fs::create_dir(scene.join("masks")).unwrap();
+    let work = Workdir::city(4, 64, 48, 500);
+    std::fs::create_dir(work.path("scene/masks")).unwrap();
     let mask = image::GrayImage::from_fn(64, 48, |x, _| image::Luma([if x < 40 { 255 } else { 0 }]));
     let write = |chunks: &[u8]| {
-        for photo in photos(&scene) {
-            let name = format!("{}.png", photo.file_name().unwrap().to_string_lossy());
-            std::fs::write(scene.join("masks").join(name), png_with(&mask.clone().into(), chunks)).unwrap();
+        for photo in work.photos() {
+            let name = format!("scene/masks/{}.png", photo.file_name().unwrap().to_string_lossy());
+            work.write(&name, png_with(&mask.clone().into(), chunks));
         }
     };
     write(&[]);
-    let plain = trained(&scene, &folder.path().join("plain"));
+    let plain = trained(&work);
     write(&profile_bomb());
-    assert!(trained(&scene, &folder.path().join("bomb")) == plain);
+    assert!(trained(&work) == plain);
 }
 
 /// transforms.json without the image size: the size is read from the photos.
 #[test]
 fn reading_the_size_of_a_photo_inflates_nothing() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 4, 64, 48, 500);
-    make_png(&scene, &profile_bomb());
-    TextModel::of(&scene).write_transforms(&scene);
-    std::fs::remove_dir_all(scene.join("sparse")).unwrap();
-    let file = scene.join("transforms.json");
-    let mut json: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
+    let work = Workdir::city(4, 64, 48, 500);
+    make_png(&work, &profile_bomb());
+    TextModel::of(&work.scene()).write_transforms(&work.scene());
+    work.remove("scene/sparse");
+    let mut json = work.json("scene/transforms.json");
     json.as_object_mut().unwrap().retain(|key, _| key != "w" && key != "h");
-    std::fs::write(&file, json.to_string()).unwrap();
-    let (output, peak) = measured(&[text(&scene), "--dry-run", "--host-mem", "200MiB"]);
+    work.write("scene/transforms.json", json.to_string());
+    let (output, peak) = measured(&work, "scene --dry-run --host-mem 200MiB");
     assert!(output.status.success(), "{}", stderr(&output));
     assert!(peak <= BUDGET, "{} MiB were taken", peak >> 20);
 }
@@ -173,40 +154,44 @@ fn jpeg_in_scans(width: u16, height: u16) -> Vec<u8> {
 }
 
 /// Replaces a photo by `bytes`: the run must refuse it by name, with the memory that it needs.
-fn refused(bytes: &[u8], more: &[&str]) {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 4, 64, 48, 500);
-    let photo = &photos(&scene)[1];
+fn refused(bytes: &[u8], more: &str) {
+    let work = Workdir::city(4, 64, 48, 500);
+    let photo = &work.photos()[1];
     std::fs::write(photo, bytes).unwrap();
-    let out = folder.path().join("out");
-    let args = [text(&scene), "--out", text(&out), "--steps", "8", "--host-mem", "200MiB", "--max-resolution", "64"];
-    let (output, peak) = measured(&[&args, more].concat());
+    let flags = "scene --out out --steps 8 --host-mem 200MiB --max-resolution 64";
+    let (output, peak) = measured(&work, &format!("{flags} {more}"));
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}; the peak was {} MiB", peak >> 20);
-    for part in [text(photo), "decoding it takes up to", "200 MiB", "remedy: raise --host-mem"] {
-        assert!(said.contains(part), "{part} is not in: {said}");
-    }
+    says(
+        &said,
+        &[
+            text(photo.strip_prefix(work.path("")).unwrap()),
+            "decoding it takes up to",
+            "200 MiB",
+            "remedy: raise --host-mem",
+        ],
+    );
     assert!(peak <= BUDGET, "{} MiB were taken before it was refused", peak >> 20);
 }
 
 #[test]
 fn a_jpeg_whose_coefficients_are_kept_is_refused_before_they_are() {
     // 3 bytes of result and 6 of coefficients for each of 27 million pixels: the result alone would fit.
-    refused(&jpeg_in_scans(6000, 4500), &[]);
+    refused(&jpeg_in_scans(6000, 4500), "");
 }
 
 #[test]
 fn a_photo_that_fits_no_cache_counts_all_the_same() {
     // 80 million pixels of 3 bytes, in 240 KB.
     let picture = image::RgbImage::new(10_240, 7_680);
-    refused(&png_with(&picture.into(), &[]), &["--image-cache", "1MiB"]);
+    refused(&png_with(&picture.into(), &[]), "--image-cache 1MiB");
 }
 
 /// Writes and reads a transforms.json; returns the peak memory as a multiple of the file size, and stderr.
 fn read_json(text_of_file: &str) -> (f64, String) {
-    let folder = TempDir::new().unwrap();
-    std::fs::write(folder.path().join("transforms.json"), text_of_file).unwrap();
-    let (output, peak) = measured(&[text(folder.path()), "--dry-run"]);
+    let work = Workdir::new();
+    work.write("transforms.json", text_of_file);
+    let (output, peak) = measured(&work, ". --dry-run");
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     (peak as f64 / text_of_file.len() as f64, said)

@@ -5,12 +5,12 @@
 //! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`). `.ci/run` installs all
 //! but pycolmap.
 
-use crate::support::scenes::{city, eval, stderr, text, train};
+use crate::support::scenes::stderr;
+use crate::support::workdir::Workdir;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use tempfile::TempDir;
 
 /// The Python that can import `module`; `None` after a printed skip.
 fn python_with(module: &str) -> Option<String> {
@@ -31,28 +31,22 @@ fn run_script(python: &str, script: &str, args: &[&Path]) -> Value {
     serde_json::from_str(out.lines().last().unwrap()).unwrap()
 }
 
-fn small_run(folder: &Path, more: &[&str]) -> (PathBuf, PathBuf) {
-    let scene = city(folder, 12, 96, 64, 400);
-    let out = folder.join("run");
-    let keys = ["--steps", "30", "--log-every", "5", "--eval-every", "10", "--quiet", "--device", "cpu"];
-    let output = train(&[&[text(&scene), "--out", text(&out)], &keys[..], more].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    (scene, out)
+/// A city and a run on it, in `run`.
+fn small_run(more: &str) -> Workdir {
+    let work = Workdir::city(12, 96, 64, 400);
+    work.run("run", &format!("--steps 30 --log-every 5 --eval-every 10 {more}"));
+    work
 }
 
 /// The held-out PSNR of a PLY.
-fn psnr_of(ply: &Path, scene: &Path) -> f64 {
-    let output = eval(&[text(ply), text(scene), "--device", "cpu"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let report: Value = serde_json::from_slice(&output.stdout).unwrap();
-    report["test"]["psnr"].as_f64().unwrap()
+fn psnr_of(work: &Workdir, ply: &str) -> f64 {
+    work.eval_psnr(&format!("{ply} scene --device cpu"))
 }
 
 #[test]
 fn plyfile_reads_results_and_writes_what_is_evaluated_alike() {
     let Some(python) = python_with("plyfile") else { return };
-    let folder = TempDir::new().unwrap();
-    let (scene, out) = small_run(folder.path(), &["--up", "keep"]);
+    let work = small_run("--up keep");
     let script = "
 import sys, json, numpy, plyfile
 ply = plyfile.PlyData.read(sys.argv[1])
@@ -63,8 +57,8 @@ for order, name in [('>', 'big.ply'), ('=', 'ascii.ply')]:
     copy.write(sys.argv[2] + '/' + name)
 print(json.dumps({'rows': len(rows), 'names': list(rows.dtype.names), 'comments': ply.comments,
                   'finite': bool(all(numpy.isfinite(rows[n]).all() for n in rows.dtype.names))}))";
-    let ply = out.join("point_cloud.ply");
-    let read = run_script(&python, script, &[&ply, folder.path()]);
+    let ply = "run/point_cloud.ply";
+    let read = run_script(&python, script, &[&work.path(ply), &work.path("")]);
     assert!(read["rows"].as_u64() > Some(300) && read["finite"] == true, "{read}");
     let names: Vec<&str> = read["names"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
     for name in ["x", "opacity", "f_dc_0", "scale_2", "rot_3"] {
@@ -72,10 +66,10 @@ print(json.dumps({'rows': len(rows), 'names': list(rows.dtype.names), 'comments'
     }
     // The comments are the file's own, not those of an element.
     assert!(read["comments"].as_array().is_some_and(|comments| !comments.is_empty()), "{read}");
-    let ours = psnr_of(&ply, &scene);
+    let ours = psnr_of(&work, ply);
     // Text holds f32 in as many digits as numpy prints, which is enough to read them back.
     for name in ["big.ply", "ascii.ply"] {
-        let theirs = psnr_of(&folder.path().join(name), &scene);
+        let theirs = psnr_of(&work, name);
         assert!((theirs - ours).abs() < 1e-4, "{name}: {theirs} dB, {ours} dB in our file");
     }
 }
@@ -83,8 +77,8 @@ print(json.dumps({'rows': len(rows), 'names': list(rows.dtype.names), 'comments'
 #[test]
 fn pycolmap_reads_and_writes_the_models_that_we_write_and_read() {
     let Some(python) = python_with("pycolmap") else { return };
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 6, 96, 64, 300);
+    let work = Workdir::city(6, 96, 64, 300);
+    let scene = work.scene();
     let before = read_scene(&scene, &ReadOptions::default()).unwrap();
     let script = "
 import sys, json, pycolmap
@@ -92,7 +86,7 @@ model = pycolmap.Reconstruction(sys.argv[1])
 model.write_text(sys.argv[2])
 print(json.dumps({'images': sorted(image.name for image in model.images.values()), 'points': len(model.points3D),
                   'cameras': [str(camera.model_name) for camera in model.cameras.values()]}))";
-    let (theirs, model) = (folder.path().join("theirs"), scene.join("sparse/0"));
+    let (theirs, model) = (work.path("theirs"), scene.join("sparse/0"));
     std::fs::create_dir_all(theirs.join("sparse/0")).unwrap();
     std::fs::create_dir(theirs.join("images")).unwrap();
     let read = run_script(&python, script, &[&model, &theirs.join("sparse/0")]);
@@ -112,8 +106,7 @@ print(json.dumps({'images': sorted(image.name for image in model.images.values()
 #[test]
 fn tensorboard_reads_curves_and_pictures() {
     let Some(python) = python_with("tensorboard") else { return };
-    let folder = TempDir::new().unwrap();
-    let (_, out) = small_run(folder.path(), &["--log", "tensorboard"]);
+    let work = small_run("--log tensorboard");
     let script = "
 import sys, json
 from tensorboard.backend.event_processing import event_accumulator
@@ -125,7 +118,7 @@ picture = events.Images(tags['images'][0])[0] if tags['images'] else None
 print(json.dumps({'train': curve('psnr/train'), 'test': curve('psnr/test'), 'images': tags['images'],
                   'picture': picture and [picture.step, picture.width, picture.height,
                                           picture.encoded_image_string[:4].decode('latin1')]}))";
-    let read = run_script(&python, script, &[&out.join("tensorboard")]);
+    let read = run_script(&python, script, &[&work.path("run/tensorboard")]);
     let steps = |tag: &str| -> Vec<u64> {
         read[tag].as_array().unwrap().iter().map(|point| point[0].as_u64().unwrap()).collect()
     };
@@ -147,9 +140,15 @@ fn splat_transform() -> Option<PathBuf> {
     None
 }
 
+/// Converts with the program.
+fn convert(work: &Workdir, program: &Path, flags: &str) {
+    let output = Command::new(program).arg("-w").args(flags.split(' ')).current_dir(work.path("")).output().unwrap();
+    assert!(output.status.success(), "{flags}: {}", stderr(&output));
+}
+
 /// Rows of a PLY.
-fn rows_of(ply: &Path) -> u64 {
-    let bytes = std::fs::read(ply).unwrap();
+fn rows_of(work: &Workdir, ply: &str) -> u64 {
+    let bytes = work.bytes(ply);
     let header = String::from_utf8_lossy(&bytes[..bytes.len().min(4096)]).into_owned();
     header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap().trim().parse().unwrap()
 }
@@ -157,53 +156,39 @@ fn rows_of(ply: &Path) -> u64 {
 #[test]
 fn splat_transform_reads_results() {
     let Some(program) = splat_transform() else { return };
-    let folder = TempDir::new().unwrap();
-    let (scene, out) = small_run(folder.path(), &["--up", "keep", "--export", "spz"]);
-    let (ply, copy) = (out.join("point_cloud.ply"), folder.path().join("copy.ply"));
-    let output = Command::new(&program).args(["-w", text(&ply), text(&copy)]).output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(rows_of(&copy), rows_of(&ply));
-    // It keeps f32 as they are, but forgets our comments: the city lies at its origin.
-    assert!((psnr_of(&copy, &scene) - psnr_of(&ply, &scene)).abs() < 0.01);
-    // SPZ rounds colours to 1/255 and scales to 6 %: half a decibel on a picture of some 20 dB.
-    let from_spz = folder.path().join("from_spz.ply");
+    let work = small_run("--up keep --export spz");
+    let ply = "run/point_cloud.ply";
+    convert(&work, &program, &format!("{ply} copy.ply"));
     // It takes the axes of an SPZ for those of a PLY. Ours are those of the specification: right, up, back.
-    let spz = out.join("point_cloud.spz");
-    let output = Command::new(&program).args(["-w", text(&spz), "-r", "180,0,0", text(&from_spz)]).output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(rows_of(&from_spz), rows_of(&ply));
-    assert!((psnr_of(&from_spz, &scene) - psnr_of(&ply, &scene)).abs() < 0.5);
+    convert(&work, &program, "run/point_cloud.spz -r 180,0,0 from_spz.ply");
+    // It keeps f32 as they are, but forgets our comments: the city lies at its origin. SPZ rounds colours to 1/255 and scales to 6 %:
+    // half a decibel on a picture of some 20 dB.
+    for (file, off) in [("copy.ply", 0.01), ("from_spz.ply", 0.5)] {
+        assert_eq!(rows_of(&work, file), rows_of(&work, ply), "{file}");
+        assert!((psnr_of(&work, file) - psnr_of(&work, ply)).abs() < off, "{file}");
+    }
 }
 
 #[test]
 fn splat_transform_reads_streamed_sogs() {
     let Some(program) = splat_transform() else { return };
-    let folder = TempDir::new().unwrap();
-    let (scene, out) = small_run(folder.path(), &["--up", "keep", "--export", "sog"]);
-    let sog = out.join("point_cloud_sog");
-    let tree: Value = serde_json::from_slice(&std::fs::read(sog.join("lod-meta.json")).unwrap()).unwrap();
+    let work = small_run("--up keep --export sog");
+    let sog = "run/point_cloud_sog";
+    let tree = work.json(&format!("{sog}/lod-meta.json"));
     let names: Vec<&str> = tree["filenames"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
     let environment = tree["environment"].as_str();
-    let convert = |level: usize| {
-        let copy = folder.path().join(format!("{level}.ply"));
+    let level = |level: usize| {
         let of_level = names.iter().filter(|name| name.starts_with(&format!("{level}_")));
-        let files: Vec<PathBuf> = of_level.chain(&environment).map(|name| sog.join(name)).collect();
-        let mut command = Command::new(&program);
-        let output = command.arg("-w").args(&files).arg(&copy).output().unwrap();
-        assert!(output.status.success(), "{}", stderr(&output));
-        (rows_of(&copy), psnr_of(&copy, &scene))
+        let files: Vec<String> = of_level.chain(&environment).map(|name| format!("{sog}/{name}")).collect();
+        convert(&work, &program, &format!("{} {level}.ply", files.join(" ")));
+        (rows_of(&work, &format!("{level}.ply")), psnr_of(&work, &format!("{level}.ply")))
     };
-    let giants = environment.map_or(0, |name| {
-        let meta: Value = serde_json::from_slice(&std::fs::read(sog.join(name)).unwrap()).unwrap();
-        meta["count"].as_u64().unwrap()
-    });
+    let giants = environment.map_or(0, |name| work.json(&format!("{sog}/{name}"))["count"].as_u64().unwrap());
     // Of a whole folder it takes the finest level.
-    let copy = folder.path().join("whole.ply");
-    let output = Command::new(&program).args(["-w", text(&sog.join("lod-meta.json")), text(&copy)]).output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
-    assert_eq!(Some(rows_of(&copy)), tree["counts"][0].as_u64());
-    let whole = psnr_of(&out.join("point_cloud.ply"), &scene);
-    let levels: Vec<(u64, f64)> = (0..4).map(convert).collect();
+    convert(&work, &program, &format!("{sog}/lod-meta.json whole.ply"));
+    assert_eq!(Some(rows_of(&work, "whole.ply")), tree["counts"][0].as_u64());
+    let whole = psnr_of(&work, "run/point_cloud.ply");
+    let levels: Vec<(u64, f64)> = (0..4).map(level).collect();
     for (level, (rows, _)) in levels.iter().enumerate() {
         assert_eq!(Some(rows - giants), tree["counts"][level].as_u64());
     }

@@ -2,18 +2,16 @@
 //! and keeps its last commit; corrupted bytes are reported by name and never used.
 
 use crate::support::faulty_engine::{Fault, Faults, FaultyEngine, Operation};
-use crate::support::scenes::{classic, stderr, summary, text, train};
+use crate::support::scenes::{stderr, text};
 use crate::support::small_drive::Small;
+use crate::support::workdir::{Workdir, says};
 use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::checkpoint::run_state::{Origin, RunIdentity};
-use gsscale::config::choice::{Chosen, Device};
 use gsscale::config::facts::{Resolved, write_config};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::{RunOptions, simd_path};
-use gsscale::config::values::Up;
 use gsscale::dataset::loader::Dataset;
-use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::optim::method::Method;
 use gsscale::page::engine::open::{IoEngine, open_engine};
@@ -25,7 +23,6 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
-use gsscale::schedule::order::Order;
 use gsscale::train::commits::checkpoint::Checkpoint;
 use gsscale::train::commits::save::save;
 use gsscale::train::error::TrainError;
@@ -37,59 +34,23 @@ use gsscale::train::start::first_scene::Start;
 use gsscale::train::start::first_scene::dataset_print;
 use gsscale::train::start::tiers::commit_options;
 use gsscale::train::state::trainer::Trainer;
-use std::io::{ErrorKind, Read, Write};
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
-use tempfile::TempDir;
+use std::io::ErrorKind;
+use std::path::Path;
 
 const PAGE_ROWS: u32 = 32;
 /// Steps before the first commit, after which faults begin.
 const FIRST_STEPS: u32 = 16;
 
-fn config(spill: &Path) -> TrainConfig {
-    TrainConfig {
-        steps: 60,
-        page_rows: PAGE_ROWS,
-        grow_grad2d: 0.001,
-        refine_start: 20,
-        refine_every: 10,
-        reset_every: 25,
-        sh_every: 15,
-        view_order: Chosen(Some(Order::Groups(4))),
-        log_every: 7,
-        test_every: 24,
-        device: Device::Cpu,
-        spill_dir: text(spill).into(),
-        spill_codec: Chosen(Some(Codec::Raw)),
-        commit_every: CommitEvery::Seconds(0.05),
-        up: Up::Keep,
-        ..TrainConfig::default()
-    }
-}
+const CONFIG: &str = r#"steps = 60, page-rows = 32, grow-grad2d = 0.001, refine-start = 20, refine-every = 10, reset-every = 25,
+    sh-every = 15, view-order = "groups:4", log-every = 7, test-every = 24, device = "cpu", spill-codec = "raw", up = "keep""#;
 
-fn make_scene(folder: &Path) -> PathBuf {
-    let scene = folder.join("scene");
-    let (views, width, height, points) = (24, 64, 48, 6000);
-    let city = CityOptions {
-        seed: 5,
-        views,
-        width,
-        height,
-        points,
-        blocks: Some(20),
-        supersample: 1,
-        ..CityOptions::default()
-    };
-    write_city(&scene, &city, &|_, _| {}).unwrap();
-    scene
+fn make_scene() -> Workdir {
+    Workdir::city_of(24, [64, 48], 6000, 20)
 }
 
 /// One scene, the result of a healthy run of it, and the most pages of a step.
 struct World {
-    folder: TempDir,
-    scene: PathBuf,
+    work: Workdir,
     want: Vec<u8>,
     fewest: usize,
     /// Frames of the faulty runs.
@@ -101,23 +62,14 @@ struct World {
     optimizer: Method,
 }
 
-/// The end of a run on a faulty drive.
-struct Life {
-    result: Result<(), TrainError>,
-    out: PathBuf,
-}
-
 impl World {
     fn new() -> World {
         World::of(Method::Deferred)
     }
 
     fn of(optimizer: Method) -> World {
-        let folder = TempDir::new().unwrap();
-        let scene = make_scene(folder.path());
         let mut world = World {
-            folder,
-            scene,
+            work: make_scene(),
             want: Vec::new(),
             fewest: usize::MAX,
             frames: usize::MAX,
@@ -126,29 +78,42 @@ impl World {
             disk_full_wait: 30.0,
             optimizer,
         };
-        let life = world.live("healthy", &Faults::new(), |_| {});
-        life.result.unwrap();
-        world.want = std::fs::read(Trainer::ply_path(&life.out)).unwrap();
-        let pinned = std::fs::read_to_string(life.out.join("pinned")).unwrap();
-        world.fewest = pinned.parse().unwrap();
+        world.live("healthy", &Faults::new(), |_| {}).unwrap();
+        world.want = world.work.ply("healthy");
+        world.fewest = world.work.text("healthy/pinned").parse().unwrap();
         world.frames = world.fewest + 20;
         world
     }
 
-    /// Trains with the engine behind `faults`; `plan` adds rules after the first commit.
-    fn live(&self, name: &str, faults: &Faults, plan: impl FnOnce(&Faults)) -> Life {
-        let out = self.folder.path().join(name);
+    /// Trains into `name` with the engine behind `faults`; `plan` adds rules after the first commit.
+    fn live(&self, name: &str, faults: &Faults, plan: impl FnOnce(&Faults)) -> Result<(), TrainError> {
+        let out = self.work.path(name);
         std::fs::create_dir(&out).unwrap();
-        let result = self.train_in(&out, faults, plan);
-        Life { result, out }
+        self.train_in(&out, faults, plan)
+    }
+
+    /// A drive that is full for some operations from the one `after` the first commit on costs no bit.
+    fn is_the_same_on_a_full_drive(&self, on: Operation, after: u64, calls: u64) {
+        let (name, faults) = (format!("full-{on:?}-{after}-{calls}"), Faults::new());
+        let life = self.live(&name, &faults, |faults| {
+            let first = faults.count(on) + after;
+            (first..first + calls).for_each(|n| faults.add(on, n, false, Fault::Error(ErrorKind::StorageFull)));
+        });
+        life.unwrap_or_else(|error| panic!("{name}: {error}"));
+        assert!(faults.count(on) > after, "{name}: nothing failed");
+        assert!(self.work.ply(&name) == self.want, "{name}: the scene is another");
     }
 
     fn train_in(&self, out: &Path, faults: &Faults, plan: impl FnOnce(&Faults)) -> Result<(), TrainError> {
         let spill_dir = out.join("spill");
-        let commit_every = CommitEvery::Seconds(self.commit_every);
-        let disk_full_wait = self.disk_full_wait;
-        let config = TrainConfig { optimizer: self.optimizer, commit_every, disk_full_wait, ..config(&spill_dir) };
-        let start = Start::read(&self.scene, &config, None)?;
+        let config = TrainConfig {
+            optimizer: self.optimizer,
+            commit_every: CommitEvery::Seconds(self.commit_every),
+            disk_full_wait: self.disk_full_wait,
+            spill_dir: text(&spill_dir).into(),
+            ..TrainConfig::parse(&CONFIG.replace(',', "\n")).unwrap()
+        };
+        let start = Start::read(&self.work.scene(), &config, None)?;
         let print = dataset_print(&start).unwrap();
         let sh_degree_start = start.sh_degree_start;
         let options = RunOptions { sh_degree_start, ..RunOptions::new(&config, start.dataset.scene_scale) };
@@ -170,7 +135,7 @@ impl World {
         let resolved = Resolved {
             version: String::new(),
             run: RunId::UNKNOWN,
-            scene: self.scene.clone(),
+            scene: self.work.scene(),
             simd: simd_path(&config).name().to_string(),
             threads: 1,
             device: trainer.renderer.device(),
@@ -254,36 +219,33 @@ impl World {
         );
     }
 
-    /// Resumes the run in `out` with the real program on a healthy drive, and compares its bytes.
-    fn goes_on(&self, out: &Path, what: &str) {
-        let output = train(&["--resume", text(out), "--frames", &(self.fewest + 30).to_string(), "--quiet"]);
-        assert!(output.status.success(), "{what}: {}", stderr(&output));
-        assert!(std::fs::read(Trainer::ply_path(out)).unwrap() == self.want, "{what}: the scene is another");
+    /// Resumes a run with the real program on a healthy drive, and compares its bytes.
+    fn goes_on(&self, name: &str) {
+        self.work.train(&format!("--resume {name} --quiet --frames {}", self.fewest + 30));
+        assert!(self.work.ply(name) == self.want, "{name}: the scene is another");
     }
 }
 
 #[test]
 fn a_full_drive_is_waited_for_and_changes_no_bit() {
     let world = World::new();
-    let full = Fault::Error(ErrorKind::StorageFull);
-    for (i, (on, after, calls)) in [
-        (Operation::Write, 0, 1),
-        (Operation::Write, 37, 4),
-        (Operation::Write, 150, 40),
-        (Operation::Write, 301, 2),
-        (Operation::Create, 0, 3),
-    ]
-    .into_iter()
-    .enumerate()
-    {
-        let faults = Faults::new();
-        let life = world.live(&format!("full-{i}"), &faults, |faults| {
-            let first = faults.count(on) + after;
-            (first..first + calls).for_each(|n| faults.add(on, n, false, full));
-        });
-        life.result.unwrap_or_else(|error| panic!("case {i}: {error}"));
-        assert!(faults.count(on) > after, "case {i}: nothing failed");
-        assert!(std::fs::read(Trainer::ply_path(&life.out)).unwrap() == world.want, "case {i}: the scene is another");
+    for (after, calls) in [(0, 1), (37, 4), (150, 40), (301, 2)] {
+        world.is_the_same_on_a_full_drive(Operation::Write, after, calls);
+    }
+    world.is_the_same_on_a_full_drive(Operation::Create, 0, 3);
+}
+
+/// The whole run is in memory: where its results have room, a drive that stays full for commits costs these and nothing else. So it is
+/// where steps change more rows after those of their view.
+#[test]
+fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
+    for optimizer in [Method::Deferred, Method::Dense] {
+        let mut world = World::of(optimizer);
+        (world.fewest, world.frames, world.is_optional) = (usize::MAX, usize::MAX, true);
+        world.disk_full_wait = 0.2;
+        for (after, calls) in [(0, 100_000), (37, 30)] {
+            world.is_the_same_on_a_full_drive(Operation::Write, after, calls);
+        }
     }
 }
 
@@ -303,19 +265,19 @@ fn a_drive_that_fails_ends_the_run_and_its_last_commit_stands() {
         (Operation::Read, 33, Fault::Torn),
     ];
     for (i, (on, after, fault)) in cases.into_iter().enumerate() {
-        let life = world.live(&format!("broken-{i}"), &Faults::new(), |faults| {
+        let name = format!("broken-{i}");
+        let life = world.live(&name, &Faults::new(), |faults| {
             faults.add(on, faults.count(on) + after, true, fault);
         });
-        let error = life.result.expect_err("the drive fails for ever").to_string();
+        let error = life.expect_err("the drive fails for ever").to_string();
         let names = match (on, fault) {
             (Operation::Write, _) => ["writing page", "check the drive"],
             (Operation::Read, Fault::FlipBit(_) | Fault::Torn) => ["is damaged", "seg-"],
             (Operation::Read, _) => ["cannot be read", "seg-"],
             _ => ["could not make writes durable", "check the drive"],
         };
-        assert!(names.iter().all(|name| error.contains(name)), "case {i}: {error}");
-        assert!(error.contains("remedy"), "case {i}: {error}");
-        world.goes_on(&life.out, &format!("case {i}"));
+        assert!(names.iter().chain(&["remedy"]).all(|name| error.contains(name)), "case {i}: {error}");
+        world.goes_on(&name);
     }
 }
 
@@ -326,12 +288,12 @@ fn a_drive_that_fails_in_either_pass_loses_one_step_at_most() {
     (world.frames, world.commit_every) = (world.fewest / 3, 1e-9);
     // Whether the steps were torn.
     let case = |on: Operation, i: u64| {
-        let name = format!("passes-{}-{i}", if on == Operation::Read { "read" } else { "write" });
+        let name = format!("passes-{on:?}-{i}");
         let life = world.live(&name, &Faults::new(), |faults| {
             faults.add(on, faults.count(on) + 5 + 61 * (i % 7) + 9 * (i / 7), true, Fault::Error(ErrorKind::Other));
         });
-        let error = life.result.expect_err("the drive fails for ever");
-        world.goes_on(&life.out, &name);
+        let error = life.expect_err("the drive fails for ever");
+        world.goes_on(&name);
         matches!(error, TrainError::Torn { .. })
     };
     // Which pass the fault meets is a matter of timing: some two of seven reads are those of the pass out. So there are more
@@ -354,8 +316,8 @@ fn transient_io_errors_do_not_change_results() {
         (0..16).for_each(|i| faults.add(Operation::Read, reads + 5 + 150 * i, false, ways[i as usize % 4]));
         faults.reorder(3);
     });
-    life.result.unwrap();
-    assert!(std::fs::read(Trainer::ply_path(&life.out)).unwrap() == world.want);
+    life.unwrap();
+    assert!(world.work.ply("once") == world.want);
 }
 
 /// A drive that silently flips a bit of a page or writes half of it.
@@ -363,247 +325,116 @@ fn transient_io_errors_do_not_change_results() {
 fn a_page_that_is_not_what_was_written_is_named_and_never_used() {
     let world = World::new();
     for (i, fault) in [Fault::FlipBit(60_000), Fault::Torn, Fault::Lost].into_iter().enumerate() {
-        let life = world.live(&format!("decay-{i}"), &Faults::new(), |faults| {
+        let name = format!("decay-{i}");
+        let life = world.live(&name, &Faults::new(), |faults| {
             let first = faults.count(Operation::Write);
             (first..first + 400).for_each(|n| faults.add(Operation::Write, n, false, fault));
         });
-        let error = life.result.expect_err("damaged pages are read again").to_string();
+        let error = life.expect_err("damaged pages are read again").to_string();
         assert!(["is damaged", "page ", "generation", "seg-", "remedy"].iter().all(|w| error.contains(w)), "{error}");
-        assert!(!Trainer::ply_path(&life.out).exists(), "nothing is exported from damaged pages");
+        assert!(!world.work.exists(&format!("{name}/point_cloud.ply")), "nothing is exported from damaged pages");
     }
 }
 
-fn args<'a>(scene: &'a Path, out: &'a Path, spill: &'a Path) -> Vec<&'a str> {
-    let mut args = vec![text(scene), "--out", text(out), "--spill-dir", text(spill), "--spill-codec", "raw"];
-    args.extend(["--steps", "60", "--page-rows", "32", "--refine-start", "1000", "--max-gaussians", "7000"]);
-    args.extend(["--view-order", "groups:4", "--test-every", "24", "--device", "cpu", "--log-every", "7"]);
-    args.extend(classic(&args));
-    args
-}
+/// Flags of runs through the program.
+const FLAGS: &str = "scene --spill-codec raw --steps 60 --page-rows 32 --refine-start 1000 --max-gaussians 7000 --view-order groups:4 \
+    --test-every 24 --device cpu --log-every 7";
+const TO_SPILL: &str = "--out out --spill-dir spill";
+/// With a drive in `drive`.
+const TO_DRIVE: &str = "--out out --spill-dir drive/spill --commit-every 0.02";
 
 /// A drive with room for the pages once, but not for the versions of two commits.
-fn small_drive(folder: &Path) -> Option<Small> {
+fn small_drive(work: &Workdir) -> Option<Small> {
     let capacity = capacity_bytes(32, 3);
     // Pages of up to 7,000 rows, filled to 70 percent.
     let segment = SlotLayout::new(capacity, 7000 / 22 + 1).segment_bytes();
-    Small::mount(folder, segment + segment / 2 + (4 << 20))
+    Small::mount(&work.path("drive"), segment + segment / 2 + (4 << 20))
 }
 
 /// The space needed is known before the first write; pages written by the import count once.
 #[test]
 fn a_drive_is_refused_only_if_it_is_too_small_and_at_once() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let Some(drive) = small_drive(&folder.path().join("drive")) else { return };
-    let (out, spill) = (folder.path().join("out"), drive.0.join("spill"));
+    let work = make_scene();
+    let Some(drive) = small_drive(&work) else { return };
     // The import writes the pages beyond the frames: more than the drive has free afterwards.
-    let mut few = args(&scene, &out, &spill);
-    let steps = few.iter().position(|arg| *arg == "60").unwrap();
-    few[steps] = "2";
-    few.extend(["--frames", "200"]);
-    let output = train(&few);
-    assert!(output.status.success(), "{}", stderr(&output));
+    let few = format!("{FLAGS} --out out --spill-dir drive/spill --steps 2 --frames 200");
+    work.train(&few);
     drive.resize(4 << 20);
-    let output = train(&[&few[..], &["--overwrite"]].concat());
-    let said = stderr(&output);
-    assert!(!output.status.success() && said.contains("the drive has") && said.contains("free space on it"), "{said}");
-    assert!(!spill.exists() && Trainer::ply_path(&out).exists(), "it took something away or left something behind");
+    work.refuses(&format!("{few} --overwrite"), &["the drive has", "free space on it"]);
+    let is_kept = !work.exists("drive/spill") && work.exists("out/point_cloud.ply");
+    assert!(is_kept, "it took something away or left something behind");
 }
 
 #[test]
 fn a_really_full_drive_pauses_the_run_until_there_is_space() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
-    let elsewhere = folder.path().join("elsewhere");
-    let output = train(&[&args(&scene, &alone, &elsewhere)[..], &["--quiet"]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let Some(drive) = small_drive(&folder.path().join("drive")) else { return };
-    let spill = drive.0.join("spill");
-    let more = ["--commit-every", "0.02", "--disk-full-wait", "120"];
-    let mut child = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
-        .args([&args(&scene, &out, &spill)[..], &more].concat())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let said = Arc::new(Mutex::new(String::new()));
-    let (mut pipe, into) = (child.stderr.take().unwrap(), Arc::clone(&said));
-    let reader = std::thread::spawn(move || {
-        let mut bytes = [0; 4096];
-        while let Ok(n @ 1..) = pipe.read(&mut bytes) {
-            into.lock().unwrap().push_str(&String::from_utf8_lossy(&bytes[..n]));
-        }
-    });
-    let (began, mut was_paused) = (Instant::now(), false);
-    while !was_paused && child.try_wait().unwrap().is_none() && began.elapsed() < Duration::from_secs(300) {
-        was_paused = said.lock().unwrap().contains("paused:");
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    let before = said.lock().unwrap().clone();
-    assert!(was_paused, "{before}");
-    std::thread::sleep(Duration::from_millis(300));
-    assert!(child.try_wait().unwrap().is_none(), "it waits");
+    let work = make_scene();
+    let Some(drive) = small_drive(&work) else { return };
+    work.train(&format!("{FLAGS} --out alone --quiet"));
+    let mut run = work.begin(&format!("{FLAGS} {TO_DRIVE} --disk-full-wait 120"));
+    run.says("paused:");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    assert!(run.child.try_wait().unwrap().is_none(), "it waits");
     drive.resize(200 << 20);
-    let status = child.wait().unwrap();
-    reader.join().unwrap();
-    let said = said.lock().unwrap().clone();
-    assert!(status.success(), "{said}");
-    for words in ["No space", "needs", "free", "--disk-full-wait", "training goes on"] {
-        assert!(said.contains(words), "{words} in: {said}");
-    }
-    let ply = |out: &Path| std::fs::read(Trainer::ply_path(out)).unwrap();
-    assert!(ply(&out) == ply(&alone), "waiting changed the scene");
-    assert!(summary(&out)["commits"].as_u64().unwrap() > 1 && summary(&out)["commit_interval"] == 0.02);
-}
-
-/// The whole run is in memory: where its results have room, a drive that stays full for commits costs these and nothing else.
-#[test]
-fn a_run_in_memory_goes_on_when_the_drive_of_its_commits_is_full() {
-    loses_commits_alone(World::new());
-}
-
-/// Its steps change more rows after those of their view.
-#[test]
-fn so_does_a_run_in_memory_that_updates_every_row() {
-    loses_commits_alone(World::of(Method::Dense));
-}
-
-fn loses_commits_alone(mut world: World) {
-    (world.fewest, world.frames, world.is_optional) = (usize::MAX, usize::MAX, true);
-    world.disk_full_wait = 0.2;
-    for (i, (on, after, calls)) in [(Operation::Write, 0, 100_000), (Operation::Write, 37, 30)].into_iter().enumerate()
-    {
-        let faults = Faults::new();
-        let life = world.live(&format!("memory-{i}"), &faults, |faults| {
-            let first = faults.count(on) + after;
-            (first..first + calls).for_each(|n| faults.add(on, n, false, Fault::Error(ErrorKind::StorageFull)));
-        });
-        life.result.unwrap_or_else(|error| panic!("case {i}: {error}"));
-        assert!(faults.count(on) > after, "case {i}: nothing failed");
-        assert!(std::fs::read(Trainer::ply_path(&life.out)).unwrap() == world.want, "case {i}: the scene is another");
-    }
+    let said = run.ends(0);
+    says(&said, &["No space", "needs", "free", "--disk-full-wait", "training goes on"]);
+    assert!(work.ply("out") == work.ply("alone"), "waiting changed the scene");
+    assert!(work.count("out", "commits") > 1 && work.summary("out")["commit_interval"] == 0.02);
 }
 
 #[test]
 fn a_drive_that_stays_full_stops_the_run_which_can_go_on() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
-    let elsewhere = folder.path().join("elsewhere");
-    let output = train(&[&args(&scene, &alone, &elsewhere)[..], &["--quiet"]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let Some(drive) = small_drive(&folder.path().join("drive")) else { return };
-    let spill = drive.0.join("spill");
-    let more = ["--commit-every", "0.02", "--disk-full-wait", "0.2", "--quiet"];
-    let output = train(&[&args(&scene, &out, &spill)[..], &more].concat());
-    let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    for words in ["is full: it needs", "the commit after step", "remedy: free space", "gsscale-train --resume"] {
-        assert!(said.contains(words), "{words} in: {said}");
-    }
+    let work = make_scene();
+    let Some(drive) = small_drive(&work) else { return };
+    work.train(&format!("{FLAGS} --out alone --quiet"));
+    let words = ["is full: it needs", "the commit after step", "remedy: free space", "gsscale-train --resume"];
+    work.refuses(&format!("{FLAGS} {TO_DRIVE} --disk-full-wait 0.2 --quiet"), &words);
     drive.resize(200 << 20);
-    let output = train(&["--resume", text(&out), "--quiet"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let ply = |out: &Path| std::fs::read(Trainer::ply_path(out)).unwrap();
-    assert!(ply(&out) == ply(&alone), "the scene is another");
-}
-
-#[test]
-fn few_open_files_are_enough_and_when_commits_happen_changes_no_bit() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let plys: Vec<Vec<u8>> = [("auto", "64"), ("0", "1024"), ("0.01", "1024"), ("3600", "1024")]
-        .into_iter()
-        .map(|(every, files)| {
-            let (out, spill) = (folder.path().join(format!("out-{every}")), folder.path().join("spill"));
-            let more = ["--commit-every", every, "--quiet"];
-            let output = Command::new("sh")
-                .args(["-c", &format!("ulimit -n {files}; exec \"$0\" \"$@\""), env!("CARGO_BIN_EXE_gsscale-train")])
-                .args([&args(&scene, &out, &spill)[..], &more].concat())
-                .output()
-                .unwrap();
-            assert!(output.status.success(), "{every}: {}", stderr(&output));
-            std::fs::read(Trainer::ply_path(&out)).unwrap()
-        })
-        .collect();
-    assert!(plys.windows(2).all(|pair| pair[0] == pair[1]));
+    work.train("--resume out --quiet");
+    assert!(work.ply("out") == work.ply("alone"), "the scene is another");
 }
 
 /// The system sends a signal with its refusal; the process must not end without a message. The refusal counts as
 /// missing space.
 #[test]
 fn a_limit_on_the_size_of_files_is_an_error_that_names_the_file() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
-    let output = Command::new("sh")
-        .args(["-c", "ulimit -f 8000; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_gsscale-train")])
-        .args([&args(&scene, &out, &spill)[..], &["--commit-every", "0.02", "--disk-full-wait", "0.1"]].concat())
-        .output()
-        .unwrap();
+    let work = make_scene();
+    let flags = format!("{FLAGS} {TO_SPILL} --commit-every 0.02 --disk-full-wait 0.1");
+    let output = work.limited("-f 8000", &flags).output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(["paused:", "seg-", "File too large", "remedy"].iter().all(|word| said.contains(word)), "{said}");
-    assert!(Trainer::ply_path(&out).exists() && !spill.exists(), "what was trained is there, nothing was committed");
+    let is_there = work.exists("out/point_cloud.ply") && !work.exists("spill");
+    assert!(is_there, "what was trained is there, nothing was committed");
 }
 
 /// Files of `--save-every` are not needed to continue.
 #[test]
 fn a_drive_without_room_for_a_saved_ply_costs_that_file_alone() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let out = folder.path().join("out");
-    let output = Command::new("sh")
-        .args(["-c", "ulimit -f 1000; exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_gsscale-train")])
-        .args([text(&scene), "--out", text(&out), "--steps", "30", "--save-every", "10", "--commit-every", "0"])
-        .args(["--device", "cpu", "--test-every", "24", "--log-every", "7", "--quiet", "--disk-full-wait", "0.2"])
-        .output()
-        .unwrap();
-    let said = stderr(&output);
-    assert!(
-        said.contains("point_cloud_000010.ply is not written") && said.contains("point_cloud_000020.ply"),
-        "{said}"
-    );
-    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    assert!(metrics.lines().last().unwrap().starts_with("{\"step\":30,"), "all steps were done: {metrics}");
+    let work = make_scene();
+    let flags = "scene --out out --steps 30 --save-every 10 --commit-every 0 --device cpu --test-every 24 --log-every 7 --quiet \
+        --disk-full-wait 0.2 --schedule run-length --strategy long-axis";
+    let said = stderr(&work.limited("-f 1000", flags).output().unwrap());
+    says(&said, &["point_cloud_000010.ply is not written", "point_cloud_000020.ply"]);
+    assert_eq!(work.logged("out", "step").last(), Some(&30), "all steps were done");
 }
 
 /// The drive of the results is full and the drive of the pages is not: the run names and waits for the drive of the
 /// results.
 #[test]
 fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
-    let Some(drive) = Small::mount(&folder.path().join("results"), 4 << 20) else { return };
-    let (out, spill) = (drive.0.join("out"), folder.path().join("spill"));
-    let mut flags = args(&scene, &out, &spill);
-    flags.extend(["--commit-every", "0.02", "--disk-full-wait", "0.2", "--quiet"]);
-    for (usual, here) in [("7", "1"), ("60", "300")] {
-        let at = flags.iter().position(|arg| *arg == usual).unwrap();
-        flags[at] = here;
-    }
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    let command = command.args(&flags);
-    let child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-    let began = Instant::now();
-    let commits = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["commits"].as_u64();
-    let metrics = || std::fs::read_to_string(out.join("metrics.jsonl")).unwrap_or_default();
-    while !metrics().lines().filter_map(commits).any(|commits| commits > 0) {
-        assert!(began.elapsed() < Duration::from_secs(120), "the run does not commit");
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    let work = make_scene();
+    let Some(drive) = Small::mount(&work.path("results"), 4 << 20) else { return };
+    let more = "--log-every 1 --steps 300 --commit-every 0.02 --disk-full-wait 0.2 --quiet";
+    let run = work.begin(&format!("{FLAGS} --out results/out --spill-dir spill {more}"));
+    let run = run.once(|| work.has_committed("results/out"));
     // A drive that is full at the beginning is refused.
-    let mut other = std::fs::File::create(drive.0.join("other")).unwrap();
-    while other.write_all(&[0; 4096]).is_ok() {}
-    let output = child.wait_with_output().unwrap();
-    let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains(&format!("the drive of {} is full", out.display())), "{said}");
+    drive.fill(0);
+    let said = run.ends(1);
+    assert!(said.contains("the drive of results/out is full"), "{said}");
     assert!(!said.contains("the reserve is used up") && said.contains("--resume"), "{said}");
-    assert!(spill.join(RESERVE_NAME).exists());
+    assert!(work.exists("spill") && work.path("spill").join(RESERVE_NAME).exists());
     drive.resize(200 << 20);
-    let output = train(&["--resume", text(&out), "--quiet"]);
-    assert!(output.status.success(), "{}", stderr(&output));
+    work.train("--resume results/out --quiet");
 }
 
 /// Containers forbid io_uring with a seccomp filter; a child process inherits the filter of the thread that starts it.
@@ -612,19 +443,16 @@ fn a_full_drive_of_results_is_named_and_costs_no_reserve() {
 fn a_run_without_io_uring_says_so_and_trains() {
     use seccompiler::{BpfProgram, SeccompAction, SeccompFilter, apply_filter};
     const SETUP: i64 = 425;
-    let folder = TempDir::new().unwrap();
-    let scene = make_scene(folder.path());
+    let work = make_scene();
     let run = std::thread::spawn(move || {
         let rules = [(SETUP, Vec::new())].into_iter().collect();
         let machine = std::env::consts::ARCH.try_into().unwrap();
         let filter = SeccompFilter::new(rules, SeccompAction::Allow, SeccompAction::Errno(1), machine);
         let program: BpfProgram = filter.unwrap().try_into().unwrap();
         apply_filter(&program).unwrap();
-        let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
-        let output = train(&args(&scene, &out, &spill));
-        (stderr(&output), output.status.code(), summary(&out)["finished"].clone())
+        (work.train(&format!("{FLAGS} {TO_SPILL}")), work.summary("out")["finished"].clone())
     });
-    let (said, code, finished) = run.join().unwrap();
-    assert_eq!((code, finished), (Some(0), serde_json::Value::Bool(true)), "{said}");
+    let (said, finished) = run.join().unwrap();
+    assert_eq!(finished, serde_json::Value::Bool(true), "{said}");
     assert!(said.contains("io_uring is refused here") && said.contains("by pread"), "{said}");
 }

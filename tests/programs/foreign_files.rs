@@ -1,51 +1,49 @@
 //! Files that other programs wrote or saved again, through the real binaries: Gaussians without the comments that say their frame,
 //! config files in other encodings, and results where a scene is expected.
 
-use crate::support::scenes::{TextModel, city, eval, psnr, stderr, summary, text, train};
+use crate::support::scenes::{TextModel, stderr};
+use crate::support::workdir::{CKPT, EVAL, TRAIN, Workdir};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
 use gsscale::scene::columns::Columns;
-use std::path::{Path, PathBuf};
-use std::process::Command;
-use tempfile::TempDir;
+use serde_json::Value;
 
-fn run(scene: &Path, out: &Path, more: &[&str]) -> String {
-    let mut args = vec![text(scene), "--out", text(out), "--quiet", "--device", "cpu"];
-    args.extend(more);
-    let output = train(&args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    stderr(&output)
+fn run(work: &Workdir, out: &str, more: &str) -> String {
+    work.train(&format!("scene --out {out} --quiet --device cpu {more}"))
 }
 
-fn refused(program: &str, args: &[&str], words: &[&str]) {
-    let output = Command::new(program).args(args).output().unwrap();
-    let said = stderr(&output);
-    assert!(!output.status.success(), "{args:?}: {said}");
-    words.iter().for_each(|word| assert!(said.contains(word), "'{word}' is not in: {said}"));
-}
-
-fn ckpt(args: &[&str]) -> (serde_json::Value, String) {
-    let output = Command::new(env!("CARGO_BIN_EXE_gsscale-ckpt")).args(args).arg("--json").output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
+/// What a program that succeeds prints as JSON, and what it says.
+fn succeeds(work: &Workdir, program: &str, flags: &str) -> (Value, String) {
+    let output = work.output(program, flags);
+    assert!(output.status.success(), "{flags}: {}", stderr(&output));
     (serde_json::from_slice(&output.stdout).unwrap(), stderr(&output))
 }
 
+fn ckpt(work: &Workdir, flags: &str) -> (Value, String) {
+    succeeds(work, CKPT, &format!("{flags} --json"))
+}
+
+fn refused(work: &Workdir, program: &str, flags: &str, words: &[&str]) {
+    let output = work.output(program, flags);
+    let said = stderr(&output);
+    assert!(!output.status.success(), "{flags}: {said}");
+    words.iter().for_each(|word| assert!(said.contains(word), "{flags}: '{word}' is not in: {said}"));
+}
+
 /// Saves a PLY as editors do, without its comments.
-fn save_without_comments(from: &Path, to: &Path) {
-    let bytes = std::fs::read(from).unwrap();
+fn save_without_comments(work: &Workdir, from: &str, to: &str) {
+    let bytes = work.bytes(from);
     let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap();
     let header = std::str::from_utf8(&bytes[..end]).unwrap();
     let kept: String =
         header.lines().filter(|line| !line.starts_with("comment")).map(|line| format!("{line}\n")).collect();
-    std::fs::write(to, [kept.as_bytes(), &bytes[end..]].concat()).unwrap();
+    work.write(to, [kept.as_bytes(), &bytes[end..]].concat());
 }
 
 /// PSNR of a file on the held-out photos, and what was said.
-fn measured(file: &Path, scene: &Path) -> (f64, String) {
-    let output = eval(&[text(file), text(scene), "--device", "cpu"]);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let report: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    (report["test"]["psnr"].as_f64().unwrap(), stderr(&output))
+fn measured(work: &Workdir, file: &str) -> (f64, String) {
+    let (report, said) = succeeds(work, EVAL, &format!("{file} scene --device cpu"));
+    (report["test"]["psnr"].as_f64().unwrap(), said)
 }
 
 const NOT_FITTING: &str = "it does not fit the cameras";
@@ -54,91 +52,74 @@ const NOT_FITTING: &str = "it does not fit the cameras";
 /// store. Without that file a warning says that Gaussians and cameras do not fit.
 #[test]
 fn a_saved_ply_is_read_in_the_frame_of_the_file_beside_it() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 24, 96, 64, 1500);
-    let path = |name: &str| folder.path().join(name);
+    let work = Workdir::city(24, 96, 64, 1500);
     // In local coordinates and upright, so that origin, scale and axes differ.
-    let said = run(&scene, &path("run"), &["--steps", "40", "--export-frame", "local", "--export", "spz,sog"]);
+    let said = run(&work, "run", "--steps 40 --export-frame local --export spz,sog");
     assert!(!said.contains(NOT_FITTING), "{said}");
-    let ply = path("run/point_cloud.ply");
-    let (want, said) = measured(&ply, &scene);
+    let ply = "run/point_cloud.ply";
+    let (want, said) = measured(&work, ply);
     assert!(!said.contains(NOT_FITTING) && !said.contains("transform"), "{said}");
-    // Saved over the original, renamed beside the files of the run, and with the transform of a copy.
-    std::fs::create_dir_all(path("copy")).unwrap();
-    std::fs::copy(path("run/point_cloud.transform.json"), path("copy/any.transform.json")).unwrap();
-    let saved = [path("run/cleaned.ply"), path("copy/any.ply"), path("copy/renamed.PLY"), ply.clone()];
-    saved.iter().rev().skip(1).chain([&ply]).for_each(|to| save_without_comments(&ply, to));
-    for file in &saved {
-        let (got, said) = measured(file, &scene);
-        assert!((got - want).abs() < 1e-3, "{}: {got} instead of {want}", file.display());
+    // Renamed beside the files of the run, with the transform of a copy, and saved over the original.
+    std::fs::create_dir_all(work.path("copy")).unwrap();
+    work.write("copy/any.transform.json", work.bytes("run/point_cloud.transform.json"));
+    for file in ["run/cleaned.ply", "copy/any.ply", "copy/renamed.PLY", ply] {
+        save_without_comments(&work, ply, file);
+        let (got, said) = measured(&work, file);
+        assert!((got - want).abs() < 1e-3, "{file}: {got} instead of {want}");
         assert!(said.contains("transform.json beside it") && !said.contains(NOT_FITTING), "{said}");
     }
     // A new run from it, in memory and in pages, and from a store of it.
-    let one = ["--steps", "1", "--means-lr", "1e-9", "--init-ply"];
-    let (_, said) = ckpt(&["import", text(&saved[0]), "--out", text(&path("store"))]);
+    let one = "--overwrite --steps 1 --means-lr 1e-9 --init-ply";
+    let (_, said) = ckpt(&work, "import run/cleaned.ply --out store");
     assert!(said.contains("transform.json beside it"), "{said}");
-    let spill = path("spill");
-    for (from, more) in [(&saved[0], &[][..]), (&saved[2], &["--spill-dir", text(&spill)]), (&path("store"), &[])] {
-        let said = run(&scene, &path("again"), &[&one[..], &[text(from), "--overwrite"], more].concat());
+    for from in ["run/cleaned.ply", "copy/renamed.PLY --spill-dir spill", "store"] {
+        let said = run(&work, "again", &format!("{one} {from}"));
         assert!(!said.contains(NOT_FITTING), "{said}");
-        let got = psnr(&path("again"));
-        assert!((got - want).abs() < 0.3, "{}: {got} instead of {want}", from.display());
+        let got = work.psnr("again");
+        assert!((got - want).abs() < 0.3, "{from}: {got} instead of {want}");
     }
     // Nothing beside it.
-    let bare = path("bare.ply");
-    save_without_comments(&ply, &bare);
-    let (got, said) = measured(&bare, &scene);
+    save_without_comments(&work, ply, "bare.ply");
+    let (got, said) = measured(&work, "bare.ply");
     assert!(got < want - 0.5 && said.contains(NOT_FITTING), "{got} of {want}: {said}");
-    ckpt(&["import", text(&bare), "--out", text(&path("bare_store"))]);
-    for from in [&bare, &path("bare_store")] {
-        let said = run(&scene, &path("wrong"), &[&one[..], &[text(from), "--overwrite"]].concat());
+    ckpt(&work, "import bare.ply --out bare_store");
+    for from in ["bare.ply", "bare_store"] {
+        let said = run(&work, "wrong", &format!("{one} {from}"));
         assert!(said.contains(NOT_FITTING), "{said}");
     }
     // A transform that is none is named.
-    std::fs::write(path("bare.transform.json"), "{\"file_to_dataset\": [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}")
-        .unwrap();
-    refused(
-        env!("CARGO_BIN_EXE_gsscale-eval"),
-        &[text(&bare), text(&scene)],
-        &["bare.transform.json", "file_to_dataset", "remedy"],
-    );
+    work.write("bare.transform.json", "{\"file_to_dataset\": [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}");
+    refused(&work, EVAL, "bare.ply scene", &["bare.transform.json", "file_to_dataset", "remedy"]);
     // The list of exports wrote both, and the report says so.
-    let summary = summary(&path("run"));
-    assert_eq!(summary["export"]["file"], "point_cloud.spz");
-    assert_eq!(summary["more_exports"][0]["file"], "point_cloud_sog/lod-meta.json");
-    let report = std::fs::read_to_string(path("run/report.html")).unwrap();
-    assert!(report.contains("point_cloud.spz: ") && report.contains("point_cloud_sog/lod-meta.json: "));
-    assert!(path("run/point_cloud.spz").is_file() && path("run/point_cloud_sog/lod-meta.json").is_file());
-    results_in_the_place_of_a_scene(&path("run"), &scene);
+    let (summary, report) = (work.summary("run"), work.text("run/report.html"));
+    let files = [&summary["export"]["file"], &summary["more_exports"][0]["file"]];
+    assert_eq!(files, ["point_cloud.spz", "point_cloud_sog/lod-meta.json"]);
+    for file in files.map(|file| file.as_str().unwrap()) {
+        assert!(report.contains(&format!("{file}: ")) && work.path("run").join(file).is_file(), "{file}");
+    }
+    results_in_the_place_of_a_scene(&work);
 }
 
-fn results_in_the_place_of_a_scene(run: &Path, scene: &Path) {
-    let (train, eval, ckpt) =
-        (env!("CARGO_BIN_EXE_gsscale-train"), env!("CARGO_BIN_EXE_gsscale-eval"), env!("CARGO_BIN_EXE_gsscale-ckpt"));
-    refused(train, &[text(run)], &["output folder of a run", "--resume", "gsscale-eval"]);
-    refused(train, &[text(&run.join("point_cloud.ply"))], &["not a scene", "gsscale-eval", "--init-ply"]);
-    refused(train, &[text(&run.join("point_cloud_sog/lod-meta.json"))], &["not a scene", "gsscale-eval"]);
+fn results_in_the_place_of_a_scene(work: &Workdir) {
+    refused(work, TRAIN, "run", &["output folder of a run", "--resume", "gsscale-eval"]);
+    refused(work, TRAIN, "run/point_cloud.ply", &["not a scene", "gsscale-eval", "--init-ply"]);
+    refused(work, TRAIN, "run/point_cloud_sog/lod-meta.json", &["not a scene", "gsscale-eval"]);
     for ending in ["splat", "ksplat", "spz", "sog", "SPLAT"] {
-        let file = run.join(format!("x.{ending}"));
-        std::fs::write(&file, [7; 64]).unwrap();
+        let file = format!("run/x.{ending}");
+        work.write(&file, [7; 64]);
         let words = &["splat-transform", "x.ply", "remedy"];
-        refused(eval, &[text(&file), text(scene)], words);
-        refused(train, &[text(scene), "--init-ply", text(&file)], words);
-        refused(ckpt, &["import", text(&file), "--out", text(&run.join("store"))], words);
-        refused(train, &[text(&file)], &["not a scene", "splat-transform"]);
+        refused(work, EVAL, &format!("{file} scene"), words);
+        refused(work, TRAIN, &format!("scene --init-ply {file}"), words);
+        refused(work, CKPT, &format!("import {file} --out run/store"), words);
+        refused(work, TRAIN, &file, &["not a scene", "splat-transform"]);
     }
-    refused(
-        train,
-        &[text(scene), "--init-ply", text(&run.join("point_cloud_sog/lod-meta.json"))],
-        &["splat-transform"],
-    );
+    refused(work, TRAIN, "scene --init-ply run/point_cloud_sog/lod-meta.json", &["splat-transform"]);
 }
 
 /// A file does not state how large its scene is: the size follows from its rows, so that few of them count as giants.
 #[test]
 fn giants_of_an_imported_file_are_those_of_its_rows() {
-    let folder = TempDir::new().unwrap();
-    let path = |name: &str| folder.path().join(name);
+    let work = Workdir::new();
     let mut rows = Columns::zeros(500, 0);
     for row in 0..500 {
         let at = row as f32;
@@ -146,14 +127,14 @@ fn giants_of_an_imported_file_are_those_of_its_rows() {
         rows.scales[3 * row..3 * row + 3].fill(if row % 100 == 0 { 900.0f32 } else { 2.0 }.ln());
         rows.quats[4 * row] = 1.0;
     }
-    write_gaussians(&path("a.ply"), &rows, &SceneMeta::default()).unwrap();
-    ckpt(&["import", text(&path("a.ply")), "--out", text(&path("store"))]);
-    let (done, _) = ckpt(&["export", text(&path("store")), "--out", text(&path("sog/lod-meta.json"))]);
+    write_gaussians(&work.path("a.ply"), &rows, &SceneMeta::default()).unwrap();
+    ckpt(&work, "import a.ply --out store");
+    let (done, _) = ckpt(&work, "export store --out sog/lod-meta.json");
     assert_eq!((done["always_shown"].as_u64(), done["levels"][0].as_u64()), (Some(5), Some(495)), "{done}");
     // The values are those of the file.
-    ckpt(&["export", text(&path("store")), "--out", text(&path("b.ply"))]);
+    ckpt(&work, "export store --out b.ply");
     let rows_of = |name: &str| {
-        let bytes = std::fs::read(path(name)).unwrap();
+        let bytes = work.bytes(name);
         let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap();
         let mut rows: Vec<Vec<u8>> = bytes[end + 11..].chunks(17 * 4).map(<[u8]>::to_vec).collect();
         rows.sort();
@@ -165,37 +146,31 @@ fn giants_of_an_imported_file_are_those_of_its_rows() {
 /// Editors of Windows save text with a byte order mark or as UTF-16.
 #[test]
 fn config_files_and_models_in_other_encodings_train() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 12, 96, 64, 400);
-    let mut model = TextModel::of(&scene);
+    let work = Workdir::city(12, 96, 64, 400);
+    let mut model = TextModel::of(&work.scene());
     // The model has the name in Windows-1252, the drive in UTF-8.
-    let first = model.views[0].name.clone();
-    std::fs::rename(scene.join("images").join(&first), scene.join("images/Gemäuer.jpg")).unwrap();
+    std::fs::rename(&work.photos()[0], work.path("scene/images/Gemäuer.jpg")).unwrap();
     model.views[0].name = "Gem@uer.jpg".to_string();
-    model.write(&scene);
-    let images = scene.join("sparse/0/images.txt");
-    let bytes = std::fs::read(&images).unwrap().into_iter().map(|byte| if byte == b'@' { 0xe4 } else { byte });
-    std::fs::write(&images, bytes.collect::<Vec<u8>>()).unwrap();
-    let cameras = scene.join("sparse/0/cameras.txt");
+    model.write(&work.scene());
+    let [images, cameras] = ["images", "cameras"].map(|name| format!("scene/sparse/0/{name}.txt"));
+    let bytes = work.bytes(&images).into_iter().map(|byte| if byte == b'@' { 0xe4 } else { byte });
+    work.write(&images, bytes.collect::<Vec<u8>>());
     let utf_16 =
         |text: &str| [&b"\xff\xfe"[..], &text.encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<u8>>()].concat();
-    std::fs::write(&cameras, utf_16(&std::fs::read_to_string(&cameras).unwrap())).unwrap();
-    let config: PathBuf = folder.path().join("run.toml");
+    work.write(&cameras, utf_16(&work.text(&cameras)));
     let keys = "# Größe\nsteps = 3\nexport = [\"spz\", \"sog\"]\n";
     for bytes in [
         utf_16(keys),
         [b"\xef\xbb\xbf", keys.as_bytes()].concat(),
         keys.replace("öß", "@").replace('@', "o").into_bytes(),
     ] {
-        std::fs::write(&config, bytes).unwrap();
-        let out = folder.path().join("out");
-        let said = run(&scene, &out, &["--config", text(&config), "--overwrite"]);
+        work.write("run.toml", bytes);
+        let said = run(&work, "out", "--config run.toml --overwrite");
         assert!(said.contains("1 name(s) are not UTF-8") && said.contains("Gem\\xE4uer.jpg is Gemäuer.jpg"), "{said}");
-        assert_eq!(summary(&out)["steps"].as_u64(), Some(3));
-        assert!(out.join("point_cloud.spz").is_file() && out.join("point_cloud_sog").is_dir());
+        assert_eq!(work.count("out", "steps"), 3);
+        assert!(work.exists("out/point_cloud.spz") && work.path("out/point_cloud_sog").is_dir());
     }
-    std::fs::write(&config, b"steps = 3\nimages = \"Geb\xe4ude\"\n").unwrap();
-    let words = ["line 2", "Geb\\xE4ude", "UTF-8"];
-    refused(env!("CARGO_BIN_EXE_gsscale-train"), &[text(&scene), "--config", text(&config)], &words);
-    refused(env!("CARGO_BIN_EXE_gsscale-train"), &[text(&scene), "--export", "spz,splat"], &["ply, spz or sog"]);
+    work.write("run.toml", b"steps = 3\nimages = \"Geb\xe4ude\"\n");
+    refused(&work, TRAIN, "scene --config run.toml", &["line 2", "Geb\\xE4ude", "UTF-8"]);
+    refused(&work, TRAIN, "scene --export spz,splat", &["ply, spz or sog"]);
 }

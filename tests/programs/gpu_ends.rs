@@ -3,11 +3,11 @@
 
 use super::gpu_flights::{Bench, Span, recorded_behind, same};
 use crate::support::scenes::stderr;
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use crate::support::workdir::{Running, TRAIN};
+use std::process::Command;
 
 /// A run whose pages are newer in their slots than in frames and on the drive, most of the time.
-const SELDOM: &[&str] = &["--commit-every", "0.5"];
+const SELDOM: &str = "--commit-every 0.5";
 
 /// Steps at which a run has another step in flight, and at the next step too.
 fn in_flight(spans: &[Span]) -> Vec<u64> {
@@ -25,28 +25,14 @@ fn a_run_that_is_killed_with_steps_in_flight_ends_with_the_same_bytes() {
     let part = |tenths: usize| steps[steps.len() * tenths / 10] as usize;
     let begin = |mut run: Command| {
         // Most of the time of a step passes while it is in flight.
-        run.env("GSSCALE_EMULATE_BUS", "200MB/s,300us").stderr(Stdio::null()).spawn().unwrap()
+        Running::spawn(&bench, run.env("GSSCALE_EMULATE_BUS", "200MB/s,300us"))
     };
-    let resume = || {
-        let mut run = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-        run.arg("--resume").arg(bench.path("killed.out")).args(["--quiet", "--keep-checkpoint"]);
-        run
-    };
-    let metrics = bench.path("killed.out").join("metrics.jsonl");
-    let lines = || std::fs::read_to_string(&metrics).unwrap_or_default().lines().count();
-    let mut child = begin(bench.command("killed", SELDOM));
-    let mut kills = 0;
+    let mut run = begin(bench.command_of("killed", SELDOM));
     for step in [part(2), part(5), part(8)] {
-        let began = Instant::now();
-        while lines() <= step && child.try_wait().unwrap().is_none() {
-            assert!(began.elapsed() < Duration::from_secs(180), "no step in three minutes");
-            std::thread::sleep(Duration::from_millis(2));
-        }
-        child.kill().unwrap();
-        kills += usize::from(!child.wait().unwrap().success());
-        child = begin(resume());
+        assert!(run.after_lines("killed.out", step).kill(), "the run ended before step {step}");
+        run = begin(bench.command(TRAIN, "--resume killed.out --quiet --keep-checkpoint"));
     }
-    assert!(child.wait().unwrap().success() && kills == 3, "{kills} kills");
+    run.ends(0);
     same(&bench.result("killed"), &want, "killed");
 }
 
@@ -83,7 +69,7 @@ fn a_device_that_is_lost_with_steps_in_flight_loses_the_steps_since_the_last_com
             break;
         }
         let name = format!("lost{at}");
-        let mut run = bench.command(&name, &[SELDOM, &["--restarts", "9"]].concat());
+        let mut run = bench.command_of(&name, &format!("{SELDOM} --restarts 9"));
         let output = run.env("GSSCALE_GPU_FAULT", format!("lost@{at}")).output().unwrap();
         let said = stderr(&output);
         assert!(output.status.success() && said.contains("(restart 1 of at most 9)"), "{said}");

@@ -2,51 +2,27 @@
 //! in flight, whatever goes wrong with a step, and what a trace shows of them.
 
 use crate::support::gpu;
-use crate::support::scenes::{classic, stderr, summary, text, wide_city};
+use crate::support::scenes::stderr;
+use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::gpu::GpuOptions;
 use gsscale::page::format::slot_header::checksum;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
+use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fmt::Write;
-use std::path::PathBuf;
+use std::ops::Deref;
 use std::process::Command;
-use tempfile::TempDir;
 
 /// Two rounds, a reset and raises within 90 steps, with stretches between them.
-const RUN: &[&str] = &[
-    "--device",
-    "gpu",
-    "--optimizer-on",
-    "device",
-    "--steps",
-    "90",
-    "--refine-start",
-    "9",
-    "--refine-every",
-    "30",
-    "--grow-grad2d",
-    "0.0005",
-    "--reset-every",
-    "60",
-    "--sh-every",
-    "50",
-    "--max-gaussians",
-    "7000",
-    "--page-rows",
-    "32",
-    "--view-order",
-    "groups:4",
-    "--log-every",
-    "1",
-    "--quiet",
-];
+const RUN: &str = "scene --device gpu --optimizer-on device --steps 90 --refine-start 9 --refine-every 30 --grow-grad2d 0.0005 \
+    --reset-every 60 --sh-every 50 --max-gaussians 7000 --page-rows 32 --view-order groups:4 --log-every 1 --quiet --keep-checkpoint";
 
 /// Events of a trace: name, beginning and end in microseconds, the step that the host was at, and the values of an event.
 pub(super) struct Span {
     pub name: String,
     pub began: f64,
     pub step: u64,
-    pub args: serde_json::Value,
+    pub args: Value,
 }
 
 /// What a run left behind.
@@ -59,38 +35,32 @@ pub(super) struct Result {
 }
 
 /// A scene, and the runs on it.
-pub(super) struct Bench {
-    folder: TempDir,
-    pub scene: PathBuf,
+pub(super) struct Bench(Workdir);
+
+impl Deref for Bench {
+    type Target = Workdir;
+
+    fn deref(&self) -> &Workdir {
+        &self.0
+    }
 }
 
 impl Bench {
     /// `None` without a device.
     pub fn new() -> Option<Bench> {
         gpu::open(&GpuOptions::default())?;
-        let folder = TempDir::new().unwrap();
-        let scene = wide_city(folder.path(), 6000);
-        Some(Bench { folder, scene })
+        Some(Bench(Workdir::wide_city(6000)))
     }
 
-    pub fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
+    /// A run with these flags, after which the store is kept.
+    pub fn command_of(&self, name: &str, more: &str) -> Command {
+        let places = format!("--out {name}.out --spill-dir {name}.spill --trace {name}.trace");
+        self.command(TRAIN, &format!("{RUN} {places} {more}"))
     }
 
-    /// A run with these arguments, after which the store is kept.
-    pub fn command(&self, name: &str, more: &[&str]) -> Command {
-        let [out, spill, trace] = ["out", "spill", "trace"].map(|part| self.path(&format!("{name}.{part}")));
-        let of_run = [text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill), "--trace", text(&trace)];
-        let mut run = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-        // Flags with their values; the last one has none.
-        let others = RUN.chunks(2).filter(|flag| !more.contains(&flag[0])).flatten();
-        run.args(of_run).arg("--keep-checkpoint").args(others).args(classic(more)).args(more);
-        run
-    }
-
-    /// Runs with these arguments and with at most `in_flight` steps in flight. Whether the run was finished.
-    pub fn run(&self, name: &str, in_flight: &str, faults: &str, more: &[&str]) -> bool {
-        let mut run = self.command(name, more);
+    /// Runs with these flags and with at most `in_flight` steps in flight. Whether the run was finished.
+    pub fn run(&self, name: &str, in_flight: &str, faults: &str, more: &str) -> bool {
+        let mut run = self.command_of(name, more);
         run.env("GSSCALE_STEPS_IN_FLIGHT", in_flight).env("GSSCALE_STEP_FAULT", faults);
         let output = run.output().unwrap();
         let is_done = output.status.success();
@@ -99,28 +69,29 @@ impl Bench {
     }
 
     /// The lines of `metrics.jsonl`.
-    pub fn metrics(&self, name: &str) -> Vec<serde_json::Value> {
-        let lines = std::fs::read_to_string(self.path(&format!("{name}.out")).join("metrics.jsonl")).unwrap();
-        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+    pub fn metrics(&self, name: &str) -> Vec<Value> {
+        self.0.metrics(&format!("{name}.out"))
+    }
+
+    /// A number about the slots, at the end of each step.
+    pub fn slots(&self, name: &str, key: &str) -> Vec<u64> {
+        self.metrics(name).iter().map(|line| line["slots"][key].as_u64().unwrap()).collect()
     }
 
     pub fn result(&self, name: &str) -> Result {
-        let out = self.path(&format!("{name}.out"));
         let losses = self.metrics(name).iter().map(|line| line["loss"].to_string()).collect();
-        let store =
-            StoreReader::open(&self.path(&format!("{name}.spill")), Access::Pages, WitnessRule::Obeyed).unwrap();
+        let spill = self.path(&format!("{name}.spill"));
+        let store = StoreReader::open(&spill, Access::Pages, WitnessRule::Obeyed).unwrap();
         let (mut reader, mut pages) = (store.slot_reader(), BTreeMap::new());
         for (page, slot, label) in store.live_versions().unwrap() {
             pages.insert(page.to_bits(), (label.to_vec(), checksum(reader.payload(page, &slot).unwrap())));
         }
-        let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
-        Result { ply, losses, pages }
+        Result { ply: self.ply(&format!("{name}.out")), losses, pages }
     }
 
     pub fn spans(&self, name: &str) -> Vec<Span> {
-        let trace: Vec<serde_json::Value> =
-            serde_json::from_slice(&std::fs::read(self.path(&format!("{name}.trace"))).unwrap()).unwrap();
-        let span = |event: &serde_json::Value| {
+        let trace = self.json(&format!("{name}.trace"));
+        let span = |event: &Value| {
             Some(Span {
                 name: event["name"].as_str()?.to_string(),
                 began: event["ts"].as_f64()?,
@@ -128,7 +99,7 @@ impl Bench {
                 args: event["args"].clone(),
             })
         };
-        trace.iter().filter_map(span).collect()
+        trace.as_array().unwrap().iter().filter_map(span).collect()
     }
 }
 
@@ -153,35 +124,36 @@ fn recorded_ahead(spans: &[Span]) -> usize {
 #[test]
 fn steps_in_flight_change_no_byte() {
     let Some(bench) = Bench::new() else { return };
-    bench.run("waits", "0", "", &[]);
+    bench.run("waits", "0", "", "");
     let want = bench.result("waits");
     assert_eq!(recorded_ahead(&bench.spans("waits")), 0);
-    let frames = summary(&bench.path("waits.out"))["pages_pinned_max"].as_u64().unwrap();
-    let [frames, many] = [frames, 2 * frames].map(|frames| frames.to_string());
-    // Steps in flight, further flags, and the fewest steps that are recorded behind another one.
-    let cases: &[(&str, &[&str], usize)] = &[
-        ("1", &["--threads", "2"], 0),
-        ("2", &["--threads", "1"], 25),
-        ("2", &["--device-mem", "8MiB", "--frames", &many], 10),
-        ("2", &["--device-mem", "5MiB", "--frames", &frames, "--commit-every", "0.05"], 0),
-        ("2", &["--eval-every", "7", "--save-every", "11", "--commit-every", "0.01"], 5),
-    ];
-    for (i, (in_flight, more, least)) in cases.iter().enumerate() {
+    let frames = bench.count("waits.out", "pages_pinned_max");
+    // Steps in flight, further flags, device memory, and the fewest steps that are recorded behind another one.
+    for (i, (in_flight, more, mebibytes, least)) in [
+        ("1", "--threads 2".to_string(), None, 0),
+        ("2", "--threads 1".to_string(), None, 25),
+        ("2", format!("--frames {}", 2 * frames), Some(8), 10),
+        ("2", format!("--frames {frames} --commit-every 0.05"), Some(5), 0),
+        ("2", "--eval-every 7 --save-every 11 --commit-every 0.01".to_string(), None, 5),
+    ]
+    .into_iter()
+    .enumerate()
+    {
         let name = format!("case{i}");
-        assert!(bench.run(&name, in_flight, "", more));
+        let limit = mebibytes.map_or(String::new(), |mebibytes| format!("--device-mem {mebibytes}MiB"));
+        assert!(bench.run(&name, in_flight, "", &format!("{more} {limit}")));
         let mut got = bench.result(&name);
-        if more.contains(&"--save-every") {
+        if more.contains("--save-every") {
             // The store has the pages of the saved steps as well.
             got.pages = want.pages.clone();
         }
-        same(&got, &want, &format!("{more:?}"));
+        same(&got, &want, &more);
         let ahead = recorded_ahead(&bench.spans(&name));
-        println!("{in_flight} in flight, {more:?}: {ahead} of 90 steps were recorded behind another one");
-        assert!(ahead >= *least, "{more:?}: {ahead} of 90 steps were recorded behind another one");
-        if let Some(at) = more.iter().position(|flag| *flag == "--device-mem") {
-            let most = u64::from(more[at + 1].trim_end_matches("MiB").parse::<u32>().unwrap()) << 20;
+        println!("{in_flight} in flight, {more}: {ahead} of 90 steps were recorded behind another one");
+        assert!(ahead >= least, "{more}: {ahead} of 90 steps were recorded behind another one");
+        if let Some(mebibytes) = mebibytes {
             let peak = bench.metrics(&name).last().unwrap()["device_bytes_peak"].as_u64().unwrap();
-            assert!(peak <= most, "{more:?}: {peak} bytes of device memory");
+            assert!(peak <= mebibytes << 20, "{more}: {peak} bytes of device memory");
         }
     }
 }
@@ -190,7 +162,7 @@ fn steps_in_flight_change_no_byte() {
 #[test]
 fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it() {
     let Some(bench) = Bench::new() else { return };
-    bench.run("sound", "2", "", &[]);
+    bench.run("sound", "2", "", "");
     let (want, spans) = (bench.result("sound"), bench.spans("sound"));
     // Those that are finished while another one is in flight, and the others.
     let finished = |behind: bool| {
@@ -207,7 +179,7 @@ fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it()
     write!(faults, "closed@{},rows@{}", with_other[1], with_other[1] + 1).unwrap();
     for in_flight in ["1", "2"] {
         let name = format!("faults{in_flight}");
-        assert!(bench.run(&name, in_flight, &faults, &[]));
+        assert!(bench.run(&name, in_flight, &faults, ""));
         same(&bench.result(&name), &want, &faults);
         let spans = bench.spans(&name);
         let given_up = |behind: u64| {
@@ -221,23 +193,20 @@ fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it()
 #[test]
 fn views_whose_loss_is_not_finite_are_skipped_however_many_steps_are_in_flight() {
     let Some(bench) = Bench::new() else { return };
-    bench.run("first", "0", "", &["--steps", "1", "--sh-degree", "0"]);
-    let bytes = std::fs::read(bench.path("first.out").join("point_cloud.ply")).unwrap();
+    bench.run("first", "0", "", "--steps 1 --sh-degree 0");
+    let bytes = bench.ply("first.out");
     let head = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
     let names = String::from_utf8_lossy(&bytes[..head]).into_owned();
     let fields: Vec<&str> = names.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
     let at = 4 * fields.iter().position(|field| *field == "f_dc_0").unwrap();
-    let row = 4 * fields.len();
-    for (brightness, bright_rows) in [(1e20f32, 1), (1e30, 1)] {
-        let (ply, mut bytes) = (bench.path("bright.ply"), bytes.clone());
-        for i in 0..bright_rows {
-            bytes[head + i * row + at..][..4].copy_from_slice(&brightness.to_le_bytes());
-        }
-        std::fs::write(&ply, bytes).unwrap();
+    for brightness in [1e20f32, 1e30] {
+        let mut bytes = bytes.clone();
+        bytes[head + at..][..4].copy_from_slice(&brightness.to_le_bytes());
+        bench.write("bright.ply", bytes);
         let of_run = |in_flight: &str| {
             let name = format!("bright{brightness:e}-{in_flight}");
-            let is_done = bench.run(&name, in_flight, "", &["--init-ply", text(&ply), "--view-order", "shuffle"]);
-            let summary = summary(&bench.path(&format!("{name}.out")));
+            let is_done = bench.run(&name, in_flight, "", "--init-ply bright.ply --view-order shuffle");
+            let summary = bench.summary(&format!("{name}.out"));
             let counts =
                 ["steps", "steps_skipped_non_finite", "rows_skipped_non_finite"].map(|key| summary[key].to_string());
             (bench.result(&name), counts, is_done)
@@ -256,8 +225,7 @@ fn views_whose_loss_is_not_finite_are_skipped_however_many_steps_are_in_flight()
 #[test]
 fn the_next_step_is_submitted_before_this_one_is_waited_for() {
     let Some(bench) = Bench::new() else { return };
-    let more = ["--strategy", "none", "--sh-every", "0", "--view-order", "shuffle"];
-    assert!(bench.run("steady", "2", "", &more));
+    assert!(bench.run("steady", "2", "", "--strategy none --sh-every 0 --view-order shuffle"));
     let spans = bench.spans("steady");
     let mut both = 0;
     for step in 0..89 {
@@ -301,11 +269,10 @@ fn took_payloads_up(spans: &[Span], step: u64) -> Option<bool> {
 #[test]
 fn views_of_several_batches_take_payloads_of_the_next_step_up_ahead() {
     let Some(bench) = Bench::new() else { return };
-    let shuffled = ["--view-order", "shuffle"];
-    assert!(bench.run("whole", "2", "", &shuffled));
+    assert!(bench.run("whole", "2", "", "--view-order shuffle"));
     let want = bench.result("whole");
     for device_mem in ["3MiB", "2500KiB"] {
-        assert!(bench.run(device_mem, "2", "", &[&shuffled[..], &["--device-mem", device_mem]].concat()));
+        assert!(bench.run(device_mem, "2", "", &format!("--view-order shuffle --device-mem {device_mem}")));
         same(&bench.result(device_mem), &want, device_mem);
         let spans = bench.spans(device_mem);
         // The last step has no next one.

@@ -2,11 +2,11 @@
 //! take their time, that neither changes a byte of the result, and what is refused.
 
 use crate::support::gpu;
-use crate::support::scenes::{city, classic, stderr, text, train, wide_city};
+use crate::support::scenes::stderr;
+use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::gpu::GpuOptions;
-use std::path::Path;
-use std::process::{Command, Output};
-use tempfile::TempDir;
+use serde_json::Value;
+use std::process::Output;
 
 /// A span of a trace; times in microseconds.
 #[derive(Debug, serde::Deserialize)]
@@ -14,7 +14,7 @@ struct Span {
     name: String,
     ts: f64,
     dur: f64,
-    args: serde_json::Value,
+    args: Value,
 }
 
 impl Span {
@@ -23,14 +23,13 @@ impl Span {
     }
 }
 
-fn spans(path: &Path) -> Vec<Span> {
-    serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap()
+fn spans(work: &Workdir, trace: &str) -> Vec<Span> {
+    serde_json::from_slice(&work.bytes(trace)).unwrap()
 }
 
 /// A run on an emulated bus.
-fn on_bus(bus: &str, args: &[&str]) -> Output {
-    let program = env!("CARGO_BIN_EXE_gsscale-train");
-    Command::new(program).args(args).args(classic(args)).env("GSSCALE_EMULATE_BUS", bus).output().unwrap()
+fn on_bus(work: &Workdir, bus: &str, flags: &str) -> Output {
+    work.command(TRAIN, flags).env("GSSCALE_EMULATE_BUS", bus).output().unwrap()
 }
 
 #[test]
@@ -38,20 +37,14 @@ fn an_emulated_bus_takes_its_time_and_changes_no_byte() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 6, 64, 48, 600);
+    let work = Workdir::city(6, 64, 48, 600);
     for place in ["host", "device"] {
-        let of = |name: &str| folder.path().join(format!("{name}-{place}"));
-        let (plain, slow, trace) = (of("plain"), of("slow"), of("trace"));
-        let args = ["--steps", "12", "--device", "gpu", "--optimizer-on", place, "--quiet"];
-        let output = train(&[&[text(&scene), "--out", text(&plain)], &args[..]].concat());
+        let flags = format!("scene --overwrite --steps 12 --device gpu --optimizer-on {place} --quiet");
+        work.train(&format!("{flags} --out plain"));
+        let output = on_bus(&work, "100MB/s,300us", &format!("{flags} --out slow --trace trace"));
         assert!(output.status.success(), "{}", stderr(&output));
-        let with_trace = [&[text(&scene), "--out", text(&slow), "--trace", text(&trace)], &args[..]].concat();
-        let output = on_bus("100MB/s,300us", &with_trace);
-        assert!(output.status.success(), "{}", stderr(&output));
-        let [plain, slow] = [plain, slow].map(|out| std::fs::read(out.join("point_cloud.ply")).unwrap());
-        assert!(plain == slow, "{place}: a slow bus gives another scene");
-        let spans = spans(&trace);
+        assert!(work.ply("plain") == work.ply("slow"), "{place}: a slow bus gives another scene");
+        let spans = spans(&work, "trace");
         for span in spans.iter().filter(|span| ["upload", "read back"].contains(&span.name.as_str())) {
             // A hundred bytes take a microsecond. Times have three decimals.
             let least = 300.0 + span.of("bytes") as f64 / 100.0;
@@ -72,19 +65,14 @@ fn payloads_of_the_next_step_go_up_before_the_gradients_of_this_one_are_waited_f
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = wide_city(folder.path(), 6000);
-    let [whole, few, trace] = ["whole", "few", "trace"].map(|name| folder.path().join(name));
-    let args = ["--steps", "60", "--strategy", "none", "--sh-every", "0", "--log-every", "1", "--device", "gpu"];
-    let of_pages = ["--optimizer-on", "device", "--page-rows", "32", "--view-order", "shuffle", "--quiet"];
-    let output = train(&[&[text(&scene), "--out", text(&whole)], &args[..], &of_pages[..]].concat());
+    let work = Workdir::wide_city(6000);
+    let flags = "scene --steps 60 --strategy none --sh-every 0 --log-every 1 --device gpu --optimizer-on device --page-rows 32 \
+        --view-order shuffle --quiet";
+    work.train(&format!("{flags} --out whole"));
+    let output = on_bus(&work, "1GB/s,20us", &format!("{flags} --out few --trace trace --device-mem 5MiB"));
     assert!(output.status.success(), "{}", stderr(&output));
-    let of_few = [text(&scene), "--out", text(&few), "--trace", text(&trace), "--device-mem", "5MiB"];
-    let output = on_bus("1GB/s,20us", &[&of_few[..], &args[..], &of_pages[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let [ply, other] = [&whole, &few].map(|out| std::fs::read(out.join("point_cloud.ply")).unwrap());
-    assert!(ply == other, "copies ahead give another scene");
-    let spans = spans(&trace);
+    assert!(work.ply("whole") == work.ply("few"), "copies ahead give another scene");
+    let spans = spans(&work, "trace");
     // Before its first step a run draws some views to measure them.
     let of_step = |step: u64, name: &str, what: &str| {
         let began = spans.iter().find(|span| span.name == "step" && span.of("step") == step).unwrap().ts;
@@ -110,41 +98,29 @@ fn payloads_of_the_next_step_go_up_before_the_gradients_of_this_one_are_waited_f
             "step {step}: payloads go up at {up} us, gradients are there at {first} us"
         );
     }
-    let lines = std::fs::read_to_string(few.join("metrics.jsonl")).unwrap();
-    let last: serde_json::Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
-    let [all, before] = ["loads", "loads_ahead"].map(|key| last["slots"][key].as_u64().unwrap());
+    let last = |out: &str, key: &str| work.metrics(out).last().unwrap()["slots"][key].as_u64().unwrap();
+    let [all, before] = ["loads", "loads_ahead"].map(|key| last("few", key));
     println!("{before} of {all} payloads went up a step ahead, in {ahead} of 59 steps");
     // By the plan, although no page leaves host memory: a run whose pages do leave it has one anyway.
-    let (out, spill) = (folder.path().join("planned"), folder.path().join("spill"));
-    let of_spill = [text(&scene), "--out", text(&out), "--spill-dir", text(&spill), "--device-mem", "5MiB"];
-    let output = train(&[&of_spill[..], &args[..], &of_pages[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let lines = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    let last: serde_json::Value = serde_json::from_str(lines.lines().last().unwrap()).unwrap();
-    let planned = last["slots"]["loads"].as_u64().unwrap();
+    work.train(&format!("{flags} --out planned --spill-dir spill --device-mem 5MiB"));
+    let planned = last("planned", "loads");
     assert!(10 * all <= 11 * planned, "{all} payloads went up, {planned} with a plan");
     assert!(ahead > 20 && 2 * before > all, "{before} of {all} payloads went up a step ahead, in {ahead} of 59 steps");
 }
 
 #[test]
 fn a_bus_or_a_trace_that_cannot_be_is_refused_with_a_remedy() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 6, 64, 48, 100);
-    let out = folder.path().join("out");
-    let args = [text(&scene), "--out", text(&out), "--steps", "3", "--quiet"];
-    let output =
-        train(&[&args[..], &["--device", "cpu", "--trace", text(&folder.path().join("none/trace.json"))]].concat());
-    let said = stderr(&output);
-    assert!(!output.status.success() && said.contains("trace.json") && said.contains("check the path"), "{said}");
-    assert!(!out.exists());
+    let work = Workdir::city(6, 64, 48, 100);
+    let flags = "scene --out out --steps 3 --quiet";
+    work.refuses(&format!("{flags} --device cpu --trace none/trace.json"), &["trace.json", "check the path"]);
+    assert!(!work.exists("out"));
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
     for bus in ["12GB/s", "fast,20us", "12GB/s,20", ""] {
-        let output = on_bus(bus, &[&args[..], &["--device", "gpu"]].concat());
+        let output = on_bus(&work, bus, &format!("{flags} --device gpu"));
         let said = stderr(&output);
-        let names = said.contains("GSSCALE_EMULATE_BUS") && said.contains("GSSCALE_EMULATE_BUS=12GB/s,20us");
-        assert!(!output.status.success() && names, "{bus:?}: {said}");
-        assert!(!out.exists());
+        assert!(!output.status.success() && said.contains("GSSCALE_EMULATE_BUS=12GB/s,20us"), "{bus:?}: {said}");
+        assert!(!work.exists("out"));
     }
 }

@@ -2,7 +2,8 @@
 //! choice of device with its reason.
 
 use crate::support::gpu;
-use crate::support::scenes::{city, classic, eval, psnr, stderr, summary, text, told, train, wide_city};
+use crate::support::scenes::{stderr, told};
+use crate::support::workdir::{EVAL, TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::photo::decode;
@@ -22,44 +23,30 @@ use gsscale::train::step::pages::PagedScene;
 use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 use std::path::Path;
-use std::process::Command;
-use tempfile::TempDir;
 
-const SHORT: &[&str] = &["--steps", "60", "--strategy", "none", "--sh-every", "20", "--log-every", "1"];
+const SHORT: &str = "--steps 60 --strategy none --sh-every 20 --log-every 1";
 
-fn run(scene: &Path, out: &Path, more: &[&str]) -> String {
-    let args = [&[text(scene), "--out", text(out)], SHORT, more].concat();
-    let output = train(&args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    stderr(&output)
-}
-
-/// metrics.jsonl of a run.
-fn metrics(out: &Path) -> Vec<serde_json::Value> {
-    let lines = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+fn run(work: &Workdir, out: &str, more: &str) -> String {
+    work.train(&format!("scene --out {out} {SHORT} {more}"))
 }
 
 #[test]
 fn a_gpu_trains_as_the_cpu_does() {
     let Some(device) = gpu::open(&GpuOptions::default()) else { return };
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 16, 128, 96, 1200);
-    let [on_cpu, on_gpu] = ["cpu", "gpu"].map(|name| folder.path().join(name));
-    run(&scene, &on_cpu, &["--device", "cpu"]);
-    let said = run(&scene, &on_gpu, &["--device", "gpu"]);
+    let work = Workdir::city(16, 128, 96, 1200);
+    run(&work, "cpu", "--device cpu");
+    let said = run(&work, "gpu", "--device gpu");
     // Plans fold at 80 columns.
     let words = said.split_whitespace().collect::<Vec<_>>().join(" ");
     assert!(words.contains(&device.summary().name), "{said}");
-    let resolved = std::fs::read_to_string(on_gpu.join("config.toml")).unwrap();
+    let resolved = work.text("gpu/config.toml");
     assert!(resolved.contains(&device.summary().name), "{resolved}");
     // Rounding differences grow with every step, in both directions. Growth would multiply them: `gpu_quality`.
-    let (want, got) = (psnr(&on_cpu), psnr(&on_gpu));
+    let (want, got) = (work.psnr("cpu"), work.psnr("gpu"));
     println!("test PSNR after 60 steps: {want:.3} dB on the CPU, {got:.3} dB on the GPU");
     assert!((want - got).abs() < 0.05, "{got} dB, on the CPU {want} dB");
-    let lines = metrics(&on_gpu);
-    assert!(want > metrics(&on_cpu)[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
-    for line in &lines {
+    assert!(want > work.metrics("cpu")[0]["psnr"].as_f64().unwrap() + 1.0, "60 steps are training");
+    for line in work.metrics("gpu") {
         for key in ["bytes_uploaded", "bytes_read_back", "device_bytes_peak"] {
             assert!(line[key].as_u64().unwrap() > 0, "{key}: {line}");
         }
@@ -68,46 +55,16 @@ fn a_gpu_trains_as_the_cpu_does() {
         let most = 1200 * (59 * 4 + 16) + 128 * 96 * 4 + (64 << 10);
         assert!(line["bytes_uploaded"].as_u64().unwrap() < most && line["bytes_read_back"].as_u64().unwrap() < most);
     }
-    for line in metrics(&on_cpu) {
+    for line in work.metrics("cpu") {
         assert_eq!((&line["bytes_uploaded"], &line["device_bytes_peak"]), (&0.into(), &0.into()));
     }
     // The same command gives the same file.
-    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    for (name, device, first) in [("again", "gpu", &on_gpu), ("again on the CPU", "cpu", &on_cpu)] {
-        let again = folder.path().join(name);
-        run(&scene, &again, &["--device", device]);
-        assert!(ply(first) == ply(&again), "two runs of the same command differ: {name}");
+    for device in ["gpu", "cpu"] {
+        run(&work, "again", &format!("--overwrite --device {device}"));
+        assert!(work.ply(device) == work.ply("again"), "two runs of the same command differ: {device}");
     }
     // The PLY alone gives the run's metrics, on the device that its config names.
-    let report = eval(&[text(&on_gpu), text(&scene)]);
-    assert!(report.status.success(), "{}", stderr(&report));
-}
-
-#[test]
-fn pages_from_a_drive_train_the_same_scene_on_a_gpu() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
-    let folder = TempDir::new().unwrap();
-    let scene = wide_city(folder.path(), 6_000);
-    let [in_memory, paged, spill] = ["memory", "paged", "spill"].map(|name| folder.path().join(name));
-    let grow = |out: &Path, more: &[&str]| {
-        let growing = ["--steps", "60", "--refine-start", "20", "--refine-every", "15", "--grow-grad2d", "0.001"];
-        let paths = [text(&scene), "--out", text(out), "--device", "gpu", "--page-rows", "32"];
-        let output = train(&[&paths[..], &growing, more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-    };
-    grow(&in_memory, &[]);
-    let whole = summary(&in_memory);
-    let frames = whole["pages_pinned_max"].as_u64().unwrap();
-    assert!(frames < whole["pages"].as_u64().unwrap() / 2, "a view sees too much");
-    let frames = frames.to_string();
-    grow(&paged, &["--frames", &frames, "--spill-dir", text(&spill)]);
-    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(ply(&in_memory) == ply(&paged), "pages from the drive give another scene");
-    let traffic = summary(&paged);
-    assert!(traffic["pages_read"].as_u64().unwrap() > 0 && traffic["evictions"].as_u64().unwrap() > 0, "{traffic}");
-    assert_ne!(traffic["gaussians"], 6_000, "no round changed anything");
+    work.json_of(EVAL, "gpu scene");
 }
 
 #[test]
@@ -115,77 +72,30 @@ fn little_device_memory_trains_the_same_scene() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 128, 96, 400);
-    let [plenty, little, none] = ["plenty", "little", "none"].map(|name| folder.path().join(name));
-    run(&scene, &plenty, &["--device", "gpu"]);
-    run(&scene, &little, &["--device", "gpu", "--device-mem", "1500KiB"]);
-    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(ply(&plenty) == ply(&little), "a budget of device memory gives another scene");
-    let peak = |out: &Path| metrics(out).last().unwrap()["device_bytes_peak"].as_u64().unwrap();
-    assert!(peak(&little) <= 1500 << 10 && peak(&plenty) > 4 << 20, "{} {}", peak(&little), peak(&plenty));
+    let work = Workdir::city(8, 128, 96, 400);
+    run(&work, "plenty", "--device gpu");
+    run(&work, "little", "--device gpu --device-mem 1500KiB");
+    assert!(work.ply("plenty") == work.ply("little"), "a budget of device memory gives another scene");
+    let [plenty, little] = ["plenty", "little"].map(|out| *work.logged(out, "device_bytes_peak").last().unwrap());
+    assert!(little <= 1500 << 10 && plenty > 4 << 20, "{little} {plenty}");
     // The pictures alone need more than 200 KiB.
-    let args = [&[text(&scene), "--out", text(&none), "--device", "gpu", "--device-mem", "200KiB"], SHORT].concat();
-    let output = train(&args);
-    let said = stderr(&output);
-    assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("--device-mem: 200 KiB is not enough") && said.contains("give at least"), "{said}");
-    assert!(!none.join("point_cloud.ply").exists(), "nothing was trained");
+    let flags = format!("scene --out none {SHORT} --device gpu --device-mem 200KiB");
+    let said = work.refuses(&flags, &["--device-mem: 200 KiB is not enough", "give at least"]);
+    assert!(!work.exists("none/point_cloud.ply"), "nothing was trained");
     // The least that the message names is enough.
     let (_, least) = said.split_once("give at least ").unwrap();
     let least = least.split_once(',').unwrap().0.replace(' ', "");
-    run(&scene, &none, &["--device", "gpu", "--device-mem", &least]);
-    assert!(ply(&plenty) == ply(&none), "{least} give another scene");
-}
-
-#[test]
-fn a_run_that_outgrows_its_device_memory_gives_the_same_scene() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 128, 96, 1200);
-    let growing = ["--steps", "60", "--refine-start", "9", "--refine-every", "10", "--grow-grad2d", "0"];
-    let [plenty, little] = ["plenty", "little"].map(|name| folder.path().join(name));
-    let grow = |out: &Path, more: &[&str]| {
-        let args = [&[text(&scene), "--out", text(out), "--device", "gpu", "--max-gaussians", "9000"], &growing[..]];
-        let output = train(&[&args.concat()[..], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-    };
-    grow(&plenty, &[]);
-    let whole = metrics(&plenty);
-    let [first, last] = [whole.first(), whole.last()].map(|line| line.unwrap()["device_bytes_peak"].as_u64().unwrap());
-    println!("{first} bytes of device memory at first, {last} at last");
-    let budget = (last / 2).to_string();
-    grow(&little, &["--device-mem", &budget]);
-    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(ply(&plenty) == ply(&little), "a budget of device memory gives another scene");
-    assert!(summary(&little)["gaussians"].as_u64().unwrap() > 2400, "the scene did not grow");
+    run(&work, "none", &format!("--device gpu --device-mem {least}"));
+    assert!(work.ply("plenty") == work.ply("none"), "{least} give another scene");
 }
 
 /// Runs the real binary with a device fault in mid-run (see `GSSCALE_GPU_FAULT`), under a limit of the address space if
 /// one is given, KiB. Asserts that the error names the stage, that the exit code is not 0, and that the last good step
 /// is written. Returns the error's line.
-fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, address_space: Option<u64>) -> String {
-    let limit = address_space.map_or(String::new(), |kib| format!("ulimit -v {kib} && "));
-    let output = Command::new("sh")
-        .args(["-c", &format!("{limit}exec \"$@\""), "sh", env!("CARGO_BIN_EXE_gsscale-train")])
-        .args([
-            text(scene),
-            "--out",
-            text(out),
-            "--device",
-            "gpu",
-            "--steps",
-            "200",
-            "--strategy",
-            "none",
-            "--restarts",
-            "0",
-        ])
-        .env("GSSCALE_GPU_FAULT", fault)
-        .output()
-        .unwrap();
+fn assert_ends_with_last_good_step(work: &Workdir, fault: &str, address_space: Option<u64>) -> String {
+    let limit = address_space.map_or("-v unlimited".to_string(), |kib| format!("-v {kib}"));
+    let flags = "scene --out out --overwrite --device gpu --steps 200 --strategy none --restarts 0";
+    let output = work.limited(&limit, flags).env("GSSCALE_GPU_FAULT", fault).output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{fault}: {said}");
     let line = said.lines().rev().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{fault}: {said}"));
@@ -193,10 +103,10 @@ fn assert_ends_with_last_good_step(scene: &Path, out: &Path, fault: &str, addres
     let stage = line.split(": ").nth(2).unwrap_or_default();
     let is_stage = STAGES.iter().any(|s| s.name == stage) || ["forward", "backward"].contains(&stage);
     assert!(is_stage, "{fault}: {line}");
-    let summary = summary(out);
+    let summary = work.summary("out");
     let steps = summary["steps"].as_u64().unwrap();
     assert!(summary["finished"] == false && steps > 10 && steps < 100, "{fault}: {summary}");
-    let ply = std::fs::read(out.join("point_cloud.ply")).unwrap();
+    let ply = work.ply("out");
     assert!(ply.starts_with(b"ply") && ply.len() > 300 * 59 * 4, "{fault}: {} bytes", ply.len());
     line.to_string()
 }
@@ -206,12 +116,11 @@ fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 300);
+    let work = Workdir::city(8, 64, 48, 300);
     let cases = [("lost", "the device was lost"), ("validation", "refused the work"), ("memory", "out of memory")];
     for (kind, expected) in cases {
         // Five submissions a step; the memory estimate renders some views before the first.
-        let line = assert_ends_with_last_good_step(&scene, &folder.path().join(kind), &format!("{kind}@150"), None);
+        let line = assert_ends_with_last_good_step(&work, &format!("{kind}@150"), None);
         assert!(line.contains(expected), "{kind}: {line}");
     }
 }
@@ -222,30 +131,19 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 300);
-    let [alone, lost, spill] = ["alone", "lost", "spill"].map(|name| folder.path().join(name));
-    let of_run = ["--device", "gpu", "--steps", "60", "--strategy", "none", "--view-order", "shuffle", "--quiet"];
-    assert!(train(&[&[text(&scene), "--out", text(&alone)], &of_run[..]].concat()).status.success());
-    let of_drive = ["--spill-dir", text(&spill), "--spill-codec", "raw", "--commit-every", "0"];
-    let output = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
-        .args([text(&scene), "--out", text(&lost)])
-        .args(of_run)
-        .args(of_drive)
-        .args(["--restarts", "0"])
-        .args(classic(&of_run))
-        .env("GSSCALE_GPU_FAULT", "lost@150")
-        .output()
-        .unwrap();
+    let work = Workdir::city(8, 64, 48, 300);
+    let of_run = "--device gpu --steps 60 --strategy none --view-order shuffle";
+    work.run("alone", of_run);
+    let drive = "--spill-dir spill --spill-codec raw --commit-every 0 --restarts 0";
+    let mut run = work.command(TRAIN, &format!("scene --out lost --quiet {of_run} {drive}"));
+    let output = run.env("GSSCALE_GPU_FAULT", "lost@150").output().unwrap();
     assert!(stderr(&output).contains("the device was lost"), "{}", stderr(&output));
-    let steps = summary(&lost)["steps"].as_u64().unwrap();
+    let steps = work.count("lost", "steps");
     assert!(steps > 10 && steps < 60, "{steps} steps before the loss");
-    let resumed = train(&["--resume", text(&lost), "--log-every", "1"]);
-    assert!(resumed.status.success(), "{}", stderr(&resumed));
-    let first = metrics(&lost).iter().map(|line| line["step"].as_u64().unwrap()).filter(|&step| step > steps).min();
+    work.train("--resume lost --log-every 1");
+    let first = work.logged("lost", "step").into_iter().filter(|&step| step > steps).min();
     assert_eq!(first, Some(steps + 1), "steps before the loss were trained again, or the run began anew");
-    let ply = |out: &Path| std::fs::read(out.join("point_cloud.ply")).unwrap();
-    assert!(ply(&lost) == ply(&alone), "the resumed run gives another scene");
+    assert!(work.ply("lost") == work.ply("alone"), "the resumed run gives another scene");
 }
 
 /// The real thing: the driver is asked for memory until it refuses. A software adapter takes the program's own memory, so
@@ -258,10 +156,8 @@ fn a_device_without_memory_left_leaves_the_last_good_step() {
     let Some(device) = gpu::open(&GpuOptions::default()) else { return };
     let is_software = device.summary().kind == gsscale::gpu::DeviceKind::Software;
     drop(device);
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 300);
-    let limit = is_software.then_some(6 << 20);
-    let line = assert_ends_with_last_good_step(&scene, &folder.path().join("run"), "full@150", limit);
+    let work = Workdir::city(8, 64, 48, 300);
+    let line = assert_ends_with_last_good_step(&work, "full@150", is_software.then_some(6 << 20));
     assert!(line.contains("the device is out of memory") && !line.contains("injected"), "{line}");
 }
 
@@ -300,8 +196,8 @@ fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(V
 /// Cuts and waits affect the execution of a step, not its result: whole steps give the same bits.
 #[test]
 fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 1500);
+    let work = Workdir::city(8, 64, 48, 1500);
+    let scene = work.scene();
     let plain = GpuOptions::default();
     let Some((want, isects, again)) = bits_of_steps(&scene, &plain, 1 << 16) else { return };
     assert_eq!(again, 0);
@@ -356,8 +252,8 @@ fn steps_of_a_scene(scene: &Path, times: usize) -> Option<(Vec<usize>, Traffic, 
 
 #[test]
 fn what_no_camera_sees_costs_the_device_nothing() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 128, 96, 1500);
+    let work = Workdir::city(8, 128, 96, 1500);
+    let scene = work.scene();
     let (Some(small), Some(large)) = (steps_of_a_scene(&scene, 1), steps_of_a_scene(&scene, 10)) else { return };
     assert!(small.0.iter().all(|&rows| rows > 100), "{:?}", small.0);
     assert_eq!(small.0, large.0, "both see the same rows");
@@ -368,30 +264,20 @@ fn what_no_camera_sees_costs_the_device_nothing() {
 
 #[test]
 fn devices_are_listed_and_an_unknown_one_is_refused() {
-    let output = train(&["--list-devices"]);
+    let work = Workdir::city(8, 64, 48, 200);
+    let output = work.output(TRAIN, "--list-devices");
     let listed = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && listed.ends_with("cpu: the CPU renderer\n"), "{listed}");
     if let Some(device) = gpu::open(&GpuOptions::default()) {
         assert!(listed.contains(&device.summary().to_string()), "{listed}");
     }
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 200);
-    let out = folder.path().join("run");
-    let output = train(&[text(&scene), "--out", text(&out), "--device", "no such device"]);
+    let output = work.command(TRAIN, "scene --out run --device").arg("no such device").output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(
-        said.contains("--device") && said.contains("'no such device'") && said.contains("--list-devices"),
-        "{said}"
-    );
-    assert!(!out.exists(), "bad input leaves nothing behind");
-}
-
-#[test]
-fn auto_never_takes_a_software_adapter() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 200);
-    let output = train(&[text(&scene), "--dry-run"]);
+    assert!(["--device", "'no such device'", "--list-devices"].iter().all(|word| said.contains(word)), "{said}");
+    assert!(!work.exists("run"), "bad input leaves nothing behind");
+    // `auto` never takes a software adapter.
+    let output = work.output(TRAIN, "scene --dry-run");
     let said = told(&output);
     assert!(output.status.success(), "{said}");
     let has_hardware = gsscale::gpu::list_adapters()

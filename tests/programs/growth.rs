@@ -1,37 +1,24 @@
 //! A run that decides how many Gaussians its scene needs: what it says about it, and what it refuses.
 
-use crate::support::scenes::{city, stderr, summary, text, told, train};
+use crate::support::scenes::told;
+use crate::support::workdir::{TRAIN, Workdir};
 use serde_json::Value;
-use tempfile::TempDir;
 
-const DECIDES: [&str; 12] = [
-    "--strategy",
-    "long-axis",
-    "--device",
-    "cpu",
-    "--steps",
-    "60",
-    "--log-every",
-    "5",
-    "--refine-start",
-    "10",
-    "--refine-every",
-    "10",
-];
+const DECIDES: &str = "scene --out out --overwrite --strategy long-axis --device cpu --steps 60 --log-every 5 --refine-start 10 \
+    --refine-every 10";
 
 #[test]
 fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
-    let folder = TempDir::new().unwrap();
-    let (scene, out) = (city(folder.path(), 20, 64, 48, 500), folder.path().join("out"));
-    let run = |more: &[&str]| {
-        let output = train(&[&[text(&scene), "--out", text(&out), "--overwrite"], &DECIDES[..], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
+    let work = Workdir::city(20, 64, 48, 500);
+    let run = |more: &str| {
+        let output = work.output(TRAIN, &format!("{DECIDES} {more}"));
+        assert!(output.status.success(), "{}", told(&output));
         told(&output)
     };
-    let planned = run(&["--dry-run"]);
+    let planned = run("--dry-run");
     assert!(planned.contains("held-out training photos") && planned.contains("--quality"), "{planned}");
-    let said = run(&["--quality", "archive"]);
-    let growth = summary(&out)["growth"].clone();
+    let said = run("--quality archive");
+    let growth = work.summary("out")["growth"].clone();
     let checks = growth.as_array().unwrap();
     assert_eq!(checks.len(), 3, "{growth}");
     let of = |check: &Value, name: &str| check[name].as_f64().unwrap();
@@ -46,28 +33,30 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     assert!(said.contains("\n  which takes about ") && said.contains(" of the drive\n"), "{said}");
     let may_follow = |pair: &[Value]| of(&pair[0], "allowed") <= of(&pair[1], "allowed") || pair[0]["is_trial"] == true;
     assert!(checks.windows(2).all(may_follow), "{growth}");
-    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    let lines: Vec<Value> = metrics.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
-    assert_eq!(lines[0]["growth"], Value::Null);
-    assert_eq!(lines.last().unwrap()["growth"], checks[2]);
-    let report = std::fs::read_to_string(out.join("report.html")).unwrap();
+    let lines = work.metrics("out");
+    assert_eq!((&lines[0]["growth"], &lines.last().unwrap()["growth"]), (&Value::Null, &checks[2]));
+    let report = work.text("out/report.html");
     assert!(report.contains("Number of Gaussians") && report.contains("growth pays from"));
+    // A higher price allows fewer, and the last check cannot come after the last round.
+    run("--quality draft --refine-stop 45");
+    let draft = work.summary("out")["growth"].clone();
+    let last = draft.as_array().unwrap().last().unwrap();
+    assert!(draft.as_array().unwrap().len() < 3 && of(last, "allowed") < of(&checks[2], "allowed"), "{draft}");
     // A cap that is given is the user's decision.
-    run(&["--max-gaussians", "600"]);
-    assert_eq!(summary(&out)["growth"], Value::Null);
+    run("--max-gaussians 600");
+    assert_eq!(work.summary("out")["growth"], Value::Null);
 }
 
 #[test]
 fn a_scene_with_too_few_views_to_decide_by_keeps_its_count() {
-    let folder = TempDir::new().unwrap();
-    let (scene, out) = (city(folder.path(), 13, 64, 48, 500), folder.path().join("out"));
+    let work = Workdir::city(13, 64, 48, 500);
     // 11 training views.
-    let run = |more: &[&str]| {
-        let output = train(&[&[text(&scene), "--out", text(&out), "--overwrite"], &DECIDES[..], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        (stderr(&output), summary(&out), std::fs::read(out.join("point_cloud.ply")).unwrap())
+    let run = |more: &str| {
+        let said = work.train(&format!("{DECIDES} {more}"));
+        (said, work.ply("out"))
     };
-    let (said, kept, ply) = run(&[]);
+    let (said, ply) = run("");
+    let kept = work.summary("out");
     let warned = said.lines().find(|line| line.starts_with("warning: the run keeps the number of Gaussians"));
     assert!(
         warned.is_some_and(|line| line.contains("11 training photos") && line.contains("--max-gaussians")),
@@ -76,5 +65,5 @@ fn a_scene_with_too_few_views_to_decide_by_keeps_its_count() {
     assert!(said.contains("which stays their number"), "{said}");
     assert!(kept["gaussians"].as_u64() <= Some(500) && kept["growth"] == Value::Null, "{kept}");
     // That is the run with its first count as the cap, and with it the scene recycles Gaussians.
-    assert!(run(&["--max-gaussians", "500"]).2 == ply && run(&["--recycle", "0"]).2 != ply);
+    assert!(run("--max-gaussians 500").1 == ply && run("--recycle 0").1 != ply);
 }

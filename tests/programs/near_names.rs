@@ -1,29 +1,19 @@
 //! Photos and masks whose names or places are not those that the model states, through the real binary: a run on them gives the
 //! bytes of a run on the scene as it was, and says what it did.
 
-use crate::support::scenes::{TextModel, city, stderr, text, train};
+use crate::support::scenes::TextModel;
+use crate::support::workdir::Workdir;
 use std::fs;
 use std::path::{Path, PathBuf};
-use tempfile::TempDir;
 
-/// A small city as a text model in a fresh folder.
-fn small() -> (TempDir, PathBuf, TextModel) {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 12, 96, 64, 400);
-    let model = TextModel::of(&scene);
-    model.write(&scene);
-    (folder, scene, model)
+/// The Gaussians of a short run of a scene, and what it said.
+fn run_of(work: &Workdir, scene: &str) -> (Vec<u8>, String) {
+    let said = work.train(&format!("{scene} --out out --steps 12 --overwrite"));
+    (work.ply("out"), said)
 }
 
-/// The Gaussians of a short run, and what it said.
-fn run(folder: &Path, scene: &Path, more: &[&str]) -> (Vec<u8>, String) {
-    let out = folder.join("out");
-    let mut args = vec![text(scene), "--out", text(&out), "--steps", "12", "--overwrite"];
-    args.extend(more);
-    let output = train(&args);
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
-    (fs::read(out.join("point_cloud.ply")).unwrap(), said)
+fn run(work: &Workdir) -> (Vec<u8>, String) {
+    run_of(work, "scene")
 }
 
 fn rename_photos(folder: &Path, new: impl Fn(&str) -> String) {
@@ -40,8 +30,9 @@ fn rename_photos(folder: &Path, new: impl Fn(&str) -> String) {
 
 #[test]
 fn models_whose_names_nearly_match_train_as_if_they_matched() {
-    let (folder, scene, model) = small();
-    let (expected, said) = run(folder.path(), &scene, &[]);
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
+    let (expected, said) = run(&work);
     assert!(!said.contains("other names"), "{said}");
     type Rename<'a> = &'a dyn Fn(&str) -> String;
     let rename: [(&str, Rename); 12] = [
@@ -62,7 +53,7 @@ fn models_whose_names_nearly_match_train_as_if_they_matched() {
         let mut changed = model.clone();
         changed.views.iter_mut().for_each(|view| view.name = new(&view.name));
         changed.write(&scene);
-        let (ply, said) = run(folder.path(), &scene, &[]);
+        let (ply, said) = run(&work);
         assert!(said.contains("12 of 12 photos have other names than the model states"), "{what}: {said}");
         assert!(ply == expected, "{what}: other Gaussians");
     }
@@ -70,45 +61,47 @@ fn models_whose_names_nearly_match_train_as_if_they_matched() {
 
 #[test]
 fn photos_that_were_renamed_or_moved_are_found() {
-    let (folder, scene, model) = small();
-    let (expected, _) = run(folder.path(), &scene, &[]);
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
+    let (expected, _) = run(&work);
     let images = scene.join("images");
     // Accents in the other Unicode form, as macOS and unzip write them.
     let mut composed = model.clone();
     composed.views.iter_mut().for_each(|view| view.name = format!("\u{e9}t\u{e9}_{}", view.name));
     composed.write(&scene);
     rename_photos(&images, |name| format!("e\u{301}te\u{301}_{name}"));
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("12 of 12 photos have other names"), "{said}");
     rename_photos(&images, |name| name.replace("e\u{301}te\u{301}_", ""));
     model.write(&scene);
     // One level deeper.
     rename_photos(&images, |name| format!("flight1/{name}"));
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("images/flight1/"), "{said}");
     rename_photos(&images.join("flight1"), |name| format!("../{name}"));
     // The folder of photos is named as the scene.
-    let (ply, said) = run(folder.path(), &images, &[]);
+    let (ply, said) = run_of(&work, "scene/images");
     assert!(ply == expected && said.contains("the scene is read from the folder above"), "{said}");
     // Another name of the folder, then photos beside the model.
     fs::rename(&images, scene.join("Images")).unwrap();
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("the photos are read from"), "{said}");
     fs::rename(scene.join("Images"), scene.join("input")).unwrap();
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("the photos are read from"), "{said}");
     rename_photos(&scene.join("input"), |name| format!("../{name}"));
     fs::remove_dir_all(scene.join("input")).unwrap();
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("the photos are read from"), "{said}");
 }
 
 #[test]
 fn transforms_and_exports_find_photos_as_models_do() {
-    let (folder, scene, model) = small();
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
     fs::remove_dir_all(scene.join("sparse")).unwrap();
     model.write_transforms(&scene);
-    let (expected, _) = run(folder.path(), &scene, &[]);
+    let (expected, _) = run(&work);
     let json = fs::read_to_string(scene.join("transforms.json")).unwrap();
     for (what, prefix) in [
         ("absolute", "/home/bob/scene/images/"),
@@ -119,26 +112,23 @@ fn transforms_and_exports_find_photos_as_models_do() {
     ] {
         let changed = json.replace("images/", prefix).replace("\"points.ply\"", "\"/home/bob/scene/points.ply\"");
         fs::write(scene.join("transforms.json"), changed).unwrap();
-        let (ply, said) = run(folder.path(), &scene, &[]);
+        let (ply, said) = run(&work);
         assert!(ply == expected && said.contains("12 of 12 photos have other names"), "{what}: {said}");
     }
     // The photos of an export beside its file, with the names in capitals.
     fs::remove_file(scene.join("transforms.json")).unwrap();
     model.write_reconstruction(&scene.join("reconstruction.json"));
-    let (expected, _) = run(folder.path(), &scene, &[]);
+    let (expected, _) = run(&work);
     rename_photos(&scene.join("images"), |name| format!("../{}", name.to_uppercase()));
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("12 of 12 photos have other names"), "{said}");
 }
 
 #[test]
 fn what_fits_several_is_named_and_not_guessed() {
-    let (folder, scene, model) = small();
-    let refused = |words: &[&str]| {
-        let output = train(&[text(&scene), "--out", text(&folder.path().join("refused")), "--steps", "12"]);
-        let said = stderr(&output);
-        assert!(!output.status.success() && words.iter().all(|word| said.contains(word)), "{words:?}: {said}");
-    };
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
+    let refused = |words: &[&str]| work.refuses("scene --out refused --steps 12", words);
     let first = &model.views[0].name;
     let images = scene.join("images");
     // Two files fit.
@@ -146,7 +136,7 @@ fn what_fits_several_is_named_and_not_guessed() {
     fs::rename(images.join(first), images.join(first.replace(".jpg", ".JPG"))).unwrap();
     refused(&["1 of 12 photos are missing", ".JPG or", ".Jpg"]);
     fs::remove_file(images.join(first.replace(".jpg", ".Jpg"))).unwrap();
-    run(folder.path(), &scene, &[]);
+    run(&work);
     // The only file that fits belongs to another view.
     let mut doubled = model.clone();
     doubled.views[1].name = first.replace(".jpg", ".png");
@@ -174,16 +164,17 @@ fn write_masks(model: &TextModel, [left, right]: [u8; 2], path_of: impl Fn(&str)
 
 #[test]
 fn masks_in_the_forms_of_other_programs_are_used_and_named() {
-    let (folder, scene, model) = small();
-    let (unmasked, _) = run(folder.path(), &scene, &[]);
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
+    let (unmasked, _) = run(&work);
     let masks = scene.join("masks");
     write_masks(&model, [255, 0], |name| masks.join(format!("{name}.png")));
-    let (expected, said) = run(folder.path(), &scene, &[]);
+    let (expected, said) = run(&work);
     assert!(expected != unmasked && !said.contains("masks:"), "{said}");
     fs::remove_dir_all(&masks).unwrap();
     for form in ["masks/X.jpg.mask.png", "masks/X_mask.png", "mask/X.png", "MASKS/X.PNG", "images/X.mask.png"] {
         write_masks(&model, [255, 0], |name| scene.join(form.replace('X', name.trim_end_matches(".jpg"))));
-        let (ply, said) = run(folder.path(), &scene, &[]);
+        let (ply, said) = run(&work);
         assert!(ply == expected && said.contains("masks: 12 of the form X"), "{form}: {said}");
         assert!(!said.contains("not in the model"), "{form}: {said}");
         for view in &model.views {
@@ -192,12 +183,12 @@ fn masks_in_the_forms_of_other_programs_are_used_and_named() {
     }
     // Labels of 0 and 1.
     write_masks(&model, [1, 0], |name| masks.join(name.replace(".jpg", ".png")));
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("1 counts as white"), "{said}");
     fs::remove_dir_all(&masks).unwrap();
     // White is left out.
     write_masks(&model, [0, 255], |name| scene.join(format!("images/dynamic_mask_{}", name.replace(".jpg", ".png"))));
-    let (ply, said) = run(folder.path(), &scene, &[]);
+    let (ply, said) = run(&work);
     assert!(ply == expected && said.contains("in which white is left out"), "{said}");
 }
 
@@ -205,11 +196,12 @@ fn masks_in_the_forms_of_other_programs_are_used_and_named() {
 #[test]
 fn masks_behind_links_are_used() {
     use std::os::unix::fs::symlink;
-    let (folder, scene, model) = small();
+    let (work, model) = Workdir::small_model();
+    let scene = work.scene();
     let masks = scene.join("masks");
     write_masks(&model, [255, 0], |name| masks.join(format!("{name}.png")));
-    let (expected, _) = run(folder.path(), &scene, &[]);
-    let store = folder.path().join("store");
+    let (expected, _) = run(&work);
+    let store = work.path("store");
     fs::rename(&masks, &store).unwrap();
     // Each file is a link; then all files lie in a folder that is one; a link back to its own folder ends.
     fs::create_dir(&masks).unwrap();
@@ -217,15 +209,15 @@ fn masks_behind_links_are_used() {
         let path = entry.unwrap().path();
         symlink(&path, masks.join(path.file_name().unwrap())).unwrap();
     }
-    assert!(run(folder.path(), &scene, &[]).0 == expected);
+    assert!(run(&work).0 == expected);
     fs::remove_dir_all(&masks).unwrap();
     fs::create_dir(&masks).unwrap();
     symlink(&masks, masks.join("again")).unwrap();
     symlink(&store, masks.join("images")).unwrap();
-    assert!(run(folder.path(), &scene, &[]).0 == expected);
+    assert!(run(&work).0 == expected);
     // Their content was never fetched.
     fs::remove_file(store.join(format!("{}.png", model.views[0].name))).unwrap();
     symlink("../nowhere.png", store.join(format!("{}.png", model.views[0].name))).unwrap();
-    let (_, said) = run(folder.path(), &scene, &[]);
+    let (_, said) = run(&work);
     assert!(said.contains("1 masks are links whose target is not on this machine"), "{said}");
 }

@@ -1,252 +1,131 @@
 //! A scene that outgrows its frames or its memory: the start warns, the run goes on with views in batches or with pages that
 //! move to a drive, and ends with the bytes of a run that had memory for everything. Through the real binary.
 
-use crate::support::scenes::{stderr, summary, text, train};
 #[cfg(target_os = "linux")]
 use crate::support::small_drive::Small;
+use crate::support::workdir::{Workdir, says};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use std::path::{Path, PathBuf};
-use tempfile::TempDir;
 
-/// Grows by half within the steps; commits only at the end or when the run stops.
-const GROWING: &[&str] = &[
-    "--steps",
-    "150",
-    "--page-rows",
-    "32",
-    "--grow-grad2d",
-    "0.001",
-    "--refine-start",
-    "40",
-    "--refine-every",
-    "30",
-    "--sh-every",
-    "50",
-    "--view-order",
-    "groups:4",
-    "--test-every",
-    "24",
-    "--commit-every",
-    "0",
-    "--device",
-    "cpu",
-];
-
-fn scene(folder: &Path) -> PathBuf {
-    let scene = folder.join("scene");
-    let (views, width, height, points, blocks) = (24, 64, 48, 6000, Some(20));
-    let city = CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
-    write_city(&scene, &city, &|_, _| {}).unwrap();
-    scene
-}
+const MIB: f64 = 1048576.0;
 
 #[test]
 fn a_run_that_outgrows_its_frames_goes_in_batches_to_the_same_bytes() {
-    let folder = TempDir::new().unwrap();
-    let scene = scene(folder.path());
-    let path = |name: &str| folder.path().join(name);
-    let (alone, out, spill) = (path("alone"), path("out"), path("spill"));
-    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], GROWING].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let most = summary(&alone)["pages_pinned_max"].as_u64().unwrap();
+    let work = Workdir::city_of(24, [64, 48], 6000, 20);
+    // Grows by half within the steps; commits only at the end or when the run stops.
+    let growing = "scene --steps 150 --page-rows 32 --grow-grad2d 0.001 --refine-start 40 --refine-every 30 --sh-every 50 \
+        --view-order groups:4 --test-every 24 --commit-every 0 --device cpu";
+    work.train(&format!("{growing} --out alone"));
+    let most = work.count("alone", "pages_pinned_max");
     // The largest view takes 65 pages at the start.
-    let too_few = (most * 85 / 100).to_string();
-    let begin = ["--out", text(&out), "--spill-dir", text(&spill), "--frames", &too_few];
-    let output = train(&[&[text(&scene)], &begin[..], GROWING].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
-    for words in ["warning: the view", "no cap", "steps on such views take several batches"] {
-        assert!(said.contains(words), "{words} is not in: {said}");
-    }
-    let done = summary(&out);
+    let said = work.train(&format!("{growing} --out out --spill-dir spill --frames {}", most * 85 / 100));
+    says(&said, &["warning: the view", "no cap", "steps on such views take several batches"]);
+    let done = work.summary("out");
     assert!(done["finished"] == true && done["pages_pinned_max"].as_u64() < Some(most), "{done}");
-    assert!(spill.read_dir().map_or(true, |mut left| left.next().is_none()), "nothing is left of its pages");
-    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-    assert!(got == want, "another scene than that of a run with enough frames");
-}
-
-#[test]
-fn a_cap_that_the_frames_hold_is_no_reason_to_warn() {
-    let folder = TempDir::new().unwrap();
-    let scene = scene(folder.path());
-    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
-    let said = |cap: &str| {
-        let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--frames", "200", "--max-gaussians", cap];
-        let output = train(&[&[text(&scene), "--steps", "2", "--page-rows", "32", "--overwrite"], &flags[..]].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        stderr(&output)
+    assert!(!work.exists("spill") || work.files("spill").is_empty(), "nothing is left of its pages");
+    assert!(work.ply("out") == work.ply("alone"), "another scene than that of a run with enough frames");
+    // A cap that the frames hold is no reason to warn.
+    let said = |cap: u32| {
+        let flags = "scene --out capped --steps 2 --page-rows 32 --overwrite --spill-dir spill --frames 200";
+        work.train(&format!("{flags} --max-gaussians {cap}"))
     };
-    assert!(!said("6300").contains("warning: the view"));
-    let warned = said("600000");
+    assert!(!said(6300).contains("warning: the view"));
+    let warned = said(600_000);
     assert!(warned.contains("--max-gaussians 600000") && warned.contains("200 frames"), "{warned}");
 }
 
 /// The purpose of the drive: a scene that outgrows its memory.
-fn large_scene(folder: &Path) -> PathBuf {
-    let scene = folder.join("scene");
-    let (views, width, height, points, blocks) = (33, 160, 120, 60_000, Some(12));
-    let city = CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
-    write_city(&scene, &city, &|_, _| {}).unwrap();
-    scene
+fn large_scene() -> Workdir {
+    Workdir::city_of(33, [160, 120], 60_000, 12)
 }
 
 /// Grows sixfold; a round every 20 steps, all colour bands in use.
-const GROWING_MUCH: &str = "--steps 120 --page-rows 64 --grow-grad2d 0.00005 --refine-start 20 --refine-every 20 --view-order \
+const GROWING: &str = "scene --steps 120 --page-rows 64 --grow-grad2d 0.00005 --refine-start 20 --refine-every 20 --view-order \
     groups:4 --test-every 11 --commit-every 0 --device cpu --threads 2 --image-cache 4MiB --prefetch-bytes 1MiB \
     --log-every 5 --sh-start 3";
 
-fn frames_logged(out: &Path) -> Vec<u64> {
-    let metrics = std::fs::read_to_string(out.join("metrics.jsonl")).unwrap();
-    let frames = |line| serde_json::from_str::<serde_json::Value>(line).unwrap()["frames"].as_u64().unwrap();
-    metrics.lines().map(frames).collect()
+/// The run in `out` has the bytes of that in `alone` and took at most this memory; the documented error is a tenth.
+fn same_within(work: &Workdir, out: &str, bytes: f64) {
+    let peak = work.count(out, "host_bytes_peak") as f64;
+    assert!(peak <= 1.1 * bytes, "{out}: {:.1} MB at the peak", peak / 1e6);
+    assert!(work.ply(out) == work.ply("alone"), "{out}: another scene than in memory");
 }
 
 #[test]
 fn a_scene_that_grows_stays_within_its_memory_and_within_less_than_its_views_take() {
-    const BUDGET: f64 = 160.0 * 1048576.0;
-    let folder = TempDir::new().unwrap();
-    let scene = large_scene(folder.path());
-    let path = |name: &str| folder.path().join(name);
-    let (alone, out, spill) = (path("alone"), path("out"), path("spill"));
-    let flags: Vec<&str> = GROWING_MUCH.split_whitespace().collect();
-    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &flags[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "160MiB"];
-    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
+    const BUDGET: f64 = 160.0 * MIB;
+    let work = large_scene();
+    work.train(&format!("{GROWING} --out alone --quiet"));
+    let said = work.train(&format!("{GROWING} --out out --spill-dir spill --host-mem 160MiB"));
     assert!(said.contains("growth has no cap") && said.contains(" frames of pages"), "{said}");
     // Without a folder for its pages it begins in memory, and finds the drive of its results when it does not fit.
-    let moved = path("moved");
-    let other = ["--out", text(&moved), "--host-mem", "160MiB", "--spill-codec", "zstd:1", "--evict", "lru"];
-    let output = train(&[&[text(&scene)], &other[..], &flags[..]].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
-    assert!(said.contains(&format!("its pages move between memory and {}/checkpoint", text(&moved))), "{said}");
-    assert!(!moved.join("checkpoint").exists(), "removed at a clean end");
+    let said = work.train(&format!("{GROWING} --out moved --host-mem 160MiB --spill-codec zstd:1 --evict lru"));
+    assert!(said.contains("its pages move between memory and moved/checkpoint"), "{said}");
+    assert!(!work.exists("moved/checkpoint"), "removed at a clean end");
     // Stopped after the move, the run continues in the same memory.
-    let cut = path("cut");
-    let begin = ["--out", text(&cut), "--host-mem", "160MiB", "--quiet", "--keep-checkpoint"];
-    let steps = GROWING_MUCH.replace("--steps 120", "--steps 90 --schedule-steps 120");
-    let output = train(&[&[text(&scene)], &begin[..], &steps.split_whitespace().collect::<Vec<_>>()].concat());
-    assert!(output.status.success() && stderr(&output).contains("move between"), "{}", stderr(&output));
-    assert!(summary(&cut)["drive_bytes_peak"].as_u64() > Some(0));
-    let more = ["--steps", "120", "--schedule-steps", "120", "--keep-checkpoint=false", "--quiet"];
-    let output = train(&[&["--resume", text(&cut)], &more[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let in_memory = summary(&alone);
-    let peak = |summary: &serde_json::Value| summary["host_bytes_peak"].as_f64().unwrap();
-    assert!(peak(&in_memory) > 1.8 * BUDGET, "{:.1} MB in memory: it hardly grew", peak(&in_memory) / 1e6);
-    assert_eq!(in_memory["bytes_read"], 0);
-    for out in [&out, &moved, &cut] {
-        // The documented error is a tenth.
-        let done = summary(out);
-        assert!(peak(&done) <= 1.1 * BUDGET, "{:.1} MB at the peak", peak(&done) / 1e6);
-        let frames = frames_logged(out);
+    let half = "--quiet --keep-checkpoint --steps 90 --schedule-steps 120";
+    let said = work.train(&format!("{GROWING} --out cut --host-mem 160MiB {half}"));
+    assert!(said.contains("move between") && work.count("cut", "drive_bytes_peak") > 0, "{said}");
+    work.train("--resume cut --steps 120 --schedule-steps 120 --keep-checkpoint=false --quiet");
+    let in_memory = work.count("alone", "host_bytes_peak") as f64;
+    assert!(in_memory > 1.8 * BUDGET, "{:.1} MB in memory: it hardly grew", in_memory / 1e6);
+    assert_eq!(work.count("alone", "bytes_read"), 0);
+    for out in ["out", "moved", "cut"] {
+        same_within(&work, out, BUDGET);
+        let frames = work.logged(out, "frames");
         let (most, least) = (frames.iter().max().unwrap(), frames[frames.len() / 2..].iter().min().unwrap());
         assert!(least * 4 < most * 3, "none gave way: {frames:?}");
-        let read = |key: &str| done[key].as_u64().unwrap();
-        assert!(read("bytes_read") > read("other_bytes_read"), "no step read a page: {done}");
-        let [got, want] = [out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-        assert!(got == want, "another scene than in memory");
-        std::fs::remove_dir_all(out).unwrap();
+        assert!(work.count(out, "bytes_read") > work.count(out, "other_bytes_read"), "{out}: no step read a page");
     }
-    finishes_in_less_than_a_view(&scene, &flags, &alone, [&out, &spill]);
-}
-
-/// 92 MiB do not hold the largest view of the grown scene. The run finishes in them, whether its pages have a drive from the
-/// start or move to the drive of its checkpoint. `alone` holds the run in memory.
-fn finishes_in_less_than_a_view(scene: &Path, flags: &[&str], alone: &Path, [out, spill]: [&Path; 2]) {
-    let pages = summary(alone)["pages_pinned_max"].as_u64();
-    for to_spill in [&["--spill-dir", text(spill)][..], &[]] {
-        let within = ["--out", text(out), "--overwrite", "--host-mem", "92MiB"];
-        let output = train(&[&[text(scene)], &within[..], to_spill, flags].concat());
-        let said = stderr(&output);
-        assert!(output.status.success(), "{said}");
-        let done = summary(out);
-        assert!(done["finished"] == true && done["pages_pinned_max"].as_u64() < pages, "no view was cut: {done}");
-        let peak = done["host_bytes_peak"].as_f64().unwrap();
-        assert!(peak <= 1.1 * 92.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
-        let [got, want] = [out, alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-        assert!(got == want, "another scene than in memory");
+    // 92 MiB do not hold the largest view of the grown scene, whether its pages have a drive from the start or move to that of its
+    // checkpoint.
+    for to_spill in ["--spill-dir spill", ""] {
+        work.train(&format!("{GROWING} --out out --overwrite --host-mem 92MiB {to_spill}"));
+        same_within(&work, "out", 92.0 * MIB);
+        let [pinned, whole] = ["out", "alone"].map(|out| work.count(out, "pages_pinned_max"));
+        assert!(work.summary("out")["finished"] == true && pinned < whole, "no view was cut: {pinned} of {whole}");
     }
 }
 
 /// A photo from high above needs most of the memory for its own rows. Afterwards the frames have this memory again.
 #[test]
 fn frames_return_after_a_photo_that_shows_much_of_the_scene() {
-    const BUDGET: f64 = 128.0 * 1048576.0;
-    let folder = TempDir::new().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    let (scene, alone, out, spill) = (path("scene"), path("alone"), path("out"), path("spill"));
-    let (width, height, points) = (96, 64, 50_000);
-    let size = CityOptions { width, height, points, tiles: [2, 4], ..CityOptions::default() };
+    let work = Workdir::new();
+    let size = CityOptions { width: 96, height: 64, points: 50_000, tiles: [2, 4], ..CityOptions::default() };
     let city = CityOptions { seed: 5, views: 24, overviews: 2, supersample: 1, ..size };
-    write_city(&scene, &city, &|_, _| {}).unwrap();
-    let flags = "--steps 60 --page-rows 64 --strategy none --test-every 0 --commit-every 0 --device cpu --log-every 1 --quiet \
-                 --image-cache 4MiB --prefetch-bytes 1MiB --sh-degree 1 --view-order shuffle";
-    let flags: Vec<&str> = flags.split_whitespace().collect();
-    let output = train(&[&[text(&scene), "--out", text(&alone)], &flags[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "128MiB"];
-    let output = train(&[&[text(&scene)], &within[..], &flags[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let (frames, done) = (frames_logged(&out), summary(&out));
+    write_city(&work.scene(), &city, &|_, _| {}).unwrap();
+    let flags = "--steps 60 --page-rows 64 --strategy none --test-every 0 --commit-every 0 --log-every 1 --image-cache 4MiB \
+        --prefetch-bytes 1MiB --sh-degree 1 --view-order shuffle";
+    work.run("alone", flags);
+    work.run("out", &format!("{flags} --spill-dir spill --host-mem 128MiB"));
+    let frames = work.logged("out", "frames");
     // The first step with the fewest frames is that of a photo from high above; few photos follow until all are ordinary.
     let (wide, least) = frames.iter().enumerate().min_by_key(|(_, frames)| **frames).unwrap();
     let again = frames[wide..].iter().max().unwrap();
     // How much of the budget is free for frames is measured in the process, so their number varies by some percent.
     assert!(3 * again >= 4 * least, "{least} frames at step {wide}, at most {again} after it: {frames:?}");
-    // The documented error is a tenth.
-    let peak = done["host_bytes_peak"].as_f64().unwrap();
-    assert!(peak <= 1.1 * BUDGET, "{:.1} MB at the peak, {frames:?}", peak / 1e6);
-    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-    assert!(got == want, "another scene than in memory");
+    same_within(&work, "out", 128.0 * MIB);
 }
 
-/// Just enough steps for the scene to grow beyond 160 MiB.
-fn growing_less() -> String {
-    let all = "--steps 120";
-    assert!(GROWING_MUCH.contains(all));
-    GROWING_MUCH.replace(all, "--steps 66")
-}
-
-/// Dense Adam updates every row at every step: also pages in memory beside those just read.
+/// Just enough steps for the scene to grow beyond 160 MiB. Dense Adam updates every row at every step: also pages in memory beside
+/// those just read.
 #[test]
 fn a_run_that_updates_every_row_moves_out_as_well() {
-    let folder = TempDir::new().unwrap();
-    let scene = large_scene(folder.path());
-    let (alone, out) = (folder.path().join("alone"), folder.path().join("out"));
-    let dense = growing_less() + " --optimizer dense --quiet";
-    let flags: Vec<&str> = dense.split_whitespace().collect();
-    let output = train(&[&[text(&scene), "--out", text(&alone)], &flags[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let output = train(&[&[text(&scene), "--out", text(&out), "--host-mem", "160MiB"], &flags[..]].concat());
-    let said = stderr(&output);
-    assert!(output.status.success() && said.contains("move between memory and"), "{said}");
-    let peak = summary(&out)["host_bytes_peak"].as_f64().unwrap();
-    assert!(peak <= 1.1 * 160.0 * 1048576.0, "{:.1} MB at the peak", peak / 1e6);
-    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-    assert!(got == want, "another scene than in memory");
+    let (work, dense) = (large_scene(), format!("{GROWING} --steps 66 --optimizer dense --quiet"));
+    work.train(&format!("{dense} --out alone"));
+    let said = work.train(&format!("{dense} --out out --host-mem 160MiB"));
+    assert!(said.contains("move between memory and"), "{said}");
+    same_within(&work, "out", 160.0 * MIB);
 }
 
 /// The drive of the results is full when the pages should move there: the run reports it and continues in memory.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_run_with_no_drive_to_move_to_goes_on_in_memory() {
-    let folder = TempDir::new().unwrap();
-    let scene = large_scene(folder.path());
-    let Some(drive) = Small::mount(&folder.path().join("drive"), 60 << 20) else { return };
-    let (alone, out) = (folder.path().join("alone"), drive.0.join("out"));
-    let fewer = growing_less();
-    let flags: Vec<&str> = fewer.split_whitespace().collect();
-    let output = train(&[&[text(&scene), "--out", text(&alone), "--quiet"], &flags[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let output = train(&[&[text(&scene), "--out", text(&out), "--host-mem", "160MiB", "--quiet"], &flags[..]].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
+    let (work, fewer) = (large_scene(), format!("{GROWING} --steps 66 --quiet"));
+    let Some(_drive) = Small::mount(&work.path("drive"), 60 << 20) else { return };
+    work.train(&format!("{fewer} --out alone"));
+    let said = work.train(&format!("{fewer} --out drive/out --host-mem 160MiB"));
     assert_eq!(said.matches("its pages cannot be moved to a drive").count(), 1, "once, not at every step: {said}");
-    assert_eq!(summary(&out)["bytes_read"], 0);
-    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-    assert!(got == want, "another scene than in memory");
+    assert_eq!(work.count("drive/out", "bytes_read"), 0);
+    assert!(work.ply("drive/out") == work.ply("alone"), "another scene than in memory");
 }

@@ -1,29 +1,35 @@
 //! `gsscale-plan` through its binary: sums that agree, exact lists, and refusals with a remedy.
 
-use crate::support::scenes::{city, stderr, summary, text, told, train, wide_city};
+use crate::support::scenes::{stderr, told};
+use crate::support::workdir::{TRAIN, Workdir};
 use serde_json::Value;
-use std::path::Path;
-use std::process::{Command, Output};
-use tempfile::TempDir;
 
-fn plan(scene: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-plan")).arg(text(scene)).args(args).output().unwrap()
+const PLAN: &str = env!("CARGO_BIN_EXE_gsscale-plan");
+
+/// A plan of the scene as text.
+fn plan(work: &Workdir, flags: &str) -> String {
+    let output = work.output(PLAN, &format!("scene {flags}"));
+    assert!(output.status.success(), "{flags}: {}", stderr(&output));
+    String::from_utf8(output.stdout).unwrap()
 }
 
-fn stdout(output: &Output) -> String {
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8(output.stdout.clone()).unwrap()
+/// The same with `--json`.
+fn json(work: &Workdir, flags: &str) -> Value {
+    serde_json::from_str(&plan(work, &format!("{flags} --json"))).unwrap()
+}
+
+fn refuses(work: &Workdir, flags: &str, words: &[&str]) {
+    let output = work.output(PLAN, flags);
+    let said = stderr(&output);
+    assert!(!output.status.success() && words.iter().all(|word| said.contains(word)), "{flags}: {said}");
 }
 
 #[test]
 fn a_scene_is_planned_for_several_memories_and_orders() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 300, 32, 24, 8000);
-    let common = ["--page-rows", "32", "--steps", "1000", "--test-every", "0"];
-    let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], more].concat()));
-    let orders = "auto,shuffle,groups:4,tour";
-    let value: Value =
-        serde_json::from_str(&with(&["--compare-frames", "70%,100%", "--compare-orders", orders, "--json"])).unwrap();
+    let work = Workdir::city(300, 32, 24, 8000);
+    let common = "--page-rows 32 --steps 1000 --test-every 0";
+    let orders = "--compare-orders auto,shuffle,groups:4,tour";
+    let value = json(&work, &format!("{common} --compare-frames 70%,100% {orders}"));
     let plans = value["plans"].as_array().unwrap();
     assert_eq!((plans.len(), value["views"].as_u64().unwrap()), (8, 300));
     let number = |plan: &Value, key: &str| plan[key].as_f64().unwrap();
@@ -42,7 +48,7 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         plans[4..].iter().all(|plan| number(plan, "hit_rate") == 1.0 && number(plan, "stall_seconds_worst") == 0.0)
     );
     assert_eq!(plans[4]["view_order"], "shuffle");
-    let table = with(&["--compare-frames", "70%", "--compare-orders", orders]);
+    let table = plan(&work, &format!("{common} --compare-frames 70% {orders}"));
     assert!(table.lines().nth(2).unwrap().contains("hit rate    of lru"), "{table}");
     assert!(table.lines().nth(3 + 4).unwrap().starts_with("*  "), "{table}");
     for (plan, line) in plans[..4].iter().zip(table.lines().skip(3)) {
@@ -50,21 +56,19 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
         assert!(line.contains(&shown), "{shown} is not in: {table}");
     }
     // Another eviction order is planned as it evicts.
-    let one = ["--compare-frames", "70%", "--view-order", "shuffle", "--json", "--evict", "lru"];
-    let lru: Value = serde_json::from_str(&with(&one)).unwrap();
-    let lru = &lru["plans"][0];
+    let lru = &json(&work, &format!("{common} --compare-frames 70% --view-order shuffle --evict lru"))["plans"][0];
     assert_eq!(lru["hit_rate"], lru["lru_hit_rate"], "{lru}");
     assert!(lru["is_belady_bound"] == false && number(lru, "hit_rate") == number(&plans[1], "lru_hit_rate"), "{lru}");
     assert!(number(lru, "bytes_read") > number(&plans[1], "bytes_read"), "{lru}");
     // Default shares hold the largest view.
-    let open: Value = serde_json::from_str(&with(&["--view-order", "shuffle", "--json"])).unwrap();
+    let open = json(&work, &format!("{common} --view-order shuffle"));
     let frames = |value: &Value| -> Vec<u64> {
         value["plans"].as_array().unwrap().iter().map(|plan| plan["frames"].as_u64().unwrap()).collect()
     };
     let (most, pages) = (open["pages_of_largest_view"].as_u64().unwrap(), open["pages"].as_u64().unwrap());
     assert!(most > pages / 2 && frames(&open) == [most, pages], "{open}");
     // The exact lists of two steps: evicted pages make room for admitted pages.
-    let lists = with(&["--compare-frames", "70%", "--view-order", "shuffle", "--lists", "700..740"]);
+    let lists = plan(&work, &format!("{common} --compare-frames 70% --view-order shuffle --lists 700..740"));
     let lines: Vec<&str> = lists.lines().collect();
     assert!(lines[0].starts_with("step 700: ") && lines.iter().any(|line| line.starts_with("step 701: ")), "{lists}");
     let count = |sign: &str| lines.iter().filter_map(|l| l.strip_prefix(sign)).flat_map(str::split_whitespace).count();
@@ -73,14 +77,11 @@ fn a_scene_is_planned_for_several_memories_and_orders() {
 
 #[test]
 fn pages_on_a_device_are_planned_over_a_bus() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 100, 32, 24, 8000);
-    let common = ["--page-rows", "32", "--steps", "400", "--test-every", "0", "--step-seconds", "0.003"];
-    let order = ["--view-order", "shuffle", "--compare-frames", "100%", "--bus", "1GB/s,10us"];
-    let with = |more: &[&str]| stdout(&plan(&scene, &[&common[..], &order[..], more].concat()));
-    let of = |more: &[&str]| -> Value { serde_json::from_str(&with(&[more, &["--json"]].concat())).unwrap() };
+    let work = Workdir::city(100, 32, 24, 8000);
+    let common = "--page-rows 32 --steps 400 --test-every 0 --step-seconds 0.003 --view-order shuffle --compare-frames 100% --bus 1GB/s,10us";
+    let of = |more: &str| json(&work, &format!("{common} {more}"));
     let number = |value: &Value, key: &str| value["device"][0][key].as_f64().unwrap();
-    let all = of(&[]);
+    let all = of("");
     // Ten copies and the bytes of photo and tables.
     assert_eq!(all["device"][0]["slots"], all["pages"]);
     assert!(number(&all, "hit_rate") == 1.0 && number(&all, "payloads_up_ms") == 0.0, "{all}");
@@ -89,7 +90,7 @@ fn pages_on_a_device_are_planned_over_a_bus() {
         |value: &Value| ["photo_ms", "results_ms", "payloads_up_ms", "payloads_down_ms"].map(|key| number(value, key));
     let [photo, results, ..] = parts(&all);
     assert!((number(&all, "step_ms") - (photo + results + 3.0)).abs() < 1e-9, "{all}");
-    let few = of(&["--device-mem", "6MiB"]);
+    let few = of("--device-mem 6MiB");
     let [photo, results, up, down] = parts(&few);
     assert!(
         few["device"][0]["slots"].as_u64() < few["pages"].as_u64() && number(&few, "bytes_up_per_step") > 0.0,
@@ -101,74 +102,45 @@ fn pages_on_a_device_are_planned_over_a_bus() {
     assert!((number(&few, "step_in_turn_ms") - (photo + results + 3.0 + up + down)).abs() < 1e-9, "{few}");
     let fewest = number(&few, "fewest_bytes_up_per_step");
     assert!(fewest > 0.0 && fewest <= bytes[0], "{few}");
-    let table = with(&["--device-mem", "6MiB"]);
+    let table = plan(&work, &format!("{common} --device-mem 6MiB"));
     assert!(table.contains("pages on the device, modelled: a bus of"), "{table}");
-    let refused = plan(&scene, &[&common[..], &["--bus", "fast"]].concat());
-    assert!(stderr(&refused).contains("12GB/s,20us") && !refused.status.success(), "{}", stderr(&refused));
-    let refused = plan(&scene, &[&common[..], &order[..], &["--device-mem", "1KiB"]].concat());
-    assert!(stderr(&refused).contains("--device-mem") && !refused.status.success(), "{}", stderr(&refused));
+    refuses(&work, &format!("scene {common} --bus fast"), &["12GB/s,20us"]);
+    refuses(&work, &format!("scene {common} --device-mem 1KiB"), &["--device-mem"]);
 }
 
 #[test]
 fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 12, 64, 48, 800);
-    let run = folder.path().join("run");
-    std::fs::create_dir(&run).unwrap();
-    std::fs::write(run.join("config.toml"), format!("steps = 77\n[resolved]\nscene = {:?}\n", text(&scene))).unwrap();
-    let told = stdout(&plan(&run, &["--page-rows", "16", "--compare-frames", "100%"]));
-    assert!(told.contains("of all 77 steps"), "{told}");
+    let work = Workdir::city(12, 64, 48, 800);
+    std::fs::create_dir(work.path("run")).unwrap();
+    work.write("run/config.toml", "steps = 77\n[resolved]\nscene = \"scene\"\n");
+    let output = work.output(PLAN, "run --page-rows 16 --compare-frames 100%");
+    assert!(told(&output).contains("of all 77 steps"), "{}", told(&output));
     // Given frames need no given memory.
-    for named in [["--frames", "80"], ["--compare-frames", "100%"]] {
-        stdout(&plan(&run, &[&["--page-rows", "16", "--host-mem", "1MiB"], &named[..]].concat()));
+    for named in ["--frames 80", "--compare-frames 100%"] {
+        plan(&work, &format!("--page-rows 16 --host-mem 1MiB {named}"));
     }
-    for (args, words) in [
-        (&["--compare-frames", "many"][..], ["'many'", "25%"]),
-        (&["--compare-orders", "random"], ["'random'", "groups:N"]),
-        (&["--drive-read", "0"], ["--drive-read", "bytes per second"]),
-        (&["--lists", "5..5"], ["5..5", "100..110"]),
-        (&["--step-seconds", "nan"], ["--step-seconds", "leave them out"]),
-        (&["--optimizer", "dense"], ["every page at every step", "deferred"]),
+    for (flags, words) in [
+        ("--compare-frames many", ["'many'", "25%"]),
+        ("--compare-orders random", ["'random'", "groups:N"]),
+        ("--drive-read 0", ["--drive-read", "bytes per second"]),
+        ("--lists 5..5", ["5..5", "100..110"]),
+        ("--step-seconds nan", ["--step-seconds", "leave them out"]),
+        ("--optimizer dense", ["every page at every step", "deferred"]),
     ] {
-        let output = plan(&run, args);
-        let said = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(!output.status.success() && words.iter().all(|word| said.contains(word)), "{said}");
+        refuses(&work, &format!("run {flags}"), &words);
     }
 }
 
 /// The plan equals the run: frames for a budget, bytes read, bytes written.
 #[test]
 fn a_run_does_what_was_planned() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 150, 96, 64, 8000);
-    let (out, spill) = (folder.path().join("out"), folder.path().join("spill"));
-    let common = [
-        "--page-rows",
-        "16",
-        "--test-every",
-        "0",
-        "--strategy",
-        "none",
-        "--steps",
-        "450",
-        "--sh-start",
-        "3",
-        "--means-lr",
-        "1e-9",
-        "--scales-lr",
-        "1e-9",
-    ];
-    let common = [&common[..], &["--view-order", "groups:9", "--prefetch-bytes", "1MiB", "--device", "cpu"]].concat();
-    let planned = |more: &[&str]| -> Value {
-        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
-    };
-    let flags = ["--out", text(&out), "--spill-dir", text(&spill), "--commit-every", "0"];
-    let common = [&common[..], &["--host-mem", "42MiB"]].concat();
-    let trained = train(&[&[text(&scene)][..], &common, &flags].concat());
-    let said = stderr(&trained);
-    assert!(trained.status.success(), "{said}");
-    let done = summary(&out);
-    let within = planned(&["--host-mem", "42MiB"]);
+    let work = Workdir::city(150, 96, 64, 8000);
+    let common = "--page-rows 16 --test-every 0 --strategy none --steps 450 --sh-start 3 --means-lr 1e-9 --scales-lr 1e-9 \
+        --view-order groups:9 --prefetch-bytes 1MiB --device cpu";
+    let drive = "--spill-dir spill --commit-every 0 --host-mem 42MiB";
+    let said = work.train(&format!("scene --out out {common} {drive}"));
+    let done = work.summary("out");
+    let within = json(&work, &format!("{common} --host-mem 42MiB"));
     assert!(within["pages"] == done["pages"] && within["gaussians"] == done["gaussians"], "{within} {done}");
     let number = |value: &Value| value.as_f64().unwrap();
     let near = |what: &str, planned: &Value, real: f64, tolerance: f64| {
@@ -178,7 +150,7 @@ fn a_run_does_what_was_planned() {
     // Threads take their buffers in another order.
     near("frames", &within["plans"][0]["frames"], number(&done["frames"]), 0.02);
     assert!(number(&done["frames"]) < 0.9 * number(&done["pages"]), "everything fits: {done}");
-    let plan = planned(&["--frames", &done["frames"].to_string()]);
+    let plan = json(&work, &format!("{common} --frames {}", done["frames"]));
     // The plan knows all views and assumes that pages stay in place, which nearly holds for these Gaussians.
     let plan = &plan["plans"][0];
     near("the bound", &plan["bytes_read"], number(&done["belady_bytes_read"]), 0.01);
@@ -205,13 +177,10 @@ fn told_to_be_written(said: &str) -> f64 {
 /// The drive wear that a run announces is its bytes to be written over the endurance of a common drive.
 #[test]
 fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 150, 96, 64, 8000);
-    let spill = folder.path().join("spill");
-    let flags = ["--page-rows", "16", "--frames", "330", "--view-order", "shuffle", "--strategy", "none"];
+    let work = Workdir::city(150, 96, 64, 8000);
+    let drive = "--page-rows 16 --frames 330 --view-order shuffle --strategy none --spill-dir spill";
     // Enough steps for some 900 GiB.
-    let more = ["--steps", "2000000", "--dry-run", "--spill-dir", text(&spill)];
-    let output = train(&[&[text(&scene)][..], &flags, &more].concat());
+    let output = work.output(TRAIN, &format!("scene --dry-run --steps 2000000 {drive}"));
     // Long lines are folded.
     let said = told(&output).replace("\n        ", " ");
     assert!(output.status.success(), "{said}");
@@ -225,32 +194,25 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
 
 #[test]
 fn the_drive_of_the_pages_is_measured_unless_its_rates_are_named() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 12, 64, 48, 800);
-    let spill = folder.path().join("spill");
-    let rates = |more: &[&str]| {
-        let args = [&["--page-rows", "16", "--compare-frames", "100%", "--json"], more].concat();
-        let value: Value = serde_json::from_str(&stdout(&plan(&scene, &args))).unwrap();
+    let work = Workdir::city(12, 64, 48, 800);
+    let rates = |more: &str| {
+        let value = json(&work, &format!("--page-rows 16 --compare-frames 100% {more}"));
         ["drive_read_bytes_per_second", "drive_write_bytes_per_second"].map(|key| value[key].as_f64().unwrap())
     };
-    assert_eq!(rates(&[]), [3e9, 2e9]);
-    assert_eq!(rates(&["--drive-read", "5GB", "--drive-write", "4GB", "--spill-dir", text(&spill)]), [5e9, 4e9]);
-    let [read, write] = rates(&["--drive-read", "5GB", "--spill-dir", text(&spill)]);
+    assert_eq!(rates(""), [3e9, 2e9]);
+    assert_eq!(rates("--drive-read 5GB --drive-write 4GB --spill-dir spill"), [5e9, 4e9]);
+    let [read, write] = rates("--drive-read 5GB --spill-dir spill");
     assert!(read == 5e9 && write > 1e6 && write != 2e9, "{write} bytes a second");
-    let left: Vec<_> = folder.path().read_dir().unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    let left: Vec<_> = work.path("").read_dir().unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(left, ["scene"], "a plan leaves no file");
 }
 
 #[test]
 fn a_scene_larger_than_memory_is_planned_within_it() {
-    let folder = TempDir::new().unwrap();
-    let scene = wide_city(folder.path(), 200_000);
-    let (budget, bytes) = ("100MiB", 100 << 20);
-    let args = ["--host-mem", budget, "--page-rows", "128", "--image-cache", "4MiB", "--prefetch-bytes", "1MiB"];
-    let args = [&args[..], &["--device", "cpu"]].concat();
-    let value: Value =
-        serde_json::from_str(&stdout(&plan(&scene, &[&args[..], &["--json", "--plan-mem", "16MiB"]].concat())))
-            .unwrap();
+    let (work, bytes) = (Workdir::wide_city(200_000), 100 << 20);
+    let flags =
+        "--host-mem 100MiB --page-rows 128 --image-cache 4MiB --prefetch-bytes 1MiB --device cpu --plan-mem 16MiB";
+    let value = json(&work, flags);
     assert!(value["gaussians"].as_u64() > Some(190_000) && value["state_bytes"].as_u64() > Some(bytes), "{value}");
     assert!(value["host_bytes_peak"].as_u64() <= Some(bytes), "{value}");
     assert!(value["step_timed_on"].is_string(), "a view of middling size fits: {value}");
@@ -261,19 +223,16 @@ fn a_scene_larger_than_memory_is_planned_within_it() {
 /// Step times are measured on the device of the run unless given; steps plus stalls make the time of the run.
 #[test]
 fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 300, 32, 24, 8000);
-    let common = ["--page-rows", "32", "--test-every", "0", "--compare-frames", "70%", "--view-order", "shuffle"];
-    let common = [&common[..], &["--device", "cpu", "--drive-write", "100MB"]].concat();
-    let planned = |more: &[&str]| -> Value {
-        serde_json::from_str(&stdout(&plan(&scene, &[&common[..], &["--json"], more].concat()))).unwrap()
-    };
+    let work = Workdir::city(300, 32, 24, 8000);
+    let common =
+        "--page-rows 32 --test-every 0 --compare-frames 70% --view-order shuffle --device cpu --drive-write 100MB";
+    let planned = |more: &str| json(&work, &format!("{common} {more}"));
     let number = |value: &Value| value.as_f64().unwrap();
-    let timed = planned(&["--steps", "1000"]);
+    let timed = planned("--steps 1000");
     assert!(number(&timed["step_seconds"]) > 1e-6 && timed["step_timed_on"] == "cpu", "{timed}");
     // As many steps as the simulation plays one by one, and many more, which repeat the later ones.
     for steps in [1200.0, 24_000.0] {
-        let of = |rate| planned(&["--steps", &steps.to_string(), "--step-seconds", "0.002", "--drive-read", rate]);
+        let of = |rate: &str| planned(&format!("--steps {steps} --step-seconds 0.002 --drive-read {rate}"));
         let (slow, fast) = (of("1MB"), of("1000GB"));
         assert!(slow["step_seconds"] == 0.002 && slow["step_timed_on"].is_null(), "{slow}");
         let [slow, fast] = [&slow, &fast].map(|value| &value["plans"][0]);
@@ -284,8 +243,8 @@ fn the_time_of_a_run_is_that_of_its_steps_and_what_they_wait() {
         assert!(number(&fast["seconds"]) >= 0.002 * steps && number(&fast["seconds"]) < 0.1 * seconds, "{fast}");
     }
     // With all pages in memory no step waits, not even the first.
-    let all = planned(&["--steps", "30", "--step-seconds", "0.5", "--compare-frames", "100%"]);
+    let all = planned("--steps 30 --step-seconds 0.5 --compare-frames 100%");
     assert_eq!(number(&all["plans"][1]["seconds"]), 15.0, "{all}");
-    let table = stdout(&plan(&scene, &[&common[..], &["--steps", "100", "--step-seconds", "72"]].concat()));
+    let table = plan(&work, &format!("{common} --steps 100 --step-seconds 72"));
     assert!(table.contains("2.0 h") && table.contains("steps of 72.0000 s"), "{table}");
 }

@@ -2,22 +2,18 @@
 //! paper's, as configs/README.md describes it. On look-alike datasets through the real binaries.
 
 use crate::support::lpips::lpips_weights;
-use crate::support::scenes::{self, eval, stderr, text, train};
-use gsscale::config::choice::Chosen;
+use crate::support::scenes::{stderr, told};
+use crate::support::workdir::{BENCH, EVAL, Workdir, says};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::{BUILT_IN, PublishedRun};
 use gsscale::dataset::layout::Layout;
 use gsscale::dataset::lookalike::write_lookalike;
 use gsscale::dataset::synthetic::CityOptions;
 use gsscale::densify::strategy::StrategyName;
-use gsscale::render::SsimPadding;
 use gsscale::render::metrics::SsimVariant;
-use gsscale::schedule::order::Order;
 use serde_json::Value;
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
-use tempfile::TempDir;
+use std::path::Path;
 
 /// GS-Scale's per-scene dictionary, typed from the paper's table rather than from the config files: name, data_factor,
 /// test_every, test_after, position_lr, scaling_lr, smallest tier's refine_stop_iter, training size.
@@ -60,38 +56,11 @@ fn find(name: &str) -> PublishedRun {
 }
 
 /// The values shared by all scenes.
-fn shared() -> TrainConfig {
-    TrainConfig {
-        steps: 200_000,
-        seed: 42,
-        sh_degree: 3,
-        sh_start: 0,
-        sh_every: 1000,
-        init_opacity: 0.1,
-        init_scale: 1.0,
-        ssim_lambda: 0.2,
-        ssim_padding: SsimPadding::Valid,
-        near_plane: 0.01,
-        max_alpha: 0.999,
-        background: "0,0,0".parse().unwrap(),
-        means_lr_final: 0.01,
-        quats_lr: 0.001,
-        opacities_lr: 0.05,
-        sh0_lr: 0.0025,
-        shn_lr: 0.0025 / 20.0,
-        adam_eps: 1e-15,
-        strategy: StrategyName::Default,
-        max_gaussians: 0,
-        refine_start: 500,
-        refine_every: 100,
-        reset_every: 3000,
-        prune_opa: 0.005,
-        prune_scale3d: 0.1,
-        ssim_variant: SsimVariant::Reflect,
-        view_order: Chosen(Some(Order::Shuffle)),
-        ..TrainConfig::default()
-    }
-}
+const SHARED: &str = r#"steps = 200000, seed = 42, sh-degree = 3, sh-start = 0, sh-every = 1000, init-opacity = 0.1, init-scale = 1.0,
+    ssim-lambda = 0.2, ssim-padding = "valid", near-plane = 0.01, max-alpha = 0.999, background = "0;0;0", means-lr-final = 0.01,
+    quats-lr = 0.001, opacities-lr = 0.05, sh0-lr = 0.0025, shn-lr = 0.000125, adam-eps = 1e-15, strategy = "default", max-gaussians = 0,
+    refine-start = 500, refine-every = 100, reset-every = 3000, prune-opa = 0.005, prune-scale3d = 0.1, ssim-variant = "reflect",
+    view-order = "shuffle""#;
 
 #[test]
 fn the_files_hold_the_tables() {
@@ -107,7 +76,7 @@ fn the_files_hold_the_tables() {
             grow_grad2d: 0.0002,
             grow_scale3d: 0.01,
             refine_stop: 15_000,
-            ..shared()
+            ..TrainConfig::parse(&SHARED.replace(',', "\n").replace(';', ",")).unwrap()
         };
         assert_eq!(run.config, expected, "{name}");
         assert_eq!((run.facts.size, run.tier_of(&run.config)), (size, Some("S1")), "{name}");
@@ -146,8 +115,8 @@ fn the_files_hold_the_published_figures() {
 
 #[test]
 fn a_file_of_ones_own_is_read_as_strictly() {
-    let folder = TempDir::new().unwrap();
-    let path = folder.path().join("mine.toml");
+    let work = Workdir::new();
+    let path = work.path("mine.toml");
     let with = |from: &str, to: &str| {
         fs::write(&path, BUILT_IN[0].1.replacen(from, to, 1)).unwrap();
         PublishedRun::find(&path).map_err(|e| e.to_string())
@@ -163,15 +132,18 @@ fn a_file_of_ones_own_is_read_as_strictly() {
     assert!(said.contains("rubble, building"), "{said}");
 }
 
-fn bench(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-bench")).args(args).output().unwrap()
+/// Runs `gsscale-bench`, and returns its line of figures and what it said.
+fn bench(work: &Workdir, flags: &str) -> (Value, String) {
+    let output = work.output(BENCH, flags);
+    assert!(output.status.success(), "{flags}: {}", stderr(&output));
+    (serde_json::from_slice(&output.stdout).unwrap(), stderr(&output))
 }
 
-fn lookalike(folder: &Path, layout: Layout) -> PathBuf {
-    let scene = folder.join(layout.name());
+/// Writes a look-alike to the folder of its layout's name, which it returns.
+fn lookalike(work: &Workdir, layout: Layout) -> &'static str {
     let options = CityOptions { seed: 5, views: 24, width: 96, height: 64, points: 1500, ..CityOptions::default() };
-    write_lookalike(&scene, &options, (layout, 6), &|_, _| {}).unwrap();
-    scene
+    write_lookalike(&work.path(layout.name()), &options, (layout, 6), &|_, _| {}).unwrap();
+    layout.name()
 }
 
 /// Points of a COLMAP look-alike as a text PLY in the axes of Mega-NeRF's world: down, right, back.
@@ -190,43 +162,39 @@ fn cloud_in_drb(city: &Path, to: &Path) {
 
 #[test]
 fn look_alikes_train_as_the_plain_layout_does() {
-    let folder = TempDir::new().unwrap();
-    let trained = |scene: &Path| {
-        let out = folder.path().join("out").join(scene.file_name().unwrap());
-        let sizes = ["--steps", "120", "--test-every", "6", "--sh-every", "40", "--quiet", "--device", "cpu"];
-        let densify = ["--refine-start", "20", "--refine-every", "20", "--refine-stop", "90", "--reset-every", "60"];
-        let output = train(&[&[text(scene), "--out", text(&out)], &sizes[..], &densify[..]].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        (fs::read(out.join("point_cloud.ply")).unwrap(), scenes::psnr(&out))
+    let work = Workdir::new();
+    let trained = |scene: &str| {
+        let flags = "--steps 120 --test-every 6 --sh-every 40 --quiet --device cpu --refine-start 20 --refine-every 20 --refine-stop 90 \
+            --reset-every 60";
+        work.train(&format!("{scene} --out out/{scene} {flags}"));
+        (work.ply(&format!("out/{scene}")), work.psnr(&format!("out/{scene}")))
     };
-    let plain = lookalike(folder.path(), Layout::Colmap);
-    let (_, psnr) = trained(&plain);
-    let (merged, of_merged) = trained(&lookalike(folder.path(), Layout::ColmapMerged));
-    let (one_folder, _) = trained(&lookalike(folder.path(), Layout::Gauu));
+    let plain = lookalike(&work, Layout::Colmap);
+    let (_, psnr) = trained(plain);
+    let (merged, of_merged) = trained(lookalike(&work, Layout::ColmapMerged));
+    let (one_folder, _) = trained(lookalike(&work, Layout::Gauu));
     assert!(merged == one_folder, "two folders read as one give the bytes of one folder");
     // These poses went through one more quaternion than the plain scene's, which changes last bits.
     assert!((of_merged - psnr).abs() < 0.5, "{of_merged} dB, {psnr} dB");
-    let mega_nerf = lookalike(folder.path(), Layout::MegaNerf);
-    cloud_in_drb(&plain, &mega_nerf.join("points.ply"));
-    for scene in [mega_nerf, lookalike(folder.path(), Layout::MatrixCity)] {
-        let (_, other) = trained(&scene);
+    let mega_nerf = lookalike(&work, Layout::MegaNerf);
+    cloud_in_drb(&work.path(plain), &work.path(mega_nerf).join("points.ply"));
+    for scene in [mega_nerf, lookalike(&work, Layout::MatrixCity)] {
+        let (_, other) = trained(scene);
         // Other axes or units round differently (Mega-NeRF's poses are f32), and densification amplifies roundings.
-        assert!((other - psnr).abs() < 0.5, "{}: {other} dB, {psnr} dB", scene.display());
+        assert!((other - psnr).abs() < 0.5, "{scene}: {other} dB, {psnr} dB");
     }
 }
 
+/// Flags of runs on a look-alike.
+const RUBBLE: &str = "run rubble --data colmap-merged --out out";
+const SHORT: &str = "--steps 30 --data-factor 1 --device cpu";
+
 #[test]
 fn a_run_is_set_beside_the_published_one() {
-    let folder = TempDir::new().unwrap();
-    let data = lookalike(folder.path(), Layout::ColmapMerged);
-    let before: Vec<PathBuf> = files_of(&data);
-    let out = folder.path().join("out");
-    let common = ["run", "rubble", "--data", text(&data), "--out", text(&out)];
-    let sizes = ["--steps", "30", "--data-factor", "1", "--device", "cpu", "--tier", "S2", "--color-correct", "affine"];
-    let output = bench(&[&common[..], &sizes].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
-    let line: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let work = Workdir::new();
+    let data = lookalike(&work, Layout::ColmapMerged);
+    let before = work.files(data);
+    let (line, said) = bench(&work, &format!("{RUBBLE} {SHORT} --tier S2 --color-correct affine"));
     assert_eq!(
         (&line["tier"], &line["layout"], &line["comparable"]),
         (&"S2".into(), &"colmap-merged".into(), &false.into())
@@ -238,30 +206,24 @@ fn a_run_is_set_beside_the_published_one() {
     let corrected = line["ours"]["test"]["color_corrected"]["cc_psnr"].as_f64().unwrap();
     assert!(corrected.is_finite() && line["ours"]["test"]["color_corrected"]["method"] == "affine");
     let why = line["not_the_published_run"].to_string();
-    for words in ["24 photos instead of 1678", "4 held-out photos instead of 21", "steps = 30 instead of 200000"] {
-        assert!(why.contains(words), "{why}");
-    }
-    for words in
-        ["GS-Scale", "26.62", "colour-corrected PSNR (affine), dB", "not the published run: ", "SSIM (reflect)"]
-    {
-        assert!(said.contains(words), "{words}: {said}");
-    }
-    let page = fs::read_to_string(out.join("published.html")).unwrap();
+    says(&why, &["24 photos instead of 1678", "4 held-out photos instead of 21", "steps = 30 instead of 200000"]);
+    says(
+        &said,
+        &["GS-Scale", "26.62", "colour-corrected PSNR (affine), dB", "not the published run: ", "SSIM (reflect)"],
+    );
+    let page = work.text("out/published.html");
     assert!(page.contains("26.62") && page.contains("colour-corrected PSNR (affine)"));
-    assert!(out.join("report.html").is_file() && out.join("published.json").is_file());
-    assert_eq!(before, files_of(&data), "nothing is written into the dataset");
+    assert!(work.exists("out/report.html") && work.exists("out/published.json"));
+    assert!(before == work.files(data), "nothing is written into the dataset");
     // The same figures again without training. Another SSIM or LPIPS gives no difference to the published one.
-    let weights = lpips_weights(folder.path());
-    let again = |more: &[&str]| -> Value {
-        let output = bench(&[&common[..], &["--no-train", "--quiet", "--lpips", text(&weights)], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        serde_json::from_slice(&output.stdout).unwrap()
-    };
-    let signed = again(&[]);
+    lpips_weights(&work.path(""));
+    let again =
+        |more: &str| bench(&work, &format!("{RUBBLE} --no-train --quiet --lpips lpips_alex.safetensors {more}")).0;
+    let signed = again("");
     assert_eq!(signed["ours"]["lpips_variant"], "alex, signed");
     let distance = signed["ours"]["test"]["lpips"].as_f64().unwrap();
     assert!((signed["difference"]["lpips"].as_f64().unwrap() - (distance - 0.194)).abs() < 1e-9);
-    let again = again(&["--ssim-variant", "same", "--lpips-range", "unit"]);
+    let again = again("--ssim-variant same --lpips-range unit");
     assert!(again["difference"]["lpips"].is_null() && again["ours"]["test"]["lpips"].is_number());
     // The PLY holds unit quaternions.
     assert!((again["ours"]["test"]["psnr"].as_f64().unwrap() - ours).abs() < 0.01);
@@ -270,9 +232,8 @@ fn a_run_is_set_beside_the_published_one() {
     assert_eq!(signed["not_the_published_run"], line["not_the_published_run"]);
     assert!(!why.contains("grow-") && !why.contains("refine-stop"), "{why}");
     // gsscale-eval with colour correction, from the same PLY; the run's config asked for the affine fit.
-    for (more, method) in [(&[][..], "affine"), (&["--colour-correct", "quadratic"], "quadratic")] {
-        let output = eval(&[&[text(&out), text(&data)], more].concat());
-        let report: Value = serde_json::from_slice(&output.stdout).unwrap();
+    for (more, method) in [("", "affine"), ("--colour-correct quadratic", "quadratic")] {
+        let report = work.json_of(EVAL, &format!("out {data} {more}"));
         let test = &report["test"];
         assert_eq!(test["color_corrected"]["method"], method);
         assert!(test["color_corrected"]["cc_psnr"].is_number() && test["psnr"] == again["ours"]["test"]["psnr"]);
@@ -281,86 +242,57 @@ fn a_run_is_set_beside_the_published_one() {
 
 #[test]
 fn the_defaults_of_gsscale_are_set_beside_both() {
-    let folder = TempDir::new().unwrap();
-    let data = lookalike(folder.path(), Layout::ColmapMerged);
-    let out = folder.path().join("out");
-    let common = ["run", "rubble", "--data", text(&data), "--out", text(&out), "--with-defaults"];
-    let output = bench(&[&common[..], &["--steps", "30", "--data-factor", "1", "--device", "cpu"]].concat());
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
-    let line: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let work = Workdir::new();
+    lookalike(&work, Layout::ColmapMerged);
+    let (line, said) = bench(&work, &format!("{RUBBLE} {SHORT} --with-defaults"));
     let psnr = |line: &Value, of: &str| line[of]["test"]["psnr"].as_f64().unwrap();
     assert!(psnr(&line, "with_defaults") != psnr(&line, "ours"), "two different rules");
     assert_eq!(line["with_defaults"]["ssim_variant"], "reflect");
     assert_eq!(line["difference"]["psnr"], psnr(&line, "ours") - 26.62);
     // The settings: those of the paper in one folder, the defaults in the other; the photos are the same.
     let [of_paper, of_defaults] =
-        [&out, &out.join("defaults")].map(|out| TrainConfig::read(&out.join("config.toml")).unwrap());
+        ["out", "out/defaults"].map(|out| TrainConfig::read(&work.path(out).join("config.toml")).unwrap());
     assert_eq!((of_paper.strategy, of_defaults.strategy), (StrategyName::Default, StrategyName::LongAxis));
     assert_eq!((of_paper.test_every, of_defaults.test_every), (83, 83));
     assert_eq!((of_paper.steps, of_defaults.steps), (30, 30));
-    for words in ["ours, defaults", "with the defaults of gsscale: "] {
-        assert!(said.contains(words), "{words}: {said}");
-    }
-    assert!(fs::read_to_string(out.join("published.html")).unwrap().contains("ours, defaults"));
-    let again = bench(&[&common[..], &["--no-train", "--quiet"]].concat());
-    assert!(again.status.success(), "{}", stderr(&again));
-    let again: Value = serde_json::from_slice(&again.stdout).unwrap();
+    says(&said, &["ours, defaults", "with the defaults of gsscale: "]);
+    assert!(work.text("out/published.html").contains("ours, defaults"));
+    let (again, _) = bench(&work, &format!("{RUBBLE} --with-defaults --no-train --quiet"));
     // The PLY holds unit quaternions.
     assert!((psnr(&again, "with_defaults") - psnr(&line, "with_defaults")).abs() < 0.01);
 }
 
-fn files_of(folder: &Path) -> Vec<PathBuf> {
-    let mut files = Vec::new();
-    let mut stack = vec![folder.to_path_buf()];
-    while let Some(path) = stack.pop() {
-        if path.is_dir() {
-            stack.extend(fs::read_dir(&path).unwrap().map(|e| e.unwrap().path()));
-        } else {
-            files.push(path);
-        }
-    }
-    files.sort();
-    files
-}
-
 #[test]
 fn the_depth_cloud_is_found_and_its_absence_said() {
-    let folder = TempDir::new().unwrap();
-    let matrix_city = lookalike(folder.path(), Layout::MatrixCity);
-    let data = lookalike(folder.path(), Layout::Colmap);
-    let dry = |data: &Path| {
-        let output = bench(&["run", "aerial", "--data", text(data), "--dry-run", "--device", "cpu"]);
-        assert!(output.status.success(), "{}", stderr(&output));
+    let work = Workdir::new();
+    let matrix_city = lookalike(&work, Layout::MatrixCity);
+    let data = lookalike(&work, Layout::Colmap);
+    let dry = |data: &str| {
+        let output = work.output(BENCH, &format!("run aerial --data {data} --dry-run --device cpu"));
         // The plan is on standard output; no line of figures is.
-        assert!(!String::from_utf8_lossy(&output.stdout).contains('{'), "{}", scenes::told(&output));
+        let has_figures = String::from_utf8_lossy(&output.stdout).contains('{');
+        assert!(output.status.success() && !has_figures, "{}", told(&output));
         stderr(&output)
     };
-    assert!(dry(&matrix_city).contains("laid out as matrixcity"));
+    assert!(dry(matrix_city).contains("laid out as matrixcity"));
     // 24 views are fewer than 5,620: no view is held out by index.
-    let said = dry(&data);
+    let said = dry(data);
     assert!(said.contains("the published point cloud is missing (sparse/0/points.ply)"), "{said}");
     assert!(said.contains("0 held-out photos instead of 741"), "{said}");
-    fs::copy(matrix_city.join("points.ply"), data.join("sparse/0/points.ply")).unwrap();
-    assert!(!dry(&data).contains("the published point cloud is missing"));
+    fs::copy(work.path(matrix_city).join("points.ply"), work.path(data).join("sparse/0/points.ply")).unwrap();
+    assert!(!dry(data).contains("the published point cloud is missing"));
 }
 
 #[test]
 fn an_incomplete_folder_is_told_from_a_complete_one() {
-    let folder = TempDir::new().unwrap();
-    let data = lookalike(folder.path(), Layout::ColmapMerged);
-    let out = folder.path().join("out");
+    let work = Workdir::new();
+    let data = work.path(lookalike(&work, Layout::ColmapMerged));
     let refuses = |words: &[&str]| {
-        let output = bench(&["run", "rubble", "--data", text(&data), "--out", text(&out), "--steps", "2"]);
-        let said = stderr(&output);
-        assert_eq!(output.status.code(), Some(1), "{said}");
-        for word in words {
-            assert!(said.contains(word), "{word}: {said}");
-        }
-        assert!(!out.exists(), "nothing is left behind");
+        work.refuses_with(BENCH, &format!("{RUBBLE} --steps 2"), words);
+        assert!(!work.exists("out"), "nothing is left behind");
     };
     fs::remove_file(data.join("val/rgbs/000006.jpg")).unwrap();
-    refuses(&["1 of 24 photos are missing: 000006.jpg", "remedy"]);
+    refuses(&["1 of 24 photos are missing: 000006.jpg"]);
     fs::remove_dir_all(data.join("val/sparse")).unwrap();
     fs::remove_file(data.join("coordinates.pt")).unwrap();
     refuses(&[
@@ -369,8 +301,7 @@ fn an_incomplete_folder_is_told_from_a_complete_one() {
         "train/sparse/0/ ",
         "https://github.com/cmusatyalab/mega-nerf",
     ]);
-    let output = bench(&["run", "rubble"]);
-    assert!(stderr(&output).contains("--data"));
+    assert!(stderr(&work.output(BENCH, "run rubble")).contains("--data"));
 }
 
 /// The commands of configs/README.md that train a look-alike, each on one line.
@@ -385,24 +316,24 @@ fn commands_of_look_alike() -> Vec<String> {
 
 #[test]
 fn the_commands_for_a_look_alike_end_at_the_table() {
-    let folder = TempDir::new().unwrap();
+    let work = Workdir::new();
     let mut said = String::new();
     for line in commands_of_look_alike() {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        let ["cargo", "run", "--release", "--bin", program, "--", args @ ..] = &words[..] else { panic!("{line}") };
-        let program = match *program {
+        let Some((program, flags)) =
+            line.strip_prefix("cargo run --release --bin ").and_then(|rest| rest.split_once(" -- "))
+        else {
+            panic!("{line}")
+        };
+        let program = match program {
             "gsscale-synth" => env!("CARGO_BIN_EXE_gsscale-synth"),
-            "gsscale-bench" => env!("CARGO_BIN_EXE_gsscale-bench"),
+            "gsscale-bench" => BENCH,
             other => panic!("{other} in {line}"),
         };
-        let output = Command::new(program).args(args).current_dir(folder.path()).output().unwrap();
+        let output = work.output(program, flags);
         assert!(output.status.success(), "{line}\n{}", stderr(&output));
         said = stderr(&output);
     }
-    for words in ["Mill-19 Rubble, tier S1", "GS-Scale", "26.62", "PSNR, dB", "not the published run: "] {
-        assert!(said.contains(words), "{words}: {said}");
-    }
-    let json: Value =
-        serde_json::from_slice(&fs::read(folder.path().join("runs/rubble/published.json")).unwrap()).unwrap();
+    says(&said, &["Mill-19 Rubble, tier S1", "GS-Scale", "26.62", "PSNR, dB", "not the published run: "]);
+    let json = work.json("runs/rubble/published.json");
     assert!(json["ours"]["test"]["psnr"].as_f64().unwrap() > 10.0);
 }

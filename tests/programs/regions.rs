@@ -1,10 +1,8 @@
 //! Regions of a scene, where views come in spatial groups: they grow as in a shuffle.
 
-use crate::support::scenes::{TextModel, stderr, text, train};
+use crate::support::scenes::TextModel;
+use crate::support::workdir::Workdir;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::exchange::ply::{PlyContent, read_ply};
-use std::path::{Path, PathBuf};
-use tempfile::TempDir;
 
 /// The middle of a scene: regions are its four quarters.
 struct Quarters {
@@ -25,12 +23,9 @@ impl Quarters {
     }
 
     /// Gaussians of a result by quarter.
-    fn count(&self, out: &Path) -> [f64; 4] {
-        let PlyContent::Gaussians { columns, .. } = read_ply(&out.join("point_cloud.ply")).unwrap() else {
-            panic!("points")
-        };
-        let transform = std::fs::read_to_string(out.join("point_cloud.transform.json")).unwrap();
-        let transform: serde_json::Value = serde_json::from_str(&transform).unwrap();
+    fn count(&self, work: &Workdir, out: &str) -> [f64; 4] {
+        let (columns, _) = work.gaussians(&format!("{out}/point_cloud.ply"));
+        let transform = work.json(&format!("{out}/point_cloud.transform.json"));
         let matrix: [[f64; 4]; 4] = serde_json::from_value(transform["file_to_dataset"].clone()).unwrap();
         let mut counts = [0.0; 4];
         for mean in columns.means.chunks_exact(3) {
@@ -42,8 +37,9 @@ impl Quarters {
 }
 
 /// A city of 96 photos with all of its points in one quarter, and every fifth point elsewhere.
-fn city_with_one_detailed_quarter(folder: &Path) -> (PathBuf, Quarters) {
-    let scene = folder.join("scene");
+fn city_with_one_detailed_quarter() -> (Workdir, Quarters) {
+    let work = Workdir::new();
+    let scene = work.scene();
     let size = CityOptions { seed: 5, views: 96, width: 96, height: 64, ..CityOptions::default() };
     write_city(&scene, &CityOptions { points: 12_000, supersample: 1, ..size }, &|_, _| {}).unwrap();
     let mut model = TextModel::of(&scene);
@@ -53,23 +49,19 @@ fn city_with_one_detailed_quarter(folder: &Path) -> (PathBuf, Quarters) {
     model.points = kept.iter().map(|&i| model.points[i]).collect();
     model.colors = kept.iter().map(|&i| model.colors[i]).collect();
     model.write(&scene);
-    (scene, quarters)
+    (work, quarters)
 }
 
 /// The counts of each quarter agree within 10 %, after 15 epochs in which the count grows to 2.5 times the points. Two shuffles of different seeds differ by as much as
 /// 7 %. With this scene, rounds by steps, each with the statistics of six groups, gave 22 % more in the detailed quarter and 22 % less in another.
 #[test]
 fn groups_of_views_grow_every_region_as_a_shuffle_does() {
-    let folder = TempDir::new().unwrap();
-    let (scene, quarters) = city_with_one_detailed_quarter(folder.path());
+    let (work, quarters) = city_with_one_detailed_quarter();
     let counts = ["shuffle", "groups:12"].map(|order| {
-        let out = folder.path().join(order.replace(':', "-"));
-        let what = [text(&scene), "--out", text(&out), "--view-order", order, "--strategy", "long-axis"];
-        let length =
-            ["--steps", "1440", "--refine-every", "48", "--schedule", "run-length", "--max-gaussians", "12000"];
-        let output = train(&[&what[..], &length, &["--test-every", "0", "--device", "cpu", "--quiet"]].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        quarters.count(&out)
+        let out = order.replace(':', "-");
+        let length = "--steps 1440 --refine-every 48 --schedule run-length --max-gaussians 12000 --test-every 0";
+        work.run(&out, &format!("--view-order {order} --strategy long-axis {length}"));
+        quarters.count(&work, &out)
     });
     println!("Gaussians by quarter: {counts:?}");
     let [shuffled, in_groups] = counts;

@@ -1,38 +1,27 @@
 //! The live page (`--serve`): what it answers, that it changes no byte of the result, and what is refused.
 
-use crate::support::scenes::{city, classic, stderr, text, train, wide_city};
-use std::io::{BufRead, BufReader, Read, Write};
+use crate::support::workdir::{Running, TRAIN, Workdir};
+use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::path::Path;
-use std::process::{Child, ChildStderr, Command, Stdio};
 use std::time::Duration;
-use tempfile::TempDir;
 
 /// A run with a page.
-struct Served {
-    child: Child,
-    said: BufReader<ChildStderr>,
+struct Served<'a> {
+    run: Running<'a>,
     address: SocketAddr,
 }
 
 /// Starts a run and reads the address of its page.
-fn begin(args: &[&str]) -> Served {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_gsscale-train"))
-        .args(args)
-        .args(classic(args))
-        .args(["--serve", "127.0.0.1:0"])
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    let mut said = BufReader::new(child.stderr.take().unwrap());
-    let mut line = String::new();
-    said.read_line(&mut line).unwrap();
-    let address = line.trim().strip_prefix("live page: http://").and_then(|rest| rest.strip_suffix('/'));
+fn begin<'a>(work: &'a Workdir, flags: &str) -> Served<'a> {
+    let mut run =
+        Running::spawn(work, &mut work.command(TRAIN, &format!("scene --out out --serve 127.0.0.1:0 {flags}")));
+    let line = run.says("\n");
+    let address = line.strip_prefix("live page: http://").and_then(|rest| rest.split('/').next());
     let address = address.unwrap_or_else(|| panic!("no address: {line}")).parse().unwrap();
-    Served { child, said, address }
+    Served { run, address }
 }
 
-impl Served {
+impl Served<'_> {
     /// Status line, headers and body of an answer.
     fn get(&self, path: &str) -> (String, Vec<u8>) {
         self.get_as(path, &self.address.to_string())
@@ -62,13 +51,6 @@ impl Served {
         assert!(head.starts_with("HTTP/1.1 200") && head.contains("image/png"), "{query}: {head}");
         image::load_from_memory(&body).unwrap().to_rgb8()
     }
-
-    /// Waits for the end of the run.
-    fn end(mut self) {
-        let mut said = String::new();
-        self.said.read_to_string(&mut said).unwrap();
-        assert!(self.child.wait().unwrap().success(), "{said}");
-    }
 }
 
 /// Sum of the absolute differences of two pictures of one size.
@@ -77,23 +59,14 @@ fn difference(a: &image::RgbImage, b: &image::RgbImage) -> u64 {
     a.iter().zip(b.iter()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum()
 }
 
-fn ply(out: &Path) -> Vec<u8> {
-    std::fs::read(out.join("point_cloud.ply")).unwrap()
-}
-
 #[test]
 fn a_page_shows_the_run_and_changes_no_byte_of_it() {
-    let folder = TempDir::new().unwrap();
-    let scene = wide_city(folder.path(), 6000);
-    let [alone, watched, spill] = ["alone", "watched", "pages"].map(|name| folder.path().join(name));
+    let work = Workdir::wide_city(6000);
     // Rounds grow the scene while pictures are drawn, and there are fewer frames than pages. The last 700 steps are time that a
     // slow machine may need for its answers.
-    let args = "--steps 1600 --refine-start 100 --refine-every 100 --max-gaussians 7000 --page-rows 32 --log-every 10 --device cpu";
-    let args: Vec<&str> = args.split(' ').collect();
-    let output = train(&[&[text(&scene), "--out", text(&alone)], &args[..]].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    let of_watched = [text(&scene), "--out", text(&watched), "--spill-dir", text(&spill), "--frames", "90"];
-    let served = begin(&[&of_watched[..], &args].concat());
+    let flags = "--steps 1600 --refine-start 100 --refine-every 100 --max-gaussians 7000 --page-rows 32 --log-every 10 --device cpu";
+    work.run("alone", flags);
+    let served = begin(&work, &format!("{flags} --spill-dir spill --frames 90"));
 
     let (head, page) = served.get("/");
     assert!(head.contains("text/html") && String::from_utf8_lossy(&page).contains("/picture?"), "{head}");
@@ -131,18 +104,15 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
         drawn += 1;
     }
     assert!(drawn > 3, "{drawn} pictures");
-    served.end();
-    assert!(ply(&alone) == ply(&watched), "a watched run gives another scene");
+    served.run.ends(0);
+    assert!(work.ply("alone") == work.ply("out"), "a watched run gives another scene");
 }
 
 #[test]
 fn a_picture_of_more_gaussians_than_the_budget_allows_is_refused_and_the_run_goes_on() {
-    let folder = TempDir::new().unwrap();
-    let scene = wide_city(folder.path(), 80_000);
-    let [out, spill] = ["out", "pages"].map(|name| folder.path().join(name));
-    let args = "--steps 200 --host-mem 64MiB --page-rows 512 --device cpu --strategy none";
-    let args: Vec<&str> = args.split(' ').collect();
-    let served = begin(&[&[text(&scene), "--out", text(&out), "--spill-dir", text(&spill)], &args[..]].concat());
+    let work = Workdir::wide_city(80_000);
+    let flags = "--steps 200 --host-mem 64MiB --page-rows 512 --device cpu --strategy none --spill-dir spill";
+    let served = begin(&work, flags);
     served.picture("view=0&width=48");
     // Far enough for the whole city.
     let (head, body) = served.get("/picture?view=0&distance=100&width=48");
@@ -152,20 +122,18 @@ fn a_picture_of_more_gaussians_than_the_budget_allows_is_refused_and_the_run_goe
         "{said}"
     );
     served.picture("view=0&width=48");
-    served.end();
+    served.run.ends(0);
 }
 
 #[test]
 fn an_address_that_cannot_be_served_is_refused_before_anything_is_written() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 8, 64, 48, 100);
-    let out = folder.path().join("out");
+    let work = Workdir::city(8, 64, 48, 100);
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = taken.local_addr().unwrap().port().to_string();
     for (address, words) in [(port.as_str(), "cannot be served"), ("localhost", "use a port (8080)")] {
-        let output = train(&[text(&scene), "--out", text(&out), "--steps", "3", "--serve", address]);
-        let said = stderr(&output);
+        let output = work.output(TRAIN, &format!("scene --out out --steps 3 --serve {address}"));
+        let said = crate::support::scenes::stderr(&output);
         assert!(!output.status.success() && said.contains("--serve") && said.contains(words), "{said}");
-        assert!(!out.exists());
+        assert!(!work.exists("out"));
     }
 }

@@ -1,38 +1,51 @@
 //! `gsscale-bench sweep`, which trains runs in child processes, and `gsscale-bench compare` of its runs.
 
-use crate::support::bench::{bench, large_city, lines, number, parse};
+use crate::support::bench::{number, parse};
 use crate::support::browser::in_a_browser;
 use crate::support::gpu;
-use crate::support::scenes::{stderr, text};
+use crate::support::scenes::stderr;
+use crate::support::workdir::{BENCH, Running, Workdir};
 use gsscale::gpu::GpuOptions;
 use serde_json::Value;
-use std::path::Path;
-use std::process::{Command, Output, Stdio};
-use std::time::{Duration, Instant};
-use tempfile::TempDir;
 
-fn names(folder: &Path) -> Vec<String> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten();
+/// A city whose views each see at most two thirds of it.
+fn large_city() -> Workdir {
+    Workdir::city(150, 48, 32, 8000)
+}
+
+fn names(work: &Workdir, folder: &str) -> Vec<String> {
+    let entries = std::fs::read_dir(work.path(folder)).into_iter().flatten();
     let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();
     names.sort();
     names
 }
 
 /// Asserts that a report page is complete and self-contained, and that it opens in a browser if one is installed.
-fn check_page(page: &Path, parts: &[&str], scratch: &Path) {
-    let html = std::fs::read_to_string(page).unwrap();
+fn check_page(work: &Workdir, page: &str, parts: &[&str]) {
+    let html = work.text(page);
     for part in parts.iter().chain(&["<svg", "</html>"]) {
-        assert!(html.contains(part), "{part} is missing in {}", page.display());
+        assert!(html.contains(part), "{part} is missing in {page}");
     }
     let addresses = html.replace("http://www.w3.org/2000/svg", "");
     assert!(!addresses.contains("http://") && !addresses.contains("https://") && !addresses.contains("src=\"/"));
-    in_a_browser(page, scratch);
+    in_a_browser(&work.path(page), &work.path(""));
 }
 
-/// Arguments of a sweep on a scene with small pages.
-fn sweep<'a>(list: &'a str, scene: &'a Path, out: &'a Path, more: &[&'a str]) -> Vec<&'a str> {
-    let common = ["--page-rows", "16", "--strategy", "none", "--pace-steps", "0"];
-    [&["sweep", list, text(scene), "--out", text(out)][..], &common, more].concat()
+/// The flags of a sweep into `out` on the scene with small pages; what it leaves is in `out/scene`.
+fn sweep(list: &str, more: &str) -> String {
+    format!("sweep {list} scene --out out --page-rows 16 --strategy none --pace-steps 0 {more}")
+}
+
+/// What a sweep that succeeds prints.
+fn said(work: &Workdir, flags: &str) -> String {
+    let output = work.output(BENCH, flags);
+    assert!(output.status.success(), "{flags}: {}", stderr(&output));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// The same with `--json`: a line for each run.
+fn lines(work: &Workdir, flags: &str) -> Vec<Value> {
+    parse(&said(work, &format!("{flags} --json")))
 }
 
 /// The record of a run.
@@ -41,24 +54,12 @@ fn of<'a>(records: &'a [Value], name: &str, seed: u64) -> &'a Value {
     found.unwrap_or_else(|| panic!("{name} {seed} in {records:?}"))
 }
 
-fn said(output: &Output) -> String {
-    String::from_utf8(output.stdout.clone()).unwrap()
-}
-
 #[test]
 fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
-    let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
-    let out = folder.path().join("ladder");
-    let command = sweep("ladder", &scene, &out, &["--steps", "60", "--share", "70", "--seeds", "3"]);
-    let at = command.iter().position(|arg| *arg == "--pace-steps").unwrap() + 1;
-    let with_pace = |steps: &'static str| {
-        let mut command = command.clone();
-        command[at] = steps;
-        command
-    };
-    let plain = with_pace("20");
-    let records = lines(&[&plain[..], &["--json"]].concat());
+    let work = large_city();
+    let flags = sweep("ladder", "--steps 60 --share 70 --seeds 3");
+    let plain = format!("{flags} --pace-steps 20");
+    let records = lines(&work, &plain);
     let [naive, deferred, planned, overlap, memory] =
         ["naive", "deferred", "planned", "overlap", "memory"].map(|name| of(&records, name, 3));
     for rung in [deferred, planned, overlap] {
@@ -76,24 +77,23 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     assert!(number(memory, "bytes_read") == 0.0 && number(overlap, "drive_bytes_peak") > 0.0);
     assert!(records.iter().all(|r| number(r, "cpu_seconds") > 0.0 && number(r, "host_bytes_peak") > 1e6));
     assert!(records.iter().all(|r| number(&r["pace"], "seconds") > 0.0), "the pace of the machine at each rung");
-    let own = out.join(scene.file_name().unwrap());
-    check_page(&own.join("sweep.html"), &["the same, byte for byte", "seconds waiting"], folder.path());
-    assert!(names(&own.join("spill")).is_empty(), "scratch is removed");
+    check_page(&work, "out/scene/sweep.html", &["the same, byte for byte", "seconds waiting"]);
+    assert!(names(&work, "out/scene/spill").is_empty(), "scratch is removed");
     // Finished runs are not repeated. Without --json, the end is a table of them, in the order of the list.
-    let table = said(&bench(&plain));
+    let table = said(&work, &plain);
     let words: Vec<&str> =
         table.lines().filter_map(|line| line.strip_prefix("| ")?.split_whitespace().next()).collect();
     assert_eq!(words, ["run", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
     assert!(table.contains(&format!(" {:.2} |", number(memory, "psnr"))) && !table.contains("DIFFER"));
-    let results = own.join("results.jsonl");
-    assert_eq!(parse(&std::fs::read_to_string(&results).unwrap()), records);
+    let results = "out/scene/results.jsonl";
+    assert_eq!(parse(&work.text(results)), records);
     // A machine that was three times as slow during one rung: a third of its 90 seconds at the pace of the others.
     let mut paced = records.clone();
     paced.iter_mut().for_each(|rung| rung["pace"]["seconds"] = 2.0.into());
     let slow = paced.iter_mut().find(|rung| rung["name"] == "memory").unwrap();
     (slow["pace"]["seconds"], slow["seconds"]) = (6.0.into(), 90.0.into());
-    std::fs::write(&results, paced.iter().map(|rung| format!("{rung}\n")).collect::<String>()).unwrap();
-    let (converted, measured) = (said(&bench(&plain)), said(&bench(&with_pace("0"))));
+    work.write(results, paced.iter().map(|rung| format!("{rung}\n")).collect::<String>());
+    let (converted, measured) = (said(&work, &plain), said(&work, &flags));
     assert!(converted.contains(" 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
     assert!(measured.contains(" 90.0 |") && measured.contains("times as measured"), "{measured}");
 }
@@ -104,12 +104,9 @@ fn rungs_on_a_device_end_alike() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
-    let out = folder.path().join("ladder");
-    let sizes = ["--steps", "30", "--share", "70"];
-    let args = sweep("ladder-gpu", &scene, &out, &sizes);
-    let records = lines(&[&args[..], &["--device-mem", "6MiB", "--device", "gpu", "--json"]].concat());
+    let work = large_city();
+    let flags = sweep("ladder-gpu", "--steps 30 --share 70");
+    let records = lines(&work, &format!("{flags} --device-mem 6MiB --device gpu"));
     let [overlap, memory, pages, ahead, split, resident] =
         ["overlap", "memory", "pages", "ahead", "split", "resident"].map(|name| of(&records, name, 42));
     assert!(
@@ -123,63 +120,51 @@ fn rungs_on_a_device_end_alike() {
     assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{records:?}");
     let words =
         ["The results of overlap, memory are the same", "The results of pages, ahead, split, resident are the same"];
-    check_page(&out.join(scene.file_name().unwrap()).join("sweep.html"), &words, folder.path());
-    let output = bench(&[&args[..], &["--device", "cpu"]].concat());
-    assert!(!output.status.success() && stderr(&output).contains("use --device auto or gpu"), "{}", stderr(&output));
+    check_page(&work, "out/scene/sweep.html", &words);
+    work.refuses_with(BENCH, &format!("{flags} --device cpu"), &["use --device auto or gpu"]);
 }
 
 #[test]
 fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
-    let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
-    let out = folder.path().join("sweep");
-    let knobs = ["--steps", "20", "--seeds", "1,2", "--other-seeds", "2", "--only", "optimizer,budget,sh,resolution"];
-    let plain = sweep("pareto", &scene, &out, &knobs);
-    let args = [&plain[..], &["--json"]].concat();
-    let planned = said(&bench(&[&args[..], &["--list-runs"]].concat())).matches("to do").count();
-    assert!(planned >= 16 && !out.exists(), "listing runs nothing");
+    let work = large_city();
+    let flags = sweep("pareto", "--steps 20 --seeds 1,2 --other-seeds 2 --only optimizer,budget,sh,resolution");
+    let planned = said(&work, &format!("{flags} --list-runs")).matches("to do").count();
+    assert!(planned >= 16 && !work.exists("out"), "listing runs nothing");
 
     // Killed in the middle of a run.
-    let program = env!("CARGO_BIN_EXE_gsscale-bench");
-    let mut killed = Command::new(program).args(&args).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
-    let out = out.join(scene.file_name().unwrap());
-    let results = out.join("results.jsonl");
-    let began = Instant::now();
-    while std::fs::read_to_string(&results).map_or(0, |t| t.lines().count()) < 2 {
-        assert!(began.elapsed() < Duration::from_secs(120), "no run ended");
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    killed.kill().unwrap();
-    killed.wait().unwrap();
-    let kept = std::fs::read_to_string(&results).unwrap();
+    let (results, part) = ("out/scene/results.jsonl", "out/scene/runs/base-seed9-00000000.part");
+    let so_far = || std::fs::read_to_string(work.path(results)).map_or(0, |text| text.lines().count());
+    Running::spawn(&work, &mut work.command(BENCH, &flags)).once(|| so_far() >= 2).kill();
+    let kept = work.text(results);
     let done = kept.lines().count();
     // And as after a crash of the machine in the middle of a line.
-    std::fs::write(&results, format!("{kept}{{\"key\":\"0123")).unwrap();
-    std::fs::create_dir_all(out.join("runs/base-seed9-00000000.part/renders")).unwrap();
+    work.write(results, format!("{kept}{{\"key\":\"0123"));
+    std::fs::create_dir_all(work.path(part).join("renders")).unwrap();
 
     // The holder of the lock is at work, even if only a run that outlived its sweep.
-    let lock = std::fs::File::open(out.join("sweep.lock")).unwrap();
+    let lock = std::fs::File::open(work.path("out/scene/sweep.lock")).unwrap();
     lock.lock().unwrap();
-    let refused = bench(&args);
-    assert!(!refused.status.success() && stderr(&refused).contains("left behind"), "{}", stderr(&refused));
-    assert!(out.join("runs/base-seed9-00000000.part").is_dir(), "it may be in use");
+    work.refuses_with(BENCH, &flags, &["left behind"]);
+    assert!(work.exists(part), "it may be in use");
     drop(lock);
 
-    let after = lines(&[&args[..], &["--max-runs", "3"]].concat());
+    let after = lines(&work, &format!("{flags} --max-runs 3"));
     assert_eq!(after.len(), 3);
-    let rest = lines(&args);
+    let rest = lines(&work, &flags);
     assert_eq!(done + after.len() + rest.len(), planned, "nothing is lost, nothing is done twice");
-    let records = parse(&std::fs::read_to_string(&results).unwrap());
-    assert!(std::fs::read_to_string(&results).unwrap().starts_with(&kept));
-    let mut keys: Vec<&str> = records.iter().map(|r| r["key"].as_str().unwrap()).collect();
-    keys.sort_unstable();
-    keys.dedup();
+    let all = work.text(results);
+    assert!(all.starts_with(&kept));
+    let records = parse(&all);
+    let keys: std::collections::BTreeSet<&str> = records.iter().map(|r| r["key"].as_str().unwrap()).collect();
     assert_eq!(keys.len(), planned);
     assert!(records.iter().all(|r| r["problem"].is_null()), "{records:?}");
-    assert!(names(&out.join("runs")).iter().all(|name| !name.contains(".part")), "half runs are removed");
-    assert_eq!(names(&out.join("runs")).len(), planned);
-    assert!(lines(&args).is_empty(), "all are done");
-    let table = said(&bench(&plain));
+    let runs = names(&work, "out/scene/runs");
+    assert!(
+        runs.len() == planned && runs.iter().all(|name| !name.contains(".part")),
+        "half runs are removed: {runs:?}"
+    );
+    assert!(lines(&work, &flags).is_empty(), "all are done");
+    let table = said(&work, &flags);
     assert!(table.starts_with("| run ") && table.contains("the same bits") && !table.contains('{'), "{table}");
 
     // The figures that follow from the settings.
@@ -194,46 +179,39 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     // own photos.
     let small = of(&records, "resolution/1/2", 1);
     assert!(number(small, "psnr") < number(base, "psnr"), "{small} {base}");
-    check_page(&out.join("sweep.html"), &["Pareto front", "the same bits", "CPU seconds"], folder.path());
-    compare(&out, small, folder.path());
-}
-
-/// As the help says: all runs of the sweep on one page, the reference first.
-fn compare(out: &Path, small: &Value, scratch: &Path) {
-    let names = names(&out.join("runs"));
-    let folders: Vec<_> = names.iter().map(|name| out.join("runs").join(name)).collect();
-    let folders: Vec<&str> = folders.iter().map(|folder| text(folder)).collect();
-    let page = out.join("compare.html");
-    let compared = bench(&[&["compare"][..], &folders[..], &["--out", text(&page)]].concat());
-    assert!(compared.status.success(), "{}", stderr(&compared));
+    check_page(&work, "out/scene/sweep.html", &["Pareto front", "the same bits", "CPU seconds"]);
+    // As the help says: all runs of the sweep on one page, the reference first.
+    let folders: Vec<String> = runs.iter().map(|name| format!("out/scene/runs/{name}")).collect();
+    said(&work, &format!("compare {} --out compare.html", folders.join(" ")));
     let figure = format!("<td class=\"number\">{:.3}</td>", number(small, "psnr"));
     let marks = ["PSNR and SSIM are of evaluated.json", "trained with data-factor 2 instead of 1", "are left out"];
-    check_page(&page, &[&marks[..], &["PSNR of training views", figure.as_str()]].concat(), scratch);
-    let sliders = std::fs::read_to_string(&page).unwrap().matches("class=\"slider\"").count();
-    assert_eq!((names[0].starts_with("base-seed1"), sliders), (true, 12));
+    check_page(&work, "compare.html", &[&marks[..], &["PSNR of training views", &figure]].concat());
+    let sliders = work.text("compare.html").matches("class=\"slider\"").count();
+    assert_eq!((runs[0].starts_with("base-seed1"), sliders), (true, 12));
 }
 
 #[test]
 fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
-    let folder = TempDir::new().unwrap();
-    let scene = large_city(folder.path());
-    let (out, own) = (folder.path().join("out"), folder.path().join("own.toml"));
-    let (scene_text, out_text, own_text) = (text(&scene), text(&out), text(&own));
-    let refuses = |args: &[&str], words: &str| {
-        let output = bench(args);
-        assert_eq!(output.status.code(), Some(1));
-        assert!(stderr(&output).contains(words) && stderr(&output).contains("remedy"), "{}", stderr(&output));
+    let work = large_city();
+    let refuses = |flags: &str, words: &str| {
+        work.refuses_with(BENCH, flags, &[words]);
     };
+    let own = "sweep own.toml scene --out out";
     let refuses_list = |list: &str, words: &str| {
-        std::fs::write(&own, list).unwrap();
-        refuses(&["sweep", own_text, scene_text, "--out", out_text], words);
+        work.write("own.toml", list);
+        refuses(own, words);
     };
-    refuses(&["sweep", "pareto", scene_text, "--out", out_text, "--only", "sh,colour"], "possible values");
-    refuses(&["sweep", "pareto", scene_text, "--out", out_text, "--share", "100"], "--share");
-    refuses(&["sweep", "pareto", scene_text, scene_text, "--out", out_text], "another scene has this name");
-    refuses(&["sweep", "ladder", "/nowhere", "--out", out_text], "nowhere");
-    refuses(&["sweep", "no-such-list", scene_text, "--out", out_text], "no-such-list");
-    refuses(&["compare", scene_text, scene_text, "--out", out_text], "metrics.jsonl");
+    for (flags, words) in [
+        ("sweep pareto scene --out out --only sh,colour", "possible values"),
+        ("sweep pareto scene --out out --share 100", "--share"),
+        ("sweep pareto scene scene --out out", "another scene has this name"),
+        ("sweep ladder /nowhere --out out", "nowhere"),
+        ("sweep no-such-list scene --out out", "no-such-list"),
+        ("compare scene scene --out out", "metrics.jsonl"),
+        ("scene --spill-dir out", "--spill-dir"),
+    ] {
+        refuses(flags, words);
+    }
     let list = "seeds = [1]\n[base]\nsteps = 4\n[view]\ntitle = \"own\"\nreference = \"plain\"\nfigures = [\"psnr\"]\n\
                 charts = []\n[[group]]\nname = \"\"\nruns = [{ name = \"plain\" }, RUN]\n";
     let with = |run: &str| list.replace("RUN", run);
@@ -251,38 +229,31 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
         &list.replace(", RUN", "").replace("seeds = [1]", "seeds = [1]\nshare = 50"),
         "nothing would leave memory",
     );
-    refuses(&[scene_text, "--spill-dir", out_text], "--spill-dir");
-    assert!(!out.exists(), "bad input leaves nothing behind");
+    assert!(!work.exists("out"), "bad input leaves nothing behind");
 
     // Too little memory fails the run without a drive, and no other; what cannot run is left out; equal runs run once.
     let more = "{ name = \"same\" }, { name = \"paged\", share = 70, set = { page-rows = 16 } }, { name = \"big pages\", share = 1 }";
-    std::fs::write(&own, with(more)).unwrap();
-    let args = ["sweep", own_text, scene_text, "--out", out_text, "--strategy", "none", "--json", "--pace-steps", "0"];
-    let args = [&args[..], &["--image-cache", "1B", "--host-mem", "1MiB"]].concat();
-    let output = bench(&args);
+    work.write("own.toml", with(more));
+    let flags = format!("{own} --strategy none --pace-steps 0 --image-cache 1B --host-mem 1MiB --json");
+    let output = work.output(BENCH, &flags);
     assert!(stderr(&output).contains("big pages is left out"), "{}", stderr(&output));
-    let records = parse(&said(&output));
+    let records = parse(&String::from_utf8(output.stdout).unwrap());
     assert!(of(&records, "plain", 1)["problem"].as_str().is_some_and(|p| p.contains("--host-mem")), "{records:?}");
     assert!(records.len() == 2 && of(&records, "paged", 1)["problem"].is_null(), "{records:?}");
     // Only failed runs are repeated.
-    assert_eq!(lines(&args).len(), 1);
-    let page = std::fs::read_to_string(out.join(scene.file_name().unwrap()).join("sweep.html")).unwrap();
+    assert_eq!(lines(&work, &flags).len(), 1);
+    let page = work.text("out/scene/sweep.html");
     assert!(page.contains("failed: ") && page.contains("--host-mem"));
 }
 
 #[test]
 fn faults_of_a_capture_are_charted_and_their_scenes_are_removed() {
-    let folder = TempDir::new().unwrap();
-    let scene = crate::support::scenes::city(folder.path(), 24, 48, 32, 400);
-    let out = folder.path().join("stability");
+    let work = Workdir::city(24, 48, 32, 400);
     let only = "swapped10/none,swapped10/own,exposure1/none,exposure1/own,points10/none";
-    let args = ["--steps", "80", "--seeds", "1", "--device", "cpu", "--only", only];
-    let plain = sweep("stability", &scene, &out, &args);
-    let json = [&plain[..], &["--json"]].concat();
-    let own = out.join(scene.file_name().unwrap());
-    let records = [lines(&[&json[..], &["--max-runs", "2"]].concat()), lines(&json)].concat();
+    let flags = sweep("stability", &format!("--steps 80 --seeds 1 --device cpu --only {only}"));
+    let records = [lines(&work, &format!("{flags} --max-runs 2")), lines(&work, &flags)].concat();
     assert_eq!(records.len(), 6, "nothing is done twice");
-    assert!(lines(&json).is_empty() && names(&own.join("scenes")).is_empty(), "scenes are removed");
+    assert!(lines(&work, &flags).is_empty() && names(&work, "out/scene/scenes").is_empty(), "scenes are removed");
     let clean = of(&records, "clean/none", 1);
     let of = |name: &str| of(&records, name, 1);
     assert_ne!(clean["ply"], of("points10/none")["ply"]);
@@ -292,8 +263,7 @@ fn faults_of_a_capture_are_charted_and_their_scenes_are_removed() {
     assert_eq!(of("swapped10/own")["wrong_views"].as_array().unwrap().len(), 4);
     assert!(clean["cc_psnr"].is_number());
     let parts = ["PSNR, dB: lost against clean/none", "wrong views named", "exposure1/own"];
-    check_page(&own.join("sweep.html"), &parts, folder.path());
+    check_page(&work, "out/scene/sweep.html", &parts);
     // Other photos are other scenes.
-    let smaller = [&json[..], &["--max-resolution", "40", "--max-runs", "1"]].concat();
-    assert_eq!(lines(&smaller).len(), 1);
+    assert_eq!(lines(&work, &format!("{flags} --max-resolution 40 --max-runs 1")).len(), 1);
 }

@@ -6,7 +6,7 @@ use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 /// A view of a [`TextModel`].
 #[derive(Debug, Clone)]
@@ -17,6 +17,19 @@ pub struct TextView {
     pub qvec: [f64; 4],
     /// As written.
     pub tvec: [f64; 3],
+}
+
+impl TextView {
+    /// The rotation, world to camera.
+    pub fn rotation(&self) -> DQuat {
+        let [w, x, y, z] = self.qvec;
+        DQuat::from_xyzw(x, y, z, w).normalize()
+    }
+
+    /// Sets it.
+    pub fn set_rotation(&mut self, q: DQuat) {
+        self.qvec = [q.w, q.x, q.y, q.z];
+    }
 }
 
 /// A COLMAP text model with one PINHOLE camera.
@@ -92,11 +105,10 @@ impl TextModel {
     pub fn write_transforms(&self, scene: &Path) {
         let [w, h] = self.size;
         let [fx, fy, cx, cy] = self.pinhole;
-        let frames = self.views.iter().map(|v| {
-            let rotation = DMat3::from_quat(DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize());
+        let frames = self.poses().map(|(v, rotation, translation)| {
             // Camera to world; y and z of the camera are reversed in OpenGL.
             let (x, y, z) = (rotation.row(0), -rotation.row(1), -rotation.row(2));
-            let t = -(rotation.transpose() * DVec3::from_array(v.tvec));
+            let t = -(rotation.transpose() * translation);
             let row = |i: usize| [x[i], y[i], z[i], t[i]];
             serde_json::json!({
                 "file_path": format!("images/{}", v.name),
@@ -113,10 +125,7 @@ impl TextModel {
 
     /// Each view with its rotation and translation, world to camera.
     fn poses(&self) -> impl Iterator<Item = (&TextView, DMat3, DVec3)> {
-        self.views.iter().map(|v| {
-            let q = DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize();
-            (v, DMat3::from_quat(q), DVec3::from_array(v.tvec))
-        })
+        self.views.iter().map(|v| (v, DMat3::from_quat(v.rotation()), DVec3::from_array(v.tvec)))
     }
 
     /// Writes the same scene as OpenSfM does, to `file`, beside an older and smaller reconstruction.
@@ -192,9 +201,7 @@ impl TextModel {
         }
         for v in &mut self.views {
             // World to camera of a turned world: first back, then as before. The translation stays.
-            let [w, x, y, z] = v.qvec;
-            let q = DQuat::from_xyzw(x, y, z, w).normalize() * by.inverse();
-            v.qvec = [q.w, q.x, q.y, q.z];
+            v.set_rotation(v.rotation() * by.inverse());
         }
     }
 
@@ -205,8 +212,7 @@ impl TextModel {
             *p = (DVec3::from_array(*p) + offset).to_array();
         }
         for v in &mut self.views {
-            let rotation = DMat3::from_quat(DQuat::from_xyzw(v.qvec[1], v.qvec[2], v.qvec[3], v.qvec[0]).normalize());
-            v.tvec = (DVec3::from_array(v.tvec) - rotation * offset).to_array();
+            v.tvec = (DVec3::from_array(v.tvec) - v.rotation() * offset).to_array();
         }
     }
 }
@@ -220,19 +226,9 @@ pub fn classic(args: &[&str]) -> Vec<&'static str> {
     CLASSIC.iter().filter(is_open).flatten().copied().collect()
 }
 
-/// Runs `gsscale-train` with these arguments and [`classic`].
-pub fn train(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-train")).args(args).args(classic(args)).output().unwrap()
-}
-
 /// Standard output, then standard error.
 pub fn told(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(output)
-}
-
-/// Runs `gsscale-eval` with these arguments.
-pub fn eval(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-eval")).args(args).output().unwrap()
 }
 
 /// The stderr of a program.
@@ -243,14 +239,4 @@ pub fn stderr(output: &Output) -> String {
 /// The path as text.
 pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
-}
-
-/// summary.json of a run.
-pub fn summary(out: &Path) -> serde_json::Value {
-    serde_json::from_slice(&std::fs::read(out.join("summary.json")).unwrap()).unwrap()
-}
-
-/// Test PSNR of a run.
-pub fn psnr(out: &Path) -> f64 {
-    summary(out)["test"]["psnr"].as_f64().unwrap()
 }

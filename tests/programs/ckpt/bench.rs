@@ -1,7 +1,7 @@
 //! Runs that are stopped early, and the output of `gsscale-ckpt` on their stores.
 
-use crate::support::scenes::{classic, stderr, text, train};
-use gsscale::dataset::synthetic::{CityOptions, write_city};
+use crate::support::scenes::stderr;
+use crate::support::workdir::{CKPT, Running, Workdir};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
@@ -9,46 +9,16 @@ use gsscale::page::format::codec::Codec;
 use gsscale::page::map::commit::Commits;
 use gsscale::page::map::opening::StoredPage;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule, commit_config};
+use serde_json::Value;
 use std::collections::BTreeMap;
+use std::ops::Deref;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
-use std::time::{Duration, Instant};
-use tempfile::TempDir;
+use std::process::Output;
 
 /// Rounds, resets and raises of the SH degree before the stop; pages that split.
-const BUSY: &[&str] = &[
-    "--steps",
-    "400",
-    "--page-rows",
-    "32",
-    "--grow-grad2d",
-    "0.001",
-    "--refine-start",
-    "15",
-    "--refine-every",
-    "10",
-    "--refine-stop",
-    "100",
-    "--reset-every",
-    "40",
-    "--sh-every",
-    "20",
-    "--view-order",
-    "groups:4",
-    "--log-every",
-    "3",
-    "--eval-every",
-    "12",
-    "--test-every",
-    "12",
-    "--device",
-    "cpu",
-    "--frames",
-    "4000",
-    "--commit-every",
-    "0",
-    "--quiet",
-];
+const BUSY: &str = "scene --steps 400 --page-rows 32 --grow-grad2d 0.001 --refine-start 15 --refine-every 10 --refine-stop 100 \
+    --reset-every 40 --sh-every 20 --view-order groups:4 --log-every 3 --eval-every 12 --test-every 12 --device cpu --frames 4000 \
+    --commit-every 0 --quiet";
 
 /// Names of the pages that differ between two generations of a store.
 pub fn changed_pages(store: &Path, from: u64, to: u64) -> Vec<String> {
@@ -58,121 +28,106 @@ pub fn changed_pages(store: &Path, from: u64, to: u64) -> Vec<String> {
     store.pages_at(to).unwrap().iter().filter(|page| is_changed(page)).map(|page| page.page.to_string()).collect()
 }
 
-/// Flags of a run without events.
-pub const EVENTLESS: &[&str] = &["--strategy", "none", "--sh-every", "0"];
+/// A scene, and one run on it at a time, in `out`, with its pages in `spill`.
+pub struct Bench(Workdir);
 
-/// The usual flags; a key in `more` replaces the usual one.
-pub fn with<'a>(more: &[&'a str]) -> Vec<&'a str> {
-    let pairs = BUSY.chunks(2).filter(|pair| !more.contains(&pair[0]));
-    pairs.flatten().chain(more).copied().collect()
-}
+impl Deref for Bench {
+    type Target = Workdir;
 
-/// A scene, and one run on it at a time.
-pub struct Bench {
-    folder: TempDir,
-    scene: PathBuf,
+    fn deref(&self) -> &Workdir {
+        &self.0
+    }
 }
 
 impl Bench {
     pub fn new() -> Bench {
-        let folder = TempDir::new().unwrap();
-        let scene = folder.path().join("scene");
-        let (views, width, height, points) = (24, 48, 36, 3000);
-        let blocks = Some(12);
-        let city =
-            CityOptions { seed: 5, views, width, height, points, blocks, supersample: 1, ..CityOptions::default() };
-        write_city(&scene, &city, &|_, _| {}).unwrap();
-        Bench { folder, scene }
+        Bench(Workdir::city_of(24, [48, 36], 3000, 12))
     }
 
-    pub fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
+    /// Without a scene.
+    pub fn empty() -> Bench {
+        Bench(Workdir::new())
     }
 
     pub fn spill(&self) -> PathBuf {
         self.path("spill")
     }
 
-    /// The PLY of the run.
-    pub fn ply(&self) -> Vec<u8> {
-        std::fs::read(self.path("out/point_cloud.ply")).unwrap()
-    }
-
-    /// The PLY of the uninterrupted run.
-    pub fn alone(&self) -> Vec<u8> {
-        std::fs::read(self.run_alone(&[]).join("point_cloud.ply")).unwrap()
-    }
-
-    /// The folder of the uninterrupted run, in memory.
-    pub fn run_alone(&self, more: &[&str]) -> PathBuf {
-        let out = self.path("alone");
-        let output = train(&[&[text(&self.scene), "--out", text(&out)], &with(more)[..]].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
-        out
+    /// The uninterrupted run, in memory, in `alone`; returns its PLY.
+    pub fn alone(&self, more: &str) -> Vec<u8> {
+        self.train(&format!("{BUSY} --out alone {more}"));
+        self.ply("alone")
     }
 
     /// A run in progress.
-    pub fn running(&self, more: &[&str]) -> (PathBuf, Child) {
-        let (out, spill) = (self.path("out"), self.spill());
-        let mut args = vec![text(&self.scene), "--out", text(&out), "--spill-dir", text(&spill)];
-        args.extend(with(more));
-        let mut child = spawn(&args);
-        self.wait_for_lines(&mut child, 20);
-        (out, child)
+    pub fn running(&self, more: &str) -> Running<'_> {
+        self.begin(&format!("{BUSY} --out out --spill-dir spill {more}")).after_lines("out", 19)
     }
 
     /// A run stopped twice, some steps apart, long before its end: two generations.
-    pub fn stopped(&self, more: &[&str]) -> PathBuf {
-        let (out, child) = self.running(more);
-        stop(child);
-        self.go_on_until_stopped(&[]);
-        out
+    pub fn stopped(&self, more: &str) {
+        self.running(more).signal("TERM").ends(143);
+        self.go_on_until_stopped("");
     }
 
     /// Resumes the run to its end.
-    pub fn go_on(&self, more: &[&str]) {
-        let output = train(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
-        assert!(output.status.success(), "{}", stderr(&output));
+    pub fn go_on(&self, more: &str) {
+        self.train(&format!("--resume out --quiet {more}"));
     }
 
     /// Resumes the run for a few steps.
-    pub fn go_on_until_stopped(&self, more: &[&str]) {
-        stop(self.going_on(more));
+    pub fn go_on_until_stopped(&self, more: &str) {
+        self.going_on(more).signal("TERM").ends(143);
     }
 
     /// A resumed run, some steps later.
-    pub fn going_on(&self, more: &[&str]) -> Child {
-        let lines = self.lines();
-        let mut child = spawn(&[&["--resume", text(&self.path("out")), "--quiet"], more].concat());
-        self.wait_for_lines(&mut child, lines + 4);
-        child
+    pub fn going_on(&self, more: &str) -> Running<'_> {
+        let lines = self.lines("out");
+        self.begin(&format!("--resume out --quiet {more}")).after_lines("out", lines + 3)
     }
 
-    fn lines(&self) -> usize {
-        std::fs::read_to_string(self.path("out/metrics.jsonl")).map_or(0, |text| text.lines().count())
+    /// `gsscale-ckpt` with these flags.
+    pub fn ckpt_output(&self, flags: &str) -> Output {
+        self.output(CKPT, flags)
     }
 
-    fn wait_for_lines(&self, child: &mut Child, lines: usize) {
-        let started = Instant::now();
-        while self.lines() < lines {
-            assert!(child.try_wait().unwrap().is_none(), "the run ended before it could be stopped");
-            assert!(started.elapsed() < Duration::from_secs(120), "the run does not get on");
-            std::thread::sleep(Duration::from_millis(1));
-        }
+    /// The output of a successful call.
+    pub fn ckpt(&self, flags: &str) -> String {
+        let output = self.ckpt_output(flags);
+        assert!(output.status.success(), "{flags}: {}", stderr(&output));
+        String::from_utf8(output.stdout).unwrap()
     }
 
-    /// Exports to a new file each time.
-    pub fn export(&self, dir: &Path, more: &[&str]) -> PathBuf {
-        let file = (0..).map(|i| self.path(&format!("export{i}.ply"))).find(|path| !path.exists()).unwrap();
-        ckpt(&[&["export", text(dir), "--out", text(&file)], more].concat());
-        file
+    /// The output with `--json`.
+    pub fn ckpt_json(&self, flags: &str) -> Value {
+        serde_json::from_str(&self.ckpt(&format!("{flags} --json"))).unwrap()
     }
 
-    /// Clones to a new folder each time.
-    pub fn copy(&self, command: &str, dir: &Path) -> PathBuf {
-        let to = (0..).map(|i| self.path(&format!("copy{i}"))).find(|path| !path.exists()).unwrap();
-        ckpt(&[command, text(dir), text(&to)]);
-        to
+    /// The message of a failing call, which has all of these words.
+    pub fn fails(&self, flags: &str, words: &[&str]) -> String {
+        let output = self.ckpt_output(flags);
+        let said = stderr(&output);
+        assert!(matches!(output.status.code(), Some(1 | 2)), "{flags}: {output:?}");
+        assert!(words.iter().all(|word| said.contains(word)), "{flags}: {words:?}: {said}");
+        said
+    }
+
+    /// No page of any generation of the store is damaged.
+    pub fn is_intact(&self, dir: &str) -> bool {
+        self.ckpt_json(&format!("verify {dir} --deep"))["faults"].as_array().unwrap().is_empty()
+    }
+
+    /// Numbers of the generations of a store.
+    pub fn generations(&self, dir: &str) -> Vec<u64> {
+        generations(&self.ckpt_json(&format!("ls {dir}")))
+    }
+
+    /// The PLY of an export.
+    pub fn export(&self, dir: &str, more: &str) -> Vec<u8> {
+        self.ckpt(&format!("export {dir} --out exported.ply {more}"));
+        let bytes = self.bytes("exported.ply");
+        std::fs::remove_file(self.path("exported.ply")).unwrap();
+        bytes
     }
 
     /// Every file of the spill directory with its bytes and modification time.
@@ -188,39 +143,9 @@ impl Bench {
     }
 }
 
-fn spawn(args: &[&str]) -> Child {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gsscale-train"));
-    command.args(args).args(classic(args)).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
-}
-
-/// Sends SIGTERM and waits.
-pub fn stop(child: Child) {
-    assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
-    let output = child.wait_with_output().unwrap();
-    assert_eq!(output.status.code(), Some(143), "{}", stderr(&output));
-}
-
-pub fn run(args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_gsscale-ckpt")).args(args).output().unwrap()
-}
-
-/// The output of a successful call.
-pub fn ckpt(args: &[&str]) -> String {
-    let output = run(args);
-    assert!(output.status.success(), "{args:?}: {}", stderr(&output));
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// The output with `--json`.
-pub fn json(args: &[&str]) -> serde_json::Value {
-    serde_json::from_str(&ckpt(&[args, &["--json"]].concat())).unwrap()
-}
-
-/// The message of a failing call, which prints nothing else.
-pub fn failed(args: &[&str]) -> String {
-    let output = run(args);
-    assert!(matches!(output.status.code(), Some(1 | 2)), "{args:?}: {output:?}");
-    stderr(&output)
+/// The numbers in the output of `ls --json`.
+pub fn generations(listed: &Value) -> Vec<u64> {
+    listed["generations"].as_array().unwrap().iter().map(|g| g["generation"].as_u64().unwrap()).collect()
 }
 
 /// Names generations, as the trainer does.
@@ -240,8 +165,7 @@ pub struct Ply {
 }
 
 impl Ply {
-    pub fn read(path: &Path) -> Ply {
-        let bytes = std::fs::read(path).unwrap();
+    pub fn of(bytes: &[u8]) -> Ply {
         let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
         let header = std::str::from_utf8(&bytes[..end]).unwrap();
         let names: Vec<String> =
@@ -270,16 +194,4 @@ impl Ply {
         scales.sort_by(f64::total_cmp);
         (scales[1] + scales[2]).exp() / (1.0 + (-at("opacity")).exp())
     }
-}
-
-/// A run of a few steps from the Gaussians of `init`.
-pub fn train_from(bench: &Bench, init: &Path, out: &str) -> Vec<u8> {
-    let out = bench.path(out);
-    let more =
-        ["--init-ply", text(init), "--steps", "12", "--page-rows", "32", "--refine-start", "4", "--refine-every", "4"];
-    let args =
-        [&[text(&bench.scene), "--out", text(&out), "--quiet", "--device", "cpu", "--grow-grad2d", "0.001"], &more[..]];
-    let output = train(&args.concat());
-    assert!(output.status.success(), "{}", stderr(&output));
-    std::fs::read(out.join("point_cloud.ply")).unwrap()
 }

@@ -4,8 +4,7 @@
 //! `GSSCALE_WRITE_FIXTURE=1` writes the fixture of the present version; fixtures of earlier versions are never
 //! rewritten.
 
-use super::bench::{Bench, ckpt, json};
-use crate::support::scenes::text;
+use super::bench::Bench;
 use gsscale::page::format::slot_header::checksum;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
@@ -45,18 +44,18 @@ fn unpack(bytes: &[u8], folder: &Path) {
     }
 }
 
-/// The contents of a store, independent of its place.
-fn content_of(folder: &Path) -> Value {
+/// The contents of the store `dir`, independent of its place.
+fn content_of(bench: &Bench, dir: &str) -> Value {
     let mut content = serde_json::Map::new();
     let mut put = |key: &str, value: Value| content.insert(key.to_string(), value);
-    put("generations", json(&["ls", text(folder)])["generations"].clone());
-    let inspected = json(&["inspect", text(folder)]);
+    put("generations", bench.ckpt_json(&format!("ls {dir}"))["generations"].clone());
+    let inspected = bench.ckpt_json(&format!("inspect {dir}"));
     for key in
         ["identity", "format_version", "slot_bytes", "pages_by_codec", "pages_by_degree", "pages_behind", "state"]
     {
         put(key, inspected[key].clone());
     }
-    let store = StoreReader::open(folder, Access::Pages, WitnessRule::Obeyed).unwrap();
+    let store = StoreReader::open(&bench.path(dir), Access::Pages, WitnessRule::Obeyed).unwrap();
     let mut reader = store.slot_reader();
     let mut bytes = Vec::new();
     for (page, slot, label) in store.live_versions().unwrap() {
@@ -65,10 +64,8 @@ fn content_of(folder: &Path) -> Value {
         bytes.extend_from_slice(reader.payload(page, &slot).unwrap());
     }
     put("pages_digest", format!("{:032x}", checksum(&bytes)).into());
-    let file = folder.with_extension("ply");
-    ckpt(&["export", text(folder), "--out", text(&file)]);
     // The PLY comments name the version of the program.
-    let ply = std::fs::read(&file).unwrap();
+    let ply = bench.export(dir, "");
     let rows = ply.windows(11).position(|w| w == b"end_header\n").unwrap();
     put("ply_digest", format!("{:032x}", checksum(&ply[rows..])).into());
     Value::Object(content)
@@ -77,12 +74,12 @@ fn content_of(folder: &Path) -> Value {
 fn write_present_version() {
     let bench = Bench::new();
     // Few small pages, with moments, statistics and pending events.
-    bench.stopped(&["--page-rows", "16", "--sh-degree", "1", "--max-gaussians", "220", "--spill-codec", "zstd:19"]);
+    bench.stopped("--page-rows 16 --sh-degree 1 --max-gaussians 220 --spill-codec zstd:19");
     let version = *VERSIONS.last().unwrap();
     let packed = pack(&bench.spill());
     assert!(packed.len() < 200 << 10, "{} bytes are too many for the repository", packed.len());
     std::fs::write(file(version, "zip.zst"), packed).unwrap();
-    let text = serde_json::to_string_pretty(&content_of(&bench.spill())).unwrap() + "\n";
+    let text = serde_json::to_string_pretty(&content_of(&bench, "spill")).unwrap() + "\n";
     std::fs::write(file(version, "json"), text).unwrap();
 }
 
@@ -97,12 +94,11 @@ fn stores_of_every_version_open_and_hold_what_they_held() {
         "a new version needs a fixture"
     );
     for &version in VERSIONS {
-        let folder = tempfile::tempdir().unwrap();
-        let store = folder.path().join("store");
-        std::fs::create_dir(&store).unwrap();
-        unpack(&std::fs::read(file(version, "zip.zst")).unwrap(), &store);
-        assert!(json(&["verify", text(&store), "--deep"])["faults"].as_array().unwrap().is_empty());
+        let bench = Bench::empty();
+        std::fs::create_dir(bench.path("store")).unwrap();
+        unpack(&std::fs::read(file(version, "zip.zst")).unwrap(), &bench.path("store"));
+        assert!(bench.is_intact("store"));
         let want: Value = serde_json::from_slice(&std::fs::read(file(version, "json")).unwrap()).unwrap();
-        assert_eq!(content_of(&store), want, "version {version}");
+        assert_eq!(content_of(&bench, "store"), want, "version {version}");
     }
 }

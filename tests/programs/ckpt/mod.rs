@@ -6,8 +6,9 @@
 mod bench;
 mod fixture;
 
-use crate::support::scenes::{self, stderr, summary, text, train};
-use bench::{Bench, EVENTLESS, Ply, changed_pages, ckpt, failed, json, pin, train_from};
+use crate::support::scenes::{self, stderr};
+use crate::support::workdir::{TRAIN, least_memory};
+use bench::{Bench, Ply, changed_pages, generations, pin};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
 use gsscale::page::format::slot_header::checksum;
@@ -16,355 +17,297 @@ use serde_json::Value;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-fn generations(listed: &Value) -> Vec<u64> {
-    listed["generations"].as_array().unwrap().iter().map(|g| g["generation"].as_u64().unwrap()).collect()
+fn number(value: &Value, key: &str) -> u64 {
+    value[key].as_u64().unwrap_or_else(|| panic!("{key}: {value}"))
 }
 
 #[test]
 fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
+    bench.stopped("");
     let before = bench.store_files();
     // The output folder and the spill directory name the same store.
-    let listed = json(&["ls", text(&out)]);
-    let there = json(&["ls", text(&bench.spill())]);
+    let [listed, there] = ["out", "spill"].map(|dir| bench.ckpt_json(&format!("ls {dir}")));
     assert_eq!(generations(&listed), generations(&there));
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
     let last = &listed["generations"][1];
-    assert_eq!(last["step"], summary(&out)["steps"]);
-    assert_eq!(last["is_latest"], true);
+    assert_eq!((&last["step"], &last["is_latest"]), (&bench.summary("out")["steps"], &true.into()));
     assert!(last["psnr"].as_f64().unwrap() > 5.0, "an evaluation was logged before: {last}");
     assert_eq!(there["generations"][1]["psnr"], last["psnr"], "the store itself knows");
     for generation in listed["generations"].as_array().unwrap() {
-        let number = |key: &str| generation[key].as_u64().unwrap();
-        assert!(number("pages") > 10 && number("bytes_alone") <= number("bytes") && number("gaussians") > 1000);
+        let of = |key: &str| number(generation, key);
+        assert!(of("pages") > 10 && of("bytes_alone") <= of("bytes") && of("gaussians") > 1000);
     }
-    let words = ckpt(&["ls", text(&out)]);
+    let words = bench.ckpt("ls out");
     assert!(words.contains("PSNR") && words.contains("(last)"), "{words}");
 
     let changed = changed_pages(&bench.spill(), a, b);
-    let whole = json(&["inspect", text(&out)]);
-    assert_eq!((whole["format_version"].as_u64(), whole["generation"].as_u64()), (Some(1), Some(b)));
+    let whole = bench.ckpt_json("inspect out");
+    assert_eq!((number(&whole, "format_version"), number(&whole, "generation")), (1, b));
     assert_eq!((&whole["pages"], &whole["segment_bytes"]), (&last["pages"], &listed["segment_bytes"]));
     let state = whole["state"].to_string();
     assert!(state.contains(&format!("step {} of", last["step"])) && state.contains("rounds"), "{state}");
     let name = changed[0].as_str();
-    let page = json(&["inspect", text(&out), "--page", name]);
-    assert_eq!(page["since"].as_u64(), Some(b));
-    assert!(page["fault"].is_null() && page["rows"].as_u64().unwrap() > 0);
+    let page = bench.ckpt_json(&format!("inspect out --page {name}"));
+    assert!(number(&page, "since") == b && page["fault"].is_null() && number(&page, "rows") > 0, "{page}");
     assert!(page["stamp"]["most"].as_f64().unwrap() <= last["step"].as_f64().unwrap());
-    assert!(ckpt(&["inspect", text(&out), "--page", name]).contains(&format!("page        {name}")));
+    assert!(bench.ckpt(&format!("inspect out --page {name}")).contains(&format!("page        {name}")));
 
-    for deep in [&[][..], &["--deep"]] {
-        let verdict = json(&[&["verify", text(&out)], deep].concat());
+    for deep in ["", "--deep"] {
+        let verdict = bench.ckpt_json(&format!("verify out {deep}"));
         assert!(
             verdict["faults"].as_array().unwrap().is_empty() && verdict["versions"].as_u64() >= last["pages"].as_u64()
         );
     }
-    bench.export(&out, &[]);
-    bench.copy("clone", &out);
+    bench.export("out", "");
+    bench.ckpt("clone out copy");
     assert!(bench.store_files() == before, "a command that only looks changed the store");
 
-    let said = failed(&["inspect", text(&out), "--page", "99999"]);
-    assert!(said.contains("no page 99999") && said.contains("remedy"), "{said}");
-    let said = failed(&["inspect", text(&out), "--generation", "nosuch"]);
-    assert!(said.contains("'nosuch' is not kept") && said.contains(&b.to_string()), "{said}");
+    bench.fails("inspect out --page 99999", &["no page 99999", "remedy"]);
+    bench.fails("inspect out --generation nosuch", &["'nosuch' is not kept", &b.to_string()]);
 }
 
 #[test]
 fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
     let bench = Bench::new();
-    let out = bench.stopped(&["--up", "keep"]);
-    let want = std::fs::read(out.join("point_cloud.ply")).unwrap();
-    let file = bench.export(&out, &[]);
-    assert!(std::fs::read(&file).unwrap() == want, "the export is not what the trainer wrote");
+    bench.stopped("--up keep");
+    let want = bench.ply("out");
+    assert!(bench.export("out", "") == want, "the export is not what the trainer wrote");
     // The minimum budget, from the tool's own message.
-    let said = failed(&["export", text(&out), "--out", text(&file), "--host-mem", "1MiB"]);
-    let least = said.split("give at least ").nth(1).unwrap().trim().replace(' ', "");
-    let file = bench
-        .export(&out, &["--host-mem", &format!("{}MiB", least.trim_end_matches("MiB").parse::<f64>().unwrap() + 1.0)]);
-    assert!(std::fs::read(&file).unwrap() == want, "the budget changed the file");
+    let least = least_memory(&bench.fails("export out --out x.ply --host-mem 1MiB", &[]));
+    let within = format!("--host-mem {}MiB", least + 1.0);
+    assert!(bench.export("out", &within) == want, "the budget changed the file");
 
     // The box is in the coordinates of the dataset, which are those of this file.
-    let all = Ply::read(&file);
+    let all = Ply::of(&want);
+    let export = |more: &str| Ply::of(&bench.export("out", more));
     let middle = all.median();
-    let crop = format!("{},{},{},{},1e9,1e9", middle[0], middle[1], -1e9, 1e9);
-    let inside = |row: &[f32]| f64::from(row[0]) >= middle[0] && f64::from(row[1]) >= middle[1];
-    let part = Ply::read(&bench.export(&out, &["--crop", &crop]));
-    let expected: Vec<&Vec<f32>> = all.rows.iter().filter(|row| inside(row)).collect();
-    assert!(expected.len() > 100 && expected.len() < all.rows.len());
+    let part = export(&format!("--crop {},{},{},{},1e9,1e9", middle[0], middle[1], -1e9, 1e9));
+    let inside = |row: &&Vec<f32>| f64::from(row[0]) >= middle[0] && f64::from(row[1]) >= middle[1];
+    let expected = all.rows.iter().filter(inside).count();
+    assert!(expected > 100 && expected < all.rows.len());
     // The file's coordinates are rounded once more than the compared ones: a row on the border may differ.
-    assert!(part.rows.len().abs_diff(expected.len()) <= 2, "{} of {}", part.rows.len(), expected.len());
-    assert!(part.rows.iter().filter(|row| inside(row)).count() + 2 >= part.rows.len());
+    assert!(part.rows.len().abs_diff(expected) <= 2, "{} of {expected}", part.rows.len());
+    assert!(part.rows.iter().filter(inside).count() + 2 >= part.rows.len());
 
-    let few = Ply::read(&bench.export(&out, &["--max-gaussians", "200"]));
+    let few = export("--max-gaussians 200");
     assert_eq!(few.rows.len(), 200);
     let mut visible: Vec<f64> = all.rows.iter().map(|row| all.visibility(row)).collect();
     visible.sort_by(f64::total_cmp);
     let least = visible[visible.len() - 200];
     assert!(few.rows.iter().all(|row| all.visibility(row) >= least * (1.0 - 1e-4)), "others are more visible");
-    assert_eq!(Ply::read(&bench.export(&out, &["--max-gaussians", "99999999"])).rows.len(), all.rows.len());
-    let flat = Ply::read(&bench.export(&out, &["--sh-degree", "0"]));
+    assert_eq!(export("--max-gaussians 99999999").rows.len(), all.rows.len());
+    let flat = export("--sh-degree 0");
     assert_eq!((flat.names.len(), flat.rows.len()), (17, all.rows.len()));
 
-    let said = failed(&["export", text(&out), "--out", text(&file), "--crop", "1e8,1e8,1e8,2e8,2e8,2e8"]);
-    assert!(said.contains("no Gaussian lies in this box"), "{said}");
-    assert!(failed(&["export", text(&out), "--out", text(&file), "--crop", "1,2,3"]).contains("is not a box"));
-    let said = failed(&["export", text(&out), "--out", text(&bench.path("no/folder.ply"))]);
-    assert!(said.contains("no/folder.ply"), "{said}");
+    bench.fails("export out --out x.ply --crop 1e8,1e8,1e8,2e8,2e8,2e8", &["no Gaussian lies in this box"]);
+    bench.fails("export out --out x.ply --crop 1,2,3", &["is not a box"]);
+    bench.fails("export out --out no/folder.ply", &["no/folder.ply"]);
 }
 
 #[test]
 fn a_run_and_an_export_write_the_same_spz() {
     let bench = Bench::new();
-    let out = bench.stopped(&["--export", "spz"]);
-    let files = ["point_cloud.spz", "point_cloud.spz.transform.json"];
-    let want = files.map(|name| std::fs::read(out.join(name)).unwrap());
-    let ply = std::fs::metadata(out.join("point_cloud.ply")).unwrap().len();
-    assert!((want[0].len() as u64) < ply / 4, "{} of {ply} bytes", want[0].len());
-    let file = bench.path("point_cloud.spz");
-    ckpt(&["export", text(&out), "--out", text(&file)]);
-    let got = files.map(|name| std::fs::read(bench.path(name)).unwrap());
-    assert!(got == want, "the export is not what the trainer wrote");
-    let transform: Value = serde_json::from_slice(&want[1]).unwrap();
-    assert_eq!(transform["up_in_file"], serde_json::json!([0.0, 1.0, 0.0]), "{transform}");
-    let said = failed(&["export", text(&out), "--out", text(&bench.path("a.splat"))]);
-    assert!(
-        said.contains("use .ply, .spz, or lod-meta.json in a folder of its own") && !bench.path("a.splat").exists(),
-        "{said}"
-    );
+    bench.stopped("--export spz");
+    let (spz, transform) = ("point_cloud.spz", "point_cloud.spz.transform.json");
+    let files = |folder: &str| [spz, transform].map(|name| bench.bytes(&format!("{folder}/{name}")));
+    let want = files("out");
+    let ply = bench.ply("out").len();
+    assert!(want[0].len() < ply / 4, "{} of {ply} bytes", want[0].len());
+    bench.ckpt(&format!("export out --out {spz}"));
+    assert!(files(".") == want, "the export is not what the trainer wrote");
+    let up = bench.json(transform)["up_in_file"].clone();
+    assert_eq!(up, serde_json::json!([0.0, 1.0, 0.0]));
+    bench.fails("export out --out a.splat", &["use .ply, .spz, or lod-meta.json in a folder of its own"]);
+    assert!(!bench.exists("a.splat"));
+    let block = |name: &str| {
+        let path = bench.path("out").join(name);
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+    };
     // A folder stands where the file is to be written: refused before the first step.
-    std::fs::remove_file(out.join(files[0])).unwrap();
-    std::fs::create_dir(out.join(files[0])).unwrap();
-    let refused = train(&["--resume", text(&out), "--quiet"]);
-    let said = stderr(&refused);
-    assert!(refused.status.code() == Some(1) && said.contains("is a folder where a file"), "{said}");
-    assert!(summary(&out)["test"].is_null(), "no step was trained");
-    std::fs::remove_dir(out.join(files[0])).unwrap();
+    block(spz);
+    bench.refuses("--resume out --quiet", &["is a folder where a file"]);
+    assert!(bench.summary("out")["test"].is_null(), "no step was trained");
+    bench.remove(&format!("out/{spz}"));
     // The export fails at the end, at its transform: the run still has its evaluation and its report, and can be resumed.
-    std::fs::remove_file(out.join(files[1])).unwrap();
-    std::fs::create_dir(out.join(files[1])).unwrap();
-    let failed_export = train(&["--resume", text(&out), "--quiet"]);
-    let said = stderr(&failed_export);
-    assert!(failed_export.status.code() == Some(1) && said.contains("point_cloud.spz"), "{said}");
-    let done = summary(&out);
-    assert!(
-        done["finished"] == false && done["test"]["psnr"].is_number() && out.join("report.html").exists(),
-        "{done}"
-    );
-    std::fs::remove_dir(out.join(files[1])).unwrap();
+    block(transform);
+    bench.refuses("--resume out --quiet", &[spz]);
+    let done = bench.summary("out");
+    assert!(done["finished"] == false && done["test"]["psnr"].is_number() && bench.exists("out/report.html"), "{done}");
+    bench.remove(&format!("out/{transform}"));
     // A new start in the folder removes the files of the run before.
-    bench.go_on(&[]);
-    assert_eq!(summary(&out)["finished"], true);
-    assert!(std::fs::read(out.join(files[0])).unwrap() != want[0], "the end of the run wrote its own");
-}
-
-/// Every file of a folder of SOGs.
-fn sog_files(sog: &Path) -> Vec<(PathBuf, Vec<u8>)> {
-    let mut found = Vec::new();
-    for entry in std::fs::read_dir(sog).unwrap().map(|entry| entry.unwrap().path()) {
-        match entry.is_dir() {
-            true => found.extend(std::fs::read_dir(entry).unwrap().map(|entry| entry.unwrap().path())),
-            false => found.push(entry),
-        }
-    }
-    found.sort();
-    let parent = sog.parent().unwrap();
-    found.into_iter().map(|path| (path.strip_prefix(parent).unwrap().into(), std::fs::read(path).unwrap())).collect()
+    bench.go_on("");
+    assert_eq!(bench.summary("out")["finished"], true);
+    assert!(files("out")[0] != want[0], "the end of the run wrote its own");
 }
 
 #[test]
 fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
     let bench = Bench::new();
-    let sog = "point_cloud_sog";
-    let want = sog_files(&bench.run_alone(&["--export", "sog"]).join(sog));
-    let out = bench.stopped(&["--export", "sog"]);
-    let early = sog_files(&out.join(sog));
-    let export = summary(&out)["export"].clone();
-    let finest = export["levels"][0].as_u64().unwrap();
+    bench.alone("--export sog");
+    bench.stopped("--export sog");
+    let early = bench.files("out/point_cloud_sog");
+    let export = bench.summary("out")["export"].clone();
     assert_eq!(export["file"], "point_cloud_sog/lod-meta.json");
-    assert_eq!(Some(finest + export["always_shown"].as_u64().unwrap()), export["gaussians"].as_u64(), "{export}");
-    let report = std::fs::read_to_string(out.join("report.html")).unwrap();
+    let finest = export["levels"][0].as_u64().unwrap();
+    assert_eq!(finest + number(&export, "always_shown"), number(&export, "gaussians"), "{export}");
+    let report = bench.text("out/report.html");
     assert!(report.contains("For viewers") && report.contains("point_cloud_sog/lod-meta.json: "));
-    let said = ckpt(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json"))]);
+    let said = bench.ckpt("export out --out sog/lod-meta.json");
     assert!(said.contains("levels of "), "{said}");
-    assert!(sog_files(&bench.path(sog)) == early, "the export is not what the trainer wrote");
-    let said = failed(&["export", text(&out), "--out", "lod-meta.json"]);
-    assert!(said.contains("city/lod-meta.json"), "{said}");
-    let said =
-        failed(&["export", text(&out), "--out", text(&bench.path(sog).join("lod-meta.json")), "--host-mem", "25MiB"]);
-    assert!(said.contains("give at least"), "the writer's memory counts: {said}");
+    assert!(bench.files("sog") == early, "the export is not what the trainer wrote");
+    bench.fails("export out --out lod-meta.json", &["city/lod-meta.json"]);
+    // The writer's memory counts.
+    bench.fails("export out --out sog/lod-meta.json --host-mem 25MiB", &["give at least"]);
     // A PLY beside the folder has a transform of its own.
-    let beside = bench.path(sog).with_extension("ply");
-    ckpt(&["export", text(&out), "--out", text(&beside)]);
-    let file_of = |path: PathBuf| -> Value {
-        serde_json::from_slice::<Value>(&std::fs::read(path).unwrap()).unwrap()["file"].clone()
-    };
-    assert_eq!(file_of(bench.path(sog).join("transform.json")), "lod-meta.json");
-    assert_eq!(file_of(beside.with_extension("transform.json")), "point_cloud_sog.ply");
+    bench.ckpt("export out --out sog.ply");
+    assert_eq!(bench.json("sog/transform.json")["file"], "lod-meta.json");
+    assert_eq!(bench.json("sog.transform.json")["file"], "sog.ply");
     // A folder that could not be replaced at the end is refused before the first step.
-    let foreign = out.join(sog).join("mine.txt");
-    std::fs::write(&foreign, b"").unwrap();
-    let logged = || std::fs::read(out.join("metrics.jsonl")).unwrap();
-    let before = logged();
-    let refused = train(&["--resume", text(&out), "--quiet"]);
-    assert!(refused.status.code() == Some(1) && stderr(&refused).contains("mine.txt"), "{}", stderr(&refused));
-    assert!(logged() == before, "it trained before it refused");
-    std::fs::remove_file(foreign).unwrap();
-    bench.go_on(&[]);
-    assert!(sog_files(&out.join(sog)) == want, "the resumed run ended with other files");
+    let foreign = || bench.write("out/point_cloud_sog/mine.txt", "");
+    let remove_foreign = || std::fs::remove_file(bench.path("out/point_cloud_sog/mine.txt")).unwrap();
+    foreign();
+    let before = bench.bytes("out/metrics.jsonl");
+    bench.refuses("--resume out --quiet", &["mine.txt"]);
+    assert!(bench.bytes("out/metrics.jsonl") == before, "it trained before it refused");
+    remove_foreign();
+    bench.go_on("");
+    assert!(
+        bench.files("out/point_cloud_sog") == bench.files("alone/point_cloud_sog"),
+        "the resumed run ended with other files"
+    );
     // A new run in the folder removes them, and nothing of others.
-    std::fs::write(out.join(sog).join("mine.txt"), b"").unwrap();
-    let again =
-        |flags: &[&str]| train(&[&[text(&bench.path("scene")), "--out", text(&out), "--overwrite"], flags].concat());
-    let flags = ["--steps", "1", "--quiet", "--device", "cpu"];
-    let said = stderr(&again(&flags));
+    let again = "scene --out out --overwrite --steps 1 --quiet --device cpu";
+    foreign();
+    let said = stderr(&bench.output(TRAIN, again));
     assert!(said.contains("mine.txt"), "{said}");
-    std::fs::remove_file(out.join(sog).join("mine.txt")).unwrap();
-    let output = again(&flags);
-    assert!(output.status.success() && !out.join(sog).exists(), "{}", stderr(&output));
+    remove_foreign();
+    bench.train(again);
+    assert!(!bench.exists("out/point_cloud_sog"));
 }
 
 #[test]
 fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     let bench = Bench::new();
-    let want = bench.alone();
-    let out = bench.stopped(&[]);
-    let listed = json(&["ls", text(&out)]);
+    let want = bench.alone("");
+    bench.stopped("");
+    let listed = bench.ckpt_json("ls out");
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
-    let said = failed(&["rollback", text(&out), &a.to_string()]);
-    assert!(said.contains("--yes"), "{said}");
-    assert_eq!(generations(&json(&["ls", text(&out)])), [a, b], "nothing may be done without --yes");
-    let copy = bench.copy("clone", &out);
-    assert_eq!(json(&["rollback", text(&out), &a.to_string(), "--yes"])["dropped"][0].as_u64(), Some(b));
-    let now = json(&["ls", text(&out)]);
+    bench.fails(&format!("rollback out {a}"), &["--yes"]);
+    assert_eq!(bench.generations("out"), [a, b], "nothing may be done without --yes");
+    bench.ckpt("clone out copy");
+    assert_eq!(bench.ckpt_json(&format!("rollback out {a} --yes"))["dropped"][0].as_u64(), Some(b));
+    let now = bench.ckpt_json("ls out");
     assert_eq!((generations(&now), &now["generations"][0]["step"]), (vec![a], &listed["generations"][0]["step"]));
-    assert!(ckpt(&["rollback", text(&out), &a.to_string()]).contains("already the latest"));
-    assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
+    assert!(bench.ckpt(&format!("rollback out {a}")).contains("already the latest"));
+    assert!(bench.is_intact("out"));
 
     // The copy has both generations with their numbers, in its own slots.
-    let copied = json(&["ls", text(&copy)]);
     let of = |listed: &Value| -> Vec<String> {
         let keys = ["generation", "step", "gaussians", "pages", "bytes", "bytes_alone", "names"];
         let lines = listed["generations"].as_array().unwrap().iter();
         lines.map(|line| keys.map(|key| line[key].to_string()).join(" ")).collect()
     };
-    assert_eq!(of(&copied), of(&listed));
-    assert!(json(&["verify", text(&copy), "--deep"])["faults"].as_array().unwrap().is_empty());
-    assert_ne!(json(&["inspect", text(&copy)])["identity"], json(&["inspect", text(&out)])["identity"]);
-    let said = failed(&["clone", text(&out), text(&copy)]);
-    assert!(said.contains("exists already"), "{said}");
+    assert_eq!(of(&bench.ckpt_json("ls copy")), of(&listed));
+    assert!(bench.is_intact("copy"));
+    assert_ne!(bench.ckpt_json("inspect copy")["identity"], bench.ckpt_json("inspect out")["identity"]);
+    bench.fails("clone out copy", &["exists already"]);
 
     // The run then uses its copy, and does not return to a store that lacks the newer steps.
-    bench.go_on_until_stopped(&["--spill-dir", text(&copy)]);
-    let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
-    assert!(config.contains(&format!("spill-dir = \"{}\"", text(&copy))), "{config}");
-    let step = summary(&out)["steps"].as_u64().unwrap();
-    assert!(step > listed["generations"][1]["step"].as_u64().unwrap());
-    assert_eq!(json(&["ls", text(&out)])["generations"][1]["step"].as_u64(), Some(step));
-    bench.go_on(&[]);
-    assert!(bench.ply() == want, "the run went on with the copy and ended otherwise");
-    assert!(!copy.join("map.redb").exists() && bench.spill().join("map.redb").exists());
+    bench.go_on_until_stopped("--spill-dir copy");
+    let config = bench.text("out/config.toml");
+    assert!(config.contains("spill-dir = \"") && config.contains("copy\"\n"), "{config}");
+    let step = bench.count("out", "steps");
+    assert!(step > number(&listed["generations"][1], "step"));
+    assert_eq!(number(&bench.ckpt_json("ls out")["generations"][1], "step"), step);
+    bench.go_on("");
+    assert!(bench.ply("out") == want, "the run went on with the copy and ended otherwise");
+    assert!(!bench.exists("copy/map.redb") && bench.exists("spill/map.redb"));
     // The output files are those of the end; the store's older generation is still the latest there.
-    std::fs::remove_file(out.join("summary.json")).unwrap();
-    bench.go_on(&["--spill-dir", text(&bench.spill())]);
-    assert!(bench.ply() == want, "the run went back and ended otherwise");
+    std::fs::remove_file(bench.path("out/summary.json")).unwrap();
+    bench.go_on("--spill-dir spill");
+    assert!(bench.ply("out") == want, "the run went back and ended otherwise");
 }
 
 #[test]
 fn names_keep_generations_until_they_are_pruned() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
-    let first = generations(&json(&["ls", text(&out)]))[0];
+    bench.stopped("");
+    let first = bench.generations("out")[0];
     pin(&bench.spill(), &[("early", first), ("also-early", first)]);
-    bench.go_on_until_stopped(&[]);
-    let listed = json(&["ls", text(&out)]);
-    let kept = generations(&listed);
+    bench.go_on_until_stopped("");
+    let listed = bench.ckpt_json("ls out");
+    let (kept, names) = (generations(&listed), r#"["also-early","early"]"#);
     assert_eq!((kept.len(), kept[0]), (3, first), "{listed}");
-    assert_eq!(listed["generations"][0]["names"].to_string(), r#"["also-early","early"]"#);
-    let whole = bench.export(&out, &["--generation", "early"]);
-    let copy = bench.copy("clone", &out);
-    assert_eq!(json(&["ls", text(&copy)])["generations"][0]["names"].to_string(), r#"["also-early","early"]"#);
-    assert!(std::fs::read(bench.export(&copy, &["--generation", "early"])).unwrap() == std::fs::read(whole).unwrap());
+    assert_eq!(listed["generations"][0]["names"].to_string(), names);
+    bench.ckpt("clone out copy");
+    assert_eq!(bench.ckpt_json("ls copy")["generations"][0]["names"].to_string(), names);
+    assert!(bench.export("copy", "--generation early") == bench.export("out", "--generation early"));
     assert!(!changed_pages(&bench.spill(), first, kept[2]).is_empty());
 
-    let said = failed(&["prune", text(&out), "nosuch"]);
-    assert!(said.contains("'nosuch'") && said.contains("also-early"), "{said}");
-    let told = json(&["prune", text(&out), "--keep", "0", "--dry-run"]);
+    bench.fails("prune out nosuch", &["'nosuch'", "also-early"]);
+    let told = bench.ckpt_json("prune out --keep 0 --dry-run");
     assert_eq!((&told["is_done"], told["dropped_names"].as_array().unwrap().len()), (&Value::from(false), 2));
-    assert_eq!(generations(&json(&["ls", text(&out)])).len(), 3);
-    let one = json(&["prune", text(&out), "early"]);
+    assert_eq!(bench.generations("out").len(), 3);
+    let one = bench.ckpt_json("prune out early");
     assert!(one["dropped"].as_array().unwrap().is_empty() && one["bytes_freed"] == 0, "another name keeps it: {one}");
-    assert!(json(&["prune", text(&out), "--keep", "1"])["dropped_names"].as_array().unwrap().is_empty());
-    let done = json(&["prune", text(&out), "--keep", "0"]);
-    let alone = listed["generations"][0]["bytes_alone"].as_u64().unwrap();
-    assert_eq!((done["dropped"][0].as_u64(), done["bytes_freed"].as_u64()), (Some(first), Some(alone)));
+    assert!(bench.ckpt_json("prune out --keep 1")["dropped_names"].as_array().unwrap().is_empty());
+    let done = bench.ckpt_json("prune out --keep 0");
+    let alone = number(&listed["generations"][0], "bytes_alone");
+    assert_eq!((done["dropped"][0].as_u64(), number(&done, "bytes_freed")), (Some(first), alone));
     assert!(alone > 0);
-    assert_eq!(generations(&json(&["ls", text(&out)])), kept[1..]);
-    assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
+    assert_eq!(bench.generations("out"), kept[1..]);
+    assert!(bench.is_intact("out"));
 }
 
 #[test]
 fn a_store_in_use_is_never_written_and_readers_report_the_use() {
     let bench = Bench::new();
-    let (out, mut child) = bench.running(&["--steps", "20000", "--commit-every", "0.02"]);
-    let busy = json(&["ls", text(&out)]);
-    assert!(busy["used_by"].as_str().unwrap().contains(&format!("process {}", child.id())), "{busy}");
-    assert!(ckpt(&["ls", text(&out)]).contains("in use"));
-    assert!(ckpt(&["inspect", text(&out)]).contains("that of the last commit"));
-    let generation = generations(&busy)[0].to_string();
-    let (file, to) = (bench.path("x.ply"), bench.path("copy"));
-    for command in [
-        &["verify", text(&out)][..],
-        &["export", text(&out), "--out", text(&file)],
-        &["clone", text(&out), text(&to)],
-        &["salvage", text(&out), "--out", text(&to)],
-        &["rollback", text(&out), &generation, "--yes"],
-        &["prune", text(&out), "--keep", "0"],
-    ] {
-        let said = failed(command);
-        assert!(said.contains(&format!("process {}", child.id())) && said.contains("remedy"), "{command:?}: {said}");
+    let run = bench.running("--steps 20000 --commit-every 0.02");
+    let process = format!("process {}", run.child.id());
+    let busy = bench.ckpt_json("ls out");
+    assert!(busy["used_by"].as_str().unwrap().contains(&process), "{busy}");
+    assert!(bench.ckpt("ls out").contains("in use"));
+    assert!(bench.ckpt("inspect out").contains("that of the last commit"));
+    for command in
+        ["verify out", "export out --out x.ply", "clone out copy", "salvage out --out copy", "prune out --keep 0"]
+    {
+        bench.fails(command, &[&process, "remedy"]);
     }
-    assert!(!file.exists() && !to.exists());
-    child.kill().unwrap();
-    child.wait().unwrap();
-    assert!(json(&["ls", text(&out)])["used_by"].is_null(), "the lock goes with its process");
-    assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
+    bench.fails(&format!("rollback out {} --yes", generations(&busy)[0]), &[&process, "remedy"]);
+    assert!(!bench.exists("x.ply") && !bench.exists("copy"));
+    assert!(run.kill());
+    assert!(bench.ckpt_json("ls out")["used_by"].is_null(), "the lock goes with its process");
+    assert!(bench.is_intact("out"));
 }
 
 /// A resumed run no longer needs its starting Gaussians.
 #[test]
 fn a_store_that_a_run_was_started_from_is_free_once_the_run_goes_on() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
-    let seed = bench.copy("clone", &out);
-    let first = generations(&json(&["ls", text(&seed)]))[0].to_string();
-    [out, bench.spill()].iter().for_each(|folder| std::fs::remove_dir_all(folder).unwrap());
-    // The import gets a part of the budget; messages name the given budget and a sufficient one.
-    let with_budget = |budget: &str| {
-        let out = bench.path("none");
-        let flags = ["--init-ply", text(&seed), "--host-mem", budget, "--out", text(&out), "--steps", "1"];
-        // Detecting a GPU loads its driver, which may take more than the rest of this budget.
-        train(&[&[text(&bench.path("scene")), "--device", "cpu"], &flags[..]].concat())
-    };
-    let said = stderr(&with_budget("48MiB"));
-    assert!(said.contains("48.0 MiB is not enough for this store"), "{said}");
-    let least = said.split("give at least ").nth(1).and_then(|rest| rest.split(" MiB").next()).expect(&said);
-    let enough = format!("{:.1}MiB", least.parse::<f64>().unwrap() + 0.1);
-    let output = with_budget(&enough);
-    assert!(!stderr(&output).contains("is not enough for this store"), "{enough} would do: {}", stderr(&output));
-    assert!(output.status.success(), "{}", stderr(&output));
-    bench.stopped(&["--init-ply", text(&seed)]);
-    let mut child = bench.going_on(&[]);
-    let dropped = json(&["rollback", text(&seed), &first, "--yes"]);
-    assert!(child.try_wait().unwrap().is_none() && dropped["dropped"].as_array().unwrap().len() == 1);
-    bench::stop(child);
+    bench.stopped("");
+    bench.ckpt("clone out seed");
+    let first = bench.generations("seed")[0];
+    ["out", "spill"].iter().for_each(|folder| bench.remove(folder));
+    // The import gets a part of the budget; messages name the given budget and a sufficient one. Detecting a GPU loads its driver,
+    // which may take more than the rest of this budget.
+    let flags = "scene --device cpu --init-ply seed --out none --steps 1 --host-mem";
+    let said = bench.refuses(&format!("{flags} 48MiB"), &["48.0 MiB is not enough for this store"]);
+    bench.train(&format!("{flags} {:.1}MiB", least_memory(&said) + 0.1));
+    bench.stopped("--init-ply seed");
+    let mut run = bench.going_on("");
+    let dropped = bench.ckpt_json(&format!("rollback seed {first} --yes"));
+    assert!(run.child.try_wait().unwrap().is_none() && dropped["dropped"].as_array().unwrap().len() == 1);
+    run.signal("TERM").ends(143);
 }
 
-/// The slot of the page that `verify` or `inspect` names: file and offset.
-fn slot_of(dir: &Path, page: &str) -> (PathBuf, u64) {
-    let page = json(&["inspect", text(dir), "--page", page]);
-    (PathBuf::from(page["file"].as_str().unwrap()), page["offset"].as_u64().unwrap())
+/// Flips a bit, so many bytes after the beginning of the slot of a page. Returns the slot's file and offset.
+fn flip_in_page(bench: &Bench, page: &str, at: u64) -> (String, u64) {
+    let page = bench.ckpt_json(&format!("inspect out --page {page}"));
+    let (file, offset) = (page["file"].as_str().unwrap().to_string(), number(&page, "offset"));
+    flip(&bench.spill().join(&file), offset + at);
+    (file, offset)
 }
 
 fn flip(file: &Path, at: u64) {
@@ -374,140 +317,114 @@ fn flip(file: &Path, at: u64) {
     file.write_all_at(&[byte[0] ^ 0x10], at).unwrap();
 }
 
+/// A place in the payload of a slot.
+const IN_PAYLOAD: u64 = 4096 + 77;
+
 #[test]
 fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
-    let listed = json(&["ls", text(&out)]);
+    bench.stopped("");
+    let listed = bench.ckpt_json("ls out");
     let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
     let names = changed_pages(&bench.spill(), a, b);
-    let (payload, header) = (names[0].as_str(), names[1].as_str());
-    let (file, offset) = slot_of(&out, payload);
-    flip(&bench.spill().join(file), offset + 4096 + 77);
-    assert!(json(&["verify", text(&out)])["faults"].as_array().unwrap().is_empty(), "headers do not know");
-    let (file, offset) = slot_of(&out, header);
-    flip(&bench.spill().join(&file), offset + 20);
-    let output = bench::run(&["verify", text(&out), "--deep", "--json"]);
+    flip_in_page(&bench, &names[0], IN_PAYLOAD);
+    assert!(bench.ckpt_json("verify out")["faults"].as_array().unwrap().is_empty(), "headers do not know");
+    let (file, offset) = flip_in_page(&bench, &names[1], 20);
+    let output = bench.ckpt_output("verify out --deep --json");
     assert_eq!(output.status.code(), Some(1));
     let verdict: Value = serde_json::from_slice(&output.stdout).unwrap();
-    let mut faults: Vec<(String, String)> = verdict["faults"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .map(|fault| {
-            assert_eq!(fault["generation"].as_u64(), Some(b));
-            (fault["page"].as_str().unwrap().to_string(), fault["kind"].as_str().unwrap().to_string())
-        })
-        .collect();
+    let fault = |fault: &Value| ["generation", "page", "kind"].map(|key| fault[key].to_string().replace('"', ""));
+    let mut faults: Vec<[String; 3]> = verdict["faults"].as_array().unwrap().iter().map(fault).collect();
+    let mut want =
+        [(&names[0], "payload"), (&names[1], "header")].map(|(page, kind)| [b.to_string(), page.clone(), kind.into()]);
     faults.sort();
-    let mut want = vec![(payload.to_string(), "payload".to_string()), (header.to_string(), "header".to_string())];
     want.sort();
     assert_eq!(faults, want);
-    let words = String::from_utf8(bench::run(&["verify", text(&out), "--deep"]).stdout).unwrap();
-    assert!(words.contains("2 faults") && words.contains(&format!("{} offset {offset}", file.display())), "{words}");
+    let words = String::from_utf8(bench.ckpt_output("verify out --deep").stdout).unwrap();
+    assert!(words.contains("2 faults") && words.contains(&format!("{file} offset {offset}")), "{words}");
     // Commands that need the pages name a damaged one; no partial copy is left.
-    let to = bench.path("copy");
-    let said = failed(&["clone", text(&out), text(&to)]);
-    assert!(said.contains("page ") && said.contains("remedy"), "{said}");
-    assert!(!to.exists() && !bench.path("copy.part").exists());
-    let said = failed(&["export", text(&out), "--out", text(&bench.path("x.ply"))]);
-    assert!(said.contains("is damaged") && !bench.path("x.ply").exists(), "{said}");
+    bench.fails("clone out copy", &["page ", "remedy"]);
+    assert!(!bench.exists("copy") && !bench.exists("copy.part"));
+    bench.fails("export out --out x.ply", &["is damaged"]);
+    assert!(!bench.exists("x.ply"));
 
     let before = bench.store_files();
-    let rescued = bench.path("rescued");
-    let done = json(&["salvage", text(&out), "--out", text(&rescued)]);
+    let done = bench.ckpt_json("salvage out --out rescued");
     assert!(bench.store_files() == before, "salvage wrote to the damaged store");
-    assert_eq!(done["has_state"], true);
-    assert_eq!(done["pages"], listed["generations"][1]["pages"], "{done}");
+    assert!(done["has_state"] == true && done["pages"] == listed["generations"][1]["pages"], "{done}");
     let lost = done["lost"].as_array().unwrap();
     assert_eq!(lost.len(), 2);
     assert!(lost.iter().all(|page| page["taken"].as_u64().is_some_and(|taken| taken <= a)), "{done}");
-    assert!(json(&["verify", text(&rescued), "--deep"])["faults"].as_array().unwrap().is_empty());
-    bench.export(&rescued, &[]);
+    assert!(bench.is_intact("rescued"));
+    bench.export("rescued", "");
     // A rollback avoids the damage as well, and the run resumes from either.
-    json(&["rollback", text(&out), &a.to_string(), "--yes"]);
-    assert!(json(&["verify", text(&out), "--deep"])["faults"].as_array().unwrap().is_empty());
-    bench.go_on(&["--spill-dir", text(&rescued)]);
+    bench.ckpt(&format!("rollback out {a} --yes"));
+    assert!(bench.is_intact("out"));
+    bench.go_on("--spill-dir rescued");
 }
 
-/// Older versions have other statistics than the run has counted, and pending rounds that newer versions have applied.
+/// Older versions have other statistics than the run has counted, and pending rounds that newer versions have applied: with rounds
+/// between the generations that grow much, and with statistics that no round cleared.
 #[test]
 fn a_run_resumes_from_many_older_pages() {
-    // With rounds between the generations that grow much, and with statistics that no round cleared.
-    for (every, grow, last) in [("10", "0.0001", "120"), ("150", "0.001", "200")] {
-        let rounds = ["--refine-every", every, "--grow-grad2d", grow, "--refine-stop", last];
-        goes_on_from_older_pages(&[&rounds[..], &["--steps", "240"]].concat());
+    for rounds in [
+        "--refine-every 10 --grow-grad2d 0.0001 --refine-stop 120",
+        "--refine-every 150 --grow-grad2d 0.001 --refine-stop 200",
+    ] {
+        let bench = Bench::new();
+        bench.stopped(&format!("{rounds} --steps 240"));
+        let [a, b] = bench.generations("out")[..] else { panic!("two generations") };
+        let names = changed_pages(&bench.spill(), a, b);
+        for name in &names {
+            flip_in_page(&bench, name, IN_PAYLOAD);
+        }
+        let done = bench.ckpt_json("salvage out --out rescued");
+        let taken = done["lost"].as_array().unwrap().iter().filter(|page| !page["taken"].is_null()).count();
+        assert!(taken > 10 && taken == names.len(), "{taken} older pages: {done}");
+        assert!(bench.is_intact("rescued"));
+        bench.export("rescued", "");
+        bench.go_on("--spill-dir rescued");
     }
-}
-
-fn goes_on_from_older_pages(more: &[&str]) {
-    let bench = Bench::new();
-    let out = bench.stopped(more);
-    let listed = json(&["ls", text(&out)]);
-    let [a, b] = generations(&listed)[..] else { panic!("{listed}") };
-    let names = changed_pages(&bench.spill(), a, b);
-    for name in &names {
-        let (file, offset) = slot_of(&out, name);
-        flip(&bench.spill().join(file), offset + 4096 + 77);
-    }
-    let rescued = bench.path("rescued");
-    let done = json(&["salvage", text(&out), "--out", text(&rescued)]);
-    let taken = done["lost"].as_array().unwrap().iter().filter(|page| !page["taken"].is_null()).count();
-    assert!(taken > 10 && taken == names.len(), "{taken} older pages: {done}");
-    assert!(json(&["verify", text(&rescued), "--deep"])["faults"].as_array().unwrap().is_empty());
-    bench.export(&rescued, &[]);
-    bench.go_on(&["--spill-dir", text(&rescued)]);
 }
 
 #[test]
 fn a_lost_map_is_rebuilt_from_the_slots() {
     let bench = Bench::new();
-    let out = bench.stopped(EVENTLESS);
-    let listed = json(&["ls", text(&out)]);
-    let want = std::fs::read(out.join("point_cloud.ply")).unwrap();
-    std::fs::remove_file(bench.spill().join("map.redb")).unwrap();
-    let said = failed(&["ls", text(&out)]);
-    assert!(said.contains("no page map") && said.contains("salvage"), "{said}");
-    let output = bench::run(&["verify", text(&out)]);
+    // Without events.
+    bench.stopped("--strategy none --sh-every 0");
+    let last = bench.ckpt_json("ls out")["generations"][1].clone();
+    let want = bench.ply("out");
+    std::fs::remove_file(bench.path("spill/map.redb")).unwrap();
+    bench.fails("ls out", &["no page map", "salvage"]);
+    let output = bench.ckpt_output("verify out");
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stdout).contains("FAULT map"));
-    let done = json(&["salvage", text(&out), "--out", text(&bench.path("rescued"))]);
-    assert_eq!((&done["has_state"], &done["step"]), (&Value::from(false), &listed["generations"][1]["step"]));
-    assert_eq!(
-        (&done["pages"], &done["gaussians"]),
-        (&listed["generations"][1]["pages"], &listed["generations"][1]["gaussians"])
-    );
-    assert!(
-        done["lost"].as_array().unwrap().is_empty() && done["notes"].to_string().contains("state is lost"),
-        "{done}"
-    );
+    let done = bench.ckpt_json("salvage out --out rescued");
+    assert!(["step", "pages", "gaussians"].iter().all(|key| done[key] == last[key]), "{done}, {last}");
+    assert!(done["has_state"] == false && done["lost"].as_array().unwrap().is_empty(), "{done}");
+    assert!(done["notes"].to_string().contains("state is lost"), "{done}");
     // Without pending events, no part of the scene is in the map alone.
-    let file = bench.export(&bench.path("rescued"), &[]);
-    assert!(std::fs::read(&file).unwrap() == want, "the rescued scene is another");
+    assert!(bench.export("rescued", "") == want, "the rescued scene is another");
 
     // Without FORMAT and without the run's config: local coordinates, the same Gaussians.
-    std::fs::remove_file(bench.spill().join("FORMAT")).unwrap();
-    let done = json(&["salvage", text(&bench.spill()), "--out", text(&bench.path("bare"))]);
-    assert_eq!(&done["gaussians"], &listed["generations"][1]["gaussians"]);
+    std::fs::remove_file(bench.path("spill/FORMAT")).unwrap();
+    let done = bench.ckpt_json("salvage spill --out bare");
+    assert_eq!(done["gaussians"], last["gaussians"]);
     assert!(done["notes"].to_string().contains("config is not known"), "{done}");
     // A damaged page is reported, and its older version is used or its rows are missing.
-    let first = json(&["inspect", text(&bench.path("rescued"))])["pages"].as_u64().unwrap();
-    let segment = bench.spill().join("seg-00000000.dat");
-    flip(&segment, 4096 + 100);
-    let done = json(&[
-        "salvage",
-        text(&bench.spill()),
-        "--out",
-        text(&bench.path("third")),
-        "--config",
-        text(&out.join("config.toml")),
-    ]);
+    let first = number(&bench.ckpt_json("inspect rescued"), "pages");
+    flip(&bench.path("spill/seg-00000000.dat"), 4096 + 100);
+    let done = bench.ckpt_json("salvage spill --out third --config out/config.toml");
     let lost = done["lost"].as_array().unwrap().len() as u64;
-    assert!(lost <= 1 && done["pages"].as_u64().unwrap() + lost >= first, "{done}");
-    let segments = bench.store_files().into_keys().filter(|p| p.extension().is_some_and(|e| e == "dat"));
-    segments.for_each(|segment| std::fs::write(segment, b"").unwrap());
-    let said = failed(&["salvage", text(&bench.spill()), "--out", text(&bench.path("fourth"))]);
-    assert!(said.contains("no slot header") && !bench.path("fourth").exists(), "{said}");
+    assert!(lost <= 1 && number(&done, "pages") + lost >= first, "{done}");
+    segments(&bench).iter().for_each(|segment| std::fs::write(segment, b"").unwrap());
+    bench.fails("salvage spill --out fourth", &["no slot header"]);
+    assert!(!bench.exists("fourth"));
+}
+
+/// The files of slots, sorted.
+fn segments(bench: &Bench) -> Vec<PathBuf> {
+    bench.store_files().into_keys().filter(|path| path.extension().is_some_and(|e| e == "dat")).collect()
 }
 
 /// The histogram in the run state is lost with the map; the statistics in the pages remain. Growth uses both.
@@ -515,32 +432,17 @@ fn a_lost_map_is_rebuilt_from_the_slots() {
 fn growth_goes_on_after_a_salvage_without_a_map() {
     let bench = Bench::new();
     // The rounds come after the stop; the cap allows half of the uncapped growth.
-    let more = ["--refine-every", "150", "--refine-stop", "400", "--grow-grad2d", "0.0001", "--max-gaussians", "4000"];
-    let (scene, alone) = (bench.path("scene"), bench.path("alone"));
-    let args = [&[text(&scene), "--out", text(&alone)], &bench::with(&more)[..]].concat();
-    let output = train(&args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let out = bench.stopped(&more);
-    std::fs::remove_file(bench.spill().join("map.redb")).unwrap();
-    let rescued = bench.path("rescued");
-    let done = json(&["salvage", text(&out), "--out", text(&rescued)]);
-    assert!(done["step"].as_u64().unwrap() < 150 && done["lost"].as_array().unwrap().is_empty(), "{done}");
-    let output = train(&[
-        "--resume",
-        text(&out),
-        "--spill-dir",
-        text(&rescued),
-        "--accept-changes",
-        "--quiet",
-        "--device",
-        "cpu",
-    ]);
-    let said = stderr(&output);
-    assert!(output.status.success(), "{said}");
+    let more = "--refine-every 150 --refine-stop 400 --grow-grad2d 0.0001 --max-gaussians 4000";
+    bench.alone(more);
+    bench.stopped(more);
+    std::fs::remove_file(bench.path("spill/map.redb")).unwrap();
+    let done = bench.ckpt_json("salvage out --out rescued");
+    assert!(number(&done, "step") < 150 && done["lost"].as_array().unwrap().is_empty(), "{done}");
+    let said = bench.train("--resume out --spill-dir rescued --accept-changes --quiet --device cpu");
     // The statistics in the pages and in the run state agree: nothing was recounted.
     assert!(!said.contains("counted anew"), "{said}");
-    let of = |out: &Path| summary(out)["gaussians"].as_u64().unwrap();
-    let (first, grown, want) = (done["gaussians"].as_u64().unwrap(), of(&out), of(&alone));
+    let (first, grown, want) =
+        (number(&done, "gaussians"), bench.count("out", "gaussians"), bench.count("alone", "gaussians"));
     println!("{first} Gaussians grew to {grown}; without the damage to {want}");
     // A few pending opacity resets are lost together with the statistics of their pages: 3 % of the growth.
     let off = grown.abs_diff(want) as f64 / (want - first) as f64;
@@ -550,53 +452,49 @@ fn growth_goes_on_after_a_salvage_without_a_map() {
 #[test]
 fn split_pages_are_not_rescued_twice() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
-    let listed = json(&["ls", text(&out)]);
-    let last = &listed["generations"][1];
-    std::fs::write(bench.spill().join("map.redb"), vec![7; 100_000]).unwrap();
-    let done = json(&["salvage", text(&out), "--out", text(&bench.path("rescued"))]);
+    bench.stopped("");
+    let last = bench.ckpt_json("ls out")["generations"][1].clone();
+    bench.write("spill/map.redb", vec![7; 100_000]);
+    let done = bench.ckpt_json("salvage out --out rescued");
     // Slots of emptied pages look like slots of existing pages.
-    let (pages, rows) = (done["pages"].as_u64().unwrap(), done["gaussians"].as_u64().unwrap());
-    let (want, want_rows) = (last["pages"].as_u64().unwrap(), last["gaussians"].as_u64().unwrap());
-    assert!(pages >= want && pages <= want + 2, "{pages} pages instead of {want}: {done}");
-    assert!(rows >= want_rows && rows <= want_rows + 64, "{rows} rows instead of {want_rows}");
-    assert!(json(&["verify", text(&bench.path("rescued")), "--deep"])["faults"].as_array().unwrap().is_empty());
+    for (key, more) in [("pages", 2), ("gaussians", 64)] {
+        let (got, want) = (number(&done, key), number(&last, key));
+        assert!((want..=want + more).contains(&got), "{got} {key} instead of {want}: {done}");
+    }
+    assert!(bench.is_intact("rescued"));
 }
 
 #[test]
 fn a_lost_witness_costs_nothing() {
     let bench = Bench::new();
-    let want = bench.alone();
-    let out = bench.stopped(&[]);
-    std::fs::write(bench.spill().join("witness"), b"gone").unwrap();
-    assert!(failed(&["ls", text(&out)]).contains("witness"));
-    let rescued = bench.path("rescued");
-    let done = json(&["salvage", text(&out), "--out", text(&rescued)]);
+    let want = bench.alone("");
+    bench.stopped("");
+    bench.write("spill/witness", "gone");
+    bench.fails("ls out", &["witness"]);
+    let done = bench.ckpt_json("salvage out --out rescued");
     assert!(done["has_state"] == true && done["lost"].as_array().unwrap().is_empty(), "{done}");
-    bench.go_on(&["--spill-dir", text(&rescued)]);
-    assert!(bench.ply() == want, "the run ended otherwise");
+    bench.go_on("--spill-dir rescued");
+    assert!(bench.ply("out") == want, "the run ended otherwise");
 }
 
 #[test]
 fn segments_that_are_cut_short_or_gone_are_named() {
     let bench = Bench::new();
-    let out = bench.stopped(&[]);
-    let mut segments: Vec<PathBuf> =
-        bench.store_files().into_keys().filter(|p| p.extension().is_some_and(|e| e == "dat")).collect();
-    segments.sort();
-    let first = std::fs::OpenOptions::new().write(true).open(&segments[0]).unwrap();
+    bench.stopped("");
+    let segment = segments(&bench).remove(0);
+    let first = std::fs::OpenOptions::new().write(true).open(&segment).unwrap();
     let bytes = first.metadata().unwrap().len();
     first.set_len(bytes / 2 + 4096 + 512).unwrap();
-    let faults = |args: &[&str]| -> Vec<Value> {
-        let output = bench::run(&[args, &["--json"]].concat());
+    let faults = || -> Vec<Value> {
+        let output = bench.ckpt_output("verify out --json");
         assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
         serde_json::from_slice::<Value>(&output.stdout).unwrap()["faults"].as_array().unwrap().clone()
     };
-    let found = faults(&["verify", text(&out)]);
+    let found = faults();
     assert!(found[0]["kind"] == "segment" && found[0]["what"].to_string().contains(&bytes.to_string()), "{found:?}");
     assert!(found[1]["kind"] == "header" && found[1]["what"].to_string().contains("ends inside"), "{found:?}");
-    std::fs::remove_file(&segments[0]).unwrap();
-    let found = faults(&["verify", text(&out)]);
+    std::fs::remove_file(&segment).unwrap();
+    let found = faults();
     assert!(found[0]["what"] == "it is missing" && found.len() > 20, "{found:?}");
     assert!(found[1]["what"].to_string().contains("seg-00000000.dat is missing"), "{found:?}");
 }
@@ -604,42 +502,36 @@ fn segments_that_are_cut_short_or_gone_are_named() {
 #[test]
 fn other_folders_and_other_versions_are_refused_by_name() {
     let bench = Bench::new();
-    let foreign = bench.path("photos");
-    std::fs::create_dir(&foreign).unwrap();
-    std::fs::write(foreign.join("a.jpg"), b"mine").unwrap();
-    let to = bench.path("to");
-    for command in [&["ls"][..], &["verify"], &["inspect"], &["rollback"], &["prune"], &["export"], &["salvage"]] {
-        let more: &[&str] = match command[0] {
-            "rollback" => &["1", "--yes"],
-            "prune" => &["--keep", "0"],
-            "export" | "salvage" => &["--out", text(&to)],
-            _ => &[],
-        };
-        let said = failed(&[command, &[text(&foreign)], more].concat());
-        assert!(said.contains("neither a store nor a run's output folder") && said.contains("remedy"), "{said}");
-        assert!(failed(&[command, &["no/such/folder"], more].concat()).contains("no such folder"));
+    std::fs::create_dir(bench.path("photos")).unwrap();
+    bench.write("photos/a.jpg", "mine");
+    for command in [
+        "ls DIR",
+        "verify DIR",
+        "inspect DIR",
+        "rollback DIR 1 --yes",
+        "prune DIR --keep 0",
+        "export DIR --out to",
+        "salvage DIR --out to",
+    ] {
+        bench.fails(&command.replace("DIR", "photos"), &["neither a store nor a run's output folder", "remedy"]);
+        bench.fails(&command.replace("DIR", "no/such/folder"), &["no such folder"]);
     }
-    assert_eq!(std::fs::read_dir(&foreign).unwrap().count(), 1);
-    assert!(!to.exists());
+    assert!(bench.files("photos").len() == 1 && !bench.exists("to"));
 
-    let out = bench.stopped(&[]);
-    let path = bench.spill().join("FORMAT");
-    let good = std::fs::read(&path).unwrap();
+    bench.stopped("");
+    let good = bench.bytes("spill/FORMAT");
     let with = |at: usize, value: u8| {
         let mut bytes = good.clone();
         bytes[at] = value;
         let sum = checksum(&bytes[..240]).to_le_bytes();
         bytes[240..].copy_from_slice(&sum);
-        std::fs::write(&path, bytes).unwrap();
+        bench.write("spill/FORMAT", bytes);
     };
-    let commands = [&["ls", text(&out)][..], &["verify", text(&out)], &["rollback", text(&out), "1", "--yes"]];
     let refused = |words: &[&str]| {
-        for command in commands {
-            let said = failed(command);
-            assert!(words.iter().all(|word| said.contains(word)) && said.contains("remedy"), "{said}");
+        for command in ["ls out", "verify out", "rollback out 1 --yes"] {
+            bench.fails(command, &[words, &["remedy"]].concat());
         }
-        let said = stderr(&train(&["--resume", text(&out), "--quiet"]));
-        assert!(words.iter().all(|word| said.contains(word)), "the trainer: {said}");
+        bench.refuses("--resume out --quiet", words);
     };
     with(8, 2);
     refused(&["format version 2", "newer", "knows version 1"]);
@@ -647,11 +539,11 @@ fn other_folders_and_other_versions_are_refused_by_name() {
     refused(&["features that this program does not know", "0x4000"]);
     // A compatible feature bit is accepted and shown.
     with(49, 0x01);
-    assert_eq!(json(&["inspect", text(&out)])["features_compatible"], 256);
-    std::fs::write(&path, &good[..200]).unwrap();
+    assert_eq!(bench.ckpt_json("inspect out")["features_compatible"], 256);
+    bench.write("spill/FORMAT", &good[..200]);
     refused(&["damaged or cut short"]);
-    std::fs::write(&path, &good).unwrap();
-    bench.go_on(&[]);
+    bench.write("spill/FORMAT", &good);
+    bench.go_on("");
 }
 
 /// Gaussians on a wavy plane; all columns differ.
@@ -670,99 +562,82 @@ fn wave(rows: usize) -> Columns {
 
 #[test]
 fn gaussians_that_do_not_fit_are_refused_by_the_header_or_go_into_pages() {
-    let folder = tempfile::tempdir().unwrap();
-    let ply = folder.path().join("in.ply");
-    let path = |name: &str| folder.path().join(name);
+    let bench = Bench::empty();
     // Each view sees at most one of ten parts.
     let mut gaussians = wave(150_000);
     gaussians.means.chunks_exact_mut(3).enumerate().for_each(|(row, mean)| mean[1] += 2000.0 * (row / 15_000) as f32);
-    write_gaussians(&ply, &gaussians, &SceneMeta::default()).unwrap();
-    let scene = scenes::city(folder.path(), 8, 32, 24, 200);
-    let (alone, out, spill) = (path("alone"), path("out"), path("spill"));
-    let flags =
-        ["--steps", "20", "--page-rows", "128", "--strategy", "none", "--view-order", "shuffle", "--device", "cpu"];
-    let common = [&[text(&scene), "--init-ply", text(&ply), "--threads", "2"][..], &flags].concat();
-    let refused = train(&[&common, &["--out", text(&out), "--host-mem", "30MiB"][..]].concat());
-    let said = stderr(&refused);
-    assert_eq!(refused.status.code(), Some(1), "{said}");
-    assert!(
-        said.contains("in.ply") && said.contains("150000 Gaussians take") && said.contains("--spill-dir"),
-        "{said}"
-    );
+    write_gaussians(&bench.path("in.ply"), &gaussians, &SceneMeta::default()).unwrap();
+    scenes::city(&bench.path(""), 8, 32, 24, 200);
+    let flags = "scene --init-ply in.ply --threads 2 --steps 20 --page-rows 128 --strategy none --view-order shuffle --device cpu";
+    let words = ["in.ply", "150000 Gaussians take", "--spill-dir"];
+    bench.refuses(&format!("{flags} --out out --host-mem 30MiB"), &words);
     // The values alone take 35 MB, 109 MB with moments; paged training equals training in memory.
-    let in_memory = train(&[&common, &["--out", text(&alone)][..]].concat());
-    assert!(in_memory.status.success(), "{}", stderr(&in_memory));
-    let within = ["--out", text(&out), "--spill-dir", text(&spill), "--host-mem", "64MiB"];
-    let paged = train(&[&common, &within[..]].concat());
-    assert!(paged.status.success(), "{}", stderr(&paged));
-    let peak = |out: &Path| summary(out)["host_bytes_peak"].as_u64().unwrap();
-    assert!(peak(&out) <= 64 << 20 && peak(&alone) > 128 << 20, "{} and {} bytes", peak(&out), peak(&alone));
-    let [got, want] = [&out, &alone].map(|folder| std::fs::read(folder.join("point_cloud.ply")).unwrap());
-    assert!(got == want, "another scene than in memory");
+    bench.train(&format!("{flags} --out alone"));
+    bench.train(&format!("{flags} --out out --spill-dir spill --host-mem 64MiB"));
+    let [paged, alone] = ["out", "alone"].map(|out| bench.count(out, "host_bytes_peak"));
+    assert!(paged <= 64 << 20 && alone > 128 << 20, "{paged} and {alone} bytes");
+    assert!(bench.ply("out") == bench.ply("alone"), "another scene than in memory");
 }
 
 #[test]
 fn gaussians_round_trip_through_a_store_within_the_budget() {
     let rows = std::env::var("GSSCALE_CKPT_GAUSSIANS").ok().map_or(40_000, |n| n.parse().unwrap());
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    write_gaussians(&path("in.ply"), &wave(rows), &SceneMeta::default()).unwrap();
+    let bench = Bench::empty();
+    write_gaussians(&bench.path("in.ply"), &wave(rows), &SceneMeta::default()).unwrap();
     // The rows alone take 29 MB at 40,000 rows, and exceed the budget from 150,000 rows on.
-    let (budget, bytes) = ("112MiB", 112u64 << 20);
-    let done = json(&["import", text(&path("in.ply")), "--out", text(&path("store")), "--host-mem", budget]);
-    assert_eq!((done["gaussians"].as_u64(), done["sh_degree"].as_u64()), (Some(rows as u64), Some(3)));
-    assert!(done["host_bytes_peak"].as_u64().unwrap() <= bytes, "{done}");
-    assert!(json(&["verify", text(&path("store")), "--deep"])["faults"].as_array().unwrap().is_empty());
-    let listed = json(&["ls", text(&path("store"))]);
-    assert_eq!((listed["generations"][0]["step"].as_u64(), generations(&listed).len()), (Some(0), 1));
-    let out = path("out.ply");
-    let done = json(&["export", text(&path("store")), "--out", text(&out), "--host-mem", budget]);
-    assert!(done["host_bytes_peak"].as_u64().unwrap() <= bytes, "{done}");
+    let (budget, bytes) = ("--host-mem 112MiB", 112u64 << 20);
+    let done = bench.ckpt_json(&format!("import in.ply --out store {budget}"));
+    assert_eq!((number(&done, "gaussians"), number(&done, "sh_degree")), (rows as u64, 3));
+    assert!(number(&done, "host_bytes_peak") <= bytes, "{done}");
+    assert!(bench.is_intact("store"));
+    let listed = bench.ckpt_json("ls store");
+    assert_eq!((number(&listed["generations"][0], "step"), generations(&listed).len()), (0, 1));
+    let done = bench.ckpt_json(&format!("export store --out out.ply {budget}"));
+    assert!(number(&done, "host_bytes_peak") <= bytes, "{done}");
     if rows <= 1_000_000 {
-        let sorted = |path: &Path| {
-            let mut rows = Ply::read(path).rows;
-            rows.sort_by(|a, b| {
-                a.iter().zip(b).map(|(a, b)| a.total_cmp(b)).find(|o| o.is_ne()).unwrap_or(std::cmp::Ordering::Equal)
-            });
+        let sorted = |name: &str| {
+            let mut rows = Ply::of(&bench.bytes(name)).rows;
+            rows.sort_by(|a, b| a.partial_cmp(b).unwrap());
             rows
         };
-        assert!(sorted(&out) == sorted(&path("in.ply")), "a value changed on its way");
+        assert!(sorted("out.ply") == sorted("in.ply"), "a value changed on its way");
     }
     // Pages are local in space: a small box reads few of them.
-    let part = json(&["export", text(&path("store")), "--out", text(&out), "--crop", "0,0,-9,12,12,9"]);
-    assert!(part["bytes_read"].as_u64().unwrap() * 4 < done["bytes_read"].as_u64().unwrap(), "{part}");
+    let part = bench.ckpt_json("export store --out out.ply --crop 0,0,-9,12,12,9");
+    assert!(number(&part, "bytes_read") * 4 < number(&done, "bytes_read"), "{part}");
 
-    let again = failed(&["import", text(&path("in.ply")), "--out", text(&path("store"))]);
-    assert!(again.contains("exists already"), "{again}");
-    let little = failed(&["import", text(&path("in.ply")), "--out", text(&path("other")), "--host-mem", "20MiB"]);
-    assert!(little.contains("is not enough") && little.contains("give at least"), "{little}");
-    let bytes = std::fs::read(path("in.ply")).unwrap();
-    std::fs::write(path("cut.ply"), &bytes[..bytes.len() / 2]).unwrap();
-    let cut = failed(&["import", text(&path("cut.ply")), "--out", text(&path("other"))]);
-    assert!(cut.contains("cut.ply") && !path("other").exists() && !path("other.part").exists(), "{cut}");
+    bench.fails("import in.ply --out store", &["exists already"]);
+    bench.fails("import in.ply --out other --host-mem 20MiB", &["is not enough", "give at least"]);
+    let bytes = bench.bytes("in.ply");
+    bench.write("cut.ply", &bytes[..bytes.len() / 2]);
+    bench.fails("import cut.ply --out other", &["cut.ply"]);
+    assert!(!bench.exists("other") && !bench.exists("other.part"));
 }
 
 #[test]
 fn a_run_starts_from_a_store_as_from_the_file_that_it_was_made_of() {
     let bench = Bench::new();
-    let out = bench.stopped(&["--export-frame", "local"]);
-    let (file, store) = (out.join("point_cloud.ply"), bench.path("store"));
-    json(&["import", text(&file), "--out", text(&store), "--page-rows", "32"]);
-    let want = train_from(&bench, &file, "from-file");
-    assert!(train_from(&bench, &store, "from-store") == want, "the store is another start than its file");
+    bench.stopped("--export-frame local");
+    bench.ckpt("import out/point_cloud.ply --out store --page-rows 32");
+    let from = |init: &str, out: &str| {
+        let rounds = "--steps 12 --page-rows 32 --refine-start 4 --refine-every 4 --grow-grad2d 0.001";
+        bench.run(out, &format!("--init-ply {init} {rounds}"))
+    };
+    let want = from("out/point_cloud.ply", "from-file");
+    assert!(from("store", "from-store") == want, "the store is another start than its file");
     // A run's checkpoint also serves as a start; its pages differ from the file's, and so do the roundings.
-    let rows = Ply::read(&file).rows.len();
-    train_from(&bench, &out, "from-run");
-    let started = summary(&bench.path("from-run"));
-    assert!(started["gaussians"].as_u64().unwrap().abs_diff(rows as u64) < rows as u64 / 5, "{started}");
+    let rows = Ply::of(&bench.ply("out")).rows.len() as u64;
+    from("out", "from-run");
+    assert!(bench.count("from-run", "gaussians").abs_diff(rows) < rows / 5);
 }
 
 #[test]
 fn every_subcommand_has_help_with_examples() {
-    let help = ckpt(&["--help"]);
+    let bench = Bench::empty();
+    let help = bench.ckpt("--help");
     for name in ["ls", "inspect", "verify", "rollback", "prune", "export", "import", "clone", "salvage"] {
         assert!(help.contains(&format!("\n  {name} ")), "{help}");
-        let of = ckpt(&[name, "--help"]);
+        let of = bench.ckpt(&format!("{name} --help"));
         assert!(of.contains("Examples:") && of.contains("--json"), "{of}");
     }
 }

@@ -1,8 +1,8 @@
 //! Keys that a resumed run may change, and keys that it may change only with explicit consent.
 
-use super::bench::{Bench, Place, SELDOM, copy_folder, ended, logged, ply, refused, signal, succeeded};
-use crate::support::scenes::{TextModel, stderr, summary, text};
-use std::path::PathBuf;
+use super::bench::{Bench, Place, SELDOM};
+use crate::support::scenes::TextModel;
+use crate::support::workdir::copy_folder;
 
 /// The rows of a binary PLY as bytes, sorted.
 fn rows(ply: &[u8]) -> Vec<&[u8]> {
@@ -16,58 +16,55 @@ fn rows(ply: &[u8]) -> Vec<&[u8]> {
     rows
 }
 
-fn files(folder: PathBuf) -> Vec<(PathBuf, Vec<u8>)> {
-    let paths = std::fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
-    let mut files: Vec<_> = paths.map(|p| (p.clone(), std::fs::read(p).unwrap())).collect();
-    files.sort();
-    files
-}
-
 #[test]
 fn what_changed_is_said_and_left_as_it_was() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let out = bench.path("out");
-    let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
-    bench.wait_for_lines(&mut child, 2);
-    // The folder is in use: a second process is refused.
-    let said = refused(bench.go_on(&[]));
-    assert!(said.contains("another process"), "{said}");
-    signal(&mut child, "INT");
-    assert_eq!(ended(child).status.code(), Some(130));
-    // The message lists every changed key and its earlier value.
-    let said = refused(bench.go_on(&["--means-lr", "0.001", "--seed", "3", "--threads", "1"]));
-    assert!(said.contains("\n    means-lr was 0.00016 and is 0.001"), "{said}");
-    assert!(said.contains("seed was 42 and is 3") && said.contains("--accept-changes"), "{said}");
-    assert!(!said.contains("threads"), "threads change nothing: {said}");
+    let alone = bench.alone("");
+    let run = bench.start(Place::Spill(alone.fewest), SELDOM).after_lines("out", 2);
+    // The folder is in use: it cannot be started, resumed or overwritten by a second process.
+    let (config, words) = (bench.bytes("out/config.toml"), ["another process trains into this folder"]);
+    bench.does_not_go_on("", &words);
+    bench.refuses(&bench.flags(Place::Memory, "--overwrite"), &words);
+    assert!(bench.bytes("out/config.toml") == config);
+    run.stop();
+    // The message lists every changed key and its earlier value; threads change nothing.
+    let changes =
+        "--means-lr 0.001 --seed 3 --threads 1 --appearance exposure --refine-poses --robust-views --robust-pixels";
+    let said = bench.does_not_go_on(
+        changes,
+        &[
+            "\n    means-lr was 0.00016 and is 0.001",
+            "seed was 42 and is 3",
+            "--accept-changes",
+            "appearance was \"off\" and is \"exposure\"",
+        ],
+    );
+    for key in ["refine-poses", "robust-views", "robust-pixels"] {
+        assert!(said.contains(&format!("{key} was false and is true")), "{said}");
+    }
+    assert!(!said.contains("threads"), "{said}");
     // The layout of stored pages cannot change, and steps cannot be fewer than were done.
-    let said = refused(bench.go_on(&["--page-rows", "64", "--accept-changes"]));
-    assert!(said.contains("page-rows was 32 and is 64") && said.contains("--init-ply"), "{said}");
-    let said = refused(bench.go_on(&["--steps", "3"]));
-    assert!(said.contains("fewer than"), "{said}");
+    bench.does_not_go_on("--page-rows 64 --accept-changes", &["page-rows was 32 and is 64", "--init-ply"]);
+    bench.does_not_go_on("--steps 3", &["fewer than"]);
     // Poses, photos, points.
-    let model = files(bench.scene.join("sparse/0"));
-    let photos = files(bench.scene.join("images"));
-    let mut moved = TextModel::of(&bench.scene);
+    let (model, photos) = (bench.files("scene/sparse/0"), bench.photos());
+    let mut moved = TextModel::of(&bench.scene());
     moved.views[3].tvec[0] += 0.01;
     moved.colors[17][1] ^= 1;
-    moved.write(&bench.scene);
-    std::fs::write(&photos[5].0, &photos[6].1).unwrap();
-    let said = refused(bench.go_on(&[]));
-    assert!(said.contains("view 4 (") && said.contains("another name, set, size or pose"), "{said}");
-    assert!(said.contains("view 6 (") && said.contains("another photo or mask"), "{said}");
-    assert!(said.contains("points") && said.contains("are others"), "{said}");
-    std::fs::write(&photos[5].0, &photos[5].1).unwrap();
-    std::fs::remove_dir_all(bench.scene.join("sparse/0")).unwrap();
-    std::fs::create_dir(bench.scene.join("sparse/0")).unwrap();
-    model.iter().for_each(|(path, bytes)| std::fs::write(path, bytes).unwrap());
+    moved.write(&bench.scene());
+    let photo = std::fs::read(&photos[5]).unwrap();
+    std::fs::copy(&photos[6], &photos[5]).unwrap();
+    let (pose, file) = (["view 4 (", "another name, set, size or pose"], ["view 6 (", "another photo or mask"]);
+    bench.does_not_go_on("", &[&pose[..], &file, &["points", "are others"]].concat());
+    std::fs::write(&photos[5], photo).unwrap();
+    bench.remove("scene/sparse/0");
+    std::fs::create_dir(bench.path("scene/sparse/0")).unwrap();
+    model.iter().for_each(|(file, bytes)| std::fs::write(bench.path("scene/sparse/0").join(file), bytes).unwrap());
     // The run still resumes, and reports the new settings.
-    let child = crate::support::scenes::train(&["--resume", text(&out), "--threads", "1", "--evict", "lru"]);
-    let said = stderr(&child);
-    assert!(child.status.success(), "{said}");
+    let said = bench.train("--resume out --threads 1 --evict lru");
     let line = said.lines().find(|l| l.starts_with("resume")).unwrap();
     assert!(line.contains("threads was 0 and is 1") && line.contains("evict was"), "{line}");
-    assert!(ply(&out) == alone.ply, "the scene is another");
+    assert!(bench.ply("out") == alone.ply, "the scene is another");
 }
 
 /// Accepted changes apply from the step at which the run stopped, independent of the pages in memory, and to all later
@@ -75,53 +72,47 @@ fn what_changed_is_said_and_left_as_it_was() {
 #[test]
 fn accepted_changes_are_the_same_in_any_memory() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    bench.stopped(Place::Memory, 12);
-    copy_folder(&bench.path("out"), &bench.path("twin"));
-    copy_folder(&bench.path("out"), &bench.path("still"));
+    let alone = bench.alone("");
+    bench.stopped(Place::Memory, 12, "");
+    for copy in ["twin", "still"] {
+        copy_folder(&bench.path("out"), &bench.path(copy));
+    }
     // The change itself moves no row: without another step the rows equal those of the stopped run bit for bit. Their
     // order may differ, because oversized pages are split by now.
-    let (stopped, steps) = (ply(&bench.path("still")), summary(&bench.path("still"))["steps"].to_string());
-    let much = ["--means-lr", "0.1", "--scales-lr", "0.5", "--accept-changes", "--steps", &steps];
-    succeeded(bench.go_on_in("still", &much));
+    let (stopped, steps) = (bench.ply("still"), bench.count("still", "steps"));
+    bench.train(&format!("--resume still --quiet --means-lr 0.1 --scales-lr 0.5 --accept-changes --steps {steps}"));
     assert!(
-        rows(&ply(&bench.path("still"))) == rows(&stopped),
+        rows(&bench.ply("still")) == rows(&stopped),
         "rows did not take the steps that they missed at the old rates"
     );
-    let other = ["--means-lr", "0.002", "--opacities-lr", "0.01", "--accept-changes"];
-    let said = succeeded(bench.go_on(&other));
+    let other = "--means-lr 0.002 --opacities-lr 0.01 --accept-changes";
+    let said = bench.go_on(other);
     assert!(said.contains("accepted from step") && said.contains("means-lr was 0.00016 and is 0.002"), "{said}");
-    // The twin has fewer frames (the largest view may grow by the change), and is stopped once more.
-    let frames = ((alone.fewest + alone.pages) / 2).to_string();
-    let mut child = bench.go_on_in("twin", &[&other[..], &["--frames", &frames], &SELDOM[..]].concat());
-    bench.wait_for_lines_in("twin", &mut child, logged(&bench.path("out")).len() - 8);
-    signal(&mut child, "INT");
-    let output = ended(child);
-    // The run may have finished before the signal arrived.
-    assert!(output.status.code() == Some(130) || output.status.success(), "{}", stderr(&output));
-    succeeded(bench.go_on_in("twin", &["--frames", &frames]));
-    let (first, second) = (ply(&bench.path("out")), ply(&bench.path("twin")));
-    assert!(first == second, "the same changes gave two scenes");
-    assert!(first != alone.ply, "the change changed nothing");
+    // The twin has fewer frames (the largest view may grow by the change), and is stopped once more, if it has not finished by then.
+    let twin = format!("--resume twin --quiet --frames {}", (alone.fewest + alone.pages) / 2);
+    let run = bench.begin(&format!("{twin} {other} {SELDOM}")).after_lines("twin", bench.lines("out") - 8);
+    crate::support::workdir::send(&run.child, "INT");
+    run.end();
+    bench.train(&twin);
+    assert!(bench.ply("out") == bench.ply("twin"), "the same changes gave two scenes");
+    assert!(bench.ply("out") != alone.ply, "the change changed nothing");
 }
 
 /// Accepted changes belong to the run: later restarts need no flag, and end with the same bytes.
 #[test]
 fn other_bands_are_accepted_once() {
     let bench = Bench::new();
-    for keys in [["--sh-start", "2"], ["--sh-every", "0"]] {
-        bench.stopped(Place::Memory, 2);
+    for (key, value) in [("sh-start", 2), ("sh-every", 0)] {
+        let other = format!("--{key} {value}");
+        bench.stopped(Place::Memory, 2, "");
         copy_folder(&bench.path("out"), &bench.path("twin"));
-        let accepted = [&keys[..], &["--accept-changes"]].concat();
-        assert!(refused(bench.go_on(&keys)).contains(&keys[0][2..]));
-        succeeded(bench.go_on_in("twin", &accepted));
-        let mut child = bench.go_on(&[&accepted[..], &SELDOM].concat());
-        bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
-        signal(&mut child, "INT");
-        assert_eq!(ended(child).status.code(), Some(130));
-        succeeded(bench.go_on(&[]));
-        assert!(ply(&bench.path("out")) == ply(&bench.path("twin")), "{keys:?}: the scene is another");
-        ["out", "twin"].iter().for_each(|out| std::fs::remove_dir_all(bench.path(out)).unwrap());
+        bench.does_not_go_on(&other, &[key]);
+        bench.train(&format!("--resume twin --quiet --accept-changes {other}"));
+        let lines = bench.lines("out");
+        bench.resume(&format!("{other} --accept-changes {SELDOM}")).after_lines("out", lines + 3).stop();
+        bench.go_on("");
+        assert!(bench.ply("out") == bench.ply("twin"), "{key}: the scene is another");
+        ["out", "twin"].iter().for_each(|out| bench.remove(out));
     }
 }
 
@@ -129,25 +120,25 @@ fn other_bands_are_accepted_once() {
 #[test]
 fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     let bench = Bench::new();
-    let (first, moved) = (bench.path("first.ply"), bench.path("moved"));
-    succeeded(bench.begin(Place::Memory, &[]));
-    std::fs::rename(bench.path("out/point_cloud.ply"), &first).unwrap();
-    std::fs::remove_dir_all(bench.path("out")).unwrap();
-    succeeded(bench.begin(Place::Memory, &["--init-ply", text(&first)]));
-    let want = ply(&bench.path("out"));
-    std::fs::remove_dir_all(bench.path("out")).unwrap();
-    bench.stopped_with(Place::Memory, 4, &["--init-ply", text(&first)]);
-    std::fs::create_dir(&moved).unwrap();
-    std::fs::rename(&bench.scene, moved.join("scene")).unwrap();
-    std::fs::rename(&first, moved.join("first.ply")).unwrap();
-    let (scene, start) = (moved.join("scene"), moved.join("first.ply"));
-    assert!(refused(bench.go_on(&[])).contains("out SCENE"), "how to name the moved one");
-    assert!(refused(bench.go_on(&[text(&scene)])).contains("first.ply"));
-    let mut child = bench.go_on(&[&[text(&scene), "--init-ply", text(&start)], &SELDOM[..]].concat());
-    bench.wait_for_lines(&mut child, logged(&bench.path("out")).len() + 3);
-    signal(&mut child, "INT");
-    assert_eq!(ended(child).status.code(), Some(130));
+    let moves = |from: &str, to: &str| std::fs::rename(bench.path(from), bench.path(to)).unwrap();
+    bench.train(&bench.flags(Place::Memory, ""));
+    moves("out/point_cloud.ply", "first.ply");
+    bench.clear();
+    bench.train(&bench.flags(Place::Memory, "--init-ply first.ply"));
+    let want = bench.ply("out");
+    bench.clear();
+    bench.stopped(Place::Memory, 4, "--init-ply first.ply");
+    std::fs::create_dir(bench.path("moved")).unwrap();
+    moves("scene", "moved/scene");
+    moves("first.ply", "moved/first.ply");
+    bench.does_not_go_on("", &["out SCENE"]);
+    bench.refuses("--resume out moved/scene --quiet", &["first.ply"]);
+    let lines = bench.lines("out");
+    bench
+        .begin(&format!("--resume out moved/scene --quiet --init-ply moved/first.ply {SELDOM}"))
+        .after_lines("out", lines + 3)
+        .stop();
     // Afterwards the file exists.
-    succeeded(bench.go_on(&[]));
-    assert!(ply(&bench.path("out")) == want, "the scene is another");
+    bench.go_on("");
+    assert!(bench.ply("out") == want, "the scene is another");
 }

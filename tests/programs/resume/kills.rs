@@ -2,17 +2,18 @@
 //!
 //! `GSSCALE_KILLS=1000` sets the number of kills (default 20).
 
-use super::bench::{Bench, Place, ended, lines, logged, ply, succeeded};
+use super::bench::{Bench, Place};
 use super::events;
 use crate::support::gpu;
-use crate::support::scenes::{stderr, summary};
+use crate::support::scenes::stderr;
+use crate::support::workdir::copy_folder;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::gpu::GpuOptions;
 use std::os::unix::process::ExitStatusExt;
 use std::time::Duration;
 
 /// Commits as often as possible, names some commits, evaluates, and writes TensorBoard files.
-const OFTEN: &[&str] = &["--commit-every", "0.02", "--save-every", "45", "--eval-every", "70", "--log", "tensorboard"];
+const OFTEN: &str = "--commit-every 0.02 --save-every 45 --eval-every 70 --log tensorboard";
 /// Maximum milliseconds from a run's first line of metrics to its kill. One in four runs is killed within this time of
 /// its start.
 const KILL_WITHIN: u64 = 200;
@@ -32,55 +33,66 @@ fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     for &place in &places {
         let mut left = kills.div_ceil(places.len() as u32);
         while left > 0 {
-            let lives = live(&bench, place, fewest, &mut left, &mut draws);
-            let out = bench.path("out");
-            assert!(ply(&out) == alone.ply, "{place:?}: after {lives} lives the scene is another");
-            assert_eq!(logged(&out), alone.logged, "{place:?}: after {lives} lives");
+            // Settings that change no result vary from process to process; a run in memory may lack memory for them.
+            let more = |lives: u32| {
+                let frames = match place {
+                    Place::Memory if lives.is_multiple_of(3) => format!("--frames {fewest}"),
+                    Place::Memory => String::new(),
+                    Place::Spill(frames) => format!("--frames {frames}"),
+                };
+                let [threads, codec] = [lives % 2, lives / 2 % 2].map(|i| i as usize);
+                format!("{OFTEN} --threads {} --spill-codec {} {frames}", [1, 2][threads], ["raw", "zstd:1"][codec])
+            };
+            let lives = live(&bench, &bench.flags(place, OFTEN), more, 0, &mut left, &mut draws);
+            assert!(bench.ply("out") == alone.ply, "{place:?}: after {lives} lives the scene is another");
+            assert_eq!(bench.logged("out", "step"), alone.logged, "{place:?}: after {lives} lives");
             // The evaluation and each picture of the last step are events of their own.
-            let [shown, logged] = [events::steps(&out.join("tensorboard")), alone.logged.clone()].map(|mut steps| {
-                steps.dedup();
-                steps
-            });
+            let [shown, logged] =
+                [events::steps(&bench.path("out/tensorboard")), alone.logged.clone()].map(|mut steps| {
+                    steps.dedup();
+                    steps
+                });
             assert_eq!(shown, logged, "{place:?}: after {lives} lives");
-            counters_go_on(&bench);
+            // Counters since the start of a run continue across restarts.
+            let lines = bench.metrics("out");
+            for key in ["seconds", "bytes_written", "pages_needed"] {
+                let values: Vec<f64> = lines.iter().map(|line| line[key].as_f64().unwrap()).collect();
+                assert!(values.is_sorted() && values.last() > Some(&0.0), "{key}: {values:?}");
+            }
             assert!(!bench.checkpoint(place).join("FORMAT").exists(), "a run that is done leaves no checkpoint");
-            assert_eq!(summary(&out)["finished"], true);
-            std::fs::remove_dir_all(&out).unwrap();
+            assert_eq!(bench.summary("out")["finished"], true);
+            bench.clear();
         }
     }
 }
 
-/// One run from start to finish, killed while kills are left. Returns its number of processes.
-fn live(bench: &Bench, place: Place, fewest: u64, left: &mut u32, draws: &mut Stream) -> u32 {
-    let mut child = bench.begin(place, OFTEN);
-    bench.wait_for_lines(&mut child, 4);
+/// One run from start to finish, killed while kills are left: some time after it has logged `lines` more lines, or within its start.
+/// Returns its number of processes.
+fn live(
+    bench: &Bench,
+    begin: &str,
+    more: impl Fn(u32) -> String,
+    lines: usize,
+    left: &mut u32,
+    draws: &mut Stream,
+) -> u32 {
+    let mut run = bench.begin(begin).after_lines("out", 4);
     let mut lives = 1;
     loop {
         if *left > 0 {
             if draws.below(4) > 0 {
-                let before = logged(&bench.path("out")).len();
-                bench.wait_for_lines(&mut child, before);
+                run = run.after_lines("out", bench.lines("out") + lines);
             }
             std::thread::sleep(Duration::from_millis(draws.below(KILL_WITHIN)));
-            let _ = child.kill();
+            let _ = run.child.kill();
         }
-        let output = ended(child);
+        let output = run.end();
         if output.status.signal() != Some(9) {
-            assert!(output.status.success(), "{place:?}, life {lives}: {}", stderr(&output));
+            assert!(output.status.success(), "{begin}, life {lives}: {}", stderr(&output));
             return lives;
         }
         (*left, lives) = (left.saturating_sub(1), lives + 1);
-        // Settings that change no result vary from process to process; a run in memory may lack memory for them.
-        let mut more = vec!["--threads", ["1", "2"][lives as usize % 2], "--spill-codec"];
-        more.push(["raw", "zstd:1"][lives as usize / 2 % 2]);
-        let frames = match place {
-            Place::Memory if lives % 3 == 0 => Some(fewest),
-            Place::Memory => None,
-            Place::Spill(frames) => Some(frames),
-        };
-        let frames = frames.map(|f| f.to_string());
-        more.extend(frames.iter().flat_map(|f| ["--frames", f.as_str()]));
-        child = bench.go_on(&[OFTEN, &more].concat());
+        run = bench.resume(&more(lives));
     }
 }
 
@@ -91,72 +103,43 @@ fn a_run_on_a_gpu_that_is_killed_within_its_passes_ends_with_the_same_bytes() {
     if gpu::open(&GpuOptions::default()).is_none() {
         return;
     }
-    let bench = Bench::on("gpu");
-    let commits = ["--commit-every", "0.02"];
-    let alone = bench.alone(&commits);
-    let (frames, memory) = ((alone.fewest / 2).max(2), (alone.device_bytes / 2).to_string());
-    let little = [&commits[..], &["--device-mem", &memory]].concat();
-    let mut child = bench.begin(Place::Spill(frames), &little);
-    bench.wait_for_lines(&mut child, 2);
-    let mut draws = Stream::new(11, Purpose::Test, 0, 0);
-    let mut kills = 0;
-    loop {
-        if kills < 6 {
-            let before = logged(&bench.path("out")).len();
-            bench.wait_for_lines(&mut child, before + 1);
-            std::thread::sleep(Duration::from_millis(draws.below(KILL_WITHIN)));
-            let _ = child.kill();
-        }
-        let output = ended(child);
-        if output.status.signal() != Some(9) {
-            assert!(output.status.success(), "{}", stderr(&output));
-            break;
-        }
-        kills += 1;
-        let frames = frames.to_string();
-        child = bench.go_on(&[&little[..], &["--frames", &frames]].concat());
-    }
-    let out = bench.path("out");
-    assert!(kills >= 4, "the run was over after {kills} kills");
-    assert!(ply(&out) == alone.ply, "after {kills} kills the scene is another");
-    assert_eq!(logged(&out), alone.logged);
-    let frames = summary(&out)["frames"].as_u64().unwrap();
-    assert!(frames < alone.fewest, "{frames} frames hold the largest view of {} pages whole", alone.fewest);
-}
-
-/// Counters since the start of a run continue across restarts.
-fn counters_go_on(bench: &Bench) {
-    let lines = lines(&bench.path("out"));
-    for key in ["seconds", "bytes_written", "pages_needed"] {
-        let of = |i: usize| lines[i][key].as_f64().unwrap();
-        let falls = (1..lines.len()).find(|&i| of(i) < of(i - 1));
-        assert_eq!(falls.map(|i| (of(i - 1), of(i))), None, "{key} falls");
-        assert!(of(lines.len() - 1) > 0.0, "{key} counts nothing");
-    }
+    let bench = Bench::new();
+    bench.train(&bench.flags(Place::Memory, "--device gpu"));
+    let (want, fewest) = (bench.ply("out"), bench.count("out", "pages_pinned_max"));
+    let (logged, memory) = (bench.logged("out", "step"), bench.logged("out", "device_bytes_peak").into_iter().max());
+    bench.clear();
+    let little = format!("--device-mem {} --commit-every 0.02", memory.unwrap() / 2);
+    let begin = bench.flags(Place::Spill((fewest / 2).max(2)), &format!("--device gpu {little}"));
+    let mut left = 6;
+    let lives = live(&bench, &begin, |_| little.clone(), 1, &mut left, &mut Stream::new(11, Purpose::Test, 0, 0));
+    assert!(lives > 1, "the run was never killed");
+    assert!(bench.ply("out") == want, "after {lives} lives the scene is another");
+    assert_eq!(bench.logged("out", "step"), logged);
+    assert!(bench.count("out", "frames") < fewest, "the frames hold the largest view whole");
 }
 
 /// A kill during the removal of a finished run's checkpoint leaves a map without its segments.
 #[test]
 fn a_run_that_was_done_is_not_trained_again() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
+    let alone = bench.alone("");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
-        let (out, checkpoint, kept) = (bench.path("out"), bench.checkpoint(place), bench.path("kept"));
-        bench.stopped(place, 4);
-        super::bench::copy_folder(&checkpoint, &kept);
-        succeeded(bench.go_on(&[]));
-        assert!(ply(&out) == alone.ply && !checkpoint.join("FORMAT").exists());
+        let checkpoint = bench.checkpoint(place);
+        bench.stopped(place, 4, "");
+        copy_folder(&checkpoint, &bench.path("kept"));
+        bench.go_on("");
+        assert!(bench.ply("out") == alone.ply && !checkpoint.join("FORMAT").exists());
         // Succeeds only if the folder is empty.
         let _ = std::fs::remove_dir(&checkpoint);
-        std::fs::rename(&kept, &checkpoint).unwrap();
+        std::fs::rename(bench.path("kept"), &checkpoint).unwrap();
         for segment in std::fs::read_dir(&checkpoint).unwrap().map(|e| e.unwrap().path()) {
             if segment.extension().is_some_and(|e| e == "dat") {
                 std::fs::remove_file(&segment).unwrap();
             }
         }
-        succeeded(bench.go_on(&[]));
-        assert!(ply(&out) == alone.ply && !checkpoint.join("FORMAT").exists(), "the results stay, what was left goes");
-        std::fs::remove_dir_all(&out).unwrap();
-        let _ = std::fs::remove_dir(&checkpoint);
+        bench.go_on("");
+        let is_gone = !checkpoint.join("FORMAT").exists();
+        assert!(bench.ply("out") == alone.ply && is_gone, "the results stay, what was left goes");
+        bench.clear();
     }
 }

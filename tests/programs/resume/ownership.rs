@@ -1,211 +1,181 @@
 //! Ownership of checkpoints: a run touches only the checkpoint that it made, wherever other checkpoints lie.
 
-use super::bench::{BUSY, Bench, Place, SELDOM, STEPS, copy_folder, ended, ply, refused, signal, succeeded};
-use crate::support::scenes::{stderr, text, train};
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
+use crate::support::scenes::{stderr, text};
+use crate::support::workdir::{CKPT, TRAIN, copy_folder};
+use std::path::Path;
 use std::process::Command;
 
-/// Every file of a folder with its bytes.
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let entries = std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
-    // The lock names the last process.
-    let entries = entries.filter(|path| path.is_file() && path.file_name().is_some_and(|name| name != "LOCK"));
-    entries.map(|path| (path.clone(), std::fs::read(&path).unwrap())).collect()
+/// A spill directory with frames for every page.
+const DRIVE: Place = Place::Spill(4000);
+
+fn rename(bench: &Bench, from: &str, to: &str) {
+    std::fs::rename(bench.path(from), bench.path(to)).unwrap();
 }
 
-/// A complete run in `out` with this spill directory.
-fn whole_run(bench: &Bench, out: &Path, spill: &Path, steps: &str) {
-    let spill = ["--spill-dir", text(spill), "--frames", "4000", "--spill-codec", "raw"];
-    let output = train(&[&[text(&bench.scene), "--out", text(out), "--steps", steps], BUSY, &spill].concat());
-    assert!(output.status.success(), "{}", stderr(&output));
+/// A short run in `first`, whose pages were in `spill`.
+fn whole_run(bench: &Bench) {
+    bench.train(&bench.flags(DRIVE, "--out first --steps 20"));
+    assert!(!bench.exists("spill/FORMAT"), "a run that is done leaves no checkpoint");
 }
 
 #[test]
 fn a_run_that_is_done_leaves_the_checkpoint_of_the_run_after_it() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let (first, spill) = (bench.path("first"), bench.path("spill"));
-    whole_run(&bench, &first, &spill, "20");
-    assert!(!spill.join("FORMAT").exists(), "a run that is done leaves no checkpoint");
-    let place = Place::Spill(alone.fewest);
-    bench.stopped(place, 4);
-    let before = files(&spill);
-    let said = succeeded(bench.go_on_in("first", &[]));
+    let alone = bench.alone("");
+    whole_run(&bench);
+    bench.stopped(Place::Spill(alone.fewest), 4, "");
+    let before = bench.files("spill");
+    let said = bench.train("--resume first --quiet");
     assert!(said.contains("left alone") && said.contains(text(&bench.path("out"))), "{said}");
-    assert!(files(&spill) == before, "the checkpoint of another run was touched");
-    succeeded(bench.go_on(&[]));
-    assert!(ply(&bench.path("out")) == alone.ply, "the scene is another");
+    assert!(bench.files("spill") == before, "the checkpoint of another run was touched");
+    bench.go_on("");
+    assert!(bench.ply("out") == alone.ply, "the scene is another");
 }
 
 #[test]
 fn a_checkpoint_that_cannot_be_opened_stays() {
     let bench = Bench::new();
-    let (out, spill) = (bench.path("first"), bench.path("spill"));
-    whole_run(&bench, &out, &spill, "20");
-    bench.stopped(Place::Spill(4000), 4);
-    std::fs::write(spill.join("map.redb"), b"damaged").unwrap();
-    let before = files(&spill);
-    assert!(succeeded(bench.go_on_in("first", &[])).contains("left alone"));
-    assert!(files(&spill) == before, "a store that cannot be opened was touched");
+    whole_run(&bench);
+    bench.stopped(DRIVE, 4, "");
+    bench.write("spill/map.redb", "damaged");
+    let before = bench.files("spill");
+    let said = bench.train("--resume first --quiet");
+    assert!(said.contains("left alone"), "{said}");
+    assert!(bench.files("spill") == before, "a store that cannot be opened was touched");
 }
 
 #[test]
 fn a_run_does_not_go_on_from_the_checkpoint_of_another() {
     let bench = Bench::new();
-    let (out, spill) = (bench.path("out"), bench.path("spill"));
-    let place = Place::Spill(4000);
-    bench.stopped(place, 4);
+    bench.stopped(DRIVE, 4, "");
     // The folder is given to another run with identical settings.
-    std::fs::rename(&out, bench.path("first")).unwrap();
-    std::fs::remove_dir_all(&spill).unwrap();
-    bench.stopped(place, 8);
-    let (before, results) = (files(&spill), files(&bench.path("first")));
-    let said = refused(bench.go_on_in("first", &[]));
-    assert!(said.contains("the checkpoint of another run") && said.contains(text(&out)), "{said}");
-    let first = bench.path("first");
-    for command in [&["ls"][..], &["verify"], &["export", "--out", "x.ply"], &["rollback", "1", "--yes"]] {
-        let args = [&[command[0], text(&first)], &command[1..]].concat();
-        let output = Command::new(env!("CARGO_BIN_EXE_gsscale-ckpt")).args(&args).output().unwrap();
-        assert_eq!(output.status.code(), Some(1), "{args:?}");
-        assert!(stderr(&output).contains("the checkpoint of another run"), "{}", stderr(&output));
+    rename(&bench, "out", "first");
+    bench.remove("spill");
+    bench.stopped(DRIVE, 8, "");
+    let before = [bench.files("spill"), bench.files("first")];
+    bench.refuses("--resume first --quiet", &["the checkpoint of another run", text(&bench.path("out"))]);
+    for command in ["ls first", "verify first", "export first --out x.ply", "rollback first 1 --yes"] {
+        bench.refuses_with(CKPT, command, &["the checkpoint of another run"]);
     }
-    assert!(files(&spill) == before && files(&bench.path("first")) == results, "a refusal changed something");
+    assert!([bench.files("spill"), bench.files("first")] == before, "a refusal changed something");
 }
 
 #[test]
 fn starting_over_leaves_a_checkpoint_that_is_another_runs() {
     let bench = Bench::new();
-    let (out, checkpoint) = (bench.path("out"), bench.path("out/checkpoint"));
     // Another run's pages lie in the place of those of the run in `out`.
-    bench.stopped(Place::Memory, 4);
-    std::fs::remove_dir_all(&checkpoint).unwrap();
-    let (other, steps) = (bench.path("other"), "60");
-    let spill = ["--spill-dir", text(&checkpoint), "--keep-checkpoint", "--commit-every", "0"];
-    let args = [&[text(&bench.scene), "--out", text(&other), "--steps", steps], BUSY, &spill].concat();
-    let output = train(&args);
-    assert!(output.status.success(), "{}", stderr(&output));
-    let before = files(&checkpoint);
-    let said = refused(bench.begin(Place::Memory, &["--overwrite"]));
-    assert!(said.contains("another run") && said.contains(text(&other)), "{said}");
-    std::fs::write(checkpoint.join("map.redb"), b"damaged").unwrap();
-    let said = refused(bench.begin(Place::Memory, &["--overwrite"]));
-    assert!(said.contains("cannot be opened"), "{said}");
-    std::fs::write(checkpoint.join("map.redb"), &before[&checkpoint.join("map.redb")]).unwrap();
-    assert!(files(&checkpoint) == before, "another run's checkpoint was touched");
+    bench.stopped(Place::Memory, 4, "");
+    bench.remove("out/checkpoint");
+    bench
+        .train(&format!("{BUSY} --out other --steps 60 --spill-dir out/checkpoint --keep-checkpoint --commit-every 0"));
+    let before = bench.files("out/checkpoint");
+    let over = bench.flags(Place::Memory, "--overwrite");
+    bench.refuses(&over, &["another run", text(&bench.path("other"))]);
+    bench.write("out/checkpoint/map.redb", "damaged");
+    bench.refuses(&over, &["cannot be opened"]);
+    bench.write("out/checkpoint/map.redb", &before[Path::new("map.redb")]);
+    assert!(bench.files("out/checkpoint") == before, "another run's checkpoint was touched");
     // The run's own pictures are removed; other files stay.
-    std::fs::remove_file(out.join("metrics.jsonl")).unwrap();
-    std::fs::remove_dir_all(&checkpoint).unwrap();
-    std::fs::create_dir_all(out.join("renders/test/more")).unwrap();
+    std::fs::remove_file(bench.path("out/metrics.jsonl")).unwrap();
+    bench.remove("out/checkpoint");
+    std::fs::create_dir_all(bench.path("out/renders/test/more")).unwrap();
     for name in ["a.png", "more/b.png", "notes.txt"] {
-        std::fs::write(out.join("renders/test").join(name), "x").unwrap();
+        bench.write(&format!("out/renders/test/{name}"), "x");
     }
-    let mut child = bench.begin(Place::Memory, &[&SELDOM[..], &["--overwrite"]].concat());
-    bench.wait_for_lines(&mut child, 2);
-    signal(&mut child, "INT");
-    assert_eq!(ended(child).status.code(), Some(130));
-    let left = files(&out.join("renders/test")).into_keys().collect::<Vec<_>>();
-    assert_eq!(left, [out.join("renders/test/notes.txt")]);
+    bench.stopped(Place::Memory, 2, "--overwrite");
+    let left: Vec<_> =
+        bench.files("out/renders/test").into_keys().filter(|path| path.components().count() == 1).collect();
+    assert_eq!(left, [Path::new("notes.txt")]);
 }
 
 #[test]
 fn the_checkpoint_alone_is_enough_to_go_on() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let out = bench.path("out");
+    let alone = bench.alone("");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
         // A part of the metrics is missing, then all of them.
-        bench.stopped(place, 6);
-        let metrics = std::fs::read(out.join("metrics.jsonl")).unwrap();
-        std::fs::write(out.join("metrics.jsonl"), &metrics[..metrics.len() / 2]).unwrap();
-        let mut child = bench.go_on(&SELDOM);
-        bench.wait_for_lines(&mut child, 8);
-        signal(&mut child, "INT");
-        let output = ended(child);
-        assert_eq!(output.status.code(), Some(130), "{}", stderr(&output));
-        assert!(stderr(&output).contains("metrics.jsonl has"), "{}", stderr(&output));
-        std::fs::remove_file(out.join("metrics.jsonl")).unwrap();
-        std::fs::remove_file(out.join("config.toml")).unwrap();
-        let spill = bench.path("spill");
-        let mut named = vec![];
+        bench.stopped(place, 6, "");
+        let metrics = bench.bytes("out/metrics.jsonl");
+        bench.write("out/metrics.jsonl", &metrics[..metrics.len() / 2]);
+        let said = bench.resume(SELDOM).after_lines("out", 8).stop();
+        assert!(said.contains("metrics.jsonl has"), "{said}");
+        for file in ["out/metrics.jsonl", "out/config.toml"] {
+            std::fs::remove_file(bench.path(file)).unwrap();
+        }
+        let mut named = "";
         if place != Place::Memory {
             // config.toml names the folder of the pages; without it, the user has to.
-            assert!(refused(bench.go_on(&[])).contains("--spill-dir"));
-            std::fs::remove_dir_all(&out).unwrap();
-            named.extend(["--spill-dir", text(&spill)]);
+            bench.does_not_go_on("", &["--spill-dir"]);
+            bench.remove("out");
+            named = "--spill-dir spill";
         }
-        let said = succeeded(bench.go_on(&named));
+        let said = bench.go_on(named);
         assert!(said.contains("config.toml is missing") && said.contains("metrics.jsonl has only 0"), "{said}");
-        assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
-        let config = std::fs::read_to_string(out.join("config.toml")).unwrap();
-        assert!(config.contains("[resolved]") && config.contains(text(&bench.scene)), "{config}");
+        assert!(bench.ply("out") == alone.ply, "{place:?}: the scene is another");
+        let config = bench.text("out/config.toml");
+        assert!(
+            config.contains("[resolved]") && config.contains("scene = \"") && config.contains("scene\"\n"),
+            "{config}"
+        );
         assert!(!bench.checkpoint(place).join("FORMAT").exists(), "a run that is done leaves no checkpoint");
-        std::fs::remove_dir_all(&out).unwrap();
+        bench.clear();
     }
 }
 
 #[test]
 fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let (out, spill) = (bench.path("out"), bench.path("spill"));
+    let alone = bench.alone("");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
-        let mut child = bench.begin(place, &SELDOM);
-        bench.wait_for_lines(&mut child, 1);
-        child.kill().unwrap();
-        ended(child);
-        let said = succeeded(bench.go_on(&[]));
+        bench.start(place, SELDOM).after_lines("out", 1).kill();
+        let said = bench.go_on("");
         assert!(said.contains("begins again"), "{said}");
-        assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
-        assert_eq!(super::bench::logged(&out), alone.logged, "{place:?}");
-        std::fs::remove_dir_all(&out).unwrap();
+        assert!(bench.ply("out") == alone.ply, "{place:?}: the scene is another");
+        assert_eq!(bench.logged("out", "step"), alone.logged, "{place:?}");
+        bench.clear();
     }
-    // An unmounted drive of pages is no reason to start over.
-    let mut child = bench.begin(Place::Spill(4000), &SELDOM);
-    bench.wait_for_lines(&mut child, 1);
-    child.kill().unwrap();
-    ended(child);
-    std::fs::rename(&spill, bench.path("unmounted")).unwrap();
-    assert!(refused(bench.go_on(&[])).contains("not mounted"));
-    std::fs::remove_dir_all(bench.path("unmounted")).unwrap();
-    std::fs::remove_dir_all(&out).unwrap();
+    // An unmounted drive of pages is no reason to start over, nor is its mount point.
+    bench.start(DRIVE, SELDOM).after_lines("out", 1).kill();
+    bench.remove("spill");
+    bench.does_not_go_on("", &["not mounted"]);
+    std::fs::create_dir(bench.path("spill")).unwrap();
+    bench.does_not_go_on("", &["not mounted"]);
+    assert!(bench.files("spill").is_empty(), "something was written to a mount point");
+    bench.clear();
     // A result is never overwritten by a second start.
-    let mut child = bench.begin(Place::Memory, &["--frames", "4000"]);
-    bench.wait_for_lines(&mut child, 1);
-    signal(&mut child, "INT");
-    assert_eq!(ended(child).status.code(), Some(130));
-    let before = files(&out);
-    let said = refused(bench.go_on(&[]));
-    assert!(said.contains("not there") && said.contains("start a new run"), "{said}");
-    assert!(files(&out) == before);
+    bench.start(Place::Memory, "--frames 4000").after_lines("out", 1).stop();
+    let before = bench.files("out");
+    bench.does_not_go_on("", &["not there", "start a new run"]);
+    assert!(bench.files("out") == before);
+    bench.clear();
+    // Nor are scenes that it saved.
+    bench.start(Place::Memory, "--frames 4000 --save-every 20").after_lines("out", 5).kill();
+    let before = bench.bytes("out/point_cloud_000020.ply");
+    bench.does_not_go_on("", &[]);
+    assert!(bench.bytes("out/point_cloud_000020.ply") == before, "a saved scene is gone");
 }
 
 /// A run killed at any early moment: the same command, or `--resume` once a config exists, trains it.
 #[test]
 fn a_kill_in_the_first_second_is_in_nobodys_way() {
-    let mut bench = Bench::new();
-    let alone = bench.alone(&[]);
+    let bench = Bench::new();
+    let place = Place::Spill(bench.alone("").fewest);
     // A fast machine does the usual steps within the longest wait.
-    bench.steps = 100 * STEPS;
-    let (out, spill) = (bench.path("out"), bench.path("spill"));
+    let steps = format!("{SELDOM} --steps {}", 100 * STEPS);
     for milliseconds in [30, 60, 100, 150, 220, 300, 400, 550, 700] {
-        let mut child = bench.begin(Place::Spill(alone.fewest), &SELDOM);
+        let run = bench.start(place, &steps);
         std::thread::sleep(std::time::Duration::from_millis(milliseconds));
-        child.kill().unwrap();
-        ended(child);
+        run.kill();
         // Wait for lines of the second process.
-        let _ = std::fs::remove_file(out.join("metrics.jsonl"));
-        let mut again = match out.join("config.toml").exists() {
-            true => bench.go_on(&SELDOM),
-            false => bench.begin(Place::Spill(alone.fewest), &SELDOM),
+        let _ = std::fs::remove_file(bench.path("out/metrics.jsonl"));
+        let again = match bench.exists("out/config.toml") {
+            true => bench.resume(SELDOM),
+            false => bench.start(place, &steps),
         };
-        bench.wait_for_lines(&mut again, 2);
-        signal(&mut again, "INT");
-        let output = ended(again);
-        assert_eq!(output.status.code(), Some(130), "after {milliseconds} ms: {}", stderr(&output));
-        assert!(out.join("point_cloud.ply").exists() && spill.join("FORMAT").exists());
-        std::fs::remove_dir_all(&spill).unwrap();
-        std::fs::remove_dir_all(&out).unwrap();
+        again.after_lines("out", 2).stop();
+        assert!(bench.exists("out/point_cloud.ply") && bench.exists("spill/FORMAT"), "after {milliseconds} ms");
+        bench.clear();
     }
 }
 
@@ -218,14 +188,12 @@ fn the_output_folder_is_synced_after_its_config_was_renamed() {
         return;
     }
     let bench = Bench::new();
-    let (out, trace) = (bench.path("out"), bench.path("trace"));
-    let program = env!("CARGO_BIN_EXE_gsscale-train");
-    let traced =
-        ["-f", "-y", "-s", "4096", "-e", "trace=rename,renameat,renameat2,fsync,mkdir,mkdirat", "-o", text(&trace)];
-    let args = [&[program, text(&bench.scene), "--out", text(&out), "--steps", "2"], BUSY].concat();
-    let output = Command::new("strace").args(traced).args(args).output().unwrap();
+    let out = bench.path("out");
+    let traced = "-f -y -s 4096 -e trace=rename,renameat,renameat2,fsync,mkdir,mkdirat -o trace";
+    let flags = format!("{traced} {TRAIN} {BUSY} --steps 2");
+    let output = bench.command("strace", &flags).arg("--out").arg(&out).output().unwrap();
     assert!(output.status.success(), "{}", stderr(&output));
-    let said = std::fs::read_to_string(&trace).unwrap();
+    let said = bench.text("trace");
     let lines: Vec<&str> = said.lines().collect();
     let synced = |folder: &Path| format!("<{}>)", folder.display());
     let is_sync = |line: &&str, folder: &Path| line.contains("fsync(") && line.contains(&synced(folder));
@@ -239,83 +207,38 @@ fn the_output_folder_is_synced_after_its_config_was_renamed() {
 #[test]
 fn a_copy_of_an_output_folder_is_the_same_run() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    bench.stopped(Place::Spill(alone.fewest), 4);
+    let alone = bench.alone("");
+    bench.stopped(Place::Spill(alone.fewest), 4, "");
     copy_folder(&bench.path("out"), &bench.path("copy"));
-    succeeded(bench.go_on_in("copy", &[]));
-    assert!(ply(&bench.path("copy")) == alone.ply);
-    let said = refused(bench.go_on(&[]));
-    assert!(said.contains("not there"), "{said}");
-}
-
-/// A running run cannot be started, resumed or overwritten by another process.
-#[test]
-fn one_process_at_a_time_trains_into_a_folder() {
-    let bench = Bench::new();
-    let out = bench.path("out");
-    let mut child = bench.begin(Place::Memory, &SELDOM);
-    bench.wait_for_lines(&mut child, 1);
-    let config = std::fs::read(out.join("config.toml")).unwrap();
-    let said = refused(bench.go_on(&[]));
-    assert!(said.contains("another process trains into this folder"), "{said}");
-    let said = refused(bench.begin(Place::Memory, &["--overwrite"]));
-    assert!(said.contains("another process trains into this folder"), "{said}");
-    assert!(std::fs::read(out.join("config.toml")).unwrap() == config);
-    signal(&mut child, "INT");
-    assert_eq!(ended(child).status.code(), Some(130));
-    succeeded(bench.go_on(&[]));
-}
-
-/// Saved scenes and the mount point of an unmounted drive are no reasons to start over.
-#[test]
-fn a_run_with_a_past_is_not_begun_again() {
-    let bench = Bench::new();
-    let (out, spill) = (bench.path("out"), bench.path("spill"));
-    let mut child = bench.begin(Place::Memory, &["--frames", "4000", "--save-every", "20"]);
-    bench.wait_for_lines(&mut child, 5);
-    child.kill().unwrap();
-    ended(child);
-    let saved = out.join("point_cloud_000020.ply");
-    let before = std::fs::read(&saved).unwrap();
-    refused(bench.go_on(&[]));
-    assert!(std::fs::read(&saved).unwrap() == before, "a saved scene is gone");
-    std::fs::remove_dir_all(&out).unwrap();
-    let mut child = bench.begin(Place::Spill(4000), &SELDOM);
-    bench.wait_for_lines(&mut child, 1);
-    child.kill().unwrap();
-    ended(child);
-    std::fs::remove_dir_all(&spill).unwrap();
-    std::fs::create_dir(&spill).unwrap();
-    assert!(refused(bench.go_on(&[])).contains("not mounted"));
-    assert_eq!(std::fs::read_dir(&spill).unwrap().count(), 0, "something was written to a mount point");
+    bench.train("--resume copy --quiet");
+    assert!(bench.ply("copy") == alone.ply);
+    bench.does_not_go_on("", &["not there"]);
 }
 
 /// An output folder whose config.toml names no run, is missing or is damaged does not get another run's checkpoint.
 #[test]
 fn a_folder_that_does_not_know_its_run_takes_no_other() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let (out, spill, first) = (bench.path("out"), bench.path("spill"), bench.path("first"));
+    let alone = bench.alone("");
     let place = Place::Spill(alone.fewest);
-    bench.stopped(place, 4);
-    std::fs::rename(&out, &first).unwrap();
-    std::fs::remove_dir_all(&spill).unwrap();
-    bench.stopped(place, 4);
-    let config = std::fs::read_to_string(first.join("config.toml")).unwrap();
+    bench.stopped(place, 4, "");
+    rename(&bench, "out", "first");
+    bench.remove("spill");
+    bench.stopped(place, 4, "");
+    let config = bench.text("first/config.toml");
     let without: Vec<&str> = config.lines().filter(|line| !line.starts_with("run = ")).collect();
     assert!(without.len() + 1 == config.lines().count());
-    std::fs::write(first.join("config.toml"), without.join("\n")).unwrap();
-    let before = (files(&spill), files(&first));
-    assert!(refused(bench.go_on_in("first", &[])).contains("the checkpoint of another run"));
-    assert!((files(&spill), files(&first)) == before);
-    std::fs::remove_file(first.join("config.toml")).unwrap();
-    let said = refused(bench.go_on_in("first", &["--spill-dir", text(&spill)]));
-    assert!(said.contains("it holds results") && said.contains(text(&out)), "{said}");
-    assert!(files(&spill) == before.0);
+    bench.write("first/config.toml", without.join("\n"));
+    let before = [bench.files("spill"), bench.files("first")];
+    bench.refuses("--resume first --quiet", &["the checkpoint of another run"]);
+    assert!([bench.files("spill"), bench.files("first")] == before);
+    std::fs::remove_file(bench.path("first/config.toml")).unwrap();
+    bench.refuses("--resume first --quiet --spill-dir spill", &["it holds results", text(&bench.path("out"))]);
+    assert!(bench.files("spill") == before[0]);
     // The remedy for a damaged config.toml, followed literally.
-    std::fs::write(out.join("config.toml"), "").unwrap();
-    assert!(refused(bench.go_on(&[])).contains("remove the file"));
-    std::fs::remove_file(out.join("config.toml")).unwrap();
-    succeeded(bench.go_on(&["--spill-dir", text(&spill)]));
-    assert!(ply(&out) == alone.ply, "the scene is another");
+    bench.write("out/config.toml", "");
+    bench.does_not_go_on("", &["remove the file"]);
+    std::fs::remove_file(bench.path("out/config.toml")).unwrap();
+    bench.go_on("--spill-dir spill");
+    assert!(bench.ply("out") == alone.ply, "the scene is another");
 }

@@ -1,37 +1,32 @@
 //! Ctrl-C and SIGTERM, followed by the same command again.
 
-use super::bench::{Bench, Place, SELDOM, ended, logged, ply, refused, signal, succeeded};
-use crate::support::scenes::{stderr, summary};
+use super::bench::{Bench, Place, SELDOM};
 
 #[test]
 fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let out = bench.path("out");
+    let alone = bench.alone("");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
         // Commits only at the stops.
-        let mut child = bench.begin(place, &SELDOM);
-        for (lines, (name, code)) in [(3, ("INT", 130)), (12, ("TERM", 143))] {
-            bench.wait_for_lines(&mut child, lines);
-            signal(&mut child, name);
-            let output = ended(child);
-            assert_eq!(output.status.code(), Some(code), "{}", stderr(&output));
-            assert!(
-                stderr(&output).contains(&format!("gsscale-train --resume {}", out.display())),
-                "{}",
-                stderr(&output)
-            );
-            assert!(bench.checkpoint(place).join("map.redb").exists() && out.join("point_cloud.ply").exists());
-            assert_eq!(summary(&out)["finished"], false);
-            child = bench.go_on(&SELDOM);
+        let mut run = bench.begin(&bench.flags(place, SELDOM).replace("--quiet", ""));
+        for (lines, name, code) in [(3, "INT", 130), (12, "TERM", 143)] {
+            let said = run.after_lines("out", lines).signal(name).ends(code);
+            assert!(said.contains("gsscale-train --resume out"), "{said}");
+            assert!(bench.checkpoint(place).join("map.redb").exists() && bench.exists("out/point_cloud.ply"));
+            assert_eq!(bench.summary("out")["finished"], false);
+            // There are held-out photos, but none was evaluated: neither stderr nor the report claims otherwise.
+            let report = bench.text("out/report.html");
+            assert!(report.contains(" of 200 steps. To go on: gsscale-train --resume") && !report.contains("held-out"));
+            assert!(said.contains("quality     not evaluated") || lines > 3, "{said}");
+            run = bench.resume(SELDOM);
         }
-        succeeded(child);
-        assert!(ply(&out) == alone.ply, "{place:?}: the scene is another");
-        assert_eq!(logged(&out), alone.logged);
-        assert!(place != Place::Memory || !out.join("checkpoint").exists(), "a run that is done leaves no checkpoint");
+        run.ends(0);
+        assert!(bench.ply("out") == alone.ply, "{place:?}: the scene is another");
+        assert_eq!(bench.logged("out", "step"), alone.logged);
+        assert!(!bench.exists("out/checkpoint"), "a run that is done leaves no checkpoint");
         // The run made the folder of its pages, in its first life.
-        assert!(!bench.path("spill").exists(), "{place:?}: an empty folder is left");
-        std::fs::remove_dir_all(&out).unwrap();
+        assert!(!bench.exists("spill"), "{place:?}: an empty folder is left");
+        bench.clear();
     }
 }
 
@@ -39,70 +34,62 @@ fn a_run_that_is_asked_to_stop_says_how_to_go_on_and_does() {
 #[test]
 fn the_same_command_again_says_that_there_is_a_run() {
     let bench = Bench::new();
-    assert!(refused(bench.go_on(&[])).contains("config.toml"));
-    bench.stopped(Place::Spill(4000), 2);
-    let said = refused(bench.begin(Place::Spill(4000), &[]));
-    assert!(said.contains("--resume") && said.contains("another --out") && !said.contains("overwrite"), "{said}");
+    let refuses = |place, more: &str, words: &[&str]| bench.refuses(&bench.flags(place, more), words);
+    let (drive, memory) = (Place::Spill(4000), Place::Memory);
+    bench.does_not_go_on("", &["config.toml"]);
+    bench.stopped(drive, 2, "");
+    assert!(!refuses(drive, "", &["--resume", "another --out"]).contains("overwrite"));
     // `--overwrite` covers the output, but not a spill directory.
-    let said = refused(bench.begin(Place::Spill(4000), &["--overwrite"]));
-    assert!(said.contains("checkpoint of another run"), "{said}");
-    std::fs::remove_dir_all(bench.path("out")).unwrap();
-    std::fs::remove_dir_all(bench.path("spill")).unwrap();
-    bench.stopped(Place::Memory, 2);
-    let said = refused(bench.begin(Place::Memory, &[]));
-    assert!(said.contains("--resume") && !said.contains("overwrite"), "{said}");
+    refuses(drive, "--overwrite", &["checkpoint of another run"]);
+    bench.clear();
+    bench.stopped(memory, 2, "");
+    assert!(!refuses(memory, "", &["--resume"]).contains("overwrite"));
     // A run that was killed before it wrote a result may be started over.
     std::fs::rename(bench.path("out/point_cloud.ply"), bench.path("kept.ply")).unwrap();
-    let said = refused(bench.begin(Place::Memory, &[]));
-    assert!(said.contains("--resume") && said.contains("start over with --overwrite"), "{said}");
+    refuses(memory, "", &["--resume", "start over with --overwrite"]);
     std::fs::rename(bench.path("kept.ply"), bench.path("out/point_cloud.ply")).unwrap();
-    assert!(bench.path("out/checkpoint/FORMAT").exists());
+    assert!(bench.exists("out/checkpoint/FORMAT"));
     // Starting over removes the checkpoint, but not foreign files beside it.
-    std::fs::write(bench.path("out/checkpoint/notes.txt"), "mine").unwrap();
+    bench.write("out/checkpoint/notes.txt", "mine");
     std::fs::remove_file(bench.path("out/metrics.jsonl")).unwrap();
-    let mut child = bench.begin(Place::Memory, &[&SELDOM[..], &["--overwrite"]].concat());
-    bench.wait_for_lines(&mut child, 2);
-    assert!(!bench.path("out/checkpoint/FORMAT").exists() && bench.path("out/checkpoint/notes.txt").exists());
+    let run = bench.start(memory, &format!("{SELDOM} --overwrite")).after_lines("out", 2);
+    assert!(!bench.exists("out/checkpoint/FORMAT") && bench.exists("out/checkpoint/notes.txt"));
     // Nothing can be committed there; the run is unaffected.
-    signal(&mut child, "INT");
-    let output = ended(child);
-    assert_eq!(output.status.code(), Some(130));
-    assert!(stderr(&output).contains("not committed") && !stderr(&output).contains("--resume"), "{}", stderr(&output));
+    let said = run.stop();
+    assert!(said.contains("not committed") && !said.contains("--resume"), "{said}");
 }
 
 /// A run whose last evaluation failed is unfinished: its checkpoint stays, and the same command completes it.
 #[test]
 fn a_run_without_its_last_evaluation_goes_on_to_it() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    bench.stopped(Place::Spill(alone.fewest), 2);
-    let out = bench.path("out");
+    let alone = bench.alone("");
+    bench.stopped(Place::Spill(alone.fewest), 2, "");
     // A file blocks the folder of the pictures.
-    std::fs::write(out.join("renders"), "mine").unwrap();
-    assert!(refused(bench.go_on(&[])).contains("renders"));
-    assert!(ply(&out) == alone.ply, "all steps were done");
-    assert!(summary(&out)["finished"] == false && bench.path("spill/map.redb").exists());
-    std::fs::remove_file(out.join("renders")).unwrap();
+    bench.write("out/renders", "mine");
+    bench.does_not_go_on("", &["renders"]);
+    assert!(bench.ply("out") == alone.ply, "all steps were done");
+    assert!(bench.summary("out")["finished"] == false && bench.exists("spill/map.redb"));
+    std::fs::remove_file(bench.path("out/renders")).unwrap();
     // An older result of gsscale-eval.
-    std::fs::write(out.join("evaluated.json"), "{}").unwrap();
-    succeeded(bench.go_on(&[]));
-    assert!(!out.join("evaluated.json").exists(), "comparisons would take it for this run's");
-    let done = summary(&out);
+    bench.write("out/evaluated.json", "{}");
+    bench.go_on("");
+    assert!(!bench.exists("out/evaluated.json"), "comparisons would take it for this run's");
+    let done = bench.summary("out");
     assert!(done["finished"] == true && done["test"]["psnr"].as_f64().is_some(), "{done}");
-    assert!(ply(&out) == alone.ply && !bench.path("spill/map.redb").exists());
+    assert!(bench.ply("out") == alone.ply && !bench.exists("spill/map.redb"));
 }
 
 /// A run that was killed between the commit of its last evaluation and its end logs that evaluation once.
 #[test]
 fn a_run_that_is_killed_after_its_last_evaluation_logs_it_once() {
     let bench = Bench::new();
-    let alone = bench.alone(&[]);
-    let out = bench.path("out");
-    succeeded(bench.begin(Place::Spill(alone.fewest), &["--keep-checkpoint"]));
-    assert_eq!(logged(&out), alone.logged);
+    let alone = bench.alone("");
+    bench.train(&bench.flags(Place::Spill(alone.fewest), "--keep-checkpoint"));
+    assert_eq!(bench.logged("out", "step"), alone.logged);
     // The summary follows that commit.
-    std::fs::remove_file(out.join("summary.json")).unwrap();
-    succeeded(bench.go_on(&[]));
-    assert_eq!(logged(&out), alone.logged);
-    assert!(summary(&out)["finished"] == true && ply(&out) == alone.ply);
+    std::fs::remove_file(bench.path("out/summary.json")).unwrap();
+    bench.go_on("");
+    assert_eq!(bench.logged("out", "step"), alone.logged);
+    assert!(bench.summary("out")["finished"] == true && bench.ply("out") == alone.ply);
 }

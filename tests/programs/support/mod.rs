@@ -23,3 +23,4 @@ pub mod scenes;
 pub mod shared;
 #[cfg(unix)]
 pub mod small_drive;
+pub mod workdir;

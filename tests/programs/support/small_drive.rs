@@ -1,5 +1,6 @@
 //! A drive of a few megabytes, for tests of full drives.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -20,6 +21,21 @@ impl Small {
                 None
             }
         }
+    }
+
+    /// Takes all its space but `left` bytes, into the file of an earlier call if there is one.
+    pub fn fill(&self, left: u64) {
+        let mut other = std::fs::File::options().create(true).append(true).open(self.0.join("other")).unwrap();
+        for size in [1 << 16, 1 << 12] {
+            while other.write_all(&vec![0; size]).is_ok() {}
+        }
+        let taken = other.metadata().unwrap().len();
+        other.set_len(taken.saturating_sub(left)).unwrap();
+    }
+
+    /// Gives back what [`Small::fill`] took.
+    pub fn free(&self) {
+        std::fs::remove_file(self.0.join("other")).unwrap();
     }
 
     /// Resizes it; its contents must fit.
