@@ -467,8 +467,8 @@ fn compare(got: &View, want: &View) -> Result<Value, String> {
     }
     let apart = got.image.rgb.iter().zip(&want.image.rgb).map(|(g, w)| (g - w).abs());
     let worst = apart.clone().fold(0.0f32, |most, d| if d <= most { most } else { d });
-    let off = apart.filter(|d| !(*d <= PIXEL)).count();
-    if !(worst < FLIPPED) || off * FLIPPED_ONE_OF > want.image.rgb.len() {
+    let off = apart.filter(|d| exceeds(f64::from(*d), f64::from(PIXEL))).count();
+    if exceeds(f64::from(worst), f64::from(FLIPPED)) || off * FLIPPED_ONE_OF > want.image.rgb.len() {
         return Err(format!(
             "the picture is another (a value by {worst:.1e}; {off} of {} values): colours (sh_fwd), lists (isect_emit, radix_sort), or \
              blending (rasterize_fwd)",
@@ -476,23 +476,28 @@ fn compare(got: &View, want: &View) -> Result<Value, String> {
         ));
     }
     let loss = (got.loss.loss - want.loss.loss).abs();
-    if !(loss < LOSS) {
+    if exceeds(loss, LOSS) {
         return Err(format!("the loss is {}, but {} on the CPU: stage image_loss", got.loss.loss, want.loss.loss));
     }
     let means2d = l2(got.grads.means2d.as_flattened(), want.grads.means2d.as_flattened());
-    if !(means2d < GRADIENT) {
+    if exceeds(means2d, GRADIENT) {
         return Err(format!("gradients of footprints are others ({means2d:.1e} relative): stage rasterize_bwd"));
     }
     let mut columns = serde_json::Map::new();
     for column in Column::ALL {
         let error = l2(got.grads.columns.column(column), want.grads.columns.column(column));
-        if !(error < GRADIENT) {
+        if exceeds(error, GRADIENT) {
             let stage = if matches!(column, Column::Sh0 | Column::ShN) { "sh_bwd" } else { "project_bwd" };
             return Err(format!("gradients of {column:?} are others ({error:.1e} relative): stage {stage}"));
         }
         columns.insert(format!("{column:?}"), error.into());
     }
     Ok(json!({ "pixel": worst, "loss": loss, "means2d": means2d, "gradients": columns }))
+}
+
+/// Whether a difference is above a limit; NaN is above any.
+fn exceeds(difference: f64, limit: f64) -> bool {
+    difference.is_nan() || difference > limit
 }
 
 /// Relative L2 distance.
