@@ -12,6 +12,7 @@ mod ckpt;
 mod cli;
 mod clients;
 #[cfg(unix)]
+mod doctor;
 mod drive_faults;
 mod dry_runs;
 mod exports;

@@ -1,0 +1,39 @@
+//! `gsscale-bench doctor`: what it says of a sound device, and of one with too little memory.
+
+use crate::support::gpu;
+use crate::support::scenes::stderr;
+use crate::support::workdir::{BENCH, Workdir};
+use gsscale::gpu::GpuOptions;
+use serde_json::Value;
+use std::process::{Command, Output};
+
+fn doctor(work: &Workdir, flags: &[&str]) -> Output {
+    Command::new(BENCH).current_dir(work.path("")).args(["doctor", "--quick"]).args(flags).output().unwrap()
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap()
+}
+
+#[test]
+fn a_sound_device_is_told_from_one_with_too_little_memory() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let work = Workdir::new();
+    let sound = doctor(&work, &[]);
+    assert!(sound.status.success(), "{}", stderr(&sound));
+    let found = json(&work.text("doctor/doctor.json"));
+    let checks = found["checks"].as_array().unwrap();
+    assert!(checks.len() == 2 && checks.iter().all(|check| check["verdict"] == "good"), "{found}");
+    assert!(work.text("doctor/doctor.html").contains("8 views agree with the CPU"));
+
+    let poor = doctor(&work, &["--device-mem", "100KiB", "--out", "poor"]);
+    assert_eq!(poor.status.code(), Some(1), "{}", stderr(&poor));
+    let found = json(&work.text("poor/doctor.json"));
+    assert_eq!(found["checks"][0]["verdict"], "failed", "{found}");
+    assert!(found["checks"][0]["found"].as_str().unwrap().contains("memory"), "{found}");
+
+    let none = doctor(&work, &["--device", "no such card"]);
+    assert!(!none.status.success() && stderr(&none).contains("--list-devices"), "{}", stderr(&none));
+}
