@@ -57,6 +57,17 @@ impl InjectedFault {
     }
 }
 
+/// Environment variable that makes a shader compute something else, as a driver that compiles it wrongly does: `sh_fwd.wgsl:0.28209479=0.3`
+/// replaces a text in the source of that shader.
+const WRONG_SHADER: &str = "GSSCALE_SHADER_FAULT";
+
+/// The source of a shader as the environment wants it.
+pub(super) fn with_shader_fault(shader: &str, source: String) -> String {
+    let Ok(fault) = std::env::var(WRONG_SHADER) else { return source };
+    let parts = fault.split_once(':').filter(|(of, _)| *of == shader).and_then(|(_, change)| change.split_once('='));
+    parts.map_or_else(|| source.clone(), |(right, wrong)| source.replace(right, wrong))
+}
+
 /// The planned fault and the count of submissions.
 #[derive(Debug, Default)]
 pub(super) struct Injector {

@@ -12,6 +12,7 @@ use wgpu::naga;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
+use super::injected::with_shader_fault;
 use super::sources::{Defines, Source, preprocess, switches};
 
 /// Kind of a binding.
@@ -98,7 +99,7 @@ impl Pipelines {
     }
 
     fn compile(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Pipeline> {
-        let mut text = preprocess(source, defines)?;
+        let mut text = with_shader_fault(source.name, preprocess(source, defines)?);
         if !self.uniform_blocks {
             // A struct that is valid in a uniform block has the same layout in storage.
             text = text.replace("var<uniform>", "var<storage, read>");

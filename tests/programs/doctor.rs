@@ -1,4 +1,4 @@
-//! `gsscale-bench doctor`: what it says of a sound device, and of one with too little memory.
+//! `gsscale-bench doctor`: what it says of a sound device, of one with too little memory, and of one that computes wrongly.
 
 use crate::support::gpu;
 use crate::support::scenes::stderr;
@@ -36,4 +36,29 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
 
     let none = doctor(&work, &["--device", "no such card"]);
     assert!(!none.status.success() && stderr(&none).contains("--list-devices"), "{}", stderr(&none));
+}
+
+/// Each is a shader that a driver compiles wrongly, and the stage that the doctor names.
+#[test]
+fn a_wrong_constant_is_found_and_its_stage_is_named() {
+    if gpu::open(&GpuOptions::default()).is_none() {
+        return;
+    }
+    let work = Workdir::new();
+    for (fault, stage) in [
+        ("sh_fwd.wgsl:0.28209479=0.3", "sh_fwd"),
+        ("sh_bwd.wgsl:0.28209479=0.3", "sh_bwd"),
+        ("project_bwd.wgsl:-2.0 * (s=-2.1 * (s", "project_bwd"),
+        ("rasterize_bwd.wgsl:alpha * over=1.01 * alpha * over", "rasterize_bwd"),
+    ] {
+        let wrong = Command::new(BENCH)
+            .current_dir(work.path(""))
+            .args(["doctor", "--quick"])
+            .env("GSSCALE_SHADER_FAULT", fault)
+            .output()
+            .unwrap();
+        assert_eq!(wrong.status.code(), Some(1), "{fault}: {}", stderr(&wrong));
+        let said = stderr(&wrong);
+        assert!(said.contains(stage) && said.contains("--device cpu"), "{fault}: {said}");
+    }
 }
