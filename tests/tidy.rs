@@ -67,7 +67,6 @@ const LAYERS: &[(&str, &[&str])] = &[
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
     "src/base/allocator.rs",
-    "src/base/eight.rs",
     "src/base/environment.rs",
     "src/base/simd.rs",
     "src/page/engine/mmap.rs",

@@ -13,6 +13,7 @@ use gsscale::base::simd::SimdPath;
 use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
+use gsscale::optim::row_kernels::step_rows;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
@@ -129,7 +130,7 @@ fn optimize(
             (rest, values, gradients) = (rest_rows, rest_values, rest_gradients);
             let at = &at;
             scope.spawn(move |_| {
-                at.step_rows(page.rows_mut(first), own, own_values, own_gradients);
+                step_rows(at, page.rows_mut(first), own, own_values, own_gradients);
             });
         }
     });

@@ -2,8 +2,6 @@
 //! folders that are written whole. Knows neither Gaussians, pictures nor disk formats.
 
 pub mod allocator;
-#[cfg(target_arch = "x86_64")]
-pub(crate) mod eight;
 pub mod environment;
 pub mod error;
 pub mod identity;

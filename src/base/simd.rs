@@ -6,7 +6,7 @@
 //! So AVX2 and AVX-512 give the same bits, and the baseline gives others. Equal bits are promised per class of paths
 //! ([`BitsClass`]). A checkpoint records the path, and a run may resume with any path of the same class.
 //!
-//! The `unsafe` of the crate's compute half is confined to this file and `eight`.
+//! The `unsafe` of the crate's compute half is confined to this file.
 #![allow(unsafe_code)] // calling a function compiled for a detected instruction set
 
 use std::sync::OnceLock;

@@ -12,7 +12,7 @@
 use super::ops::{self, RoundCounts, RoundEdits};
 use super::strategy::{Effect, Extremes, Round, effect_of};
 use crate::base::ids::PageId;
-use crate::optim::bounds::SplitLimits;
+use crate::optim::bounds::{SplitLimits, lowest_opacity, page_bounds};
 use crate::optim::deferred::{AdamNow, DeferredAdam};
 use crate::scene::columns::Column;
 use crate::scene::events::{Event, EventLog};
@@ -191,8 +191,8 @@ impl<'a> PendingEvents<'a> {
 
     fn extremes(&self, rows: &Rows<'_>) -> Extremes {
         Extremes {
-            lowest_opacity: self.adam.lowest_opacity(rows),
-            sigma_max: self.adam.page_bounds(rows, &SplitLimits::NEVER).sigma_max,
+            lowest_opacity: lowest_opacity(self.adam, rows),
+            sigma_max: page_bounds(self.adam, rows, &SplitLimits::NEVER).sigma_max,
         }
     }
 

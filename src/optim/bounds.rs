@@ -13,8 +13,8 @@
 //! they are computed; 2. they hold for every later step, whatever events are pending, in the f32 arithmetic of the
 //! evaluation; 3. the same bits on every instruction path; 4. bounds of finite rows are finite.
 
-use super::adam_now::DeferredAdam;
-use super::lanes::{Coordinates, LANES, LaneDrifts, by_coordinate, drifted_lanes, drifted_opacities, tables_of};
+use super::deferred::DeferredAdam;
+use super::lanes::{LANES, LaneDrifts, by_element, drifted_lanes, tables_of};
 use super::moments::Moments;
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
@@ -56,17 +56,15 @@ impl SplitLimits {
     pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
 }
 
-impl DeferredAdam {
-    /// Bounds of the rows of a page that has just been rewritten.
-    pub fn page_bounds(&self, rows: &Rows<'_>, splits: &SplitLimits) -> PageBounds {
-        dispatch(self.simd(), BoundRows { adam: self, rows, splits })
-    }
+/// Bounds of the rows of a page that has just been rewritten.
+pub fn page_bounds(adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits) -> PageBounds {
+    dispatch(adam.simd, BoundRows { adam, rows, splits })
+}
 
-    /// A lower bound, for all later steps, of the opacities (logit) of untouched rows; infinity without rows. Does not
-    /// account for opacity resets.
-    pub fn lowest_opacity(&self, rows: &Rows<'_>) -> f32 {
-        dispatch(self.simd(), LowestOpacity { adam: self, rows })
-    }
+/// A lower bound, for all later steps, of the opacities (logit) of untouched rows; infinity without rows. Does not
+/// account for opacity resets.
+pub fn lowest_opacity(adam: &DeferredAdam, rows: &Rows<'_>) -> f32 {
+    dispatch(adam.simd, LowestOpacity { adam, rows })
 }
 
 struct LowestOpacity<'k> {
@@ -79,7 +77,8 @@ impl Kernel for LowestOpacity<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) -> f32 {
         let LowestOpacity { adam, rows } = self;
-        let values = rows.columns.opacities;
+        let tables = tables_of(rows, Column::Opacities);
+        let values = tables[0];
         let slack = movement_slack(adam);
         let of_row = |row: usize| {
             let (m, v) = (rows.exp_avg.opacities[row], rows.exp_avg_sq.opacities[row]);
@@ -88,15 +87,15 @@ impl Kernel for LowestOpacity<'_> {
         let mut lowest = [f32::INFINITY; LANES];
         let whole = rows.rows() / LANES * LANES;
         for first in (0..whole).step_by(LANES) {
-            let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
-            let (limits, direct) = drifted_opacities(adam, rows, first, &drifts);
+            let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.tables.limit(stamp));
+            let (limits, direct) = drifted_lanes::<1>(adam, Column::Opacities, tables, first, &drifts);
             if direct {
                 (0..LANES).for_each(|l| lowest[l] = lowest[l].min(of_row(first + l)));
                 continue;
             }
             let values = &values[first..first + LANES];
             for l in 0..LANES {
-                lowest[l] = lowest[l].min(hull(values[l], limits[l], slack)[0]);
+                lowest[l] = lowest[l].min(hull(values[l], limits[0][l], slack)[0]);
             }
         }
         (whole..rows.rows()).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
@@ -130,8 +129,8 @@ impl Kernel for BoundRows<'_> {
 
 /// Bounds of the rows in each lane, separately.
 struct LaneBounds {
-    lo: Coordinates,
-    hi: Coordinates,
+    lo: [[f32; LANES]; 3],
+    hi: [[f32; LANES]; 3],
     sigma_max: [f32; LANES],
 }
 
@@ -143,15 +142,15 @@ impl LaneBounds {
     /// false.
     #[inline(always)]
     fn add(&mut self, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, first: usize) -> bool {
-        let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.limit_drift(stamp));
+        let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.tables.limit(stamp));
         let (means, scales) = (tables_of(rows, Column::Means), tables_of(rows, Column::Scales));
-        let (mean_limits, a) = drifted_lanes(adam, Column::Means, means, first, &drifts);
-        let (scale_limits, b) = drifted_lanes(adam, Column::Scales, scales, first, &drifts);
+        let (mean_limits, a) = drifted_lanes::<3>(adam, Column::Means, means, first, &drifts);
+        let (scale_limits, b) = drifted_lanes::<3>(adam, Column::Scales, scales, first, &drifts);
         if a | b {
             return false;
         }
         let (from, to) = (first * 3, (first + LANES) * 3);
-        let (means, scales) = (by_coordinate(&means[0][from..to]), by_coordinate(&scales[0][from..to]));
+        let (means, scales) = (by_element::<3>(&means[0][from..to]), by_element::<3>(&scales[0][from..to]));
         let (grad2d, count) = (&rows.grad2d[first..first + LANES], &rows.count[first..first + LANES]);
         let slack = movement_slack(adam);
         let mut reach = [0.0; LANES];
@@ -207,7 +206,7 @@ fn add_row(bounds: &mut PageBounds, adam: &DeferredAdam, rows: &Rows<'_>, splits
 
 #[inline(always)]
 fn movement_slack(adam: &DeferredAdam) -> f32 {
-    if adam.moments() == Moments::Bf16 { MOVEMENT_SLACK_BF16 } else { MOVEMENT_SLACK }
+    if adam.moments == Moments::Bf16 { MOVEMENT_SLACK_BF16 } else { MOVEMENT_SLACK }
 }
 
 /// The range that a value passes through on its way to its limit, in the evaluation's arithmetic.
@@ -274,7 +273,7 @@ mod tests {
         }
         let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
         let of = |simd: SimdPath, rows: &Rows<'_>| {
-            DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd).page_bounds(rows, &splits)
+            page_bounds(&DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd), rows, &splits)
         };
         let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), SimdPath::Baseline);
         let mut want = PageBounds::EMPTY;
@@ -302,7 +301,7 @@ mod tests {
                     state.exp_avg_sq.means[c] = (root * root) as f32;
                 }
                 state.stamp[0] = draws.below(600) as u32;
-                let bounds = adam.page_bounds(&state.view(), &SplitLimits::NEVER);
+                let bounds = page_bounds(&adam, &state.view(), &SplitLimits::NEVER);
                 let mut now = state.stamp[0];
                 for _ in 0..6 {
                     now += 1 + draws.below(60) as u32;

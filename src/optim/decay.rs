@@ -17,8 +17,7 @@
 //!
 //! The first moment remembers ten steps, which contain few roundings: it is multiplied by beta1^k.
 //!
-//! Here: the factors of one gap and their effect on one value. Not here: the table of common gaps
-//! ([`super::deferred`]), and the same arithmetic in vectors of eight (`super::eights`).
+//! Here: the factors of one gap and their effect on one value. Not here: the table of common gaps ([`super::deferred`]).
 //!
 //! Invariants: 1. a decay is a function of the betas and k alone; 2. the same bits on every instruction path: only
 //! `+ - x`, nothing contracted; 3. no second moment becomes negative; 4. results below the smallest normal float are zero.
@@ -38,9 +37,6 @@ pub(super) struct Decay {
 }
 
 impl Decay {
-    /// Decay over no steps.
-    pub const NONE: Decay = Decay { first: 1.0, kept: 1.0, lost: 0.0 };
-
     /// Decay over `k` steps.
     pub fn new(config: AdamConfig, k: u32) -> Decay {
         let steps = f64::from(k);
@@ -74,7 +70,7 @@ mod tests {
     fn a_decay_over_any_gap_errs_by_a_rounding_or_two() {
         const VALUES: u32 = 1024;
         let config = AdamConfig::default();
-        assert_eq!(Decay::new(config, 0), Decay::NONE);
+        assert_eq!(Decay::new(config, 0), Decay { first: 1.0, kept: 1.0, lost: 0.0 });
         for k in (0..2000).chain((2000..30_000).step_by(61)) {
             let decay = Decay::new(config, k);
             let mut draws = Stream::new(3, Purpose::Test, u64::from(k), 0);

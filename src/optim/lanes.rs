@@ -1,26 +1,21 @@
-//! Sixteen rows at a time: moves the three coordinates of a column by the series, one vector per coordinate.
+//! Sixteen rows at a time: moves the elements of a column by the series, one vector per element.
 //!
 //! Not here: rows with second moments so small that eps matters; they are reported, and the caller evaluates them one
 //! by one.
 //!
 //! Invariant: the bits are those of `RowsNow` on every instruction path.
 
-use super::adam_now::{AdamNow, DeferredAdam};
+use super::deferred::{AdamNow, DeferredAdam};
 use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};
 use crate::base::simd::Kernel;
+pub(crate) use crate::base::simd::LANES;
 use crate::scene::columns::Column;
 use crate::scene::rows::{Rows, RowsNow};
-
-/// Rows per vector.
-pub(crate) const LANES: usize = 16;
 
 /// Series sums of [`LANES`] rows, one vector per sum: T1, T2, T3 of the means, then of the other columns.
 pub(crate) struct LaneDrifts {
     sums: [[f32; LANES]; 8],
 }
-
-/// Values of three coordinates of [`LANES`] rows.
-pub(crate) type Coordinates = [[f32; LANES]; 3];
 
 impl LaneDrifts {
     /// Gathers the sums of the rows with these stamps.
@@ -44,37 +39,33 @@ impl LaneDrifts {
     }
 }
 
-/// Values, first and second moments of a column of three coordinates.
+/// Values, first and second moments of a column.
 #[inline(always)]
 pub(crate) fn tables_of<'a>(rows: &Rows<'a>, column: Column) -> [&'a [f32]; 3] {
-    let (values, m, v) = (&rows.columns, &rows.exp_avg, &rows.exp_avg_sq);
-    match column {
-        Column::Means => [values.means, m.means, v.means],
-        _ => [values.scales, m.scales, v.scales],
-    }
+    [rows.columns.column(column), rows.exp_avg.column(column), rows.exp_avg_sq.column(column)]
 }
 
-/// The coordinates of rows `first..` after their drift, and whether one of them needs the direct sum instead.
+/// The `W` elements of rows `first..` in a column after their drift, and whether one of them needs the direct sum instead.
 #[inline(always)]
-pub(crate) fn drifted_lanes(
+pub(crate) fn drifted_lanes<const W: usize>(
     adam: &DeferredAdam,
     column: Column,
     tables: [&[f32]; 3],
     first: usize,
     drifts: &LaneDrifts,
-) -> (Coordinates, bool) {
-    let EpsFloor { eps, floor } = adam.eps_floor();
+) -> ([[f32; LANES]; W], bool) {
+    let EpsFloor { eps, floor } = adam.eps;
     let rate = adam.base_rate(column);
     let sums = drifts.of(column);
-    let (from, to) = (first * 3, (first + LANES) * 3);
+    let (from, to) = (first * W, (first + LANES) * W);
     // Not `map` over the tables: its closure is not always inlined, and would then be compiled without vector
     // instructions.
-    let value = by_coordinate(&tables[0][from..to]);
-    let m = by_coordinate(&tables[1][from..to]);
-    let v = by_coordinate(&tables[2][from..to]);
-    let mut out = [[0.0; LANES]; 3];
+    let value = by_element::<W>(&tables[0][from..to]);
+    let m = by_element::<W>(&tables[1][from..to]);
+    let v = by_element::<W>(&tables[2][from..to]);
+    let mut out = [[0.0; LANES]; W];
     let mut direct = false;
-    for c in 0..3 {
+    for c in 0..W {
         let mut lanes = [false; LANES];
         for l in 0..LANES {
             out[c][l] = drifted(value[c][l], m[c][l], v[c][l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
@@ -87,40 +78,17 @@ pub(crate) fn drifted_lanes(
     (out, direct)
 }
 
-/// `[LANES][3]` to `[3][LANES]`.
+/// `[LANES][W]` to `[W][LANES]`.
 #[inline(always)]
-pub(crate) fn by_coordinate(rows: &[f32]) -> Coordinates {
-    let rows = &rows[..LANES * 3];
-    let mut out = [[0.0; LANES]; 3];
+pub(crate) fn by_element<const W: usize>(rows: &[f32]) -> [[f32; LANES]; W] {
+    let rows = &rows[..LANES * W];
+    let mut out = [[0.0; LANES]; W];
     for l in 0..LANES {
-        out[0][l] = rows[l * 3];
-        out[1][l] = rows[l * 3 + 1];
-        out[2][l] = rows[l * 3 + 2];
+        for c in 0..W {
+            out[c][l] = rows[l * W + c];
+        }
     }
     out
-}
-
-/// The opacities (logit) of rows `first..` after their drift, and whether one of them needs the direct sum instead.
-#[inline(always)]
-pub(crate) fn drifted_opacities(
-    adam: &DeferredAdam,
-    rows: &Rows<'_>,
-    first: usize,
-    drifts: &LaneDrifts,
-) -> ([f32; LANES], bool) {
-    let EpsFloor { eps, floor } = adam.eps_floor();
-    let rate = adam.base_rate(Column::Opacities);
-    let sums = drifts.of(Column::Opacities);
-    let value = &rows.columns.opacities[first..first + LANES];
-    let m = &rows.exp_avg.opacities[first..first + LANES];
-    let v = &rows.exp_avg_sq.opacities[first..first + LANES];
-    let mut out = [0.0; LANES];
-    let mut direct = false;
-    for l in 0..LANES {
-        out[l] = drifted(value[l], m[l], v[l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
-        direct |= needs_direct_sum(m[l], v[l], floor);
-    }
-    (out, direct)
 }
 
 /// Computes the current largest log-scale and opacity of every row.
@@ -136,13 +104,13 @@ impl Kernel for SizeRows<'_, '_> {
     #[inline(always)]
     fn run<const FMA: bool>(self) {
         let SizeRows { at, rows, log_scales, opacities } = self;
-        let adam = at.adam();
-        let scale_tables = tables_of(rows, Column::Scales);
+        let adam = at.adam;
+        let (scale_tables, opacity_tables) = (tables_of(rows, Column::Scales), tables_of(rows, Column::Opacities));
         let whole = rows.rows() / LANES * LANES;
         for first in (0..whole).step_by(LANES) {
             let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| at.drift(stamp));
-            let (scales, a) = drifted_lanes(adam, Column::Scales, scale_tables, first, &drifts);
-            let (opacity, b) = drifted_opacities(adam, rows, first, &drifts);
+            let (scales, a) = drifted_lanes::<3>(adam, Column::Scales, scale_tables, first, &drifts);
+            let (opacity, b) = drifted_lanes::<1>(adam, Column::Opacities, opacity_tables, first, &drifts);
             if a | b {
                 (first..first + LANES).for_each(|row| size_row(at, rows, row, log_scales, opacities));
                 continue;
@@ -150,7 +118,7 @@ impl Kernel for SizeRows<'_, '_> {
             for l in 0..LANES {
                 log_scales[first + l] = scales[0][l].max(scales[1][l]).max(scales[2][l]);
             }
-            opacities[first..first + LANES].copy_from_slice(&opacity);
+            opacities[first..first + LANES].copy_from_slice(&opacity[0]);
         }
         (whole..rows.rows()).for_each(|row| size_row(at, rows, row, log_scales, opacities));
     }

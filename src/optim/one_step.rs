@@ -63,8 +63,10 @@ mod tests {
     use crate::base::rng::{Purpose, Stream};
     use crate::base::simd::SimdPath;
     use crate::optim::adam::AdamConfig;
+    use crate::optim::bounds::page_bounds;
     use crate::optim::deferred::DeferredAdam;
     use crate::optim::rates::Rates;
+    use crate::optim::row_kernels::take_step;
     use crate::scene::columns::Columns;
     use crate::scene::state::SceneState;
 
@@ -86,15 +88,15 @@ mod tests {
             let (mut now, listed) = (0, [0, 1, 2, 3]);
             let grows = draws.range(0.0, 1.5);
             while now + 1 < STEPS {
-                let before = adam.page_bounds(&state.view(), &splits);
+                let before = page_bounds(&adam, &state.view(), &splits);
                 let mut grads = Columns::zeros(rows, 0);
                 let size = libm::pow(10.0, -8.0 + grows * f64::from(now % 9));
                 for column in [Column::Means, Column::Scales] {
                     grads.column_mut(column).iter_mut().for_each(|g| *g = (size * draws.range(0.5, 1.0)) as f32);
                 }
-                adam.step(&mut state, &listed, &grads, now);
+                take_step(&adam, &mut state, &listed, &grads, now);
                 (state.grad2d[0], state.count[0]) = (draws.uniform() as f32, 1);
-                let (after, within) = (adam.page_bounds(&state.view(), &splits), one_step.widened(&before, now));
+                let (after, within) = (page_bounds(&adam, &state.view(), &splits), one_step.widened(&before, now));
                 for c in 0..3 {
                     assert!(after.lo[c] >= within.lo[c] && after.hi[c] <= within.hi[c], "seed {seed}, step {now}");
                     let [moved, most] = [before.lo[c] - after.lo[c], before.lo[c] - within.lo[c]];

@@ -11,8 +11,6 @@
 //! suffices; 2. lanes of the next row may hold anything: they may send a row to slower code with the same bits, but no
 //! stored or counted result depends on them.
 
-#[cfg(target_arch = "x86_64")]
-use crate::base::eight::{Avx2, EIGHT, Eight};
 use crate::base::simd::{LANES, prefetch};
 use crate::scene::columns::Column;
 use crate::scene::rows::{BLOCK_LANES, ColumnsMut, ColumnsRef, RowBlock, SH_N_LANE, first_lane};
@@ -60,14 +58,6 @@ impl<const W: usize> RowVectors<W> {
         }
         RowVectors(lanes)
     }
-}
-
-/// Start of each vector of eight of an `sh_n` of width `W`; the last one starts so that it ends within `sh_n`, see
-/// above.
-#[cfg(target_arch = "x86_64")]
-pub(super) const fn start_of_eight<const W: usize>(part: usize) -> usize {
-    let last = W.saturating_sub(EIGHT);
-    if part * EIGHT < last { part * EIGHT } else { last }
 }
 
 /// Rows of columns, `[rows][width]` each as in [`ColumnsRef`]; `sh_n` is `[rows * W]`.
@@ -121,8 +111,7 @@ impl<'a, const W: usize> Table<'a, W> {
     }
 
     /// Prefetches the narrow columns. The hardware prefetcher loads them, many rows to a line, as long as it can follow
-    /// all tables: forwarding gains nothing from this call, the step with its five tables a tenth to a fifth (AMD
-    /// Milan). The loops in vectors of eight use fewer tables at a time and gain nothing.
+    /// all tables: forwarding gains nothing from this call, the step with its five tables a tenth to a fifth (AMD Milan).
     #[inline(always)]
     pub fn prefetch_narrow(&self, row: usize) {
         prefetch(self.means, row);
@@ -131,34 +120,6 @@ impl<'a, const W: usize> Table<'a, W> {
         prefetch(self.opacities, row);
         prefetch(self.sh0, row);
     }
-}
-
-#[cfg(target_arch = "x86_64")]
-impl<'a, const W: usize> Table<'a, W> {
-    /// Loads the narrow columns of a row: means, opacity and quats; scales and sh0. Panics at the last row and beyond.
-    #[inline(always)]
-    pub fn load_narrow(&self, avx2: Avx2, row: usize) -> [Eight; 2] {
-        let low = avx2.load_three_one_four(with_behind(self.means, row), self.opacities[row], &self.quats[row]);
-        [low, avx2.load_threes(with_behind(self.scales, row), with_behind(self.sh0, row))]
-    }
-
-    #[inline(always)]
-    pub fn rows(&self) -> usize {
-        self.opacities.len()
-    }
-
-    /// `sh_n` of a row.
-    #[inline(always)]
-    pub fn sh_n_of(&self, row: usize) -> &'a [f32] {
-        &self.sh_n[row * W..][..W]
-    }
-}
-
-/// A row and the next one.
-#[cfg(target_arch = "x86_64")]
-#[inline(always)]
-fn with_behind(rows: &[[f32; 3]], row: usize) -> &[[f32; 3]; 2] {
-    &rows[row..row + 2].as_chunks().0[0]
 }
 
 /// A mutable [`Table`].
@@ -225,21 +186,5 @@ impl<'a, const W: usize> TableMut<'a, W> {
             let start = if is_last { self.last_start } else { start };
             sh_n[start..start + len].copy_from_slice(&block[lane..lane + len]);
         }
-    }
-}
-
-#[cfg(target_arch = "x86_64")]
-impl<const W: usize> TableMut<'_, W> {
-    /// Stores the narrow columns of a row, lanes as in [`Table::load_narrow`], without touching the next row.
-    #[inline(always)]
-    pub fn store_narrow(&mut self, row: usize, [low, high]: [Eight; 2]) {
-        low.store_three_one_four(&mut self.means[row], &mut self.opacities[row], &mut self.quats[row]);
-        high.store_threes(&mut self.scales[row], &mut self.sh0[row]);
-    }
-
-    /// `sh_n` of a row.
-    #[inline(always)]
-    pub fn sh_n_of(&mut self, row: usize) -> &mut [f32] {
-        &mut self.sh_n[row * W..][..W]
     }
 }

@@ -10,6 +10,7 @@ use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::take_step;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Renderer;
@@ -103,7 +104,7 @@ fn scene(rows: usize, adam: &DeferredAdam) -> SceneState {
                 *g = (draws.normal() * libm::pow(10.0, -draws.range(0.0, 16.0))) as f32;
             });
         }
-        adam.step(&mut state, &listed, &grads, step);
+        take_step(&adam, &mut state, &listed, &grads, step);
     }
     state
 }

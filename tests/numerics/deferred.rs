@@ -9,6 +9,7 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::{evaluate_rows, step_rows, take_step};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rows::{BLOCK_LANES, RowsMut, RowsNow, first_lane};
 use gsscale::scene::state::SceneState;
@@ -75,7 +76,7 @@ fn values_follow_dense_adam_in_f64() {
         for step in 0..STEPS {
             let listed = touched_rows(rows, step);
             let grads = grads_at(&listed, 0, step);
-            adam.step(&mut state, &listed, &grads, step);
+            take_step(&adam, &mut state, &listed, &grads, step);
             listed.iter().for_each(|&row| writes[row as usize] += 1.0);
             let mut full = Columns::zeros(rows, 0);
             for column in Column::ALL {
@@ -142,7 +143,7 @@ fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
             (dense[0][row], dense[1][row]) = (f64::from(a), f64::from(b));
             writes[row] += 1.0;
         }
-        adam.step(&mut state, &listed, &grads, step);
+        take_step(&adam, &mut state, &listed, &grads, step);
         means.step(&dense[0], rates.at(Column::Means, step));
         opacities.step(&dense[1], rates.at(Column::Opacities, step));
         if (step + 1) % resets == 0 {
@@ -190,7 +191,7 @@ fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
     for step in 0..1000 {
         let listed = touched_rows(rows, step);
         let grads = grads_at(&listed, degree, step);
-        adam.step(&mut quiet, &listed, &grads, step);
+        take_step(&adam, &mut quiet, &listed, &grads, step);
         if step % 3 == 0 {
             let before = read.clone();
             let mut out = Columns::zeros(0, degree);
@@ -198,7 +199,7 @@ fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
             evaluate_all(&read, &adam, step + 500);
             assert_eq!(before, read);
         }
-        adam.step(&mut read, &listed, &grads, step);
+        take_step(&adam, &mut read, &listed, &grads, step);
     }
     assert_eq!(quiet, read);
     assert_eq!(evaluate_all(&quiet, &adam, 3000), evaluate_all(&read, &adam, 3000));
@@ -268,7 +269,7 @@ fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam
                 *x = value;
             }
         }
-        let of_step = adam.step(&mut state, &listed, &grads, step);
+        let of_step = take_step(&adam, &mut state, &listed, &grads, step);
         counts = [counts[0] + of_step.updated, counts[1] + of_step.skipped_non_finite];
     }
     (adam, state, counts)
@@ -278,7 +279,7 @@ fn eventful_steps(simd: SimdPath, degree: u8, moments: Moments) -> (DeferredAdam
 fn evaluate_listed(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
     let rows = state.rows();
     let mut out = Columns::zeros(rows + 130, state.sh_degree());
-    adam.at(now).evaluate_rows(state.view(), |i| (rows - 1 - i % rows) * 11 % rows, out.view_mut());
+    evaluate_rows(&adam.at(now), state.view(), |i| (rows - 1 - i % rows) * 11 % rows, out.view_mut());
     out
 }
 
@@ -358,7 +359,7 @@ fn settling_a_row_keeps_its_later_values() {
     let mut state = SceneState::from_columns(random_columns(20, 1, 1.0, 4));
     let all: Vec<u32> = (0..20).collect();
     for step in 0..40 {
-        adam.step(&mut state, &all, &grads_at(&all, 1, step), step);
+        take_step(&adam, &mut state, &all, &grads_at(&all, 1, step), step);
     }
     let want = evaluate_all(&state, &adam, 300);
     let mut view = state.view_mut();
@@ -392,7 +393,7 @@ fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
         grads.row_mut(column, 4).fill(-0.0);
     }
     let before = state.clone();
-    let counts = adam.step(&mut state, &all, &grads, 9);
+    let counts = take_step(&adam, &mut state, &all, &grads, 9);
     assert_eq!((counts.updated, counts.skipped_non_finite), (2, 3));
     assert_eq!(state.stamp, [10, 0, 0, 0, 0, 10]);
     for row in 1..5 {
@@ -432,12 +433,12 @@ fn rows_beside_it_change_no_bit(simd: SimdPath) {
                     Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(value));
                 }
             }
-            let counts = adam.step(&mut together, &listed, &grads, now);
+            let counts = take_step(&adam, &mut together, &listed, &grads, now);
             let mut counted = (0, 0);
             for (i, &row) in listed.iter().enumerate() {
                 let mut own = Columns::zeros(1, degree);
                 Column::ALL.into_iter().for_each(|c| own.row_mut(c, 0).copy_from_slice(grads.row(c, i)));
-                let of_row = adam.step(&mut alone[row as usize], &[0], &own, now);
+                let of_row = take_step(&adam, &mut alone[row as usize], &[0], &own, now);
                 counted = (counted.0 + of_row.updated, counted.1 + of_row.skipped_non_finite);
             }
             assert_eq!((counts.updated, counts.skipped_non_finite), counted);
@@ -470,7 +471,7 @@ fn a_list_that_does_not_ascend_is_refused_before_any_row_is_changed() {
         let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
         let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
         let (before, grads) = (state.clone(), grads_at(&list, 3, 0));
-        let step = std::panic::AssertUnwindSafe(|| adam.step(&mut state, &list, &grads, 9));
+        let step = std::panic::AssertUnwindSafe(|| take_step(&adam, &mut state, &list, &grads, 9));
         assert!(std::panic::catch_unwind(step).is_err(), "{list:?}");
         assert_eq!(state, before, "{list:?}");
     }
@@ -492,7 +493,7 @@ fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
             let mut state = start.clone();
             let step = std::panic::AssertUnwindSafe(|| {
                 let view = RowsMut { first_row: 3000, ..state.view_mut() };
-                adam.at(9).step_rows(view, &list, values.view(), grads.view())
+                step_rows(&adam.at(9), view, &list, values.view(), grads.view())
             });
             let counts = std::panic::catch_unwind(step).ok().map(|counts| counts.updated);
             assert_eq!(counts, is_right.then_some(all.len()), "{} {at} {row}", simd.name());
@@ -511,8 +512,8 @@ fn without_catch_up_rows_keep_their_values_without_a_gradient() {
     let (mut still, mut exact) = (SceneState::from_columns(start.clone()), SceneState::from_columns(start));
     for step in 0..5 {
         let grads = grads_at(&all, degree, step);
-        sparse.step(&mut still, &all, &grads, step);
-        adam.step(&mut exact, &all, &grads, step);
+        take_step(&sparse, &mut still, &all, &grads, step);
+        take_step(&adam, &mut exact, &all, &grads, step);
     }
     assert!(still == exact, "with a gradient at every step there is nothing to catch up with");
     // Many steps later.
@@ -526,7 +527,7 @@ fn without_catch_up_rows_keep_their_values_without_a_gradient() {
     );
     // The next gradient finds the moments as the last gradient left them.
     let grads = grads_at(&all, degree, 1500);
-    sparse.step(&mut still, &all, &grads, 1500);
+    take_step(&sparse, &mut still, &all, &grads, 1500);
     let (m, g) = (before.exp_avg.means[0], grads.means[0]);
     assert!((still.exp_avg.means[0] - (0.9 * m + 0.1 * g)).abs() <= 1e-6 * (m.abs() + g.abs()));
 }

@@ -9,9 +9,10 @@ use gsscale::densify::ops::child_uid;
 use gsscale::densify::stats::{GradHistogram, accumulate};
 use gsscale::densify::strategy::{RoundSteps, RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
-use gsscale::optim::bounds::SplitLimits;
+use gsscale::optim::bounds::{SplitLimits, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
@@ -62,7 +63,7 @@ fn touch(
         v_means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
         radii.push([draws.below(8) as u32, draws.below(8) as u32]);
     }
-    adam.step(state, &rows, &grads, step);
+    take_step(adam, state, &rows, &grads, step);
     accumulate(&mut state.view_mut(), &rows, &v_means2d, &radii, [20, 30], histogram);
 }
 
@@ -287,7 +288,7 @@ fn rows_whose_log_scales_drift_beyond_reason_stay_finite() {
             assert!(state.columns.column(column).iter().all(|x| x.is_finite()), "{kind:?}: {column:?}");
         }
         assert!(state.columns.scales.iter().all(|&s| s <= range.high), "{kind:?}");
-        let bounds = adam.page_bounds(&state.view(), &SplitLimits::NEVER);
+        let bounds = page_bounds(&adam, &state.view(), &SplitLimits::NEVER);
         assert!(bounds.lo.iter().chain(&bounds.hi).all(|x| x.is_finite()) && bounds.sigma_max.is_finite());
     }
 }

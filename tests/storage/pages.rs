@@ -13,10 +13,11 @@ use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
 use gsscale::densify::stats::{GradHistogram, WEIGHED_VIEWS, accumulate};
 use gsscale::densify::strategy::{DrawnRows, Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
-use gsscale::optim::bounds::SplitLimits;
+use gsscale::optim::bounds::{SplitLimits, lowest_opacity, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RelocationRound, RoundThresholds};
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, read_page, write_page};
@@ -66,7 +67,7 @@ fn touch(
         radii.push([draws.below(8) as u32, draws.below(8) as u32]);
         weights.push([(draws.uniform() * 9.0) as f32, draws.uniform() as f32]);
     }
-    adam.step(state, &rows, &grads, step);
+    take_step(adam, state, &rows, &grads, step);
     strategy.after_update(&mut state.view_mut(), &rows, step);
     let drawn = DrawnRows {
         step,
@@ -231,12 +232,12 @@ struct InPages<'a> {
 fn facts_of(state: &SceneState, adam: &DeferredAdam) -> PageFacts {
     let rows = state.view();
     let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
-    let sigma_max = adam.page_bounds(&rows, &SplitLimits::NEVER).sigma_max;
+    let sigma_max = page_bounds(&adam, &rows, &SplitLimits::NEVER).sigma_max;
     let weights = rows.count.iter().filter(|&&word| views(word) >= WEIGHED_VIEWS).filter_map(|&word| mean_weight(word));
     PageFacts {
         largest_mean: means.fold(0.0, f32::max),
         least_weight: weights.fold(f32::INFINITY, f32::min),
-        extremes: Extremes { lowest_opacity: adam.lowest_opacity(&rows), sigma_max },
+        extremes: Extremes { lowest_opacity: lowest_opacity(&adam, &rows), sigma_max },
         sh_degree: state.sh_degree(),
     }
 }
@@ -476,7 +477,7 @@ fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
                 *g = (draws.normal() * libm::pow(10.0, -draws.range(0.0, 17.0))) as f32;
             });
         }
-        adam.step(&mut state, &listed, &grads, step);
+        take_step(&adam, &mut state, &listed, &grads, step);
         let v_means2d: Vec<[f32; 2]> = listed.iter().map(|_| [(draws.normal() * 3e-5) as f32, 0.0]).collect();
         accumulate(&mut state.view_mut(), &listed, &v_means2d, &vec![[1, 1]; listed.len()], [20, 20], &mut histogram);
     }
@@ -551,7 +552,7 @@ fn tightest_bounds(adam: &DeferredAdam, limits: &SplitLimits) -> f64 {
     let (mut children, mut at_edge, mut tightest) = (0, 0, f64::INFINITY);
     for key in 0..60 {
         let state = moving_page(37, adam, key);
-        let bounds = adam.page_bounds(&state.view(), limits);
+        let bounds = page_bounds(&adam, &state.view(), limits);
         let last = state.stamp.iter().copied().max().unwrap();
         let log = random_log(key, last, limits);
         let mut exact = [f32::INFINITY, f32::NEG_INFINITY];

@@ -9,8 +9,9 @@
 use crate::base::math::exp32;
 use crate::base::room;
 use crate::base::simd::{Kernel, dispatch};
-use crate::optim::deferred::{AdamNow, DeferredAdam, ROWS_PER_TASK};
+use crate::optim::deferred::{AdamNow, DeferredAdam};
 use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
+use crate::optim::row_kernels::{ROWS_PER_TASK, evaluate_rows};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::frustum::Frustum;
@@ -57,7 +58,7 @@ fn evaluate_into(at: &AdamNow<'_>, tables: &[Rows<'_>], rows: &[u32], out: Colum
     if let [table] = tables
         && rows.len() <= ROWS_PER_TASK
     {
-        return at.evaluate_rows(*table, |i| rows[i] as usize - table.first_row, out);
+        return evaluate_rows(at, *table, |i| rows[i] as usize - table.first_row, out);
     }
     let (listed, head_tables, tail_tables) = match tables {
         [_] => (rows.len().div_ceil(ROWS_PER_TASK) / 2 * ROWS_PER_TASK, tables, tables),
@@ -86,7 +87,7 @@ fn cull(at: &AdamNow<'_>, frustum: &Frustum, tables: &[Rows<'_>], out: &mut [u32
     let rows = out.len();
     match tables {
         [] => return 0,
-        [view] if rows <= ROWS_PER_TASK => return dispatch(at.simd(), CullRows { at, frustum, view: *view, out }),
+        [view] if rows <= ROWS_PER_TASK => return dispatch(at.adam.simd, CullRows { at, frustum, view: *view, out }),
         _ => {}
     }
     let halves;
@@ -141,8 +142,8 @@ impl Kernel for CullRows<'_, '_> {
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
     let drifts = LaneDrifts::gather(&view.stamp[first..], |stamp| at.drift(stamp));
-    let (means, a) = drifted_lanes(at.adam(), Column::Means, tables_of(view, Column::Means), first, &drifts);
-    let (scales, b) = drifted_lanes(at.adam(), Column::Scales, tables_of(view, Column::Scales), first, &drifts);
+    let (means, a) = drifted_lanes::<3>(at.adam, Column::Means, tables_of(view, Column::Means), first, &drifts);
+    let (scales, b) = drifted_lanes::<3>(at.adam, Column::Scales, tables_of(view, Column::Scales), first, &drifts);
     if a | b {
         return cull_row_by_row(at, frustum, view, first);
     }

@@ -14,7 +14,7 @@ use crate::config::limits::RunOptions;
 use crate::densify::replay::{PageEdit, PendingEvents, Replay};
 use crate::densify::stats::GradHistogram;
 use crate::densify::strategy::{Effect, Strategy, effect_of};
-use crate::optim::bounds::SplitLimits;
+use crate::optim::bounds::{SplitLimits, page_bounds};
 use crate::optim::deferred::DeferredAdam;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::page::format::slot_header::HEADER_BYTES;
@@ -102,7 +102,7 @@ impl PageRules {
 
     /// Bounds of a page with these rows, for the index.
     pub(crate) fn bounds(&self, rows: &Rows<'_>) -> PageBounds {
-        self.adam.page_bounds(rows, &self.splits)
+        page_bounds(&self.adam, rows, &self.splits)
     }
 
     pub(super) fn pending(&self) -> PendingEvents<'_> {

@@ -5,7 +5,7 @@
 
 use super::pages::PagedScene;
 use crate::densify::strategy::DrawnRows;
-use crate::optim::deferred::StepCounts;
+use crate::optim::row_kernels::{StepCounts, step_rows};
 use crate::paging::pinned::PinnedPage;
 use crate::render::Gradients;
 use crate::scene::columns::Columns;
@@ -51,7 +51,7 @@ pub(super) fn update_pages(
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
-            let counts = at.step_rows(share.page.rows_mut(share.first_row), share.rows, share.values, share.grads);
+            let counts = step_rows(&at, share.page.rows_mut(share.first_row), share.rows, share.values, share.grads);
             share.touched = counts.updated > 0;
             if share.touched {
                 strategy.after_update(&mut share.page.rows_mut(share.first_row), share.rows, input.step);

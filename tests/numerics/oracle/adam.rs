@@ -9,6 +9,7 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::state::SceneState;
 
@@ -203,7 +204,7 @@ fn adam_deferred_equals_torch_at_every_snapshot() {
             for (i, g) in case.grads(step).into_iter().enumerate() {
                 grads.means[3 * i] = g as f32;
             }
-            let counts = adam.step(&mut state, &all, &grads, step as u32 - 1);
+            let counts = take_step(&adam, &mut state, &all, &grads, step as u32 - 1);
             let touched = all.iter().filter(|&&r| grads.row(Column::Means, r as usize).iter().any(|&g| g != 0.0));
             assert_eq!(counts.updated, touched.count());
             let Some(snap) = case.snaps.iter().position(|&s| s == step) else { continue };

@@ -10,6 +10,7 @@ use gsscale::base::simd::SimdPath;
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::state::SceneState;
 
@@ -134,7 +135,7 @@ fn outcome_of(run: &Run, simd: SimdPath) -> Outcome {
         }
         let of_values: Vec<f32> = grads.means.iter().copied().step_by(3).collect();
         let rate = rates.at(Column::Means, step);
-        adam.step(&mut state, &all, &grads, step);
+        take_step(&adam, &mut state, &all, &grads, step);
         dense.step(&of_values.iter().map(|&g| f64::from(g)).collect::<Vec<_>>(), rate);
         torch.step(&of_values, rate);
         if step % 37 == 36 || step + 1 == run.steps {
