@@ -50,22 +50,20 @@
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
 
 use super::device_needs::ViewSizes;
-use super::gpu_frame::splat_bytes;
+use super::gpu_back::{read_gradient, read_loss_value, read_unusable, record_picture_back, rows_out};
 use super::gpu_gradients::Scratch;
-use super::gpu_loss::LossStage;
 use super::gpu_pages::{DevicePages, PagesView};
-use super::gpu_ranges::RangeStages;
-use super::gpu_rows::{DeviceColumns, HostRows, RowSource, RowStages, SplatRows};
-use super::gpu_segments::{self, Segment};
-use super::gpu_tiles::TileStages;
-use super::gpu_view::{InFlight, Lists, Loss, LossSums, Recorded, RowsIn, View, WholeRows};
+use super::gpu_picture::ViewStages;
+use super::gpu_rows::HostRows;
+use super::gpu_view::{InFlight, Lists, Loss, LossSums, Recorded, RowsIn, View};
 use super::pages::PageRenderer;
-use super::sequence::{Sequence, ViewOptions};
-use super::{Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches};
+use super::sequence::Sequence;
+use super::{
+    Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches,
+    none_if_out_of_memory,
+};
 use crate::gpu::{DeviceKind, Gpu, GpuResult, Traffic};
 use crate::kernels::image_loss::LossPlan;
-use crate::kernels::splats::Grid;
-use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms::pack_target;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
@@ -75,11 +73,7 @@ use std::collections::VecDeque;
 /// Renders views on a GPU.
 #[derive(Debug)]
 pub struct GpuRenderer {
-    pub(super) gpu: Gpu,
-    pub(super) rows: RowStages,
-    pub(super) tiles: TileStages,
-    pub(super) ranges: RangeStages,
-    pub(super) loss: LossStage,
+    pub(super) stages: ViewStages,
     pub(super) sequence: Sequence,
     pub(super) rows_in: Option<RowsIn>,
     pub(super) view: Option<View>,
@@ -87,14 +81,13 @@ pub struct GpuRenderer {
     pub(super) pages: Option<Box<DevicePages>>,
     /// What the view knows of the pages that its rows come from.
     pub(super) pages_view: Option<PagesView>,
-    pub(super) image: Image,
+    image: Image,
     /// The gradient of the picture, valid if `gradient_on_host`.
-    pub(super) gradient: PictureGradient,
+    gradient: PictureGradient,
     /// Whether the caller requested the gradient of the picture, and the host copy therefore replaces the device's.
-    pub(super) gradient_on_host: bool,
-    pub(super) scratch: Scratch,
+    gradient_on_host: bool,
+    scratch: Scratch,
     packed_target: Vec<u32>,
-    pub(super) frames_rerecorded: u64,
     /// A step that is recorded without waiting, while it is recorded.
     pub(super) records: Option<Recorded>,
     /// Steps that are recorded and not finished, the first first.
@@ -111,11 +104,7 @@ impl GpuRenderer {
     /// The device rejects a shader.
     pub fn new(gpu: Gpu) -> GpuResult<Self> {
         Ok(GpuRenderer {
-            rows: RowStages::new(&gpu)?,
-            tiles: TileStages::new(&gpu)?,
-            ranges: RangeStages::new(&gpu)?,
-            loss: LossStage::new(&gpu)?,
-            gpu,
+            stages: ViewStages::new(gpu)?,
             sequence: Sequence::default(),
             rows_in: None,
             view: None,
@@ -126,7 +115,6 @@ impl GpuRenderer {
             gradient_on_host: false,
             scratch: Scratch::default(),
             packed_target: Vec::new(),
-            frames_rerecorded: 0,
             records: None,
             in_flight: VecDeque::new(),
             weighs_next: false,
@@ -136,17 +124,17 @@ impl GpuRenderer {
 
     /// The device.
     pub fn gpu(&self) -> &Gpu {
-        &self.gpu
+        &self.stages.gpu
     }
 
     /// Sets the capacity of the next view in intersections. The capacity grows on demand.
     pub fn set_capacity(&mut self, isects: u32) {
-        self.tiles.set_capacity(isects);
+        self.stages.tiles.set_capacity(isects);
     }
 
     /// Frames so far that were recorded again because a buffer was too small.
     pub fn frames_rerecorded(&self) -> u64 {
-        self.frames_rerecorded
+        self.stages.frames_rerecorded
     }
 
     /// Intersections of the last view; 0 until a call has read the picture, the loss or a gradient.
@@ -170,8 +158,8 @@ impl GpuRenderer {
     pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
         self.sequence.image()?;
         self.with_view("coverage", |renderer, view| {
-            renderer.wait_for_valid_picture(view)?;
-            let gpu = &renderer.gpu;
+            renderer.stages.wait_for_valid_picture(view)?;
+            let gpu = &renderer.stages.gpu;
             let mut alpha = vec![0.0; view.of.camera.pixels()];
             let mut recorder = gpu.begin("coverage");
             let bytes = recorder.read_back("rasterize_fwd", &view.pixels.t_final.view())?;
@@ -185,7 +173,7 @@ impl GpuRenderer {
     /// Drops the view and its device memory.
     pub(super) fn drop_view(&mut self) {
         self.sequence.drop_view();
-        (self.rows_in, self.view, self.pages_view) = (None, None, None);
+        (self.rows_in, self.view, self.pages_view, self.records) = (None, None, None, None);
     }
 
     /// Runs a stage on a view with a picture. A stage that lacks device memory runs again while the view can give some back. A
@@ -198,7 +186,7 @@ impl GpuRenderer {
         let mut view = self.view.take().ok_or(RenderError::OutOfOrder { call, needs: "picture" })?;
         let result = loop {
             match stage(self, &mut view) {
-                Err(RenderError::Device(error)) if error.is_out_of_memory() => match self.give_back(&mut view) {
+                Err(RenderError::Device(error)) if error.is_out_of_memory() => match self.stages.give_back(&mut view) {
                     Ok(true) => {}
                     Ok(false) => break Err(error.into()),
                     Err(other) => break Err(other.into()),
@@ -227,52 +215,14 @@ impl GpuRenderer {
         }
         Ok(())
     }
-}
 
-/// Submits rows, projection and depth sort of a view of one batch; records the colours. Does not wait.
-pub(super) fn submit_whole(
-    (gpu, stages, tiles): (&Gpu, &RowStages, &TileStages),
-    rows: &mut dyn RowSource,
-    view: &ViewOptions,
-) -> GpuResult<RowsIn> {
-    let ViewOptions { camera, options } = view;
-    // `Sequence::rows_in` has checked that the count fits.
-    let (count, all) = (rows.rows() as u32, 0..rows.rows());
-    let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
-    let splats = gpu.buffer("splats", splat_bytes(count))?;
-    let mut recorder = gpu.begin("forward");
-    rows.geometry(gpu, &mut recorder, &columns, &all)?;
-    let into = SplatRows::from(&splats);
-    stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
-    let grid = Grid::new(camera.width, camera.height);
-    let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
-    gpu.submit(recorder)?;
-    // The device projects and sorts during the upload of the colours, four fifths of a row.
-    let mut recorder = gpu.begin("forward");
-    rows.colors(&mut recorder, &columns, &all)?;
-    stages.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
-    let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
-    let segment = Segment { first: 0, rows: count, splats, v_splats: None };
-    Ok(RowsIn { segments: vec![segment], whole: Some(whole) })
-}
-
-/// Submits the rows of a batch, which begins at row `first` of the view: in one piece if `is_whole` and memory allow, else in
-/// chunks.
-pub(super) fn submit_batch(
-    (gpu, stages, tiles): (&Gpu, &RowStages, &TileStages),
-    rows: &mut dyn RowSource,
-    view: &ViewOptions,
-    first: usize,
-    is_whole: bool,
-) -> GpuResult<RowsIn> {
-    if is_whole {
-        match submit_whole((gpu, stages, tiles), rows, view) {
-            Err(error) if error.is_out_of_memory() => {}
-            submitted => return submitted,
+    /// Gives up the view of a step that could not be recorded; false where memory is short.
+    pub(super) fn false_if_out_of_memory(&mut self, recorded: Result<(), RenderError>) -> Result<bool, RenderError> {
+        if recorded.is_err() {
+            self.drop_view();
         }
+        Ok(none_if_out_of_memory(recorded)?.is_some())
     }
-    let segments = gpu_segments::submit_rows(gpu, stages, rows, first, view)?;
-    Ok(RowsIn { segments, whole: None })
 }
 
 impl Renderer for GpuRenderer {
@@ -281,19 +231,19 @@ impl Renderer for GpuRenderer {
     }
 
     fn device(&self) -> String {
-        let summary = self.gpu.summary();
+        let summary = self.stages.gpu.summary();
         format!("{} ({})", summary.name, summary.backend)
     }
 
     fn traffic(&self) -> Traffic {
-        self.gpu.traffic()
+        self.stages.gpu.traffic()
     }
 
     fn host_bytes(&self) -> u64 {
         let floats = self.packed_target.capacity() + self.image.rgb.capacity();
-        let traffic = self.gpu.traffic();
+        let traffic = self.stages.gpu.traffic();
         // Integrated and software adapters allocate device memory from host memory.
-        let is_shared = matches!(self.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
+        let is_shared = matches!(self.stages.gpu.summary().kind, DeviceKind::Integrated | DeviceKind::Software);
         let device = if is_shared { traffic.device_bytes_peak } else { traffic.staging_bytes };
         4 * floats as u64 + self.scratch.bytes() + self.gradient.bytes() + device
     }
@@ -308,9 +258,10 @@ impl Renderer for GpuRenderer {
 
     fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError> {
         if is_wanted && !self.weighs_next {
-            self.rows.weigh_rows(&self.gpu)?;
-            self.tiles.weigh_rows(&self.gpu)?;
-            self.loss.weigh_rows(&self.gpu)?;
+            let ViewStages { gpu, rows, tiles, loss, .. } = &mut self.stages;
+            rows.weigh_rows(gpu)?;
+            tiles.weigh_rows(gpu)?;
+            loss.weigh_rows(gpu)?;
         }
         self.weighs_next = is_wanted;
         Ok(())
@@ -328,8 +279,7 @@ impl Renderer for GpuRenderer {
         let (view, place) = self.sequence.rows_in(rows.rows(), rows.sh_degree)?;
         let mut source = HostRows { rows, band: &mut self.scratch.band };
         let is_whole = self.sequence.batches() == Some(RowBatches::One);
-        let stages = (&self.gpu, &self.rows, &self.tiles);
-        let submitted = submit_batch(stages, &mut source, &view, place.start, is_whole);
+        let submitted = self.stages.submit_batch(&mut source, &view, place.start, is_whole);
         Ok(self.append(submitted)?)
     }
 
@@ -340,17 +290,24 @@ impl Renderer for GpuRenderer {
     fn picture(&mut self) -> Result<(), RenderError> {
         let of = self.sequence.picture()?;
         let rows = self.rows_in.take().ok_or(RenderError::OutOfOrder { call: "picture", needs: "rows_in" })?;
-        let view = self.submit_picture(of, rows).inspect_err(|_| self.drop_view())?;
-        self.view = Some(view);
+        let view = self.stages.submit_picture(of, rows).inspect_err(|_| self.drop_view())?;
+        self.view = Some(View { weighs: self.weighs, ..view });
         Ok(())
     }
 
     fn image(&mut self) -> Result<&Image, RenderError> {
         self.sequence.image()?;
         self.with_view("image", |renderer, view| {
-            renderer.wait_for_valid_picture(view)?;
+            renderer.stages.wait_for_valid_picture(view)?;
             if !view.image_is_read {
-                renderer.read_image(view)?;
+                let (gpu, image, Camera { width, height, .. }) =
+                    (&renderer.stages.gpu, &mut renderer.image, view.of.camera);
+                let mut recorder = gpu.begin("picture");
+                let bytes = recorder.read_back("rasterize_fwd", &view.pixels.rgb.view())?;
+                gpu.submit(recorder)?;
+                (image.width, image.height) = (width, height);
+                image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
+                bytes.copy_to(&mut image.rgb)?;
                 view.image_is_read = true;
             }
             Ok(())
@@ -375,17 +332,19 @@ impl Renderer for GpuRenderer {
             let plan = LossPlan::new(width, height, target.mask.as_deref(), options);
             // The device blends while the host packs and uploads the photo and records the loss.
             pack_target(target, &mut renderer.packed_target);
-            let mut recorder = renderer.gpu.begin("image_loss");
+            let gpu = &renderer.stages.gpu;
+            let mut recorder = gpu.begin("image_loss");
             let pixels = recorder.buffer_with("target", &renderer.packed_target)?;
             let corrected = match view.image_is_corrected {
                 true => Some(recorder.buffer_with("corrected picture", &renderer.image.rgb)?),
                 false => None,
             };
             let rgb = corrected.as_ref().unwrap_or(&view.pixels.rgb);
-            let v_rgb = renderer.gpu.buffer("v_rgb", view.pixels.rgb.size())?;
-            let errors = renderer.weighs.then(|| renderer.gpu.buffer("squared errors", view.pixels.t_final.size()));
+            let v_rgb = gpu.buffer("v_rgb", view.pixels.rgb.size())?;
+            let errors = view.weighs.then(|| gpu.buffer("squared errors", view.pixels.t_final.size()));
             let mut loss = Loss { plan, target: pixels, v_rgb, errors: errors.transpose()?, sums: LossSums::Stale };
-            loss.sums = renderer.submit_loss(recorder, [target.width, target.height], rgb, &loss)?;
+            loss.sums =
+                renderer.stages.submit_loss(recorder, [target.width, target.height], rgb, &loss, view.is_recorded)?;
             view.loss = Some(loss);
             Ok(())
         })
@@ -394,7 +353,9 @@ impl Renderer for GpuRenderer {
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError> {
         self.sequence.picture_gradient()?;
         if !self.gradient_on_host {
-            self.with_view("picture_gradient", |renderer, view| Ok(renderer.read_gradient(view)?))?;
+            self.with_view("picture_gradient", |renderer, view| {
+                Ok(read_gradient(&mut renderer.stages, view, &mut renderer.gradient)?)
+            })?;
             self.gradient_on_host = true;
         }
         Ok(&mut self.gradient)
@@ -402,23 +363,28 @@ impl Renderer for GpuRenderer {
 
     fn picture_back(&mut self) -> Result<(), RenderError> {
         self.sequence.picture_back(self.gradient_on_host.then_some(&self.gradient))?;
-        self.with_view("picture_back", |renderer, view| renderer.record_picture_back(view))
+        self.with_view("picture_back", |renderer, view| {
+            let of_host = renderer.gradient_on_host.then_some(&renderer.gradient);
+            record_picture_back(&mut renderer.stages, view, of_host)
+        })
     }
 
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         let (_, place) = self.sequence.rows_out(batch, rows.rows())?;
-        self.with_view("rows_out", |renderer, view| renderer.rows_out_of(view, rows, &place, grads))
+        self.with_view("rows_out", |renderer, view| {
+            Ok(rows_out(&renderer.stages, view, (rows, &place), grads, &mut renderer.scratch)?)
+        })
     }
 
     fn unusable_splats(&mut self) -> Result<u64, RenderError> {
         self.sequence.splat_gradients("unusable_splats")?;
-        self.with_view("unusable_splats", |_, view| Ok(GpuRenderer::read_unusable(view)?))
+        self.with_view("unusable_splats", |_, view| Ok(read_unusable(view)?))
     }
 
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {
         if self.view.as_ref().is_none_or(|view| view.loss.is_none()) {
             return Err(RenderError::OutOfOrder { call: "loss_value", needs: "loss" });
         }
-        self.with_view("loss_value", |renderer, view| renderer.read_loss_value(view))
+        self.with_view("loss_value", |renderer, view| read_loss_value(&mut renderer.stages, view))
     }
 }

@@ -14,7 +14,7 @@ use super::gpu_slots::Slots;
 use super::pages::{PageRules, SlotPage};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::deferred::DeferredTables;
-use crate::kernels::page_words::{DevicePage, PageResult, PageSurvey};
+use crate::kernels::page_words::{DevicePage, PageSurvey};
 use crate::kernels::uniforms_pages::{GatherUniforms, UpdateUniforms};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Column;
@@ -83,34 +83,18 @@ pub struct PagesView {
     pub(super) updating: Option<PendingResults>,
 }
 
-/// What an update does to the pages of a batch, on its way to the host.
-#[derive(Debug, Default)]
-pub struct PendingResults {
-    read: Option<Readback>,
-    pages: usize,
-}
-
-impl PendingResults {
-    /// Waits for the results of the pages.
-    ///
-    /// # Errors
-    /// The device failed.
-    pub fn wait(self) -> GpuResult<Vec<PageResult>> {
-        let mut results = vec![PageResult::zeroed(); self.pages];
-        self.read.map_or(Ok(()), |read| read.copy_to(&mut results))?;
-        Ok(results)
-    }
-}
+/// What an update does to the pages of a batch ([`crate::kernels::page_words::PageResult`]s), on its way to the host; `None` for a batch without pages.
+pub(super) type PendingResults = Option<Readback>;
 
 /// The listed rows of a batch.
 #[derive(Debug)]
 pub struct PageBatch {
     /// First listed row of each page; empty where only the device knows.
-    pub(super) first_listed: Vec<u32>,
+    pub first_listed: Vec<u32>,
     /// Listed rows, or those that the list has room for.
     pub rows: u32,
     /// `[rows]`: number of the page, number of the row in it.
-    pub(super) listed: Buffer,
+    pub listed: Buffer,
 }
 
 /// Pages of a batch in their slots.
@@ -156,27 +140,8 @@ impl DevicePages {
         Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins, gate })
     }
 
-    /// Begins a view at a step.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
-    pub fn begin(&self, gpu: &Gpu, camera: &Camera, step: &StepNumbers) -> GpuResult<PagesView> {
-        let mut recorder = gpu.begin("gather");
-        let view = self.begin_in(&mut recorder, camera, step)?;
-        gpu.submit(recorder)?;
-        Ok(view)
-    }
-
-    /// As [`DevicePages::begin`], recorded.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
-    pub(super) fn begin_in(
-        &self,
-        recorder: &mut Recorder<'_>,
-        camera: &Camera,
-        step: &StepNumbers,
-    ) -> GpuResult<PagesView> {
+    /// Begins a view at a step: records the upload of its tables.
+    pub fn begin(&self, recorder: &mut Recorder<'_>, camera: &Camera, step: &StepNumbers) -> GpuResult<PagesView> {
         let recent = recorder.buffer_with("recent", step.recent.as_flattened())?;
         Ok(PagesView { camera: *camera, step: step.clone(), recent, batches: Vec::new(), updating: None })
     }
@@ -240,10 +205,8 @@ impl DevicePages {
         let read = recorder.read_back("gather", &counts.slice(0, 4 * pages.len() as u64))?;
         gpu.submit(recorder)?;
         drop(table);
-        let mut of_pages = vec![0u32; pages.len()];
-        read.copy_to(&mut of_pages)?;
         let (mut first_listed, mut listed) = (Vec::with_capacity(pages.len()), 0);
-        for count in of_pages {
+        for count in read.to_vec::<u32>()? {
             first_listed.push(listed);
             listed += count;
         }
@@ -256,6 +219,29 @@ impl DevicePages {
         recorder.dispatch("gather", &self.stages.list, &views, groups)?;
         gpu.submit(recorder)?;
         Ok((batch, table))
+    }
+
+    /// Records the list of the rows that the camera may draw, with room for `rows` rows. Returns it with the counts of the pages and
+    /// their sum.
+    pub(super) fn list_within(
+        &self,
+        gpu: &Gpu,
+        recorder: &mut Recorder<'_>,
+        (view, pages): (&PagesView, &[SlotPage]),
+        rows: u32,
+    ) -> GpuResult<(PageBatch, PageTable, Buffer)> {
+        let (table, [counts, found]) = self.cull(gpu, recorder, view, pages)?;
+        let listed = gpu.buffer("listed", LISTED_BYTES * u64::from(rows))?;
+        let uniforms = GatherUniforms { row_count: rows, ..self.uniforms(view, pages.len()) };
+        let uniform = recorder.uniform(&uniforms)?;
+        let views = [uniform.clone(), counts.view(), table.on_device.view()];
+        recorder.dispatch("gather", &self.stages.place, &views, groups_1d(1, 1))?;
+        let views = [uniform.clone(), counts.view(), listed.view()];
+        recorder.dispatch("gather", &self.stages.pad, &views, groups_1d(rows, WORKGROUP))?;
+        let views = [uniform, table.on_device.view(), counts.view(), found.view(), listed.view()];
+        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        recorder.dispatch("gather", &self.stages.list, &views, groups)?;
+        Ok((PageBatch { first_listed: Vec::new(), rows, listed }, table, counts))
     }
 
     /// The listed rows of a batch as a source of columns.
@@ -310,29 +296,16 @@ impl DevicePages {
         Ok(())
     }
 
-    /// Finds the bounds of the pages of a batch and reads what the update did. Waits.
+    /// Finds the bounds of the pages of a batch and begins to read what the update did: a [`crate::kernels::page_words::PageResult`] for each. Does not wait.
     ///
     /// # Errors
     /// The device failed, or has no memory.
-    pub fn results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Vec<PageResult>> {
-        self.begin_results(gpu, source, results)?.wait()
-    }
-
-    /// As [`DevicePages::results`], without waiting.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
-    pub(super) fn begin_results(
-        &self,
-        gpu: &Gpu,
-        source: &PageRows<'_>,
-        results: &Buffer,
-    ) -> GpuResult<PendingResults> {
+    pub fn begin_results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Readback> {
         let mut recorder = gpu.begin("update");
         self.bounds(&mut recorder, source, results)?;
         let read = recorder.read_back("update", &results.view())?;
         gpu.submit(recorder)?;
-        Ok(PendingResults { read: Some(read), pages: source.table.pages.len() })
+        Ok(read)
     }
 
     /// Records the bounds of the pages of a batch.
@@ -372,9 +345,7 @@ impl DevicePages {
         }
         let read = recorder.read_back("survey", &surveys.view())?;
         gpu.submit(recorder)?;
-        let mut of_pages = vec![PageSurvey::zeroed(); pages.len()];
-        read.copy_to(&mut of_pages)?;
-        Ok(of_pages)
+        read.to_vec()
     }
 
     /// Clears the statistics of all rows of these pages. Does not wait.
@@ -427,29 +398,11 @@ pub struct UpdateBuffers<'a> {
 /// The listed rows of a batch, as a source of columns.
 #[derive(Clone, Copy)]
 pub struct PageRows<'a> {
-    pages: &'a DevicePages,
+    /// The pages of the run.
+    pub(super) pages: &'a DevicePages,
     view: &'a PagesView,
     batch: &'a PageBatch,
     table: &'a PageTable,
-}
-
-impl<'a> PageRows<'a> {
-    /// The pages of the run.
-    pub fn pages(&self) -> &'a DevicePages {
-        self.pages
-    }
-}
-
-impl PageBatch {
-    /// `[rows]`: number of the page, number of the row in it.
-    pub fn listed(&self) -> &Buffer {
-        &self.listed
-    }
-
-    /// First listed row of each page.
-    pub fn first_listed(&self) -> &[u32] {
-        &self.first_listed
-    }
 }
 
 impl RowSource for PageRows<'_> {

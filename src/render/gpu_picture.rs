@@ -1,21 +1,93 @@
-//! The picture of a view on a GPU: its lists, whole or in ranges of tiles, and whether it came from buffers that were large enough.
+//! From the rows of a view to its picture and its loss on a GPU: the recording of the rows, lists, whole or in ranges of tiles,
+//! and whether the picture came from buffers that were large enough.
 //!
-//! Not here: the recording of the stages (`gpu_tiles`, `gpu_ranges`), the order of a view (`gpu`), loss and gradients (`gpu_back`).
+//! Not here: the recording of each stage (`gpu_rows`, `gpu_tiles`, `gpu_ranges`, `gpu_loss`), the order of a view (`gpu`), the way
+//! back (`gpu_back`).
 //!
 //! Invariant: a picture whose lists lacked room is drawn again, and so is its loss, before anything of it is read.
 
-use super::gpu::GpuRenderer;
 use super::gpu_frame::{Blend, Demand, Pixels, splat_bytes};
-use super::gpu_ranges::{PLACE_BYTES, Ranges};
-use super::gpu_segments::Segment;
-use super::gpu_view::{DemandState, Lists, LossSums, RowsIn, View, WholeLists, WholeRows, blend_of};
+use super::gpu_loss::LossStage;
+use super::gpu_ranges::{PLACE_BYTES, RangeStages, Ranges};
+use super::gpu_rows::{DeviceColumns, RowSource, RowStages, SplatRows};
+use super::gpu_segments::{Segment, submit_rows};
+use super::gpu_tiles::TileStages;
+use super::gpu_view::{DemandState, Lists, Loss, LossSums, RowsIn, View, WholeLists, WholeRows, blend_of};
 use super::sequence::ViewOptions;
-use crate::gpu::{GpuError, GpuResult};
-use crate::scene::camera::Camera;
+use crate::gpu::{Buffer, Gpu, GpuError, GpuResult, Recorder};
+use crate::kernels::splats::Grid;
+use crate::kernels::tile_range::TileRange;
 
-impl GpuRenderer {
+/// A device with the compiled stages of a view.
+#[derive(Debug)]
+pub(super) struct ViewStages {
+    pub gpu: Gpu,
+    pub rows: RowStages,
+    pub tiles: TileStages,
+    pub ranges: RangeStages,
+    pub loss: LossStage,
+    /// Frames so far that were recorded again because a buffer was too small.
+    pub frames_rerecorded: u64,
+}
+
+impl ViewStages {
+    /// Compiles the stages for `gpu`.
+    pub fn new(gpu: Gpu) -> GpuResult<Self> {
+        Ok(ViewStages {
+            rows: RowStages::new(&gpu)?,
+            tiles: TileStages::new(&gpu)?,
+            ranges: RangeStages::new(&gpu)?,
+            loss: LossStage::new(&gpu)?,
+            gpu,
+            frames_rerecorded: 0,
+        })
+    }
+
+    /// Submits rows, projection and depth sort of a view of one batch; records the colours. Does not wait.
+    fn submit_whole(&self, rows: &mut dyn RowSource, view: &ViewOptions) -> GpuResult<RowsIn> {
+        let gpu = &self.gpu;
+        let ViewOptions { camera, options } = view;
+        // `Sequence::rows_in` has checked that the count fits.
+        let (count, all) = (rows.rows() as u32, 0..rows.rows());
+        let columns = DeviceColumns::new(gpu, count, options.sh_degree)?;
+        let splats = gpu.buffer("splats", splat_bytes(count))?;
+        let mut recorder = gpu.begin("forward");
+        rows.geometry(gpu, &mut recorder, &columns, &all)?;
+        let into = SplatRows::from(&splats);
+        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
+        let grid = Grid::new(camera.width, camera.height);
+        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
+        gpu.submit(recorder)?;
+        // The device projects and sorts during the upload of the colours, four fifths of a row.
+        let mut recorder = gpu.begin("forward");
+        rows.colors(&mut recorder, &columns, &all)?;
+        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
+        let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
+        let segment = Segment { first: 0, rows: count, splats, v_splats: None };
+        Ok(RowsIn { segments: vec![segment], whole: Some(whole) })
+    }
+
+    /// Submits the rows of a batch, which begins at row `first` of the view: in one piece if `is_whole` and memory allow, else in
+    /// chunks.
+    pub fn submit_batch(
+        &self,
+        rows: &mut dyn RowSource,
+        view: &ViewOptions,
+        first: usize,
+        is_whole: bool,
+    ) -> GpuResult<RowsIn> {
+        if is_whole {
+            match self.submit_whole(rows, view) {
+                Err(error) if error.is_out_of_memory() => {}
+                submitted => return submitted,
+            }
+        }
+        let segments = submit_rows(&self.gpu, &self.rows, rows, first, view)?;
+        Ok(RowsIn { segments, whole: None })
+    }
+
     /// Frees device memory that a view can do without: the columns of its rows, then its lists. Returns whether it did.
-    pub(super) fn give_back(&mut self, view: &mut View) -> GpuResult<bool> {
+    pub fn give_back(&mut self, view: &mut View) -> GpuResult<bool> {
         if view.columns.take().is_some() {
             return Ok(true);
         }
@@ -35,7 +107,7 @@ impl GpuRenderer {
     }
 
     /// Replaces the lists of a view by ranges of tiles and draws the picture again. Waits.
-    pub(super) fn draw_in_ranges(&self, view: &mut View) -> GpuResult<()> {
+    pub fn draw_in_ranges(&self, view: &mut View) -> GpuResult<()> {
         view.lists = Lists::Ranges(Vec::new()); // frees the lists
         let bytes = self.bytes_for_lists(&view.of, &view.segments);
         view.lists = Lists::Ranges(self.in_ranges(&view.of, &view.pixels).draw(&view.segments, bytes)?);
@@ -55,7 +127,7 @@ impl GpuRenderer {
 
     /// Submits the recorded stages of the rows, the tile lists and the blending. Waits only if the lists do not fit at
     /// once.
-    pub(super) fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
+    pub fn submit_picture(&mut self, of: ViewOptions, rows: RowsIn) -> GpuResult<View> {
         let (gpu, blend) = (&self.gpu, blend_of(&of));
         let RowsIn { segments, whole } = rows;
         if let (Some(whole), Some(segment)) = (whole, segments.first()) {
@@ -87,7 +159,7 @@ impl GpuRenderer {
 
     /// Waits until the picture of the view is known to be valid. A frame with too little room is recorded again with larger
     /// buffers, or drawn in ranges where these do not fit, and so is the loss of its picture.
-    pub(super) fn wait_for_valid_picture(&mut self, view: &mut View) -> GpuResult<()> {
+    pub fn wait_for_valid_picture(&mut self, view: &mut View) -> GpuResult<()> {
         let blend = view.blend();
         while let Lists::Whole(lists) = &mut view.lists {
             let unread = DemandState::Known(Demand { isects: 0, list_max: 0 });
@@ -121,7 +193,8 @@ impl GpuRenderer {
         }
         if let Some(loss) = view.loss.as_mut().filter(|loss| matches!(loss.sums, LossSums::Stale)) {
             let size = [view.of.camera.width, view.of.camera.height];
-            loss.sums = self.submit_loss(self.gpu.begin("image_loss"), size, &view.pixels.rgb, loss)?;
+            loss.sums =
+                self.submit_loss(self.gpu.begin("image_loss"), size, &view.pixels.rgb, loss, view.is_recorded)?;
         }
         Ok(())
     }
@@ -144,13 +217,28 @@ impl GpuRenderer {
         Ok(())
     }
 
-    pub(super) fn read_image(&mut self, view: &View) -> GpuResult<()> {
-        let Camera { width, height, .. } = view.of.camera;
-        let mut recorder = self.gpu.begin("picture");
-        let bytes = recorder.read_back("rasterize_fwd", &view.pixels.rgb.view())?;
-        self.gpu.submit(recorder)?;
-        (self.image.width, self.image.height) = (width, height);
-        self.image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
-        bytes.copy_to(&mut self.image.rgb)
+    /// Submits the loss of `rgb`: the picture of the view, which may still turn out invalid, or the corrected picture. Writes the
+    /// gradient of `loss`, and returns its sums.
+    pub fn submit_loss(
+        &self,
+        mut recorder: Recorder<'_>,
+        size: [u32; 2],
+        rgb: &Buffer,
+        loss: &Loss,
+        is_recorded: bool,
+    ) -> GpuResult<LossSums> {
+        let gpu = &self.gpu;
+        let (rgb, photo, v_rgb) = (rgb.view(), loss.target.view(), loss.v_rgb.view());
+        let sums = self.loss.run(gpu, &mut recorder, size, &loss.plan, &rgb, &photo, &v_rgb)?;
+        if let Some(errors) = &loss.errors {
+            self.loss.errors(&mut recorder, size, &loss.plan, [&rgb, &photo, &errors.view()])?;
+        }
+        let sums = match sums {
+            Some(sums) if is_recorded => LossSums::OnDevice(sums),
+            Some(sums) => LossSums::Pending(recorder.read_back("image_loss", &sums.slice(0, 16))?),
+            None => LossSums::Known([0.0; 4]),
+        };
+        gpu.submit(recorder)?;
+        Ok(sums)
     }
 }

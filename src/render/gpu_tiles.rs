@@ -407,32 +407,6 @@ impl TileStages {
         }
         Ok(room && reached)
     }
-
-    /// Runs sort, lists and blending, again with larger buffers if needed, and waits. `splats` holds `rows` records.
-    ///
-    /// # Errors
-    /// Device memory is exhausted, or the device failed.
-    pub fn forward(
-        &mut self,
-        gpu: &Gpu,
-        splats: &BufferView,
-        rows: u32,
-        blend: Blend,
-    ) -> GpuResult<(Ranks, Frame, Pixels, Demand)> {
-        let mut recorder = gpu.begin("tiles");
-        let pixels = Pixels::new(gpu, blend.grid)?;
-        let ranks = self.order(gpu, &mut recorder, splats, rows, blend.grid, TileRange::all(blend.grid))?;
-        loop {
-            let (frame, demand) = self.frame(gpu, &mut recorder, splats, &ranks, blend, &pixels)?;
-            gpu.submit(recorder)?;
-            let demand = demand.wait()?;
-            if self.fits(&frame, demand)? {
-                return Ok((ranks, frame, pixels, demand));
-            }
-            drop(frame);
-            recorder = gpu.begin("tiles again");
-        }
-    }
 }
 
 /// Uniforms of one rasterizer dispatch over the list entries [`length` * `segment`, `length` * (`segment` + 1)).

@@ -9,7 +9,7 @@
 use super::gpu_frame::{Blend, Demand, Frame, Pixels, Ranks};
 use super::gpu_segments::{Segment, gradients_of};
 use super::gpu_tiles::{TileStages, Weighing, raster_uniforms};
-use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
+use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms_tiles::{
     FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
@@ -209,21 +209,7 @@ impl TileStages {
     }
 
     /// Records the count of the rows of all segments with unusable gradients, as
-    /// [`crate::render::Renderer::unusable_splats`] defines them; the result is one u32.
-    ///
-    /// # Errors
-    /// A segment has no gradients, or device memory is exhausted.
-    pub(super) fn count_unusable(
-        &self,
-        recorder: &mut Recorder<'_>,
-        segments: &[Segment],
-        blend: Blend,
-    ) -> GpuResult<Readback> {
-        let unusable = self.unusable(recorder, segments, blend)?;
-        recorder.read_back("rasterize_bwd", &unusable.view())
-    }
-
-    /// Records the same count; returns its buffer.
+    /// [`crate::render::Renderer::unusable_splats`] defines them, into one u32.
     ///
     /// # Errors
     /// A segment has no gradients, or device memory is exhausted.

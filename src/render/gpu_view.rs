@@ -66,6 +66,10 @@ pub(super) struct View {
     pub columns: Option<DeviceColumns>,
     pub pixels: Pixels,
     pub lists: Lists,
+    /// Whether it belongs to a step that is recorded without waiting: its gate reads the sums of the loss on the device.
+    pub is_recorded: bool,
+    /// Whether its rows are weighed.
+    pub weighs: bool,
     /// Whether `GpuRenderer::image` holds the picture of this view.
     pub image_is_read: bool,
     /// Whether the caller may have changed `GpuRenderer::image`; the loss then compares that image.
@@ -97,15 +101,16 @@ impl View {
         pixels: Pixels,
         lists: Lists,
     ) -> View {
-        let (image_is_read, image_is_corrected) = (false, false);
         View {
             of,
             segments,
             columns,
             pixels,
             lists,
-            image_is_read,
-            image_is_corrected,
+            is_recorded: false,
+            weighs: false,
+            image_is_read: false,
+            image_is_corrected: false,
             loss: None,
             tiles_back: None,
             unusable: Unusable::Uncounted,
@@ -158,8 +163,6 @@ pub(super) struct InFlight {
     pub verdict: Readback,
     /// What the update did to each page.
     pub results: Readback,
-    /// How many pages.
-    pub pages: usize,
     pub plan: LossPlan,
 }
 
@@ -180,12 +183,10 @@ pub(super) struct Loss {
 pub(super) enum LossSums {
     /// They and the gradient belong to an invalid picture, and must be computed again.
     Stale,
-    /// The picture has no pixels.
-    Empty,
     /// They stay on the device, for the gate of a step that is recorded without waiting.
     OnDevice(Buffer),
     /// The readback is pending.
     Pending(Readback),
-    /// The host has read the sums.
+    /// The host has read the sums; zeros for a picture without pixels.
     Known([f32; 4]),
 }

@@ -42,6 +42,8 @@ pub mod gpu_tiles;
 #[cfg(feature = "gpu")]
 pub mod gpu_tiles_bwd;
 #[cfg(feature = "gpu")]
+mod gpu_update;
+#[cfg(feature = "gpu")]
 mod gpu_view;
 pub mod lpips;
 pub mod metrics;

@@ -1,5 +1,6 @@
 //! The f32 form of deferred Adam that devices compute, by its twin and on a device, against dense Adam in f64 over 50,000 steps.
 
+use crate::support::begin_view;
 use crate::support::dense_adam::DenseAdam;
 use crate::support::gpu::open;
 use crate::twins::deferred::TableWords;
@@ -196,7 +197,7 @@ impl OnDevice {
         pages.slots.add(&gpu, 1).unwrap();
         let slot = SlotPage { slot: DeviceSlot(0), layout };
         pages.slots.write(&gpu, &[(slot.slot, &bytemuck::cast_slice(words)[..layout.bytes()])]).unwrap();
-        let view = pages.begin(&gpu, &camera(), &dense.adam.at(0).numbers()).unwrap();
+        let view = begin_view(&gpu, &pages, &camera(), &dense.adam.at(0).numbers());
         let listed = pages.list(&gpu, &view, &[slot]).unwrap();
         assert_eq!(listed.0.rows as usize, ROWS, "a row is out of view");
         let [values, grads] = [0; 2].map(|_| DeviceColumns::new(&gpu, ROWS as u32, 0).unwrap());
@@ -210,7 +211,7 @@ impl OnDevice {
     /// Takes a step; with `is_checked` returns what it did to the page.
     fn step(&self, adam: &DeferredAdam, now: u32, of_columns: &[Vec<f32>], is_checked: bool) -> Option<PageResult> {
         let OnDevice { gpu, pages, values, grads, footprints, largest, .. } = self;
-        let view = pages.begin(gpu, &camera(), &adam.at(now).numbers()).unwrap();
+        let view = begin_view(gpu, pages, &camera(), &adam.at(now).numbers());
         let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
         let mut recorder = gpu.begin("adam");
         source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
@@ -222,13 +223,13 @@ impl OnDevice {
             UpdateBuffers { values, grads, footprints, largest, results: &results, collects: false, weighs: false };
         pages.update(gpu, &mut recorder, &source, &(0..ROWS), &buffers).unwrap();
         gpu.submit(recorder).unwrap();
-        is_checked.then(|| pages.results(gpu, &source, &results).unwrap()[0])
+        is_checked.then(|| pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap()[0])
     }
 
     /// The values after `now` steps, by column, as the device evaluates them.
     fn values(&self, adam: &DeferredAdam, now: u32) -> Vec<Vec<f32>> {
         let OnDevice { gpu, pages, values, .. } = self;
-        let view = pages.begin(gpu, &camera(), &adam.at(now).numbers()).unwrap();
+        let view = begin_view(gpu, pages, &camera(), &adam.at(now).numbers());
         let mut recorder = gpu.begin("adam");
         let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
         source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();

@@ -3,6 +3,7 @@
 //! Source of the tolerances: a movement is some ten roundings of 6e-8, or devices' divisions of 2.5 units in the last
 //! place, so 3e-6 of the movement; a value has one rounding of its own.
 
+use crate::support::begin_view;
 use crate::support::gpu::open;
 use crate::twins::gather::{self, GatherInput};
 use crate::twins::page_words::Words;
@@ -236,9 +237,9 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
         assert!(list.len() > rows / 10 && list.len() < rows, "{} of {rows} rows in view", list.len());
         let Some(gpu) = device(&world) else { return };
         let on = OnDevice::new(&gpu, &world);
-        let view = on.pages.begin(&gpu, &camera(), &world.adam.at(now).numbers()).unwrap();
+        let view = begin_view(&gpu, &on.pages, &camera(), &world.adam.at(now).numbers());
         let (batch, table) = on.pages.list(&gpu, &view, &on.slots).unwrap();
-        let listed: Vec<[u32; 2]> = read(&gpu, batch.listed(), batch.rows as usize);
+        let listed: Vec<[u32; 2]> = read(&gpu, &batch.listed, batch.rows as usize);
         assert!(listed.is_sorted(), "lists are in the order of pages and rows");
         // A row at the edge of the cull's slack may be listed on one side alone.
         let differ = listed.iter().filter(|row| !list.contains(row)).count()
@@ -331,7 +332,7 @@ fn updated_by_device(
     (poison, weighs): (f64, bool),
 ) -> (Updated, Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let (gpu, sh_degree) = (on.gpu, world.layouts[0].sh_degree);
-    let view = on.pages.begin(gpu, &camera(), &world.adam.at(world.now).numbers()).unwrap();
+    let view = begin_view(gpu, &on.pages, &camera(), &world.adam.at(world.now).numbers());
     let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
     let rows = batch.rows as usize;
     let [values, grads] = [0; 2].map(|_| DeviceColumns::new(gpu, batch.rows, sh_degree).unwrap());
@@ -357,10 +358,10 @@ fn updated_by_device(
     };
     on.pages.update(gpu, &mut recorder, &source, &(0..rows), &buffers).unwrap();
     gpu.submit(recorder).unwrap();
-    let results = on.pages.results(gpu, &source, &results).unwrap();
+    let results = on.pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap();
     let gathered = values.columns().map(|(buffer, width)| read(gpu, buffer, width * rows)).collect();
     let bins = on.pages.take_bins(gpu).unwrap();
-    ((on.payloads(), results, bins), read(gpu, batch.listed(), rows), gathered)
+    ((on.payloads(), results, bins), read(gpu, &batch.listed, rows), gathered)
 }
 
 /// Whether two floats, by their bits, agree within three units in the last place and `slack`.
@@ -415,9 +416,9 @@ fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
 /// The same for positions and scales as the device evaluates them, of the rows that the camera sees at later steps.
 fn assert_bounds_of_device(on: &OnDevice<'_>, world: &World, results: &[PageResult]) {
     for later in [1, 3, 50, 199] {
-        let view = on.pages.begin(on.gpu, &camera(), &world.adam.at(world.now + later).numbers()).unwrap();
+        let view = begin_view(on.gpu, &on.pages, &camera(), &world.adam.at(world.now + later).numbers());
         let (batch, table) = on.pages.list(on.gpu, &view, &on.slots).unwrap();
-        let listed: Vec<[u32; 2]> = read(on.gpu, batch.listed(), batch.rows as usize);
+        let listed: Vec<[u32; 2]> = read(on.gpu, &batch.listed, batch.rows as usize);
         let columns = DeviceColumns::new(on.gpu, batch.rows, world.layouts[0].sh_degree).unwrap();
         let mut recorder = on.gpu.begin("parity");
         let all = 0..batch.rows as usize;

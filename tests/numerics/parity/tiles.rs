@@ -3,7 +3,7 @@
 use crate::support::gpu;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::gpu::{Gpu, GpuOptions};
+use gsscale::gpu::{BufferView, Gpu, GpuOptions};
 use gsscale::kernels::fold::{FoldPart, FootprintGradients, fold_rows};
 use gsscale::kernels::isect_emit::{Isect, count, emit};
 use gsscale::kernels::isect_offsets::isect_offsets;
@@ -15,7 +15,7 @@ use gsscale::kernels::rasterize_fwd::{Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::kernels::tile_range::TileRange;
-use gsscale::render::gpu_frame::{Blend, Pairs, splat_bytes};
+use gsscale::render::gpu_frame::{Blend, Demand, Frame, Pairs, Pixels, Ranks, splat_bytes};
 use gsscale::render::gpu_tiles::TileStages;
 use gsscale::render::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -242,6 +242,28 @@ fn on_cpu(scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     }
 }
 
+/// Runs sort, lists and blending, again with larger buffers if needed, and waits. `splats` holds `rows` records.
+fn forward(
+    gpu: &Gpu,
+    stages: &mut TileStages,
+    splats: &BufferView,
+    rows: u32,
+    blend: Blend,
+) -> (Ranks, Frame, Pixels, Demand) {
+    let mut recorder = gpu.begin("tiles");
+    let pixels = Pixels::new(gpu, blend.grid).unwrap();
+    let ranks = stages.order(gpu, &mut recorder, splats, rows, blend.grid, TileRange::all(blend.grid)).unwrap();
+    loop {
+        let (frame, demand) = stages.frame(gpu, &mut recorder, splats, &ranks, blend, &pixels).unwrap();
+        gpu.submit(recorder).unwrap();
+        let demand = demand.wait().unwrap();
+        if stages.fits(&frame, demand).unwrap() {
+            return (ranks, frame, pixels, demand);
+        }
+        recorder = gpu.begin("tiles again");
+    }
+}
+
 fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_alpha: Option<&[f32]>) -> Outcome {
     let rows = scene.projected.radii.len() as u32;
     let grid = scene.blend.grid;
@@ -252,7 +274,7 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let v_alpha_view = v_alpha.as_ref().map(|b| b.view());
     let v_splats = recorder.buffer_zeroed("v_splats", splat_bytes(rows)).unwrap();
     gpu.submit(recorder).unwrap();
-    let (ranks, frame, pixels, demand) = stages.forward(gpu, &splats.view(), rows, scene.blend).unwrap();
+    let (ranks, frame, pixels, demand) = forward(gpu, stages, &splats.view(), rows, scene.blend);
     let mut recorder = gpu.begin("backward");
     let (from, to) = (splats.view(), v_splats.view());
     let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref(), errors: None };
@@ -440,7 +462,7 @@ fn dispatches_beyond_65_535_workgroups_fold() {
         let mut recorder = gpu.begin("upload");
         let splats = recorder.buffer_with("splats", &scene.records()).unwrap();
         gpu.submit(recorder).unwrap();
-        let (_, frame, pixels, demand) = stages.forward(&gpu, &splats.view(), rows, scene.blend).unwrap();
+        let (_, frame, pixels, demand) = forward(&gpu, &mut stages, &splats.view(), rows, scene.blend);
         assert_eq!(demand.isects, 4150 * 4095);
         assert!(demand.isects > 65_535 * 256);
         let mut recorder = gpu.begin("read");
