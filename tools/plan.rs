@@ -36,7 +36,7 @@ use gsscale::train::memory::estimate::host_bytes_peak;
 use gsscale::train::preflight::first_look::{LookFor, first_look};
 use gsscale::train::preflight::forecast::{Forecast, STEP_GROWTH};
 use gsscale::train::run::begin::forecast;
-use gsscale::train::step::device_tier::slots_of_budget;
+use gsscale::train::step::device_slots::slots_of_budget;
 use output::{json_of, json_of_forecast, report};
 use serde_json::json;
 use std::ops::Range;

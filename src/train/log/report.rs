@@ -15,7 +15,7 @@ use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
 use crate::photos::appearance::AppearanceMode;
 use crate::render::color_correct::ColorCorrect;
-use crate::train::step::device_tier::SlotTraffic;
+use crate::train::step::device_slots::SlotTraffic;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;

@@ -9,7 +9,7 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::train::error::TrainError;
 use crate::train::memory::estimate::{INDEX_BYTES, MemoryEstimate};
-use crate::train::step::device_tier::{SLOTS_SHARE, slots_in};
+use crate::train::step::device_slots::{SLOTS_SHARE, slots_in};
 use crate::train::step::pages::PagedScene;
 
 use crate::gpu::{GpuError, budget_for_buffers, bytes_for_buffers};

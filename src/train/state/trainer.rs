@@ -354,7 +354,7 @@ impl Trainer {
 
     /// Whether the coming step is recorded on the device already. Nothing may read or change the scene then.
     pub fn is_ahead(&self) -> bool {
-        self.device.as_ref().is_some_and(|tier| tier.in_flight() > 0)
+        self.device.as_ref().is_some_and(|tier| tier.flights.in_flight() > 0)
     }
 
     /// Takes the current step on a device that holds the pages. Records the next step before it waits for the current one, if the next step
@@ -378,8 +378,8 @@ impl Trainer {
         if self.is_ahead() {
             self.record_next(dataset, targets)?;
             let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
-            let _span = trace::span("finish step").with("in_flight", tier.in_flight() as u64);
-            if let Some(outcome) = tier.finish(&mut self.scene, &mut *self.renderer)? {
+            let _span = trace::span("finish step").with("in_flight", tier.flights.in_flight() as u64);
+            if let Some(outcome) = tier.flights.finish(&mut tier.cache, &mut self.scene, &mut *self.renderer)? {
                 return Ok(outcome);
             }
         }
@@ -412,15 +412,15 @@ impl Trainer {
             pages_most: self.fitting.pages_most,
         };
         let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
-        if !tier.may_record() {
+        if !tier.flights.may_record() {
             return Ok(false);
         }
-        tier.record(&mut self.scene, &mut *self.renderer, &to_record)
+        tier.flights.record(&mut tier.cache, &mut self.scene, &mut *self.renderer, &to_record)
     }
 
     /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
     fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
-        let may_record = self.device.as_ref().is_some_and(DeviceTier::may_record);
+        let may_record = self.device.as_ref().is_some_and(|tier| tier.flights.may_record());
         if !may_record || !self.ahead.is_allowed || !self.has_no_event_or_end_after(self.state.step) {
             return Ok(());
         }
@@ -538,7 +538,7 @@ impl Trainer {
     /// Updates the pager's plan every [`LOOK_AHEAD_EVERY`] steps; doing it at every step would cost too much.
     fn look_ahead(&mut self, dataset: &Dataset) {
         let pages = self.scene.pager.index().len();
-        let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.slots() < pages);
+        let is_on_device_in_part = self.device.as_ref().is_some_and(|tier| tier.cache.slots() < pages);
         let has_plan = !self.scene.is_in_memory() || is_on_device_in_part;
         self.expect_edits();
         // The step in flight has begun already.
@@ -567,7 +567,7 @@ impl Trainer {
         let raises = |step: u32| options.sh_degree_at(step + 1) > options.sh_degree_at(step);
         if let Some(tier) = &mut self.device {
             let edits_all = |step| options.strategy.edits_all_after(step) || raises(step);
-            tier.expect_edits(self.state.step, options.steps, edits_all);
+            tier.cache.expect_edits(self.state.step, options.steps, edits_all);
         }
     }
 

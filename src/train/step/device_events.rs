@@ -15,7 +15,7 @@
 //! Invariants: 1. a page is cleared by the device only if the host would have changed nothing else; 2. where the device has no memory for
 //! a survey, the host applies the events.
 
-use super::device_tier::{DeviceTier, device_of};
+use super::device_slots::{SlotCache, device_of};
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
 use crate::base::trace;
@@ -52,70 +52,68 @@ pub(super) fn are_edits_due(scene: &PagedScene, page: PageNo) -> bool {
     scene.rules.is_behind(page) && !scene.rules.pending().only_clears(page.events_applied as usize, &best_facts(page))
 }
 
-impl DeviceTier {
-    /// Prepares pinned pages for the events that they are behind in: the device clears the statistics of those of which nothing else
-    /// changes, and they are behind no more; the others are copied back, and their slots given up.
-    pub(super) fn before_events(
-        &mut self,
-        scene: &PagedScene,
-        renderer: &mut dyn Renderer,
-        pinned: &mut [PinnedPage],
-    ) -> Result<(), TrainError> {
-        self.clear_statistics(scene, renderer, pinned)?;
-        let slots = &self.slots;
-        let behind = pinned.iter_mut().filter(|page| scene.rules.is_behind(&page.meta));
-        let (newer, equal): (Vec<_>, Vec<_>) = behind.partition(|page| slots.is_dirty(page.page));
-        let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
-        self.copy_back(renderer, newer.into_iter())?;
-        for page in pages {
-            self.fewest.lose(page);
-            if self.slots.state(page).is_some() {
-                self.slots.evict(page);
-            }
+/// Prepares pinned pages for the events that they are behind in: the device clears the statistics of those of which nothing else
+/// changes, and they are behind no more; the others are copied back, and their slots given up.
+pub(super) fn before_events(
+    cache: &mut SlotCache,
+    scene: &PagedScene,
+    renderer: &mut dyn Renderer,
+    pinned: &mut [PinnedPage],
+) -> Result<(), TrainError> {
+    clear_statistics(cache, scene, renderer, pinned)?;
+    let slots = &cache.slots;
+    let behind = pinned.iter_mut().filter(|page| scene.rules.is_behind(&page.meta));
+    let (newer, equal): (Vec<_>, Vec<_>) = behind.partition(|page| slots.is_dirty(page.page));
+    let pages: Vec<PageNo> = newer.iter().chain(&equal).map(|page| page.page).collect();
+    cache.copy_back(renderer, newer.into_iter())?;
+    for page in pages {
+        cache.fewest.lose(page);
+        if cache.slots.state(page).is_some() {
+            cache.slots.evict(page);
         }
-        Ok(())
     }
+    Ok(())
+}
 
-    /// Clears the statistics of pages in slots, where the events that they are behind in do nothing else.
-    fn clear_statistics(
-        &mut self,
-        scene: &PagedScene,
-        renderer: &mut dyn Renderer,
-        pinned: &mut [PinnedPage],
-    ) -> Result<(), TrainError> {
-        let (pending, slots) = (scene.rules.pending(), &self.slots);
-        let only_clears =
-            |page: &PinnedPage, facts: &PageFacts| pending.only_clears(page.meta.events_applied as usize, facts);
-        let in_slot = |page: &PinnedPage| Some(SlotPage { slot: *slots.memory(page.page)?, layout: page.layout() });
-        let (mut pages, mut in_slots) = (Vec::new(), Vec::new());
-        for page in pinned.iter_mut().filter(|page| page.meta.rows > 0 && scene.rules.is_behind(&page.meta)) {
-            if let Some(slot) = in_slot(page).filter(|_| only_clears(page, &best_facts(&page.meta))) {
-                pages.push(page);
-                in_slots.push(slot);
-            }
+/// Clears the statistics of pages in slots, where the events that they are behind in do nothing else.
+fn clear_statistics(
+    cache: &mut SlotCache,
+    scene: &PagedScene,
+    renderer: &mut dyn Renderer,
+    pinned: &mut [PinnedPage],
+) -> Result<(), TrainError> {
+    let (pending, slots) = (scene.rules.pending(), &cache.slots);
+    let only_clears =
+        |page: &PinnedPage, facts: &PageFacts| pending.only_clears(page.meta.events_applied as usize, facts);
+    let in_slot = |page: &PinnedPage| Some(SlotPage { slot: *slots.memory(page.page)?, layout: page.layout() });
+    let (mut pages, mut in_slots) = (Vec::new(), Vec::new());
+    for page in pinned.iter_mut().filter(|page| page.meta.rows > 0 && scene.rules.is_behind(&page.meta)) {
+        if let Some(slot) = in_slot(page).filter(|_| only_clears(page, &best_facts(&page.meta))) {
+            pages.push(page);
+            in_slots.push(slot);
         }
-        if pages.is_empty() {
-            return Ok(());
-        }
-        let _span = trace::span("clear statistics").with("pages", pages.len() as u64);
-        let device = device_of(renderer)?;
-        let Some(surveys) = none_if_out_of_memory(device.survey(&in_slots))? else { return Ok(()) };
-        let of_pages = pages.into_iter().zip(in_slots).zip(&surveys);
-        let (cleared, in_slots): (Vec<&mut PinnedPage>, Vec<SlotPage>) = of_pages
-            .filter(|((page, _), survey)| only_clears(page, &facts(&page.meta, survey)))
-            .map(|(page_in_slot, _)| page_in_slot)
-            .unzip();
-        if cleared.is_empty() || none_if_out_of_memory(device.clear_statistics(&in_slots))?.is_none() {
-            return Ok(());
-        }
-        self.traffic.cleared += cleared.len() as u64;
-        for page in cleared {
-            page.meta.events_applied = scene.events().len() as u32;
-            page.dirty = true;
-            if let Some((slot, _)) = self.slots.pin(page.page, false) {
-                self.slots.unpin(page.page, slot, true);
-            }
-        }
-        Ok(())
     }
+    if pages.is_empty() {
+        return Ok(());
+    }
+    let _span = trace::span("clear statistics").with("pages", pages.len() as u64);
+    let device = device_of(renderer)?;
+    let Some(surveys) = none_if_out_of_memory(device.survey(&in_slots))? else { return Ok(()) };
+    let of_pages = pages.into_iter().zip(in_slots).zip(&surveys);
+    let (cleared, in_slots): (Vec<&mut PinnedPage>, Vec<SlotPage>) = of_pages
+        .filter(|((page, _), survey)| only_clears(page, &facts(&page.meta, survey)))
+        .map(|(page_in_slot, _)| page_in_slot)
+        .unzip();
+    if cleared.is_empty() || none_if_out_of_memory(device.clear_statistics(&in_slots))?.is_none() {
+        return Ok(());
+    }
+    cache.traffic.cleared += cleared.len() as u64;
+    for page in cleared {
+        page.meta.events_applied = scene.events().len() as u32;
+        page.dirty = true;
+        if let Some((slot, _)) = cache.slots.pin(page.page, false) {
+            cache.slots.unpin(page.page, slot, true);
+        }
+    }
+    Ok(())
 }

@@ -7,8 +7,9 @@
 //! Invariant: an update that failed is [`TrainError::Torn`]: pages that exist on the device alone may be changed.
 
 use super::batch::{AtStep, RowBackend, UpdateCounts};
-use super::device_leaving::Leaves;
-use super::device_tier::{DeviceTier, device_of};
+use super::device_events::before_events;
+use super::device_slots::{Leaves, device_of};
+use super::device_tier::DeviceTier;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
@@ -43,14 +44,14 @@ impl<'a> DeviceRows<'a> {
         renderer: &'a mut dyn Renderer,
         (step, next): (u32, Option<&'a Camera>),
     ) -> Result<DeviceRows<'a>, TrainError> {
-        tier.begin_step(scene, renderer, step)?;
+        tier.flights.begin_step(&mut tier.cache, scene, renderer, step)?;
         Ok(DeviceRows { tier, renderer, step, next, of_next: None })
     }
 
     /// Copies payloads of the next step up.
     fn load_ahead(&mut self, scene: &PagedScene, leaves: Leaves) -> Result<(), TrainError> {
         let Some(of_next) = &self.of_next else { return Ok(()) };
-        self.tier.load_ahead(scene, self.renderer, (self.step + 1, of_next), leaves)
+        self.tier.cache.load_ahead(scene, self.renderer, (self.step + 1, of_next), leaves)
     }
 
     /// Updates the pages of a batch in their slots; payloads of the next step go up behind that.
@@ -61,11 +62,12 @@ impl<'a> DeviceRows<'a> {
         pinned: &mut [PinnedPage],
         collects: bool,
     ) -> Result<Vec<PageResult>, TrainError> {
-        let pages = self.tier.loaded(pinned.iter());
+        let pages = self.tier.cache.loaded(pinned.iter());
         device_of(self.renderer)?.begin_update(batch, &pages, collects)?;
         self.load_ahead(scene, Leaves::Used)?;
         let results = device_of(self.renderer)?.finish_update()?;
-        self.tier.finish_leaving(scene, self.renderer, self.step, pinned)?;
+        let DeviceTier { cache, flights } = &mut *self.tier;
+        cache.finish_leaving(scene, self.renderer, self.step, &mut flights.pinned_pages().chain(pinned))?;
         Ok(results)
     }
 }
@@ -76,17 +78,17 @@ impl RowBackend for DeviceRows<'_> {
     }
 
     fn pages_most(&self) -> usize {
-        self.tier.slots()
+        self.tier.cache.slots()
     }
 
     /// A view that needs several batches anyway leaves slots free for pages of the next step: smaller batches copy no byte more.
     fn pages_per_batch(&self, pages: usize) -> usize {
-        let slots = self.tier.slots();
+        let slots = self.tier.cache.slots();
         if pages <= slots { slots } else { slots - slots / SLOTS_AHEAD_SHARE }
     }
 
     fn pages_held(&self) -> usize {
-        self.tier.pages_held()
+        self.tier.cache.pages_held()
     }
 
     fn pin(
@@ -96,14 +98,15 @@ impl RowBackend for DeviceRows<'_> {
         pages: &[PageNo],
         is_again: bool,
     ) -> Result<Vec<PinnedPage>, TrainError> {
-        self.tier.pin(scene, self.renderer, pages, |scene, others| match is_again {
+        let in_flight = self.tier.flights.pinned_pages().len();
+        self.tier.cache.pin(scene, self.renderer, (pages, in_flight), |scene, others| match is_again {
             true => scene.pager.pin_batch_again(step, others),
             false => scene.pager.pin_batch(step, others),
         })
     }
 
     fn before_events(&mut self, scene: &PagedScene, pinned: &mut [PinnedPage]) -> Result<(), TrainError> {
-        self.tier.before_events(scene, self.renderer, pinned)
+        before_events(&mut self.tier.cache, scene, self.renderer, pinned)
     }
 
     fn rows_in(
@@ -113,7 +116,7 @@ impl RowBackend for DeviceRows<'_> {
         at: AtStep<'_>,
         _: &mut WorkingSet,
     ) -> Result<usize, TrainError> {
-        let pages = self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
+        let pages = self.tier.cache.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
         let step = scene.rules.adam.at(at.step).numbers();
         Ok(device_of(self.renderer)?.pages_in(&pages, &step)?)
     }
@@ -127,13 +130,13 @@ impl RowBackend for DeviceRows<'_> {
         _: &mut WorkingSet,
     ) -> Result<(), TrainError> {
         if is_again {
-            self.tier.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
+            self.tier.cache.load(scene, self.renderer, &pinned.iter().collect::<Vec<_>>())?;
         }
         device_of(self.renderer)?.pages_out(batch)?;
         // The last batch of the pass out: the step needs no other page any more.
         if batch == 0 {
             let behind = self.step;
-            self.of_next = self.next.map(|camera| self.tier.pages_behind(scene, camera, behind));
+            self.of_next = self.next.map(|camera| self.tier.flights.pages_behind(scene, camera, behind));
         }
         // The device is at work on the gradients, which only `loss_value` and what follows wait for.
         if is_again { Ok(()) } else { self.load_ahead(scene, Leaves::Unused) }
@@ -157,7 +160,7 @@ impl RowBackend for DeviceRows<'_> {
             counts.drawn += u64::from(result.drawn);
             if let Some(bounds) = result.bounds() {
                 (page.meta.bounds, page.dirty) = (bounds, true);
-                self.tier.changed(page.page);
+                self.tier.cache.changed(page.page);
             }
         }
         counts.drawn = if counts.updated == 0 { counts.drawn } else { 0 };
@@ -165,6 +168,6 @@ impl RowBackend for DeviceRows<'_> {
     }
 
     fn release(&mut self, scene: &mut PagedScene, pinned: Vec<PinnedPage>) {
-        self.tier.release(scene, pinned);
+        self.tier.cache.release(scene, pinned);
     }
 }

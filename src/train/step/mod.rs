@@ -6,15 +6,11 @@
 pub mod batch;
 pub mod catch_up;
 pub mod comparison;
-mod device_ahead;
 mod device_events;
 pub mod device_flights;
-mod device_leaving;
-mod device_loads;
 pub mod device_rows;
+pub mod device_slots;
 pub mod device_tier;
-mod flights;
-mod leaving;
 pub mod pages;
 pub(crate) mod soundness;
 mod step_faults;
