@@ -5,7 +5,7 @@
 
 use std::fmt;
 
-use super::choice::DeviceChoice;
+use super::DeviceChoice;
 use super::error::{GpuError, GpuResult};
 
 /// Invocations of a workgroup, unless a shader needs another number.
@@ -186,13 +186,6 @@ pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, Adapter
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn hardware_comes_before_software() {
-        let mut kinds = [DeviceKind::Software, DeviceKind::Other, DeviceKind::Integrated, DeviceKind::Discrete];
-        kinds.sort();
-        assert_eq!(kinds, [DeviceKind::Discrete, DeviceKind::Integrated, DeviceKind::Other, DeviceKind::Software]);
-    }
 
     #[test]
     fn an_adapter_below_a_limit_is_refused_with_the_name_of_the_limit() {

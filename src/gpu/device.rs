@@ -7,10 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request};
-use super::belt::Belt;
+use super::belt::{Belt, UniformRing};
 use super::buffers::{Buffer, Pool, Purpose};
 use super::bus::EmulatedBus;
-use super::choice::DeviceChoice;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
@@ -19,8 +18,7 @@ use super::profile::{Profiler, StageTime};
 use super::readback::Staging;
 use super::shader::{Pipeline, Pipelines};
 use super::sources::{Defines, SOURCES, Source};
-use super::traffic::Traffic;
-use super::uniforms::UniformRing;
+use super::{DeviceChoice, Traffic};
 
 /// Smallest and largest memory block under a budget, bytes: the API raises smaller ones to 4 MiB.
 const BLOCK_MIN: u64 = 4 << 20;

@@ -25,8 +25,8 @@
 //! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
 //! adapter.
 //!
-//! Files import each other in one direction: `error` <- `bus`, `faults`, `mapping` <- `submitter` <- `driver` (the wgpu device that the others
-//! share) <- `buffers`, `belt`, `shader` <- `readback`, `uniforms` <- `profile` <- `device` <- `record`.
+//! Files import each other in one direction: `error` <- `bus`, `faults` <- `submitter` <- `driver` (the wgpu device that the others
+//! share) <- `buffers`, `belt`, `shader` <- `readback` <- `profile` <- `device` <- `record`.
 
 #[cfg(feature = "gpu")]
 mod adapter;
@@ -35,7 +35,6 @@ mod belt;
 #[cfg(feature = "gpu")]
 mod buffers;
 mod bus;
-mod choice;
 #[cfg(feature = "gpu")]
 mod device;
 #[cfg(feature = "gpu")]
@@ -46,8 +45,6 @@ mod faults;
 #[cfg(feature = "gpu")]
 mod injected;
 mod layout;
-#[cfg(feature = "gpu")]
-mod mapping;
 #[cfg(feature = "gpu")]
 mod profile;
 #[cfg(feature = "gpu")]
@@ -60,9 +57,6 @@ mod shader;
 mod sources;
 #[cfg(feature = "gpu")]
 mod submitter;
-mod traffic;
-#[cfg(feature = "gpu")]
-mod uniforms;
 
 #[cfg(feature = "gpu")]
 pub use adapter::{AdapterSummary, DeviceKind, WORKGROUP, list_adapters};
@@ -71,7 +65,6 @@ pub use belt::staging_bytes;
 #[cfg(feature = "gpu")]
 pub use buffers::{Buffer, BufferView};
 pub use bus::EmulatedBus;
-pub use choice::DeviceChoice;
 #[cfg(feature = "gpu")]
 pub use device::{Gpu, GpuOptions, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
@@ -88,7 +81,34 @@ pub use record::{Recorder, Recording, Submission, groups_1d};
 pub use shader::{Pipeline, validate};
 #[cfg(feature = "gpu")]
 pub use sources::{Defines, SOURCES, Source, preprocess, variants};
-pub use traffic::Traffic;
+
+/// The device that the user requests. Exists in programs without GPU support too: configs name it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum DeviceChoice {
+    /// The best hardware GPU; [`GpuError::NoHardwareGpu`] if there is none.
+    Auto,
+    /// The best adapter, even a software one.
+    Gpu,
+    /// The best adapter whose name contains this text, ignoring case.
+    Named(String),
+}
+
+/// Traffic over the bus since the device was opened, and memory, for reports; zeros in programs without GPU support.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Traffic {
+    /// Bytes from the host to the device: uploads and uniforms.
+    pub bytes_uploaded: u64,
+    /// Bytes from the device to the host.
+    pub bytes_read_back: u64,
+    /// Device memory of live buffers, staging and uniforms, bytes.
+    pub device_bytes: u64,
+    /// Most device memory ever allocated, bytes, including free buffers in the pool.
+    pub device_bytes_peak: u64,
+    /// Buffers allocated so far: constant once warmed up.
+    pub device_allocations: u64,
+    /// The part of this memory that stages uploads, uniforms and read-backs, bytes. It may lie in host memory.
+    pub staging_bytes: u64,
+}
 
 /// No adapter: this program was built without the feature `gpu`.
 #[cfg(not(feature = "gpu"))]

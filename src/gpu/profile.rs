@@ -8,9 +8,8 @@ use std::sync::Arc;
 use super::buffers::BufferView;
 use super::driver::Driver;
 use super::error::GpuResult;
-use super::mapping::Mapping;
 use super::readback::{Readback, Staging};
-use super::submitter::Ticket;
+use super::submitter::{Mapping, Ticket};
 
 /// Most passes of one recorder that are timed; further ones are not.
 const PASSES_MAX: u32 = 1024;

@@ -11,8 +11,7 @@ use super::belt::COPY_PART;
 use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
-use super::mapping::{MapState, Mapping, SharedState};
-use super::submitter::Ticket;
+use super::submitter::{MapState, Mapping, SharedState, Ticket};
 use crate::base::trace;
 use rayon::prelude::*;
 

@@ -8,16 +8,15 @@ use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
 use super::adapter::GROUPS_MAX;
+use super::belt::UNIFORM_CHUNK;
 use super::buffers::{Buffer, BufferView};
 use super::device::Gpu;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
 use super::injected::{FaultKind, fill_device};
-use super::mapping::Mapping;
 use super::readback::Readback;
 use super::shader::{BindingKind, Pipeline};
-use super::submitter::{Job, Ticket, Waker};
-use super::uniforms::UNIFORM_CHUNK;
+use super::submitter::{Job, Mapping, Ticket, Waker};
 use crate::base::trace;
 
 /// Workgroups for `count` invocations in workgroups of `workgroup`, folded into two dimensions beyond 65,535.

@@ -10,21 +10,13 @@
 crate::wgsl_struct! {
     /// Uniform of `gate.wgsl`.
     pub struct GateUniforms {
-        /// Listed rows that the buffers of the step hold.
         pub rows_room: u32,
-        /// Intersections that they hold.
         pub isects_room: u32,
-        /// Entries of one tile's list that the recorded blending covers.
         pub list_room: u32,
-        /// The gate closes if more than one in this many rows has unusable gradients.
         pub rows_per_unusable: u32,
-        /// Word of the counts with the number of listed rows.
         pub rows_at: u32,
-        /// Word of the offsets with the number of intersections.
         pub isects_at: u32,
-        /// 1 if the loss has sums.
         pub has_loss: u32,
-        /// Unused.
         pub pad: u32,
     }
 

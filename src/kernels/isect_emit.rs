@@ -68,8 +68,8 @@ fn for_each_tile<const CUT: bool>(
 }
 
 /// Calls `each(row, tile, pixel rows, k)` for every intersection of a chunk of the drawn rows with the tiles of a range, front to
-/// back.
-struct EachIsect<'a, F> {
+/// back. `CUT`: the range is a part of the picture; all tiles need not pay for its tests.
+struct EachIsect<'a, F, const CUT: bool> {
     order: &'a [u32],
     packed: &'a Packed,
     grid: Grid,
@@ -77,19 +77,23 @@ struct EachIsect<'a, F> {
     each: F,
 }
 
-/// The same for a range that is a part of the picture, whose tests all tiles need not pay for.
-struct EachIsectOfPart<'a, F>(EachIsect<'a, F>);
-
-fn each_isect<F: FnMut(u32, usize, [u8; 2], u32)>(simd: SimdPath, isects: EachIsect<'_, F>) {
-    match isects.range.is_all(isects.grid) {
-        true => dispatch(simd, isects),
-        false => dispatch(simd, EachIsectOfPart(isects)),
+fn each_isect(
+    simd: SimdPath,
+    (order, packed): (&[u32], &Packed),
+    (grid, range): (Grid, TileRange),
+    each: impl FnMut(u32, usize, [u8; 2], u32),
+) {
+    match range.is_all(grid) {
+        true => dispatch(simd, EachIsect::<_, false> { order, packed, grid, range, each }),
+        false => dispatch(simd, EachIsect::<_, true> { order, packed, grid, range, each }),
     }
 }
 
-impl<F: FnMut(u32, usize, [u8; 2], u32)> EachIsect<'_, F> {
+impl<F: FnMut(u32, usize, [u8; 2], u32), const CUT: bool> Kernel for EachIsect<'_, F, CUT> {
+    type Out = ();
+
     #[inline(always)]
-    fn call<const CUT: bool>(mut self) {
+    fn run<const FMA: bool>(mut self) {
         let Packed { splats, spans, .. } = self.packed;
         for (i, &row) in self.order.iter().enumerate() {
             // Depth order is random order in memory.
@@ -106,24 +110,6 @@ impl<F: FnMut(u32, usize, [u8; 2], u32)> EachIsect<'_, F> {
     }
 }
 
-impl<F: FnMut(u32, usize, [u8; 2], u32)> Kernel for EachIsect<'_, F> {
-    type Out = ();
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        self.call::<false>();
-    }
-}
-
-impl<F: FnMut(u32, usize, [u8; 2], u32)> Kernel for EachIsectOfPart<'_, F> {
-    type Out = ();
-
-    #[inline(always)]
-    fn run<const FMA: bool>(self) {
-        self.0.call::<true>();
-    }
-}
-
 /// Counts the intersections with the tiles of `range` as `[chunks][tiles]` for [`super::isect_offsets`]; a chunk is a part
 /// of `order`, the drawn rows front to back.
 pub fn count(order: &[u32], packed: &Packed, grid: Grid, range: TileRange, simd: SimdPath, tile_counts: &mut Vec<u32>) {
@@ -136,7 +122,7 @@ pub fn count(order: &[u32], packed: &Packed, grid: Grid, range: TileRange, simd:
     }
     order.par_chunks(len).zip(tile_counts.par_chunks_mut(tiles)).for_each(|(order, tile_counts)| {
         let each = |_, tile: usize, _, _| tile_counts[tile] += 1;
-        each_isect(simd, EachIsect { order, packed, grid, range, each });
+        each_isect(simd, (order, packed), (grid, range), each);
     });
 }
 
@@ -165,7 +151,7 @@ pub fn emit(
             isects[*place as usize].store(Isect { row, pixel_rows, k }.pack(), Relaxed);
             *place += 1;
         };
-        each_isect(simd, EachIsect { order, packed, grid, range, each });
+        each_isect(simd, (order, packed), (grid, range), each);
     });
 }
 

@@ -27,19 +27,3 @@ pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u
         cursors[at] = cursors[at - tiles] + u64::from(tile_counts[at - tiles]);
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn chunks_follow_each_other_within_a_tile() {
-        let (mut offsets, mut cursors) = (vec![5; 9], vec![5; 2]);
-        isect_offsets(&[1, 0, 2, 3, 1, 0], 3, &mut offsets, &mut cursors);
-        assert_eq!(offsets, [0, 4, 5, 7]);
-        assert_eq!(cursors, [0, 4, 5, 1, 4, 7]);
-        isect_offsets(&[], 3, &mut offsets, &mut cursors);
-        assert_eq!(offsets, [0, 0, 0, 0]);
-        assert!(cursors.is_empty());
-    }
-}

@@ -12,7 +12,6 @@ mod image_pair;
 pub mod isect_emit;
 pub mod isect_offsets;
 pub mod lanes;
-pub mod page_words;
 pub mod project_bwd;
 pub mod project_fwd;
 pub mod radix_sort;
@@ -28,8 +27,4 @@ mod ssim_band;
 pub mod stages;
 mod tile_block;
 pub mod tile_range;
-#[cfg(feature = "gpu")]
 pub mod uniforms;
-pub mod uniforms_pages;
-#[cfg(feature = "gpu")]
-pub mod uniforms_tiles;

@@ -307,25 +307,25 @@ pub fn rasterize_bwd(
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
     reset(partials, lists.isects.len());
-    let partials = &partials[..];
-    let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
-    let Some(Weighing { errors, partials: weights }) = weighing else {
-        return tiles.for_each(|tile| {
-            SCRATCH.with_borrow_mut(|state| {
-                state.load(lists, raster, upstream, &[], tile);
-                let weight_partials = &[];
-                let work = BackTile::<false> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
-                dispatch(lists.simd, work);
-            });
-        });
+    let (partials, weighs) = (&partials[..], weighing.is_some());
+    let (errors, weight_partials) = match weighing {
+        Some(Weighing { errors, partials }) => {
+            reset(partials, lists.isects.len());
+            (errors, &partials[..])
+        }
+        None => (&[][..], &[][..]),
     };
-    reset(weights, lists.isects.len());
-    let weight_partials = &weights[..];
+    let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
     tiles.for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
             state.load(lists, raster, upstream, errors, tile);
-            let work = BackTile::<true> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
-            dispatch(lists.simd, work);
+            if weighs {
+                let work = BackTile::<true> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
+                dispatch(lists.simd, work);
+            } else {
+                let work = BackTile::<false> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
+                dispatch(lists.simd, work);
+            }
         });
     });
 }

@@ -19,6 +19,7 @@ use super::moments::Moments;
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
 use crate::scene::columns::Column;
+pub use crate::scene::optimizer_numbers::SplitLimits;
 use crate::scene::page_meta::PageBounds;
 use crate::scene::rows::{Rows, mean_grad2d};
 
@@ -39,22 +40,6 @@ const SIGMA_SLACK: f32 = 1e-6;
 const SIGMA_MOST: f32 = 1e30;
 /// Factor of a split's reach for the roundings of its rotation and scales.
 const REACH_SLACK: f32 = 1.0 + 1e-4;
-
-/// The lowest thresholds for splitting that any round of the run can have.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SplitLimits {
-    /// Rows grow only above this mean gradient norm.
-    pub grow_grad2d: f32,
-    /// Growing rows split only above this largest standard deviation.
-    pub split_scale: f32,
-    /// Largest distance of a child's mean from its parent's, in the parent's largest standard deviation.
-    pub reach: f32,
-}
-
-impl SplitLimits {
-    /// For a run without rounds.
-    pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
-}
 
 /// Bounds of the rows of a page that has just been rewritten.
 pub fn page_bounds(adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits) -> PageBounds {

@@ -45,6 +45,10 @@
 //! that is recorded without waiting (`gpu_recorded`) has three submissions and two read-backs, which the host waits for once it has
 //! submitted the next step.
 //!
+//! # Errors
+//! Functions of the `gpu_*` files fail where the device failed or has no memory left, constructors of stages also where the device
+//! rejects a shader. Their comments name other errors only.
+//!
 //! Invariants: 1. the device holds the rows, lists and picture of the last view only; 2. the same input gives the same
 //! bits on the same device; 3. no result comes from buffers that were too small: the frame and its loss are recorded
 //! again with larger buffers; 4. after a device error there is no view until the next `begin_view`.
@@ -99,9 +103,6 @@ pub struct GpuRenderer {
 
 impl GpuRenderer {
     /// Compiles the stages for `gpu`.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn new(gpu: Gpu) -> GpuResult<Self> {
         Ok(GpuRenderer {
             stages: ViewStages::new(gpu)?,
@@ -260,7 +261,7 @@ impl Renderer for GpuRenderer {
         if is_wanted && !self.weighs_next {
             let ViewStages { gpu, rows, tiles, loss, .. } = &mut self.stages;
             rows.weigh_rows(gpu)?;
-            tiles.weigh_rows(gpu)?;
+            tiles.back.weigh_rows(gpu)?;
             loss.weigh_rows(gpu)?;
         }
         self.weighs_next = is_wanted;

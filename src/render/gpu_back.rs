@@ -69,7 +69,7 @@ pub(super) fn record_picture_back(
                 let (splats, out) = (segment.splats.view(), v_splats.view());
                 let (into, pixels) = (&mut recorder, &view.pixels);
                 let fold = Fold::Whole;
-                stages.tiles.backward(gpu, into, &splats, ranks, frame, pixels, *demand, gradient, &out, fold)?;
+                stages.tiles.back.backward(gpu, into, &splats, ranks, frame, pixels, *demand, gradient, &out, fold)?;
                 segment.v_splats = Some(v_splats);
             }
             view.tiles_back = Some(recorder.set_aside());
@@ -117,7 +117,7 @@ pub(super) fn rows_out(
 fn count_unusable<'g>(stages: &'g ViewStages, view: &mut View) -> GpuResult<Recorder<'g>> {
     let gpu = &stages.gpu;
     let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
-    let counted = stages.tiles.unusable(&mut recorder, &view.segments, view.blend());
+    let counted = stages.tiles.back.unusable(&mut recorder, &view.segments, view.blend());
     match counted.and_then(|unusable| recorder.read_back("rasterize_bwd", &unusable.view())) {
         Ok(unusable) => {
             view.unusable = Unusable::Pending(unusable);

@@ -7,7 +7,8 @@
 use crate::gpu::{Buffer, Gpu, GpuResult, Readback};
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::SPLAT_WORDS;
+use crate::kernels::uniforms::{RasterUniforms, SPLAT_WORDS, grid_words, range_words};
+use bytemuck::Zeroable;
 
 /// Bytes of `count` 32-bit words.
 pub(super) fn words(count: u32) -> u64 {
@@ -63,9 +64,6 @@ pub struct Pixels {
 
 impl Pixels {
     /// The buffers of a picture, with arbitrary contents.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn new(gpu: &Gpu, grid: Grid) -> GpuResult<Pixels> {
         let pixels = u64::from(grid.width) * u64::from(grid.height);
         Ok(Pixels {
@@ -142,13 +140,31 @@ pub struct Demand {
 
 impl DemandReadback {
     /// Waits for the device.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn wait(self) -> GpuResult<Demand> {
         let (mut isects, mut list_max) = ([0u32], [0u32]);
         self.total.copy_to(&mut isects)?;
         self.longest.copy_to(&mut list_max)?;
         Ok(Demand { isects: isects[0], list_max: list_max[0] })
+    }
+}
+
+/// Uniforms of one rasterizer dispatch over the list entries [`length` * `segment`, `length` * (`segment` + 1)).
+pub(super) fn raster_uniforms(
+    blend: &Blend,
+    range: TileRange,
+    segment: u32,
+    length: u32,
+    flags: u32,
+) -> RasterUniforms {
+    RasterUniforms {
+        grid: grid_words(blend.grid),
+        background: blend.background,
+        max_alpha: blend.max_alpha,
+        log2_max_alpha: libm::log2f(blend.max_alpha),
+        first: segment.saturating_mul(length),
+        end: segment.saturating_add(1).saturating_mul(length),
+        flags,
+        range: range_words(range),
+        ..RasterUniforms::zeroed()
     }
 }

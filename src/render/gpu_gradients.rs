@@ -48,9 +48,6 @@ pub(super) struct RowGradients {
 
 impl RowGradients {
     /// Allocates the gradients of `rows` rows, with weights if `weighs`.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8, weighs: bool) -> GpuResult<Self> {
         let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
         let footprints = gpu.buffer("footprints", footprint_bytes(weighs) * u64::from(rows))?;
@@ -65,9 +62,6 @@ pub(super) fn chunk_row_bytes(sh_degree: u8) -> u64 {
 }
 
 /// Checks that the smallest chunk has room, so that a pass out that has begun does not end for want of it.
-///
-/// # Errors
-/// Device memory is exhausted.
 pub(super) fn check_room(gpu: &Gpu, sh_degree: u8) -> GpuResult<()> {
     let columns = DeviceColumns::new(gpu, CHUNK_STEP as u32, sh_degree)?;
     RowGradients::new(gpu, columns.rows, sh_degree, true).map(|_| ())
@@ -106,9 +100,6 @@ impl RowsOut<'_> {
 
     /// Submits the stages on rows whose columns are on the device, behind the work of `recorder`, and copies the gradients to
     /// `grads`, which is prepared.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn whole(
         &self,
         recorder: Recorder<'_>,
@@ -125,9 +116,6 @@ impl RowsOut<'_> {
 
     /// Uploads the rows of a batch again, which begins at row `first` of the view, runs the stages on them in chunks, and copies
     /// the gradients to `grads`, which is prepared. `segments` are those of the batch.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory for the smallest chunk.
     pub fn in_chunks<'s>(
         &self,
         rows: &Columns,
@@ -167,9 +155,6 @@ impl RowsOut<'_> {
     }
 
     /// Records the gradients of rows whose columns are on the device, for an update there.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn record(
         &self,
         recorder: &mut Recorder<'_>,

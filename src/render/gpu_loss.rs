@@ -20,9 +20,6 @@ pub struct LossStage {
 
 impl LossStage {
     /// Compiles the stage.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         let entry = |name: &str| gpu.pipeline("image_loss.wgsl", name, &[]);
         Ok(LossStage {
@@ -34,9 +31,6 @@ impl LossStage {
     }
 
     /// Compiles [`LossStage::errors`].
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
         self.squared_errors = Some(gpu.pipeline("image_loss.wgsl", "squared_errors", &[])?);
         Ok(())
@@ -44,9 +38,6 @@ impl LossStage {
 
     /// Records the squared error of each pixel of the picture into `errors` (`[height][width]`): the twin of
     /// [`crate::kernels::squared_error`]. Does nothing before [`LossStage::weigh_rows`].
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn errors(
         &self,
         recorder: &mut Recorder<'_>,
@@ -63,9 +54,6 @@ impl LossStage {
     /// Records the gradient of the picture `rgb` (planar) against `target_pixels` (layout:
     /// [`crate::kernels::uniforms::pack_target`]) into `v_rgb`. Returns the buffer whose first four floats [`value`]
     /// turns into the loss, or `None` for a picture without pixels.
-    ///
-    /// # Errors
-    /// The device failed, or its budget has less than 12 bytes per pixel left.
     pub fn run(
         &self,
         gpu: &Gpu,

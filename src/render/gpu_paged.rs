@@ -13,7 +13,7 @@ use super::gpu_update::update_batch;
 use super::gpu_view::View;
 use super::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepDone, StepJob};
 use super::{RenderError, Renderer, RowBatches};
-use crate::kernels::page_words::{PageResult, PageSurvey};
+use crate::kernels::uniforms::{PageResult, PageSurvey};
 use crate::scene::optimizer_numbers::StepNumbers;
 
 const NO_PAGES: RenderError = RenderError::OutOfOrder { call: "pages", needs: "prepare_page_storage" };

@@ -14,8 +14,7 @@ use super::gpu_slots::Slots;
 use super::pages::{PageRules, SlotPage};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::deferred::DeferredTables;
-use crate::kernels::page_words::{DevicePage, PageSurvey};
-use crate::kernels::uniforms_pages::{GatherUniforms, UpdateUniforms};
+use crate::kernels::uniforms::{DevicePage, GatherUniforms, PageSurvey, UpdateUniforms};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Column;
 use crate::scene::optimizer_numbers::StepNumbers;
@@ -83,7 +82,7 @@ pub struct PagesView {
     pub(super) updating: Option<PendingResults>,
 }
 
-/// What an update does to the pages of a batch ([`crate::kernels::page_words::PageResult`]s), on its way to the host; `None` for a batch without pages.
+/// What an update does to the pages of a batch ([`crate::kernels::uniforms::PageResult`]s), on its way to the host; `None` for a batch without pages.
 pub(super) type PendingResults = Option<Readback>;
 
 /// The listed rows of a batch.
@@ -113,9 +112,6 @@ impl PageTable {
 
 impl DevicePages {
     /// Compiles the stages and uploads the tables of a run.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn new(gpu: &Gpu, rules: &PageRules) -> GpuResult<DevicePages> {
         let of = |shader: &str, entry: &str| gpu.pipeline(shader, entry, &[]);
         let stages = Stages {
@@ -151,9 +147,6 @@ impl DevicePages {
     }
 
     /// Uploads the table of pages in their slots, with the first listed row of each.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], first_listed: &[u32]) -> GpuResult<PageTable> {
         let mut first_row = 0;
         let mut entries = Vec::with_capacity(pages.len());
@@ -168,9 +161,6 @@ impl DevicePages {
     }
 
     /// Records the cull of the pages. Returns their table, their counts with a word for the sum, and the rows that were found.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub(super) fn cull(
         &self,
         gpu: &Gpu,
@@ -194,9 +184,6 @@ impl DevicePages {
     }
 
     /// Lists the rows of the pages that the camera may draw. Waits for their numbers.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn list(&self, gpu: &Gpu, view: &PagesView, pages: &[SlotPage]) -> GpuResult<(PageBatch, PageTable)> {
         let mut recorder = gpu.begin("gather");
         let (table, [counts, found]) = self.cull(gpu, &mut recorder, view, pages)?;
@@ -250,9 +237,6 @@ impl DevicePages {
     }
 
     /// Records the update of the listed rows `part` of a batch.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn update(
         &self,
         gpu: &Gpu,
@@ -296,10 +280,7 @@ impl DevicePages {
         Ok(())
     }
 
-    /// Finds the bounds of the pages of a batch and begins to read what the update did: a [`crate::kernels::page_words::PageResult`] for each. Does not wait.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
+    /// Finds the bounds of the pages of a batch and begins to read what the update did: a [`crate::kernels::uniforms::PageResult`] for each. Does not wait.
     pub fn begin_results(&self, gpu: &Gpu, source: &PageRows<'_>, results: &Buffer) -> GpuResult<Readback> {
         let mut recorder = gpu.begin("update");
         self.bounds(&mut recorder, source, results)?;
@@ -309,9 +290,6 @@ impl DevicePages {
     }
 
     /// Records the bounds of the pages of a batch.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub(super) fn bounds(&self, recorder: &mut Recorder<'_>, source: &PageRows<'_>, results: &Buffer) -> GpuResult<()> {
         let PageRows { view, table, .. } = *source;
         let uniforms = self.uniforms(view, table.pages.len());
@@ -326,9 +304,6 @@ impl DevicePages {
     }
 
     /// What decides whether a round edits rows of these pages. Waits.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn survey(&self, gpu: &Gpu, pages: &[SlotPage]) -> GpuResult<Vec<PageSurvey>> {
         let mut recorder = gpu.begin("survey");
         let table = self.table(&mut recorder, pages, &[])?;
@@ -349,9 +324,6 @@ impl DevicePages {
     }
 
     /// Clears the statistics of all rows of these pages. Does not wait.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn clear_statistics(&self, gpu: &Gpu, pages: &[SlotPage]) -> GpuResult<()> {
         let mut recorder = gpu.begin("clear statistics");
         let table = self.table(&mut recorder, pages, &[])?;
@@ -365,9 +337,6 @@ impl DevicePages {
     }
 
     /// Takes the bins and clears them. Waits.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory.
     pub fn take_bins(&self, gpu: &Gpu) -> GpuResult<Vec<u32>> {
         let mut recorder = gpu.begin("update");
         let read = recorder.read_back("update", &self.bins.view())?;

@@ -12,7 +12,7 @@ use super::gpu_frame::{Demand, FrameRoom, ListPart, splat_bytes};
 use crate::gpu::GpuResult;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{DEPTH_BINS, WEIGHED_SUMS};
+use crate::kernels::uniforms::{DEPTH_BINS, WEIGHED_SUMS};
 
 /// Device memory of a range, bytes a splat: the splat and its gradient, two pairs of keys and values of the depth sort, and
 /// counts, offsets and order.
@@ -112,9 +112,6 @@ impl Tally {
 
     /// Cuts the picture into ranges and parts of tiles within the limits. `bins_of(range, keys, bits)` counts the splats that reach
     /// the range by depth: entry k counts the keys from `keys[0] + (k << bits)` on.
-    ///
-    /// # Errors
-    /// As `bins_of`.
     pub fn plan(
         &self,
         limits: RangeLimits,

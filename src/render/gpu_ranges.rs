@@ -19,7 +19,8 @@ use super::gpu_tiles::TileStages;
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers, carry_bytes};
 use crate::gpu::{Buffer, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{DEPTH_BINS, RangeUniforms, grid_words, range_words};
+use crate::kernels::uniforms::{DEPTH_BINS, RangeUniforms, grid_words, range_words};
+use bytemuck::Zeroable;
 use std::sync::Arc;
 
 /// Invocations per workgroup of the stages on rows.
@@ -40,9 +41,6 @@ pub(super) struct RangeStages {
 
 impl RangeStages {
     /// Compiles the stages.
-    ///
-    /// # Errors
-    /// The device rejects the shader.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         let entry = |name: &str| gpu.pipeline("tile_range.wgsl", name, &[]);
         Ok(RangeStages {
@@ -82,9 +80,6 @@ pub(super) struct Ranges<'a> {
 impl Ranges<'_> {
     /// Blends the splats of `segments` in ranges of at most `bytes` bytes of device memory, or less if the device has less.
     /// Returns the ranges.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory for the smallest part of a tile's list.
     pub fn draw(&self, segments: &[Segment], bytes: u64) -> GpuResult<Vec<PlannedRange>> {
         let mut tally = self.tally(segments)?;
         let binding = self.gpu.max_binding_bytes();
@@ -105,9 +100,6 @@ impl Ranges<'_> {
 
     /// Propagates the gradient of the picture back to the splats of `segments`, which get gradients. `planned` is what
     /// [`Ranges::draw`] returned; ranges that lack memory now are cut again.
-    ///
-    /// # Errors
-    /// As [`Ranges::draw`].
     pub fn back(
         &self,
         segments: &mut [Segment],
@@ -130,7 +122,15 @@ impl Ranges<'_> {
         for segment in segments.iter() {
             let (splats, v_splats) = (segment.splats.view(), gradients_of(segment)?.view());
             let weighs = picture.errors.is_some();
-            self.tiles.finish_sums(self.gpu, &mut recorder, &splats, &v_splats, segment.rows, self.blend, weighs)?;
+            self.tiles.back.finish_sums(
+                self.gpu,
+                &mut recorder,
+                &splats,
+                &v_splats,
+                segment.rows,
+                self.blend,
+                weighs,
+            )?;
         }
         self.gpu.submit(recorder).map(|_| ())
     }
@@ -160,10 +160,8 @@ impl Ranges<'_> {
             range: range_words(range),
             segment: number as u32,
             row_count: segment.rows,
-            capacity: 0,
-            bin_bits: 0,
             depths,
-            pad: [0; 2],
+            ..RangeUniforms::zeroed()
         }
     }
 
@@ -331,7 +329,7 @@ impl Ranges<'_> {
         let sums = gpu.buffer("sums of a range", splat_bytes(planned.rows))?;
         self.gather(&mut recorder, segments, planned, &places, gradients_of, &sums)?;
         let (into, of_splats, of_sums) = (&mut recorder, splats.view(), sums.view());
-        self.tiles.backward(
+        self.tiles.back.backward(
             gpu,
             into,
             &of_splats,

@@ -29,9 +29,9 @@ use super::pages::{RecordedUpdate, StepDone, StepJob};
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, GpuResult, Readback, Recorder, groups_1d};
 use crate::kernels::gate::{GateUniforms, StepVerdict};
-use crate::kernels::page_words::PageResult;
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
+use crate::kernels::uniforms::PageResult;
 use bytemuck::Zeroable;
 
 /// Submits rows, lists and picture of a step.
@@ -76,7 +76,7 @@ pub(super) fn back_and_update(
     let needs = || RenderError::OutOfOrder { call: "record_update", needs: "record_picture" };
     let (tiles_back, columns) = (view.tiles_back.take().ok_or_else(needs)?, view.columns.take().ok_or_else(needs)?);
     let mut recorder = stages.gpu.resume(tiles_back);
-    let unusable = stages.tiles.unusable(&mut recorder, &view.segments, view.blend())?;
+    let unusable = stages.tiles.back.unusable(&mut recorder, &view.segments, view.blend())?;
     let verdict = decide(&mut recorder, (held, records), &view, &unusable, update)?;
     let (batch, segment) = (of_view.batches.first().ok_or_else(needs)?, view.segments.first().ok_or_else(needs)?);
     let source = held.source(of_view, batch, &records.table);

@@ -52,9 +52,6 @@ pub struct DeviceColumns {
 
 impl DeviceColumns {
     /// Allocates `rows` rows with the bands 1 to `sh_degree`, uninitialised.
-    ///
-    /// # Errors
-    /// Device memory or its budget is exhausted.
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
         let column = |label, width: usize| gpu.buffer(label, 4 * width as u64 * u64::from(rows));
         let band_labels = ["sh1", "sh2", "sh3"];
@@ -83,9 +80,6 @@ impl DeviceColumns {
     }
 
     /// Uploads means, quats, scales and opacities of the rows `part`, which are `self.rows` rows.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn upload_geometry(&self, recorder: &mut Recorder<'_>, rows: &Columns, part: &Range<usize>) -> GpuResult<()> {
         recorder.upload(&self.means.view(), &rows.means[3 * part.start..3 * part.end])?;
         recorder.upload(&self.quats.view(), &rows.quats[4 * part.start..4 * part.end])?;
@@ -95,9 +89,6 @@ impl DeviceColumns {
 
     /// Uploads the colours of the rows `part`, which are `self.rows` rows with at least the bands in use. `scratch` holds one
     /// band at a time.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn upload_colors(
         &self,
         recorder: &mut Recorder<'_>,
@@ -153,9 +144,6 @@ pub trait RowSource {
 
     /// Records what fills means, quats, scales and opacities of `columns` with the rows `part` of the batch, and
     /// perhaps the colours.
-    ///
-    /// # Errors
-    /// The device failed.
     fn geometry(
         &mut self,
         gpu: &Gpu,
@@ -165,9 +153,6 @@ pub trait RowSource {
     ) -> GpuResult<()>;
 
     /// Records what fills the colours, if [`RowSource::geometry`] has not.
-    ///
-    /// # Errors
-    /// The device failed.
     fn colors(&mut self, recorder: &mut Recorder<'_>, columns: &DeviceColumns, part: &Range<usize>) -> GpuResult<()>;
 }
 
@@ -269,9 +254,6 @@ pub struct RowStages {
 
 impl RowStages {
     /// Compiles the stages.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
         let sh = |shader: &str, entry: &str, degree: usize| gpu.pipeline(shader, entry, &defines[..degree]);
@@ -288,18 +270,12 @@ impl RowStages {
     }
 
     /// Compiles what [`RowStages::project_bwd`] needs to pass weights on.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
         self.project_bwd_weighing = Some(gpu.pipeline("project_bwd.wgsl", "project_bwd", &WEIGHS)?);
         Ok(())
     }
 
     /// Records the footprints of all rows into `splats`, with colours 0.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn project_fwd(
         &self,
         gpu: &Gpu,
@@ -319,9 +295,6 @@ impl RowStages {
     }
 
     /// Records the colours of the visible rows into `splats`, from the bands up to `sh_degree`.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn sh_fwd(
         &self,
         gpu: &Gpu,
@@ -345,9 +318,6 @@ impl RowStages {
     }
 
     /// Records the gradients of sh0, of the bands up to `sh_degree`, and the colour's part of the gradients of means.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn sh_bwd(
         &self,
         gpu: &Gpu,
@@ -376,9 +346,6 @@ impl RowStages {
     /// Records the gradients of quats, scales and opacities, adds the projection's part to the gradients of means, and
     /// records `footprints` ([`footprint_bytes`] per row), with weights if `weighs`, which needs
     /// [`RowStages::weigh_rows`].
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn project_bwd(
         &self,
         gpu: &Gpu,

@@ -49,9 +49,6 @@ pub(super) fn in_chunks(rows: usize, mut stage: impl FnMut(Range<usize>) -> GpuR
 }
 
 /// Submits gathering, projection and colours of the rows of a batch, which begins at row `first` of the view. Does not wait.
-///
-/// # Errors
-/// The device failed, or has no memory for the splats or the smallest chunk.
 pub(super) fn submit_rows(
     gpu: &Gpu,
     stages: &RowStages,
@@ -94,9 +91,6 @@ fn submit_chunk(
 }
 
 /// Allocates and zeroes the gradients of the splats.
-///
-/// # Errors
-/// The device failed, or has no memory for the gradients.
 pub(super) fn zero_gradients(gpu: &Gpu, segments: &mut [Segment]) -> GpuResult<()> {
     let mut recorder = gpu.begin("backward");
     for segment in segments {
@@ -107,9 +101,6 @@ pub(super) fn zero_gradients(gpu: &Gpu, segments: &mut [Segment]) -> GpuResult<(
 }
 
 /// The gradients of the splats of a segment.
-///
-/// # Errors
-/// The segment has none: a bug of the caller.
 pub(super) fn gradients_of(segment: &Segment) -> GpuResult<&Buffer> {
     segment.v_splats.as_ref().ok_or_else(|| GpuError::Bindings {
         stage: "backward".into(),

@@ -56,9 +56,6 @@ impl Slots {
     }
 
     /// Makes up to `wanted` slots in slabs as large as one binding allows; returns how many the device had memory for.
-    ///
-    /// # Errors
-    /// The device failed, or a slot does not exist.
     pub fn add(&mut self, gpu: &Gpu, wanted: usize) -> GpuResult<usize> {
         let most = (gpu.max_binding_bytes() / self.slot_bytes).max(1) as usize;
         let (mut added, mut next) = (0, wanted.min(most));
@@ -85,9 +82,6 @@ impl Slots {
     }
 
     /// All bytes of a slab.
-    ///
-    /// # Errors
-    /// The device failed, or a slot does not exist.
     pub fn slab(&self, slab: u32) -> GpuResult<BufferView> {
         self.slabs.get(slab as usize).map(|slab| slab.buffer.view()).ok_or_else(no_such_slot)
     }
@@ -100,9 +94,6 @@ impl Slots {
     }
 
     /// Copies payloads into slots. Does not wait.
-    ///
-    /// # Errors
-    /// The device failed, or a slot does not exist.
     pub fn write(&self, gpu: &Gpu, payloads: &[(DeviceSlot, &[u8])]) -> GpuResult<()> {
         let mut recorder = gpu.begin("pages");
         for (slot, payload) in payloads {
@@ -112,9 +103,6 @@ impl Slots {
     }
 
     /// Copies slots into payloads, as many at once as staging should hold. Waits.
-    ///
-    /// # Errors
-    /// The device failed, or a slot does not exist.
     pub fn read(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
         let mut at_once = (READ_BYTES / self.slot_bytes).max(1) as usize;
         let mut rest = payloads;
@@ -131,9 +119,6 @@ impl Slots {
 
     /// Begins to read slots, each with the bytes of its payload; returns how many, from the first: those that memory allows. Does not
     /// wait.
-    ///
-    /// # Errors
-    /// The device failed, or a slot does not exist.
     pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[(DeviceSlot, usize)]) -> GpuResult<usize> {
         let reading = self.under_way.len() as u64 * self.slot_bytes;
         let most = UNDER_WAY_BYTES.saturating_sub(reading).min(gpu.room() / READ_SHARE) / self.slot_bytes;
@@ -151,9 +136,6 @@ impl Slots {
     }
 
     /// Ends the reads that began first, into the payloads of the same slots. Waits for them alone.
-    ///
-    /// # Errors
-    /// The device failed, or other slots were begun.
     pub fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
         let count = payloads.len().min(self.under_way.len());
         let ending: Vec<(DeviceSlot, Readback)> = self.under_way.drain(..count).collect();

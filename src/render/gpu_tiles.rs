@@ -9,12 +9,14 @@
 //! the longest list so far, and a frame with a longer list is recorded again; 3. the order of every sum is fixed, so
 //! the same input gives the same bits on one device.
 
-use super::gpu_frame::{Blend, Demand, DemandReadback, Frame, FrameRoom, ListPart, Pairs, Pixels, Ranks, words};
-use super::gpu_rows::WEIGHS;
+use super::gpu_frame::{
+    Blend, Demand, DemandReadback, Frame, FrameRoom, ListPart, Pairs, Pixels, Ranks, raster_uniforms, words,
+};
+use super::gpu_tiles_bwd::BackStages;
 use crate::gpu::{BufferView, Gpu, GpuError, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{
+use crate::kernels::uniforms::{
     DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_BWD, SEGMENT_FIRST,
     SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, ScanUniforms, SortUniforms, grid_words, range_words,
 };
@@ -30,9 +32,9 @@ const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
 /// Capacities of frames whose demand nobody waits for are multiples of this: few sizes of buffers.
 const LIST_STEP: u32 = 1 << 10;
 
-/// The compiled tile stages, forward and backward.
+/// The compiled tile stages of the forward pass.
 #[derive(Debug)]
-pub(super) struct Pipelines {
+struct Pipelines {
     scan_reduce: Arc<Pipeline>,
     scan: Arc<Pipeline>,
     radix_histogram: Arc<Pipeline>,
@@ -42,24 +44,14 @@ pub(super) struct Pipelines {
     isect_emit: Arc<Pipeline>,
     isect_offsets: Arc<Pipeline>,
     rasterize_fwd: Arc<Pipeline>,
-    pub(super) rasterize_bwd: Arc<Pipeline>,
-    pub(super) fold_rows: Arc<Pipeline>,
-    pub(super) count_unusable: Arc<Pipeline>,
-    /// The two stages that collect weights; `None` before [`TileStages::weigh_rows`].
-    pub(super) weighing: Option<Weighing>,
-}
-
-/// The stages of the backward pass that collect weights besides gradients.
-#[derive(Debug)]
-pub(super) struct Weighing {
-    pub rasterize_bwd: Arc<Pipeline>,
-    pub fold_rows: Arc<Pipeline>,
 }
 
 /// The tile stages of one device, and the buffer sizes for the next frame.
 #[derive(Debug)]
 pub struct TileStages {
-    pub(super) pipelines: Pipelines,
+    pipelines: Pipelines,
+    /// The backward pass.
+    pub back: BackStages,
     /// Sizes of the next frame.
     room: FrameRoom,
     /// The most that a frame has needed so far; `None` before the first.
@@ -70,9 +62,6 @@ pub struct TileStages {
 
 impl TileStages {
     /// Compiles the stages.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
     pub fn new(gpu: &Gpu) -> GpuResult<TileStages> {
         let get = |stage: &str, entry: &str| gpu.pipeline(&format!("{stage}.wgsl"), entry, &[]);
         let pipelines = Pipelines {
@@ -85,29 +74,15 @@ impl TileStages {
             isect_emit: get("isect_emit", "isect_emit")?,
             isect_offsets: get("isect_offsets", "isect_offsets")?,
             rasterize_fwd: get("rasterize_fwd", "rasterize_fwd")?,
-            rasterize_bwd: get("rasterize_bwd", "rasterize_bwd")?,
-            fold_rows: get("rasterize_bwd", "fold_rows")?,
-            count_unusable: get("rasterize_bwd", "count_unusable")?,
-            weighing: None,
         };
         let binding_words = u32::try_from(gpu.max_binding_bytes() / 4).unwrap_or(u32::MAX);
         Ok(TileStages {
             pipelines,
+            back: BackStages::new(gpu)?,
             room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD },
             seen: None,
             binding_words,
         })
-    }
-
-    /// Compiles what the backward pass needs to collect weights.
-    ///
-    /// # Errors
-    /// The device rejects a shader.
-    pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
-        let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &WEIGHS);
-        let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
-        self.pipelines.weighing = Some(Weighing { rasterize_bwd, fold_rows });
-        Ok(())
     }
 
     /// Sizes of the next frame of a whole view, as earlier frames needed them.
@@ -143,9 +118,6 @@ impl TileStages {
 
     /// Records the exclusive prefix sum of `count` words into `offsets` (`count` + 1 words; the last is the total).
     /// Sums saturate: a total of 2^32 - 1 means 2^32 - 1 or more.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn scan(
         &self,
         gpu: &Gpu,
@@ -173,9 +145,6 @@ impl TileStages {
 
     /// Records a stable radix sort of `pairs` by the low `bits` bits of the keys. Word `live_at` of the buffer `live`
     /// holds the number of pairs, at most `capacity`. Returns the sorted pairs.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn sort(
         &self,
         gpu: &Gpu,
@@ -218,9 +187,6 @@ impl TileStages {
 
     /// Records the depth sort of the rows and the offsets of their intersections with the tiles of `range`. `splats` holds
     /// `rows` records.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn order(
         &self,
         gpu: &Gpu,
@@ -255,9 +221,6 @@ impl TileStages {
 
     /// Records the lists of the tiles of `range`, with buffers of the sizes `room`. The lists are complete if the demand of
     /// the frame is within `room`.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn lists(
         &self,
         gpu: &Gpu,
@@ -309,9 +272,6 @@ impl TileStages {
 
     /// Records the tile lists and the blending of a whole view, with buffers as large as earlier frames needed. The picture
     /// is valid if [`TileStages::fits`] is true for the demand that the readback returns.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn frame(
         &self,
         gpu: &Gpu,
@@ -329,9 +289,6 @@ impl TileStages {
     }
 
     /// As [`TileStages::frame`], with buffers of the sizes `room`, and without reading the demand.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub(super) fn frame_of(
         &self,
         gpu: &Gpu,
@@ -347,9 +304,6 @@ impl TileStages {
     }
 
     /// Records the blending of the tiles of a frame.
-    ///
-    /// # Errors
-    /// The device failed.
     pub fn blend(
         &self,
         recorder: &mut Recorder<'_>,
@@ -406,33 +360,5 @@ impl TileStages {
             self.room.list_max = self.room.list_max.max(demand.list_max.next_multiple_of(SEGMENT_FWD));
         }
         Ok(room && reached)
-    }
-}
-
-/// Uniforms of one rasterizer dispatch over the list entries [`length` * `segment`, `length` * (`segment` + 1)).
-pub(super) fn raster_uniforms(
-    blend: &Blend,
-    range: TileRange,
-    segment: u32,
-    length: u32,
-    flags: u32,
-) -> RasterUniforms {
-    RasterUniforms {
-        grid: grid_words(blend.grid),
-        background: blend.background,
-        max_alpha: blend.max_alpha,
-        log2_max_alpha: libm::log2f(blend.max_alpha),
-        first: segment.saturating_mul(length),
-        end: segment.saturating_add(1).saturating_mul(length),
-        flags,
-        row_count: 0,
-        isect_count: 0,
-        window_first: 0,
-        window_end: 0,
-        range: range_words(range),
-        list_base: 0,
-        pad0: 0,
-        pad1: 0,
-        pad2: 0,
     }
 }

@@ -6,16 +6,17 @@
 //! size; 2. the same holds for ranges of tiles ([`Fold::Range`]), whose rows continue the sums of the ranges before; 3. the
 //! order of every sum is fixed; 4. collecting weights changes no bit of the gradients, and costs nothing when it is off.
 
-use super::gpu_frame::{Blend, Demand, Frame, Pixels, Ranks};
+use super::gpu_frame::{Blend, Demand, Frame, Pixels, Ranks, raster_uniforms};
+use super::gpu_rows::WEIGHS;
 use super::gpu_segments::{Segment, gradients_of};
-use super::gpu_tiles::{TileStages, Weighing, raster_uniforms};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::tile_range::TileRange;
-use crate::kernels::uniforms_tiles::{
+use crate::kernels::uniforms::{
     FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
     SEGMENT_FIRST, SEGMENT_LAST, SUMS, WEIGHED_FOLD_ROWS, WEIGHED_SUMS,
 };
 use std::ops::Range;
+use std::sync::Arc;
 
 /// Gradient of the picture on the device: the input of the backward pass.
 #[derive(Debug, Clone, Copy)]
@@ -24,7 +25,7 @@ pub struct PictureGradientBuffers<'a> {
     pub v_rgb: &'a BufferView,
     /// `[height][width]` f32; `None` stands for zeros.
     pub v_alpha: Option<&'a BufferView>,
-    /// `[height][width]` f32: the error of each pixel; `None` if the rows are not weighed. Needs [`TileStages::weigh_rows`].
+    /// `[height][width]` f32: the error of each pixel; `None` if the rows are not weighed. Needs [`BackStages::weigh_rows`].
     pub errors: Option<&'a BufferView>,
 }
 
@@ -64,32 +65,47 @@ pub fn carry_bytes(pixels: &Pixels) -> u64 {
 }
 
 /// The stages of a backward pass, with or without weights.
-struct BackStages<'a> {
-    rasterize_bwd: &'a Pipeline,
-    fold_rows: &'a Pipeline,
-    sums: u32,
+#[derive(Debug)]
+struct Sums {
+    rasterize_bwd: Arc<Pipeline>,
+    fold_rows: Arc<Pipeline>,
+    /// Sums of an intersection.
+    count: u32,
     rows_per_group: u32,
 }
 
-impl TileStages {
-    fn back_stages(&self, weighs: bool) -> BackStages<'_> {
-        let of = &self.pipelines;
-        match of.weighing.as_ref().filter(|_| weighs) {
-            Some(Weighing { rasterize_bwd, fold_rows }) => {
-                BackStages { rasterize_bwd, fold_rows, sums: WEIGHED_SUMS, rows_per_group: WEIGHED_FOLD_ROWS }
-            }
-            None => {
-                let (rasterize_bwd, fold_rows) = (&*of.rasterize_bwd, &*of.fold_rows);
-                BackStages { rasterize_bwd, fold_rows, sums: SUMS, rows_per_group: FOLD_ROWS }
-            }
-        }
+/// The compiled tile stages of the backward pass.
+#[derive(Debug)]
+pub struct BackStages {
+    plain: Sums,
+    /// `None` before [`BackStages::weigh_rows`].
+    weighing: Option<Sums>,
+    count_unusable: Arc<Pipeline>,
+}
+
+impl BackStages {
+    /// Compiles the stages.
+    pub(super) fn new(gpu: &Gpu) -> GpuResult<BackStages> {
+        let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &[]);
+        let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
+        let plain = Sums { rasterize_bwd, fold_rows, count: SUMS, rows_per_group: FOLD_ROWS };
+        Ok(BackStages { plain, weighing: None, count_unusable: get("count_unusable")? })
     }
 
-    /// Records the gradients of the splats into `v_splats`, one record per row. [`TileStages::fits`] must be true for
+    /// Compiles what the backward pass needs to collect weights.
+    pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
+        let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &WEIGHS);
+        let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
+        self.weighing = Some(Sums { rasterize_bwd, fold_rows, count: WEIGHED_SUMS, rows_per_group: WEIGHED_FOLD_ROWS });
+        Ok(())
+    }
+
+    fn stages(&self, weighs: bool) -> &Sums {
+        self.weighing.as_ref().filter(|_| weighs).unwrap_or(&self.plain)
+    }
+
+    /// Records the gradients of the splats into `v_splats`, one record per row. [`super::gpu_tiles::TileStages::fits`] must be true for
     /// `frame` and `demand`.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn backward(
         &self,
         gpu: &Gpu,
@@ -104,8 +120,8 @@ impl TileStages {
         fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
-        let stages = self.back_stages(picture.errors.is_some());
-        let isect_bytes = 4 * u64::from(stages.sums);
+        let stages = self.stages(picture.errors.is_some());
+        let isect_bytes = 4 * u64::from(stages.count);
         let (own_carry, partials, window);
         let carry = match fold {
             Fold::Part(carry) => {
@@ -140,7 +156,7 @@ impl TileStages {
                 v_splats.clone(),
             ];
             let groups = groups_1d(ranks.rows, stages.rows_per_group);
-            recorder.dispatch("rasterize_bwd", stages.fold_rows, &views, groups)?;
+            recorder.dispatch("rasterize_bwd", &stages.fold_rows, &views, groups)?;
             first = isects.end;
             if first >= demand.isects {
                 return Ok(());
@@ -178,15 +194,12 @@ impl TileStages {
             ];
             views.extend(errors.cloned());
             let groups = groups_1d(frame.range.tiles(), 1);
-            recorder.dispatch("rasterize_bwd", self.back_stages(errors.is_some()).rasterize_bwd, &views, groups)?;
+            recorder.dispatch("rasterize_bwd", &self.stages(errors.is_some()).rasterize_bwd, &views, groups)?;
         }
         Ok(())
     }
 
     /// Records the conversion of the sums of `rows` rows to gradients, after the last range of tiles.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     pub fn finish_sums(
         &self,
         gpu: &Gpu,
@@ -197,7 +210,7 @@ impl TileStages {
         blend: Blend,
         weighs: bool,
     ) -> GpuResult<()> {
-        let stages = self.back_stages(weighs);
+        let stages = self.stages(weighs);
         // Bound in place of the lists that the stage does not read.
         let (no_list, no_sums) = (gpu.buffer("no list", 4)?.view(), gpu.buffer("no sums", 4)?.view());
         let flags = FOLD_CARRIED | FOLD_WITHOUT_LISTS;
@@ -205,14 +218,11 @@ impl TileStages {
         fold.row_count = rows;
         let uniform = recorder.uniform(&fold)?;
         let views = [uniform, splats.clone(), no_list.clone(), no_sums, no_list.clone(), no_list, v_splats.clone()];
-        recorder.dispatch("rasterize_bwd", stages.fold_rows, &views, groups_1d(rows, stages.rows_per_group))
+        recorder.dispatch("rasterize_bwd", &stages.fold_rows, &views, groups_1d(rows, stages.rows_per_group))
     }
 
     /// Records the count of the rows of all segments with unusable gradients, as
     /// [`crate::render::Renderer::unusable_splats`] defines them, into one u32.
-    ///
-    /// # Errors
-    /// A segment has no gradients, or device memory is exhausted.
     pub(super) fn unusable(
         &self,
         recorder: &mut Recorder<'_>,
@@ -225,7 +235,7 @@ impl TileStages {
             uniform.row_count = segment.rows;
             let views = [recorder.uniform(&uniform)?, gradients_of(segment)?.view(), unusable.view()];
             let groups = groups_1d(segment.rows, crate::gpu::WORKGROUP);
-            recorder.dispatch("rasterize_bwd", &self.pipelines.count_unusable, &views, groups)?;
+            recorder.dispatch("rasterize_bwd", &self.count_unusable, &views, groups)?;
         }
         Ok(unusable)
     }

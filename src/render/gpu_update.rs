@@ -15,7 +15,7 @@ use super::gpu_view::View;
 use super::pages::SlotPage;
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, GpuResult, Recorder};
-use crate::kernels::page_words::PageResult;
+use crate::kernels::uniforms::PageResult;
 use std::ops::Range;
 
 /// Updates the pages of a batch in their slots and begins to read what that did to them. Does not wait.

@@ -116,15 +116,6 @@ mod tests {
     }
 
     #[test]
-    fn a_uniform_offset_has_the_psnr_of_its_square() {
-        let target = Target { width: 12, height: 11, rgb: vec![51; 3 * 132], mask: None };
-        let mut image = Image::new(12, 11);
-        image.rgb.fill(0.3);
-        // 0.3 is rounded to f32: 3e-8 relative to the difference 0.1, which is 3e-6 dB.
-        assert!((psnr(&image, &target) - 20.0).abs() < 1e-5);
-    }
-
-    #[test]
     fn masked_pixels_do_not_matter_and_nan_shows() {
         let (mut image, mut target) = gradient_pair(23, 14);
         image.rgb[40] = 0.9;
@@ -142,11 +133,5 @@ mod tests {
         assert!(SsimVariant::ALL.iter().all(|&v| ssim(&image, &target, v, SimdPath::best()).is_nan()));
         target.mask = Some(vec![0; 23 * 14]);
         assert!(psnr(&image, &target).is_nan() && ssim(&image, &target, SsimVariant::Same, SimdPath::best()).is_nan());
-    }
-
-    #[test]
-    fn the_mean_weighs_views_alike() {
-        assert_eq!(mean(&[20.0, 30.0]), 25.0);
-        assert!(mean(&[]).is_nan());
     }
 }

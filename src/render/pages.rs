@@ -7,11 +7,10 @@
 //! batches or the room for them.
 
 use super::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
-use crate::kernels::page_words::{PageResult, PageSurvey};
-use crate::kernels::uniforms_pages::SplitNumbers;
+use crate::kernels::uniforms::{PageResult, PageSurvey};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
-use crate::scene::optimizer_numbers::{RunNumbers, StepNumbers};
+use crate::scene::optimizer_numbers::{RunNumbers, SplitLimits, StepNumbers};
 use crate::scene::page_layout::PageLayout;
 
 /// A place on a device for the payload of one page.
@@ -35,7 +34,7 @@ pub struct PageRules {
     /// The optimizer.
     pub numbers: RunNumbers,
     /// Limits within which rows may split.
-    pub splits: SplitNumbers,
+    pub splits: SplitLimits,
     /// Whether steps may weigh rows ([`Renderer::weigh_rows`]).
     pub weighs: bool,
 }

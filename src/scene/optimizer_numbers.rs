@@ -42,3 +42,19 @@ pub struct StepNumbers {
     /// 1 / sqrt(1 - beta2^t).
     pub inv_root_correction: f32,
 }
+
+/// The lowest thresholds for splitting that any round of the run can have.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SplitLimits {
+    /// Rows grow only above this mean gradient norm.
+    pub grow_grad2d: f32,
+    /// Growing rows split only above this largest standard deviation.
+    pub split_scale: f32,
+    /// Largest distance of a child's mean from its parent's, in the parent's largest standard deviation.
+    pub reach: f32,
+}
+
+impl SplitLimits {
+    /// For a run without rounds.
+    pub const NEVER: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
+}

@@ -11,8 +11,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::gpu::{Buffer, Gpu, GpuOptions};
 use gsscale::kernels::deferred::DeferredTables;
-use gsscale::kernels::page_words::{DevicePage, PageResult};
-use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
+use gsscale::kernels::uniforms::{DevicePage, GatherUniforms, PageResult, UpdateUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
@@ -21,6 +20,7 @@ use gsscale::render::gpu_rows::{DeviceColumns, RowSource, footprint_bytes};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
 
@@ -30,7 +30,7 @@ const PERIODS: [u32; 12] = [1, 1, 2, 3, 7, 40, 199, 201, 399, 401, 3000, 20_000]
 const ROWS: usize = PERIODS.len();
 /// Values are compared once in so many steps: a prime, so that every row is met at many ages.
 const CHECKED: u32 = 997;
-const SPLITS: SplitNumbers = SplitNumbers { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
+const SPLITS: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scale: f32::INFINITY, reach: 0.0 };
 
 /// Sees all rows, which move some units at most.
 fn camera() -> Camera {

@@ -2,31 +2,30 @@
 //! struct layouts and constants equal those of the Rust side. All failures are reported at once.
 
 use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
-use gsscale::kernels::uniforms::{LossUniforms, RowsUniforms};
-use gsscale::kernels::{constants, gate, page_words, uniforms_pages, uniforms_tiles};
+use gsscale::kernels::{constants, gate, uniforms};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use wgpu::naga;
 
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
 const LAYOUTS: &[&[StructLayout]] = &[
-    &[RowsUniforms::LAYOUT, LossUniforms::LAYOUT],
+    &[uniforms::RowsUniforms::LAYOUT, uniforms::LossUniforms::LAYOUT],
     &[
-        page_words::DevicePage::LAYOUT,
-        page_words::PageResult::LAYOUT,
-        page_words::PageSurvey::LAYOUT,
-        uniforms_pages::GatherUniforms::LAYOUT,
-        uniforms_pages::UpdateUniforms::LAYOUT,
+        uniforms::DevicePage::LAYOUT,
+        uniforms::PageResult::LAYOUT,
+        uniforms::PageSurvey::LAYOUT,
+        uniforms::GatherUniforms::LAYOUT,
+        uniforms::UpdateUniforms::LAYOUT,
         gate::GateUniforms::LAYOUT,
         gate::StepVerdict::LAYOUT,
     ],
     &[
-        uniforms_tiles::ScanUniforms::LAYOUT,
-        uniforms_tiles::SortUniforms::LAYOUT,
-        uniforms_tiles::IsectUniforms::LAYOUT,
-        uniforms_tiles::OffsetsUniforms::LAYOUT,
-        uniforms_tiles::RasterUniforms::LAYOUT,
-        uniforms_tiles::RangeUniforms::LAYOUT,
+        uniforms::ScanUniforms::LAYOUT,
+        uniforms::SortUniforms::LAYOUT,
+        uniforms::IsectUniforms::LAYOUT,
+        uniforms::OffsetsUniforms::LAYOUT,
+        uniforms::RasterUniforms::LAYOUT,
+        uniforms::RangeUniforms::LAYOUT,
     ],
 ];
 

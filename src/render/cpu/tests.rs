@@ -1,6 +1,5 @@
 //! Tests of the stages together: batches, ranges, threads and instruction paths give the same bits.
 
-use super::memory::{CROWDED_ROW_BYTES, LIST_BYTES};
 use super::*;
 use crate::base::rng::{Purpose, Stream};
 use crate::kernels::image_loss::SsimPadding;
@@ -218,17 +217,6 @@ fn stages_out_of_order_are_errors_and_change_nothing() {
     renderer.rows_out(0, &rows, &mut grads).unwrap();
     renderer.picture_gradient().unwrap().v_alpha = Some(Vec::new());
     assert_eq!(renderer.picture_back(), Err(RenderError::GradientSize { pixels: 40 * 30 }));
-}
-
-#[test]
-fn avx2_and_avx512_agree_to_the_bit() {
-    if !SimdPath::Avx512.is_supported() {
-        crate::tell!("SKIPPED: this machine has no AVX-512");
-        return;
-    }
-    let (rows, camera) = scene(3000, 100, 60);
-    let wide = render_bits(&rows, &camera, SimdPath::Avx512, 1);
-    assert!(wide == render_bits(&rows, &camera, SimdPath::Avx2, 1));
 }
 
 #[test]

@@ -21,7 +21,7 @@ use crate::base::ids::PageNo;
 use crate::base::trace;
 use crate::densify::replay::PageFacts;
 use crate::densify::strategy::Extremes;
-use crate::kernels::page_words::PageSurvey;
+use crate::kernels::uniforms::PageSurvey;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::SlotPage;
 use crate::render::{Renderer, none_if_out_of_memory};

@@ -13,7 +13,7 @@ use super::device_tier::DeviceTier;
 use super::pages::PagedScene;
 use super::working_set::WorkingSet;
 use crate::base::ids::PageNo;
-use crate::kernels::page_words::PageResult;
+use crate::kernels::uniforms::PageResult;
 use crate::paging::pinned::PinnedPage;
 use crate::render::Renderer;
 use crate::scene::camera::Camera;

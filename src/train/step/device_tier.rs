@@ -5,8 +5,6 @@
 use super::device_flights::Flights;
 use super::device_slots::{SlotCache, SlotTraffic, device_of, slots_in};
 use super::pages::PagedScene;
-use crate::kernels::uniforms_pages::SplitNumbers;
-use crate::optim::bounds::SplitLimits;
 use crate::optim::one_step::OneStep;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::render::pages::PageRules;
@@ -29,8 +27,7 @@ impl DeviceTier {
         let name = renderer.name();
         let numbers = scene.rules.adam.numbers(steps);
         let numbers = numbers.ok_or(TrainError::Render(RenderError::NoPages { backend: name }))?;
-        let SplitLimits { grow_grad2d, split_scale, reach } = *scene.rules.splits();
-        let splits = SplitNumbers { grow_grad2d, split_scale, reach };
+        let splits = *scene.rules.splits();
         let flights = Flights::new(OneStep::new(&numbers, scene.rules.splits()));
         let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;

@@ -5,12 +5,12 @@ use crate::twins::{self, gather};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, groups_1d};
 use gsscale::kernels::gate::{self, GateUniforms, StepVerdict};
-use gsscale::kernels::page_words::DevicePage;
-use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers};
+use gsscale::kernels::uniforms::{DevicePage, GatherUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::scene::camera::Camera;
+use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::PageLayout;
 
 /// A step within all limits, and its limits.
@@ -105,7 +105,7 @@ fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
         near_plane: 0.01,
         far_plane: 1e10,
     };
-    let splits = SplitNumbers { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
+    let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
     let layout = PageLayout { rows: 40, sh_degree: 0 };
     for (count, room) in [(1u32, 64u32), (700, 16_000), (700, 9000), (256, 1)] {
         let mut draws = Stream::new(3, Purpose::Test, u64::from(count), 0);

@@ -13,8 +13,7 @@ use gsscale::base::simd::SimdPath;
 use gsscale::densify::stats::{GradHistogram, WEIGHED_VIEWS};
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, Source, groups_1d};
 use gsscale::kernels::deferred::DeferredTables;
-use gsscale::kernels::page_words::{DevicePage, PageResult, PageSurvey};
-use gsscale::kernels::uniforms_pages::{GatherUniforms, SplitNumbers, UpdateUniforms};
+use gsscale::kernels::uniforms::{DevicePage, GatherUniforms, PageResult, PageSurvey, UpdateUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
@@ -24,6 +23,7 @@ use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, footprint
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use gsscale::scene::rows::{RowsNow, mean_grad2d};
 use gsscale::scene::sightings::{mean_weight, views, with_view};
@@ -32,7 +32,7 @@ use gsscale::scene::state::SceneState;
 const STEPS: u32 = 900;
 /// Rows of the pages: one, below, at and above a workgroup, several workgroups.
 const PAGES: [usize; 5] = [1, 255, 256, 600, 64];
-const SPLITS: SplitNumbers = SplitNumbers { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
+const SPLITS: SplitLimits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
 
 fn adam() -> DeferredAdam {
     DeferredAdam::new(Rates::new(1.0, STEPS), AdamConfig::default(), SimdPath::best())

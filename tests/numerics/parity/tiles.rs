@@ -279,7 +279,7 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let (from, to) = (splats.view(), v_splats.view());
     let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref(), errors: None };
     let (into, fold) = (&mut recorder, Fold::Whole);
-    stages.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, &to, fold).unwrap();
+    stages.back.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, &to, fold).unwrap();
     let read = [
         &ranks.order,
         &frame.row_from_isect,

@@ -2,7 +2,7 @@
 //!
 //! Invariant: places are functions of (rows, degree) alone.
 
-use gsscale::kernels::page_words::DevicePage;
+use gsscale::kernels::uniforms::DevicePage;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::page_layout::{TABLE_ALIGNMENT, capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
