@@ -57,7 +57,7 @@ fn threads_do_not_change_a_bit() {
     }
 }
 
-fn part(rows: &Columns, place: std::ops::Range<usize>) -> Columns {
+fn part(rows: &Columns, place: Range<usize>) -> Columns {
     let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
     for column in Column::ALL {
         let width = column.width(rows.sh_degree);
