@@ -104,7 +104,7 @@ fn scene(rows: usize, adam: &DeferredAdam) -> SceneState {
                 *g = (draws.normal() * libm::pow(10.0, -draws.range(0.0, 16.0))) as f32;
             });
         }
-        take_step(&adam, &mut state, &listed, &grads, step);
+        take_step(adam, &mut state, &listed, &grads, step);
     }
     state
 }
