@@ -90,7 +90,7 @@
 //!    a [`photos::parameter::PhotoParameter`]; its [`photos::parameter::Kind`] names it for commits. What the report shows of it: `report/photo_sections.rs`.
 //!    The trait's methods come in the order of a step; what is left out does nothing. Steps, the rehearsal, commits, resumes, the
 //!    forecast, `summary.json` and the report follow. `photos/appearance` acts on pictures, `photos/poses` on
-//!    cameras, `photos/outliers/masked.rs` on photos.
+//!    cameras, `photos/masked_blocks.rs` on photos.
 //! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
 //! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!

@@ -4,7 +4,7 @@
 
 use super::chart::{Chart, Mark};
 use super::html::{Cell, Page};
-use super::run_files::{POINTS_MAX, read_json};
+use super::run_report::{POINTS_MAX, read_json};
 use serde_json::Value;
 use std::path::Path;
 

@@ -1,10 +1,7 @@
 //! The files in the output folder of a run: names, kinds, and the part of a run that each belongs to.
 //!
-//! Not here: what they say, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
+//! Not here: their content, and the checkpoint, whose folder `config` names. [`RUN_FILES`] is the one list: whoever writes
 //! another file into the folder adds it, and so it is removed with the rest when a run replaces an earlier one.
-
-use serde_json::Value;
-use std::path::Path;
 
 /// Every setting of the run, with the facts resolved at its start. A folder without it is not a run's.
 pub const CONFIG_FILE: &str = "config.toml";
@@ -91,21 +88,6 @@ pub fn saved_ply_name(step: u32) -> String {
 pub fn is_saved_ply(name: &str) -> bool {
     let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
     step.is_some_and(|step| step.len() >= 6 && step.bytes().all(|b| b.is_ascii_digit()))
-}
-
-/// Size limit of a text file, bytes.
-const TEXT_BYTES_MAX: u64 = 256 << 20;
-/// Most points of a curve.
-pub const POINTS_MAX: usize = 600;
-
-pub(super) fn read_text(path: &Path) -> Option<String> {
-    let len = std::fs::metadata(path).ok()?.len();
-    (len <= TEXT_BYTES_MAX).then(|| std::fs::read_to_string(path).ok())?
-}
-
-/// A file of a run; `None` if it is missing, too large, or no JSON.
-pub fn read_json(path: &Path) -> Option<Value> {
-    serde_json::from_str(&read_text(path)?).ok()
 }
 
 #[cfg(test)]

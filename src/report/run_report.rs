@@ -9,10 +9,7 @@ use super::numbers::short;
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::photo_sections::add_photos;
 use super::picture::view_pictures;
-use super::run_files::{
-    CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, POINTS_MAX, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
-    read_json, read_text,
-};
+use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
@@ -21,6 +18,10 @@ use std::path::{Path, PathBuf};
 
 /// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
+/// Most points of a curve.
+pub const POINTS_MAX: usize = 600;
+/// Size limit of a text file, bytes.
+const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
 /// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its
@@ -88,6 +89,16 @@ pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> Input
     let path = folder.join(REPORT_FILE);
     write_whole(&path, html.as_bytes())?;
     Ok(path)
+}
+
+pub(super) fn read_text(path: &Path) -> Option<String> {
+    let len = std::fs::metadata(path).ok()?.len();
+    (len <= TEXT_BYTES_MAX).then(|| std::fs::read_to_string(path).ok())?
+}
+
+/// A file of a run; `None` if it is missing, too large, or no JSON.
+pub fn read_json(path: &Path) -> Option<Value> {
+    serde_json::from_str(&read_text(path)?).ok()
 }
 
 /// The complete lines of metrics.jsonl.
