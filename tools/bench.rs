@@ -1,8 +1,6 @@
 //! `gsscale-bench`: measures training and prints the figures. The first argument names the measurement; without a
 //! name it is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
 
-#[path = "bench/bars.rs"]
-mod bars;
 #[path = "bench/compare.rs"]
 mod compare;
 #[cfg(feature = "gpu")]
@@ -10,30 +8,18 @@ mod compare;
 mod doctor;
 #[path = "bench/facts.rs"]
 mod facts;
-#[path = "bench/figures.rs"]
-mod figures;
-#[path = "bench/front.rs"]
-mod front;
 #[path = "bench/list.rs"]
 mod list;
-#[path = "bench/pace.rs"]
-mod pace;
 #[path = "bench/published.rs"]
 mod published;
 #[path = "bench/published_table.rs"]
 mod published_table;
-#[path = "bench/record.rs"]
-mod record;
-#[path = "bench/results_log.rs"]
-mod results_log;
 #[path = "bench/run.rs"]
 mod run;
 #[path = "bench/runs.rs"]
 mod runs;
 #[path = "bench/sweep.rs"]
 mod sweep;
-#[path = "bench/sweep_page.rs"]
-mod sweep_page;
 
 use clap::Parser;
 use gsscale::base::error::InputError;

@@ -22,7 +22,7 @@ const LEGEND_ROW: u32 = 20;
 /// Longest name in the legend, characters.
 const NAME_MAX: usize = 24;
 /// Colours of series, as many as a sweep needs for the reference, eleven groups and the front.
-pub const COLORS: [RGBColor; 13] = [
+pub(super) const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
     RGBColor(46, 139, 87),
@@ -50,7 +50,7 @@ const SMOOTH_SHARE: usize = 20;
 const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
 
 /// Colour of axes and frames.
-pub const AXIS: RGBColor = RGBColor(97, 97, 97);
+pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
 
 /// The mark of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -279,10 +279,10 @@ impl Chart {
 }
 
 type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-pub type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+pub(super) type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// The SVG of a drawing, or a paragraph with the error.
-pub fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), String>) -> String {
+pub(super) fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), String>) -> String {
     let mut svg = String::new();
     let drawn = {
         let root = SVGBackend::with_string(&mut svg, size).into_drawing_area();
@@ -295,7 +295,7 @@ pub fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), S
 }
 
 /// The text of an error of `plotters`, whose type depends on the backend.
-pub fn text<E: std::fmt::Display>(e: E) -> String {
+pub(super) fn text<E: std::fmt::Display>(e: E) -> String {
     e.to_string()
 }
 

@@ -3,14 +3,21 @@
 //! A report reads only the files of a run (metrics.jsonl, summary.json, config.toml, pictures). It can be made again at
 //! any time, also for a run that was stopped.
 
+pub mod bars;
 pub mod chart;
 pub mod compare_report;
+pub mod figures;
+pub mod front;
 pub mod html;
 pub mod levels_page;
 pub mod live;
 mod numbers;
+pub mod pace;
 pub mod page_map;
 mod photo_sections;
 pub mod picture;
+pub mod record;
+pub mod results_log;
 pub mod run_files;
 pub mod run_report;
+pub mod sweep_page;

@@ -5,9 +5,6 @@
 //! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
 //! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
-use super::pace::convert_to_one_pace;
-use super::record::{Pace, RunRecord};
-use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
@@ -16,6 +13,9 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::disturb::Disturbance;
 use gsscale::photos::outliers::left_out;
+use gsscale::report::pace::convert_to_one_pace;
+use gsscale::report::record::{Pace, RunRecord};
+use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
 use gsscale::train::log::report::Summary;
 use serde_json::Value;

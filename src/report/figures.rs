@@ -3,7 +3,7 @@
 //! Not here: means over seeds ([`super::front`]), tables and charts ([`super::sweep_page`]).
 
 use super::record::RunRecord;
-use gsscale::base::units::format_bytes;
+use crate::base::units::format_bytes;
 use serde::de::Error;
 use serde::{Deserialize, Deserializer};
 

@@ -2,7 +2,7 @@
 //!
 //! Invariant: a missing or non-finite value gives an empty bar, not an error.
 
-use gsscale::report::chart::{AXIS, COLORS, Canvas, draw_svg, text};
+use super::chart::{AXIS, COLORS, Canvas, draw_svg, text};
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 

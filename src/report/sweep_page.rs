@@ -3,11 +3,11 @@
 //! Every value of a setting is a mean over seeds. A list says which figures are shown ([`View`]).
 
 use super::bars::Bars;
+use super::chart::{Chart, Mark};
 use super::figures::Figure;
 use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
+use super::html::{Cell, Column, Page};
 use super::record::RunRecord;
-use gsscale::report::chart::{Chart, Mark};
-use gsscale::report::html::{Cell, Column, Page};
 use serde::Deserialize;
 
 /// Number of the front's colour, grey.
