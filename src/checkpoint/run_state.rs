@@ -275,14 +275,14 @@ impl RunState {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use crate::appearance::state::AppearanceState;
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
-    use crate::photos::appearance::state::AppearanceState;
-    use crate::photos::outliers::blocks::{BlockOutliers, look};
-    use crate::photos::outliers::views::ViewState;
-    use crate::photos::poses::gradient::MotionGradient;
-    use crate::photos::poses::state::PoseState;
+    use crate::outliers::blocks::{BlockOutliers, look};
+    use crate::outliers::views::ViewState;
     use crate::photos::saved::Encoded;
+    use crate::poses::gradient::MotionGradient;
+    use crate::poses::state::PoseState;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 

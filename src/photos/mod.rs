@@ -1,11 +1,12 @@
 //! What a run knows of each photo, and how it acts on the steps that see the photo: the one list of [`KINDS`].
 //!
-//! A kind is a file or a folder here: a [`PhotoParameter`] and its [`Kind`], with the values and their mathematics. The trainer, the run
-//! state, the forecast and the summary walk the list, and name no kind.
+//! A kind is a file of this folder: a [`PhotoParameter`] and its [`Kind`]. The trainer, the run state, the forecast, the summary and
+//! the report walk the list, and name no kind. The values and their mathematics lie in rooms of their own where they fill
+//! more than a file ([`crate::appearance`], [`crate::poses`], [`crate::outliers`]).
 //!
 //! A kind that is off is not in the list of a run. The kinds that judge photos are always in it.
 //!
-//! Not here: what the report shows of them (`report::photo_sections`), evaluation, which fits exposures without a run (`train::state::eval`), and which optimizer a kind needs
+//! Not here: evaluation, which fits exposures without a run (`train::state::eval`), and which optimizer a kind needs
 //! (`config::check`).
 //!
 //! Invariants: 1. a step that was skipped teaches nothing but the error of its view; 2. what is known after a step is a function of
@@ -13,16 +14,18 @@
 //! before all looks at it; 4. a kind that adds to the loss stands behind the kinds that correct, and behind masks, so that it
 //! compares what the loss compares, and its gradient is taken back through the corrections.
 
-pub mod appearance;
-pub mod outliers;
+mod appearance;
+mod masked_blocks;
+pub mod outlier_views;
 pub mod parameter;
-pub mod poses;
+mod poses;
 pub mod saved;
 
+use crate::appearance::AppearanceMode;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
+use crate::report::run_report::Section;
 use crate::scene::camera::Camera;
-use appearance::AppearanceMode;
 use parameter::{Kind, PhotoParameter};
 use saved::{SavedValues, ValuesError};
 
@@ -45,7 +48,7 @@ pub struct PhotoOptions {
 
 /// All kinds, in the order in which they correct a picture; gradients pass them in the opposite order. The sections of the report have
 /// this order too.
-pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outliers::left_out::KIND, outliers::masked::KIND];
+pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outlier_views::KIND, masked_blocks::KIND];
 
 /// The parameters of a run.
 pub type PhotoParameters = Vec<Box<dyn PhotoParameter>>;
@@ -91,4 +94,9 @@ pub fn check(saved: &SavedValues) -> Result<(), ValuesError> {
 /// The files that kinds write into the folder of a run.
 pub fn files() -> impl Iterator<Item = &'static str> {
     KINDS.iter().filter_map(|kind| kind.file)
+}
+
+/// What the report of a run says about each kind.
+pub fn sections() -> Vec<Section> {
+    KINDS.iter().map(|kind| kind.section).collect()
 }

@@ -13,6 +13,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
+use crate::report::run_report::Section;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
@@ -30,6 +31,8 @@ pub struct Kind {
     /// Its parameters in a run that has seen nothing; `None` in a run without it.
     pub first: fn(&PhotoOptions, &Dataset) -> Option<Box<dyn PhotoParameter>>,
     pub check: fn(&Encoded) -> Result<(), ValuesError>,
+    /// What the report of a run says about it.
+    pub section: Section,
 }
 
 /// Steps from the last opacity reset to step `step`; `None` before the first one.

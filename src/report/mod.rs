@@ -14,7 +14,6 @@ pub mod live;
 mod numbers;
 pub mod pace;
 pub mod page_map;
-mod photo_sections;
 pub mod picture;
 pub mod record;
 pub mod results_log;

@@ -7,7 +7,6 @@ use super::chart::{Chart, Mark, smoothed};
 use super::html::{Page, slider};
 use super::numbers::short;
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
-use super::photo_sections::add_photos;
 use super::picture::view_pictures;
 use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE};
 use crate::base::error::{InputError, InputResult};
@@ -24,12 +23,15 @@ pub const POINTS_MAX: usize = 600;
 const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
-/// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its
+/// A part of a report that another room writes, from the folder of the run and its summary.
+pub type Section = fn(&mut Page, &Path, &Value);
+
+/// The report of the run in `folder` as HTML, with `sections` about its photos. `progress(done, all)` is called after each of its
 /// pictures.
 ///
 /// # Errors
 /// The folder holds no metrics, or a picture cannot be decoded.
-pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
+pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
     let scene = summary["scene"].as_str().unwrap_or("").to_string();
@@ -53,7 +55,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.heading("Memory and disk");
         page.charts(&tiers);
     }
-    add_photos(&mut page, folder, &summary);
+    sections.iter().for_each(|add| add(&mut page, folder, &summary));
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, folder, progress)?;
     page.heading("Config");
@@ -80,12 +82,12 @@ fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
 }
 
-/// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].
+/// Writes the report of the run in `folder` into the folder; returns its path. `sections` and `progress` as for [`run_report`].
 ///
 /// # Errors
 /// As [`run_report`], or the folder cannot be written.
-pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
-    let html = run_report(folder, progress)?;
+pub fn write_run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
+    let html = run_report(folder, sections, progress)?;
     let path = folder.join(REPORT_FILE);
     write_whole(&path, html.as_bytes())?;
     Ok(path)

@@ -12,7 +12,7 @@ use gsscale::config::choice::Choice;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::disturb::Disturbance;
-use gsscale::photos::outliers::left_out;
+use gsscale::photos::outlier_views;
 use gsscale::report::pace::convert_to_one_pace;
 use gsscale::report::record::{Pace, RunRecord};
 use gsscale::report::results_log::{ResultsLog, successful_run};
@@ -292,7 +292,7 @@ impl Sweep {
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
-        record.outlier_views = left_out::names_in(&read_json(&folder.join(SUMMARY_FILE))?);
+        record.outlier_views = outlier_views::names_in(&read_json(&folder.join(SUMMARY_FILE))?);
         record.seconds = summary.train_seconds;
         record.cpu_seconds = summary.costs.train_cpu_seconds;
         record.stall_seconds = summary.costs.train_stall_seconds;

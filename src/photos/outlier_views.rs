@@ -1,22 +1,24 @@
-//! Views whose photo contradicts the scene: [`crate::photos::outliers::views`] in the steps of a run. Every run names them;
+//! Views whose photo contradicts the scene: [`crate::outliers::views`] in the steps of a run. Every run names them;
 //! `--robust-views` leaves them out.
 //!
 //! Not here: the verdict.
 
-use super::views::{FIRST_EPOCHS, ViewOutliers, ViewState};
+use super::PhotoOptions;
+use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep, STEPS_AFTER_RESET};
+use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
+use crate::outliers::views::{FIRST_EPOCHS, ViewOutliers, ViewState};
 use crate::page::format::encoding::EncodingError;
-use crate::photos::PhotoOptions;
-use crate::photos::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep, STEPS_AFTER_RESET};
-use crate::photos::saved::{Encoded, ValuesError};
+use crate::report::html::{Cell, Page};
 use crate::scene::image::Target;
 use serde_json::{Value, json};
+use std::path::Path;
 
 /// In summary.json, the views whose photo contradicts the scene: `name`, `unexplained` (share of the photo's variance that its
 /// picture leaves unexplained; above 1 where a grey picture would be closer) and `is_left_out` (whether the run has left it out).
 const FIGURE: &str = "outlier_views";
 
-pub(in crate::photos) const KIND: Kind = Kind { name: "outliers", file: None, first, check };
+pub(super) const KIND: Kind = Kind { name: "outliers", file: None, first, check, section };
 
 /// Names that a warning lists.
 const NAMES_LISTED: usize = 20;
@@ -197,6 +199,29 @@ impl OutlierViews {
 pub fn names_in(summary: &Value) -> Vec<String> {
     let views = summary[FIGURE].as_array().map_or(&[][..], Vec::as_slice);
     views.iter().filter_map(|view| Some(view["name"].as_str()?.to_string())).collect()
+}
+
+/// The training views whose photo contradicts the scene, if there are any.
+fn section(page: &mut Page, _: &Path, summary: &Value) {
+    let views = summary[FIGURE].as_array().map_or(&[][..], Vec::as_slice);
+    if views.is_empty() {
+        return;
+    }
+    page.heading("Photos that contradict the scene");
+    page.paragraph(
+        "These training photos differ from their pictures far more than others do: a wrong pose, another place, another \
+         exposure. Unexplained is the squared error over the variance of the photo; it is above 1 where a plain grey would be \
+         closer. Check these photos and their poses, or leave them out with --robust-views.",
+    );
+    let state = |view: &Value| if view["is_left_out"] == true { "left out" } else { "trained on" };
+    page.table(
+        views,
+        &[
+            ("photo", &|view| Cell::text(view["name"].as_str().unwrap_or_default())),
+            ("unexplained", &|view| Cell::number(view["unexplained"].as_f64(), 2)),
+            ("", &|view| Cell::text(state(view))),
+        ],
+    );
 }
 
 #[cfg(test)]

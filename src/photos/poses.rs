@@ -1,38 +1,28 @@
-//! Poses: a small rigid motion of the camera of each training photo, trained beside the scene (`--refine-poses`).
+//! Refined poses of training photos (`--refine-poses`): [`crate::poses`] in the steps of a run.
 //!
-//! A motion of the camera is the opposite motion of all Gaussians. So the gradients of the rows, which a step has anyway,
-//! give that of the motion ([`gradient`]), and no stage of the renderer knows of it. Rates and bounds are shares of the
-//! scene's scale ([`state`]).
-//!
-//! Scene and poses share a freedom: a scene that moves as a whole, with all of its cameras, gives the same pictures. Held-out
-//! photos keep their poses, so what acts on a photo is its motion less the mean over the photos seen.
-//!
-//! Invariants: 1. the bits are the same for any number of threads, and for any cut of a view into batches; 2. no value that
-//! is not finite or out of bounds is stored; 3. a camera without a motion keeps its bits.
-//!
+//! Not here: how a motion is derived and learnt.
 
-pub mod gradient;
-pub mod motion;
-pub mod state;
-
-use self::gradient::MotionSum;
-use self::state::{PoseState, first_step, rate_at};
 use super::PhotoOptions;
 use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep, views_by_name, write_values};
 use super::saved::{Encoded, ValuesError};
 use crate::base::error::InputResult;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
+use crate::poses::gradient::MotionSum;
+use crate::poses::state::{PoseState, first_step, rate_at};
+use crate::report::html::Page;
+use crate::report::run_report::read_json;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use glam::DVec3;
 use serde::Serialize;
+use serde_json::Value;
 use std::path::Path;
 
 /// The poses of training photos as the run leaves them.
 const FILE: &str = "poses.json";
 
-pub(super) const KIND: Kind = Kind { name: "poses", file: Some(FILE), first, check };
+pub(super) const KIND: Kind = Kind { name: "poses", file: Some(FILE), first, check, section };
 
 struct Poses {
     state: PoseState,
@@ -169,4 +159,25 @@ impl Spread {
         let at = |i: usize| values.get(i).copied().unwrap_or_default();
         Spread { median: at(values.len() / 2), largest: at(values.len().saturating_sub(1)) }
     }
+}
+
+/// How far the run has moved the cameras of its photos, if it refines poses.
+fn section(page: &mut Page, folder: &Path, _: &Value) {
+    let file = read_json(&folder.join(FILE)).unwrap_or(Value::Null);
+    let of = |what: &str, which: &str| file[what][which].as_f64();
+    let (Some(median), Some(largest), Some(scale)) =
+        (of("shift", "median"), of("shift", "largest"), file["scene_scale"].as_f64())
+    else {
+        return;
+    };
+    let [turn, most] = ["median", "largest"].map(|which| of("turn_degrees", which).unwrap_or_default());
+    page.heading("Poses");
+    page.paragraph(&format!(
+        "The run has refined the poses of {} training photos (--refine-poses): against the dataset their cameras moved by {:.2} % \
+         of the scene's scale (median; {:.2} % at most) and turned by {turn:.2} degrees ({most:.2} at most). poses.json has the \
+         refined poses.",
+        file["refined"],
+        100.0 * median / scale,
+        100.0 * largest / scale,
+    ));
 }

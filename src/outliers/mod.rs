@@ -5,13 +5,12 @@
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
 //! Invariants: 1. every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
-//! of threads, frames and budgets, and a resumed run goes on with the values of its commit; 2. what the user did not ask for
-//! changes no picture, no photo and no gradient.
+//! of threads, frames and budgets, and a resumed run goes on with the values of its commit; 2. nothing here changes a
+//! picture, a photo or a gradient: `train` does, as far as the user asked for it.
 //!
+//! Not here: which step leaves out what (`train`), and the bytes of a commit (`checkpoint`).
 
 pub mod blocks;
-pub mod left_out;
-pub mod masked;
 pub mod residuals;
 pub mod rims;
 pub mod views;

@@ -1,23 +1,25 @@
-//! Masks of what moved on photos (`--robust-pixels`): [`crate::photos::outliers::blocks`] in the steps of a run. A run that masks
+//! Masks of what moved on photos (`--robust-pixels`): [`crate::outliers::blocks`] in the steps of a run. A run that masks
 //! nothing keeps the blocks of an earlier part of the run that did.
 //!
 //! Not here: which block is masked.
 
-use super::blocks::{self, BlockOutliers, BlockState};
-use super::blocks::{counts_masked_blocks, first_look_at_blocks};
+use super::PhotoOptions;
+use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
+use super::saved::{Encoded, ValuesError};
 use crate::dataset::loader::Dataset;
+use crate::outliers::blocks::{self, BlockOutliers, BlockState};
+use crate::outliers::blocks::{counts_masked_blocks, first_look_at_blocks};
 use crate::page::format::encoding::EncodingError;
-use crate::photos::PhotoOptions;
-use crate::photos::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep};
-use crate::photos::saved::{Encoded, ValuesError};
+use crate::report::html::Page;
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 use serde_json::Value;
+use std::path::Path;
 
 /// In summary.json, the share of the blocks of training photos that are masked; absent in runs that masked none.
 const FIGURE: &str = "masked_share";
 
-pub(in crate::photos) const KIND: Kind = Kind { name: "blocks", file: None, first, check };
+pub(super) const KIND: Kind = Kind { name: "blocks", file: None, first, check, section };
 
 /// What a step does with the blocks of its photo.
 #[derive(Debug, Clone, Copy)]
@@ -137,4 +139,16 @@ impl PhotoParameter for MaskedBlocks {
     fn figures(&self, _: &Dataset) -> Vec<(&'static str, Value)> {
         self.state.masked_share().map(|share| (FIGURE, share.into())).into_iter().collect()
     }
+}
+
+/// How much of the photos is masked because it shows what the scene does not, if the run masks such blocks.
+fn section(page: &mut Page, _: &Path, summary: &Value) {
+    let Some(share) = summary[FIGURE].as_f64() else { return };
+    page.heading("Parts of photos that contradict the scene");
+    page.paragraph(&format!(
+        "At the end, blocks of {:.1} % of the area of the training photos did not count (--robust-pixels), because they differ \
+         from the pictures as cars, people or shadows that moved do; rims of objects come on top. Much more than such things \
+         take suggests wrong poses or changing exposures.",
+        100.0 * share
+    ));
 }
