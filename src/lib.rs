@@ -30,10 +30,7 @@
 //! | [`render`] | the stages in order, on the CPU or a device: rows in, picture, loss, picture back, rows out; image metrics |
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
-//! | [`appearance`] | what differs between photos: exposure and colours of each, vignetting of each camera; a correction of the picture, its derivatives, its values |
-//! | [`poses`] | where the cameras of photos really stand: a small motion of each, its gradient from those of the rows, its values |
-//! | [`outliers`] | what in the photos contradicts the rest of the scene: views whose photo does not match their pose, blocks of photos with what has moved |
-//! | [`photos`] | the one list of what a run learns of each photo: how each kind acts on a step, is saved, and shows in the report |
+//! | [`photos`] | what a run learns of each photo: exposure and colours, where its camera really stands, what on it contradicts the rest of the scene; the one list of kinds: how each acts on a step, is saved, and what a report says about it |
 //! | [`exchange`] | PLY in and out, SPZ out, SOG out and in for evaluation; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
@@ -92,8 +89,8 @@
 //! 1. A file in `photos/`: the values, their change of a picture, a photo or a camera, their derivatives, and what they learn, as
 //!    a [`photos::parameter::PhotoParameter`]; its [`photos::parameter::Kind`] names it for commits, and says what the report shows.
 //!    The trait's methods come in the order of a step; what is left out does nothing. Steps, the rehearsal, commits, resumes, the
-//!    forecast, `summary.json` and the report follow. `photos/appearance.rs` acts on pictures, `photos/poses.rs` on
-//!    cameras, `photos/masked_blocks.rs` on photos.
+//!    forecast, `summary.json` and the report follow. `photos/exposure/` acts on pictures, `photos/pose.rs` on
+//!    cameras, `photos/outlier/blocks.rs` on photos.
 //! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
 //! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
@@ -121,7 +118,6 @@
 //! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 //! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 
-pub mod appearance;
 pub mod base;
 pub mod checkpoint;
 pub mod config;
@@ -131,11 +127,9 @@ pub mod exchange;
 pub mod gpu;
 pub mod kernels;
 pub mod optim;
-pub mod outliers;
 pub mod page;
 pub mod paging;
 pub mod photos;
-pub mod poses;
 pub mod render;
 pub mod report;
 pub mod scene;

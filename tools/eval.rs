@@ -11,7 +11,8 @@ use gsscale::config::facts::read_resolved;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::exchange::sog::is_tree;
 use gsscale::render::lpips::InputRange;
-use gsscale::report::levels_page::{LevelFigures, levels_page};
+use gsscale::report::chart::{Chart, Mark};
+use gsscale::report::html::{Cell, Page};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
@@ -103,18 +104,39 @@ fn start(args: Args) -> Result<(), TrainError> {
     Ok(())
 }
 
-/// The page of the levels of a report.
+/// The page of the levels of a report, the finest first: PSNR and SSIM of held-out photos by level.
 fn page_of(report: &EvalReport) -> String {
-    let of_level = |level: &LevelReport| LevelFigures {
-        level: level.level,
-        gaussians: level.figures.gaussians,
-        psnr: level.figures.test.map(|test| test.psnr),
-        ssim: level.figures.test.map(|test| test.ssim),
+    let (views, scene) = (report.test.map_or(0, |test| test.views), report.scene.display());
+    let facts = format!("{views} held-out photos of {scene}; SSIM: {}", report.ssim_variant);
+    let mut page = Page::new(&format!("gsscale: levels of detail of {}", report.ply.display()), &facts);
+    page.paragraph(
+        "Each level was drawn everywhere. A viewer mixes levels, finer ones near the camera, so its pictures lie between the finest and \
+         the coarsest level that it shows.",
+    );
+    let psnr = |level: &LevelReport| level.figures.test.map(|test| test.psnr);
+    let ssim = |level: &LevelReport| level.figures.test.map(|test| test.ssim);
+    let chart = |title: &str, unit: &str, of: &dyn Fn(&LevelReport) -> Option<f64>| {
+        let label = |level: &LevelReport| {
+            Some((f64::from(level.level), of(level)?, format!("{} Gaussians", level.figures.gaussians)))
+        };
+        let labels: Vec<(f64, f64, String)> = report.levels.iter().filter_map(label).collect();
+        let line = labels.iter().map(|&(level, value, _)| (level, value)).collect();
+        let chart = Chart { labels, ..Chart::new(title, "level", unit).with("", line, Mark::LineAndDots) };
+        (chart.svg(), String::new())
     };
-    let levels: Vec<LevelFigures> = report.levels.iter().map(of_level).collect();
-    let views = report.test.map_or(0, |test| test.views);
-    let facts = format!("{views} held-out photos of {}; SSIM: {}", report.scene.display(), report.ssim_variant);
-    levels_page(&report.ply.display().to_string(), &facts, &levels)
+    page.charts(&[chart("PSNR by level", "PSNR, dB", &psnr), chart("SSIM by level", "SSIM", &ssim)]);
+    let finest = report.levels.first().and_then(psnr);
+    let row = |level: &LevelReport| {
+        vec![
+            Cell::Number(level.level.to_string()),
+            Cell::Number(level.figures.gaussians.to_string()),
+            Cell::number(psnr(level), 2),
+            Cell::difference(psnr(level).zip(finest).map(|(own, finest)| own - finest), 2),
+            Cell::number(ssim(level), 3),
+        ]
+    };
+    page.table(["level", "Gaussians", "PSNR, dB", "against the finest", "SSIM"], report.levels.iter().map(row));
+    page.finish()
 }
 
 /// The scene and the config file of the run that wrote `file`: a PLY in the run's folder, or a folder of SOGs there.

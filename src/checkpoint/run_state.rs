@@ -14,7 +14,7 @@ use crate::densify::growth::GrowthState;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
 use crate::photos;
-use crate::photos::saved::{SavedValues, ValuesError};
+use crate::photos::parameter::{SavedValues, ValuesError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
@@ -275,14 +275,14 @@ impl RunState {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::appearance::state::AppearanceState;
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
-    use crate::outliers::blocks::{BlockOutliers, look};
-    use crate::outliers::views::ViewState;
-    use crate::photos::saved::Encoded;
-    use crate::poses::gradient::MotionGradient;
-    use crate::poses::state::PoseState;
+    use crate::photos::exposure::state::AppearanceState;
+    use crate::photos::outlier::blocks::{BlockOutliers, look};
+    use crate::photos::outlier::views::ViewState;
+    use crate::photos::parameter::Encoded;
+    use crate::photos::pose::MotionGradient;
+    use crate::photos::pose::PoseState;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 

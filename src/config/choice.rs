@@ -6,7 +6,6 @@
 //! through the list, so that a new key or word is named here alone.
 
 use super::schedule::Schedule;
-use crate::appearance::AppearanceMode;
 use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -20,6 +19,7 @@ use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::timing::Transfers;
+use crate::photos::exposure::AppearanceMode;
 use crate::render::SsimPadding;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;

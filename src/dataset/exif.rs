@@ -2,7 +2,7 @@
 //!
 //! Of two photos of one surface in the same light, the photo with the longer exposure time, the higher ISO or the wider
 //! aperture is brighter. A brightness is in stops of light. Pixel values are stored with a gamma, so they differ by fewer stops
-//! (`crate::appearance::first_values` converts).
+//! (`crate::photos::exposure::state` converts).
 //!
 //! Not here: where the data lie in a file ([`super::photo_header`]).
 //!

@@ -1,8 +1,8 @@
 //! What a run knows of each photo, and how it acts on the steps that see the photo: the one list of [`KINDS`].
 //!
-//! A kind is a file of this folder: a [`PhotoParameter`] and its [`Kind`]. The trainer, the run state, the forecast, the summary and
-//! the report walk the list, and name no kind. The values and their mathematics lie in rooms of their own where they fill
-//! more than a file ([`crate::appearance`], [`crate::poses`], [`crate::outliers`]).
+//! A kind is a file or folder here: its values, their mathematics, and a [`PhotoParameter`] with its [`Kind`]. [`exposure`] corrects
+//! pictures, [`pose`] moves cameras, [`outlier`] judges photos. The trainer, the run state, the forecast, the summary and
+//! the report walk the list, and name no kind.
 //!
 //! A kind that is off is not in the list of a run. The kinds that judge photos are always in it.
 //!
@@ -14,20 +14,16 @@
 //! before all looks at it; 4. a kind that adds to the loss stands behind the kinds that correct, and behind masks, so that it
 //! compares what the loss compares, and its gradient is taken back through the corrections.
 
-mod appearance;
-mod masked_blocks;
-pub mod outlier_views;
+pub mod exposure;
+pub mod outlier;
 pub mod parameter;
-mod poses;
-pub mod saved;
+pub mod pose;
 
-use crate::appearance::AppearanceMode;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
-use crate::report::run_report::Section;
 use crate::scene::camera::Camera;
-use parameter::{Kind, PhotoParameter};
-use saved::{SavedValues, ValuesError};
+use exposure::AppearanceMode;
+use parameter::{Kind, PhotoParameter, SavedValues, ValuesError};
 
 /// What the user asked for, and what the kinds need of the other options of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,7 +44,7 @@ pub struct PhotoOptions {
 
 /// All kinds, in the order in which they correct a picture; gradients pass them in the opposite order. The sections of the report have
 /// this order too.
-pub const KINDS: [Kind; 4] = [appearance::KIND, poses::KIND, outlier_views::KIND, masked_blocks::KIND];
+pub const KINDS: [Kind; 4] = [exposure::KIND, pose::KIND, outlier::views::KIND, outlier::blocks::KIND];
 
 /// The parameters of a run.
 pub type PhotoParameters = Vec<Box<dyn PhotoParameter>>;
@@ -94,9 +90,4 @@ pub fn check(saved: &SavedValues) -> Result<(), ValuesError> {
 /// The files that kinds write into the folder of a run.
 pub fn files() -> impl Iterator<Item = &'static str> {
     KINDS.iter().filter_map(|kind| kind.file)
-}
-
-/// What the report of a run says about each kind.
-pub fn sections() -> Vec<Section> {
-    KINDS.iter().map(|kind| kind.section).collect()
 }

@@ -2,24 +2,25 @@
 //!
 //! A step calls [`PhotoParameter::begin_step`], then [`PhotoParameter::correct`] and [`PhotoParameter::target`] between the
 //! picture and its loss, [`PhotoParameter::picture_back`] and [`PhotoParameter::row_gradients`] on the way of the gradient, and
-//! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on.
+//! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on. A commit holds the values as bytes by the
+//! name of their kind, so a new kind changes no layout, and a state without it is one whose values start.
 //!
 //! Invariants: 1. values change in `start`, `end_step` and `restore` alone, so that a step can be repeated or rehearsed; 2. what
-//! a kind does not override does nothing.
+//! a kind does not override does nothing; 3. equal values have equal bytes.
 
 use super::PhotoOptions;
-use super::saved::{Encoded, ValuesError};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
-use crate::page::format::encoding::EncodingError;
-use crate::report::run_report::Section;
+use crate::page::format::encoding::{self, EncodingError};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
-use serde::Serialize;
+use serde::de::{DeserializeOwned, Visitor};
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// A kind of parameters.
@@ -31,8 +32,30 @@ pub struct Kind {
     /// Its parameters in a run that has seen nothing; `None` in a run without it.
     pub first: fn(&PhotoOptions, &Dataset) -> Option<Box<dyn PhotoParameter>>,
     pub check: fn(&Encoded) -> Result<(), ValuesError>,
-    /// What the report of a run says about it.
-    pub section: Section,
+    /// What the report of a run says about it, if anything, from its file (null without) and the run's summary.json.
+    pub finding: fn(&Value, &Value) -> Option<Finding>,
+}
+
+/// What a report says about a kind, as plain data.
+#[derive(Debug, Default)]
+pub struct Finding {
+    pub title: &'static str,
+    /// A paragraph; empty for none.
+    pub text: String,
+    /// Headings of a table, and its rows of texts and numbers.
+    pub table: Option<([&'static str; 3], Vec<[Value; 3]>)>,
+    pub curve: Option<Curve>,
+}
+
+/// A curve over the photos.
+#[derive(Debug)]
+pub struct Curve {
+    pub title: &'static str,
+    /// Unit of the values.
+    pub unit: &'static str,
+    /// A value for each photo, in the order of names.
+    pub values: Vec<f64>,
+    pub caption: String,
 }
 
 /// Steps from the last opacity reset to step `step`; `None` before the first one.
@@ -234,6 +257,89 @@ pub fn views_by_name(dataset: &Dataset) -> Vec<usize> {
     let mut views = dataset.train_views();
     views.sort_by(|&a, &b| dataset.views[a].name.cmp(&dataset.views[b].name));
     views
+}
+
+/// By name of the kind.
+pub type SavedValues = BTreeMap<String, Encoded>;
+
+/// Values of one kind.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Encoded(Vec<u8>);
+
+/// Why bytes are not values of a kind.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ValuesError {
+    /// The encoding is invalid.
+    #[error(transparent)]
+    Encoding(#[from] EncodingError),
+    /// No run can have written them.
+    #[error("{0}")]
+    Impossible(&'static str),
+}
+
+impl Encoded {
+    /// Encodes values.
+    ///
+    /// # Errors
+    /// The type contains something that cannot be encoded.
+    pub fn of<T: Serialize>(values: &T) -> Result<Encoded, EncodingError> {
+        encoding::to_bytes(values).map(Encoded)
+    }
+
+    /// Decodes values, and checks them.
+    ///
+    /// # Errors
+    /// The bytes are no such values, or `check` refuses them.
+    pub fn decoded<T: DeserializeOwned>(
+        &self,
+        check: impl Fn(&T) -> Result<(), &'static str>,
+    ) -> Result<T, ValuesError> {
+        let values = encoding::from_bytes(&self.0)?;
+        check(&values).map_err(ValuesError::Impossible)?;
+        Ok(values)
+    }
+
+    /// As [`Encoded::decoded`], in place of `values`, unless they are of another number of photos.
+    ///
+    /// # Errors
+    /// As [`Encoded::decoded`].
+    pub fn restore<T: DeserializeOwned>(
+        &self,
+        values: &mut T,
+        check: impl Fn(&T) -> Result<(), &'static str>,
+        has_same_counts: impl Fn(&T, &T) -> bool,
+    ) -> Result<(), ValuesError> {
+        let saved = self.decoded(check)?;
+        if has_same_counts(&saved, values) {
+            *values = saved;
+        }
+        Ok(())
+    }
+}
+
+/// As one run of bytes: a list would be written byte by byte.
+impl Serialize for Encoded {
+    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+        s.serialize_bytes(&self.0)
+    }
+}
+
+impl<'de> Deserialize<'de> for Encoded {
+    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Encoded, D::Error> {
+        struct Bytes;
+        impl Visitor<'_> for Bytes {
+            type Value = Encoded;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("bytes")
+            }
+
+            fn visit_byte_buf<E>(self, bytes: Vec<u8>) -> Result<Encoded, E> {
+                Ok(Encoded(bytes))
+            }
+        }
+        d.deserialize_byte_buf(Bytes)
+    }
 }
 
 #[cfg(test)]

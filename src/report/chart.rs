@@ -1,10 +1,9 @@
-//! Line and point charts as SVG text, drawn by `plotters`.
+//! Line, point and bar charts as SVG text, drawn by `plotters`; numbers in few characters.
 //!
 //! Invariants: 1. points that are not finite are dropped, and a chart without points shows "no data"; 2. the same data
 //! give the same text.
 
 use super::html::escape;
-use super::numbers::tick;
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
@@ -22,7 +21,7 @@ const LEGEND_ROW: u32 = 20;
 /// Longest name in the legend, characters.
 const NAME_MAX: usize = 24;
 /// Colours of series, as many as a sweep needs for the reference, eleven groups and the front.
-pub(super) const COLORS: [RGBColor; 13] = [
+const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
     RGBColor(46, 139, 87),
@@ -50,7 +49,7 @@ const SMOOTH_SHARE: usize = 20;
 const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
 
 /// Colour of axes and frames.
-pub(super) const AXIS: RGBColor = RGBColor(97, 97, 97);
+const AXIS: RGBColor = RGBColor(97, 97, 97);
 
 /// The mark of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -279,10 +278,10 @@ impl Chart {
 }
 
 type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
-pub(super) type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
+type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// The SVG of a drawing, or a paragraph with the error.
-pub(super) fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), String>) -> String {
+fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Result<(), String>) -> String {
     let mut svg = String::new();
     let drawn = {
         let root = SVGBackend::with_string(&mut svg, size).into_drawing_area();
@@ -295,7 +294,7 @@ pub(super) fn draw_svg(size: (u32, u32), draw: impl FnOnce(&Canvas<'_>) -> Resul
 }
 
 /// The text of an error of `plotters`, whose type depends on the backend.
-pub(super) fn text<E: std::fmt::Display>(e: E) -> String {
+fn text<E: std::fmt::Display>(e: E) -> String {
     e.to_string()
 }
 
@@ -358,6 +357,87 @@ pub fn smoothed(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
         around.iter().map(|p| p.1).sum::<f64>() / around.len() as f64
     };
     (0..points.len()).map(|i| (points[i].0, mean(i))).collect()
+}
+
+/// Of a bar chart: height of a bar with the gap below it and of the title, width of the names and of the value beside the longest bar.
+const BAR: i32 = 26;
+const TITLE: i32 = 40;
+const NAMES: i32 = 320;
+const VALUES: i32 = 250;
+
+/// Named values, one horizontal bar each; an empty bar for a value that is missing or not finite.
+#[derive(Debug, Clone)]
+pub struct Bars {
+    /// Title with the unit.
+    pub title: String,
+    /// Name, value, and text of the value.
+    pub bars: Vec<(String, Option<f64>, String)>,
+}
+
+impl Bars {
+    /// The chart as SVG, the first bar on top.
+    pub fn svg(&self) -> String {
+        draw_svg((WIDE.0, (TITLE + BAR * self.bars.len() as i32 + 6) as u32), |root| self.draw(root))
+    }
+
+    fn draw(&self, root: &Canvas<'_>) -> Result<(), String> {
+        let anchor = |h| Pos::new(h, VPos::Center);
+        let title = TextStyle::from(("sans-serif", 20)).pos(anchor(HPos::Center));
+        root.draw(&Text::new(self.title.clone(), (WIDE.0 as i32 / 2, TITLE / 2), title)).map_err(text)?;
+        let finite = |v: &Option<f64>| v.filter(|v| v.is_finite());
+        let most = self.bars.iter().filter_map(|(_, v, _)| finite(v)).fold(0.0, f64::max);
+        let room = f64::from(WIDE.0 as i32 - NAMES - VALUES);
+        for (i, (name, value, written)) in self.bars.iter().enumerate() {
+            let y = TITLE + BAR * i as i32;
+            let middle = y + BAR / 2 - 3;
+            let style = TextStyle::from(("sans-serif", 15)).pos(anchor(HPos::Right));
+            root.draw(&Text::new(name.clone(), (NAMES - 8, middle), style)).map_err(text)?;
+            let length =
+                finite(value).map_or(0, |v| if most > 0.0 { (v.max(0.0) / most * room).round() as i32 } else { 0 });
+            let bar = [(NAMES, y), (NAMES + length.max(1), y + BAR - 6)];
+            root.draw(&Rectangle::new(bar, COLORS[0].filled())).map_err(text)?;
+            let style = TextStyle::from(("sans-serif", 15)).color(&AXIS).pos(anchor(HPos::Left));
+            root.draw(&Text::new(written.clone(), (NAMES + length + 6, middle), style)).map_err(text)?;
+        }
+        Ok(())
+    }
+}
+
+/// Scale and letter that shorten a number.
+fn unit(value: f64) -> (f64, &'static str) {
+    match value.abs() {
+        m if m >= 1e9 => (1e9, "G"),
+        m if m >= 1e6 => (1e6, "M"),
+        m if m >= 1e4 => (1e3, "k"),
+        _ => (1.0, ""),
+    }
+}
+
+/// A number in few characters, such as 1.2M, 350k, 0.25.
+pub fn short(value: f64) -> String {
+    let (scale, unit) = unit(value);
+    let scaled = value / scale;
+    let digits = match scaled.abs() {
+        s if s >= 100.0 || s == 0.0 => 0,
+        s if s >= 10.0 => 1,
+        s if s >= 1.0 => 2,
+        _ => 3,
+    };
+    let mut text = format!("{scaled:.digits$}");
+    if text.contains('.') {
+        text.truncate(text.trim_end_matches('0').trim_end_matches('.').len());
+    }
+    text + unit
+}
+
+/// The label of a tick on an axis that covers `span`, with enough digits to tell neighbours apart.
+fn tick(value: f64, span: f64) -> String {
+    let (scale, unit) = unit(value);
+    // About eight ticks; one digit more than their distance needs.
+    let digits = (1.0 - (span / scale / 8.0).log10()).floor().clamp(0.0, 12.0) as usize;
+    let text = format!("{:.digits$}", value / scale);
+    let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    if text == "-0" { "0".to_string() } else { format!("{text}{unit}") }
 }
 
 #[cfg(test)]
@@ -446,5 +526,37 @@ mod tests {
         assert!(Chart::new("a", "b", "c").svg().contains("no data"));
         let flat = Chart::new("a", "b", "c").with("", vec![(5.0, 1.0), (5.0, 1.0)], Mark::Line).zero_based().svg();
         assert!(flat.contains("polyline"));
+    }
+
+    #[test]
+    fn bars_are_as_long_as_their_values() {
+        let bar = |name: &str, value| (name.to_string(), value, format!("{value:?}"));
+        let bars = vec![bar("a <", Some(2.0)), bar("b", Some(1.0)), bar("c", None), bar("d", Some(f64::NAN))];
+        let svg = Bars { title: "seconds".into(), bars }.svg();
+        let width = |w: i32| format!("width=\"{w}\"");
+        let longest = WIDE.0 as i32 - NAMES - VALUES;
+        assert!(svg.contains(&width(longest)) && svg.contains(&width(longest / 2)), "{svg}");
+        assert!(svg.contains("a &lt;") && svg.matches(&width(1)).count() == 2);
+        assert!(Bars { title: String::new(), bars: Vec::new() }.svg().starts_with("<svg"));
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let cases = [(0.0, "0"), (0.25, "0.25"), (26.7, "26.7"), (12_345.0, "12.3k"), (2.5e6, "2.5M"), (-3e9, "-3G")];
+        for (value, want) in cases {
+            assert_eq!(short(value), want);
+        }
+    }
+
+    #[test]
+    fn ticks_of_a_narrow_axis_differ() {
+        let ticks = [19.3, 19.35, 19.4].map(|v| tick(v, 0.3));
+        assert_eq!(ticks, ["19.3", "19.35", "19.4"]);
+        assert_eq!([0.0, 0.0005, 0.001].map(|v| tick(v, 0.003)), ["0", "0.0005", "0.001"]);
+        assert_eq!([tick(25_000.0, 1e5), tick(3000.0, 3000.0), tick(-0.0, 1.0)], ["25k", "3000", "0"]);
+        let ticks = [149_880.0, 149_890.0, 149_900.0, 149_950.0].map(|v| tick(v, 77.0));
+        assert_eq!(ticks, ["149.88k", "149.89k", "149.9k", "149.95k"]);
+        assert_eq!([1.5e6, 2e6, -2e6].map(|v| tick(v, 3e6)), ["1.5M", "2M", "-2M"]);
+        assert_eq!([2_000_000.0, 2_000_010.0].map(|v| tick(v, 70.0)), ["2M", "2.00001M"]);
     }
 }

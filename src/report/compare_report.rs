@@ -231,25 +231,27 @@ fn add_table(page: &mut Page, runs: &[Compared]) {
             run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.has_same_photo_size(first));
         both.map(|(own, first)| own - first)
     };
-    let number = |run: &Compared, key: &str, digits: usize| Cell::number(run.summary[key].as_f64(), digits);
-    let bytes = |run: &Compared, key: &str| Cell::bytes(run.summary[key].as_f64());
-    page.table(
-        runs,
-        &[
-            ("run", &|r| Cell::text(r.label())),
-            ("PSNR, dB", &|r| Cell::number(r.psnr(), 3)),
-            ("against the first", &|r| Cell::difference(against(r), 3)),
-            ("SSIM", &|r| Cell::number(r.judged["test"]["ssim"].as_f64(), 4)),
-            ("Gaussians", &|r| number(r, "gaussians", 0)),
-            ("steps", &|r| number(r, "steps", 0)),
-            ("seconds", &|r| number(r, "train_seconds", 1)),
-            ("CPU s", &|r| number(r, "train_cpu_seconds", 1)),
-            ("peak memory", &|r| bytes(r, "host_bytes_peak")),
-            ("read", &|r| bytes(r, "bytes_read")),
-            ("written", &|r| bytes(r, "bytes_written")),
-            ("remarks", &|r| Cell::text(r.remarks.join("; "))),
-        ],
-    );
+    let row = |run: &Compared| {
+        let number = |key: &str, digits: usize| Cell::number(run.summary[key].as_f64(), digits);
+        let bytes = |key: &str| Cell::bytes(run.summary[key].as_f64());
+        vec![
+            Cell::text(run.label()),
+            Cell::number(run.psnr(), 3),
+            Cell::difference(against(run), 3),
+            Cell::number(run.judged["test"]["ssim"].as_f64(), 4),
+            number("gaussians", 0),
+            number("steps", 0),
+            number("train_seconds", 1),
+            number("train_cpu_seconds", 1),
+            bytes("host_bytes_peak"),
+            bytes("bytes_read"),
+            bytes("bytes_written"),
+            Cell::text(run.remarks.join("; ")),
+        ]
+    };
+    let costs = ["seconds", "CPU s", "peak memory", "read", "written", "remarks"];
+    let head = ["run", "PSNR, dB", "against the first", "SSIM", "Gaussians", "steps"];
+    page.table(head.into_iter().chain(costs), runs.iter().map(row));
 }
 
 #[cfg(test)]

@@ -95,9 +95,6 @@ impl Cell {
     }
 }
 
-/// A column of a table: its heading, and its cell for a row.
-pub type Column<'a, T> = (&'a str, &'a dyn Fn(&T) -> Cell);
-
 impl Page {
     /// A page with a title and a line under it.
     pub fn new(title: &str, subtitle: &str) -> Page {
@@ -123,14 +120,7 @@ impl Page {
         self.body += "</section>\n";
     }
 
-    /// A chart with its legend below it, both markup whose texts are escaped, in a grid.
-    pub fn charts_with_legend(&mut self, svg: &str, legend: &str, caption: &str) {
-        self.body += "<div class=\"charts\">\n";
-        self.figure("", &format!("{svg}{legend}"), caption);
-        self.body += "</div>\n";
-    }
-
-    /// Charts in a grid: (SVG, caption). [`super::chart`] escapes the texts of the SVG.
+    /// Charts in a grid: (SVG, caption). The texts of the SVG, and of markup below it, are escaped.
     pub fn charts(&mut self, charts: &[(String, String)]) {
         self.body += "<div class=\"charts\">\n";
         charts.iter().for_each(|(svg, caption)| self.figure("", svg, caption));
@@ -147,13 +137,14 @@ impl Page {
         self.body += &format!("<figure class=\"{class}\">{svg}<figcaption>{caption}</figcaption></figure>\n");
     }
 
-    pub fn table<T>(&mut self, rows: &[T], columns: &[Column<'_, T>]) {
-        let headings: String = columns.iter().map(|(heading, _)| format!("<th>{}</th>", escape(heading))).collect();
-        self.body += &format!("<div class=\"table\"><table><thead><tr>{headings}</tr></thead><tbody>\n");
+    /// A table of these headings and rows.
+    pub fn table<'a>(&mut self, head: impl IntoIterator<Item = &'a str>, rows: impl IntoIterator<Item = Vec<Cell>>) {
+        let head: String = head.into_iter().map(|heading| format!("<th>{}</th>", escape(heading))).collect();
+        self.body += &format!("<div class=\"table\"><table><thead><tr>{head}</tr></thead><tbody>\n");
         for row in rows {
-            let cells = columns.iter().map(|(_, cell)| match cell(row) {
-                Cell::Text(text) => format!("<td>{}</td>", escape(&text)),
-                Cell::Number(text) => format!("<td class=\"number\">{}</td>", escape(&text)),
+            let cells = row.iter().map(|cell| match cell {
+                Cell::Text(text) => format!("<td>{}</td>", escape(text)),
+                Cell::Number(text) => format!("<td class=\"number\">{}</td>", escape(text)),
             });
             self.body += &format!("<tr>{}</tr>\n", cells.collect::<String>());
         }
@@ -213,7 +204,7 @@ mod tests {
         let hostile = "<script>alert('x')</script>\" onload=\"y";
         let mut page = Page::new(hostile, hostile);
         page.heading(hostile);
-        page.table(&[hostile], &[(hostile, &|t| Cell::text(*t)), (hostile, &|t| Cell::Number(t.to_string()))]);
+        page.table([hostile], [vec![Cell::text(hostile), Cell::Number(hostile.into())]]);
         page.folded(hostile, hostile);
         page.tiles(&[(hostile.into(), hostile)]);
         page.views(&[slider(hostile, hostile, [(hostile, "data:,"); 2], (hostile, "data:,"))]);

@@ -3,16 +3,11 @@
 //! A report reads only the files of a run (metrics.jsonl, summary.json, config.toml, pictures). It can be made again at
 //! any time, also for a run that was stopped.
 
-pub mod bars;
 pub mod chart;
 pub mod compare_report;
-pub mod figures;
 pub mod front;
 pub mod html;
-pub mod levels_page;
 pub mod live;
-mod numbers;
-pub mod pace;
 pub mod page_map;
 pub mod picture;
 pub mod record;

@@ -3,35 +3,32 @@
 //! Invariants: 1. missing or incomplete files (of a run that was stopped) make the report shorter; only a folder
 //! without metrics is an error; 2. the number of pictures and of points in a chart is bounded.
 
-use super::chart::{Chart, Mark, smoothed};
-use super::html::{Page, slider};
-use super::numbers::short;
+use super::chart::{Chart, Mark, short, smoothed};
+use super::html::{Cell, Page, slider};
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
 use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
+use crate::photos::KINDS;
+use crate::photos::parameter::Finding;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
 /// Most points of a curve.
-pub const POINTS_MAX: usize = 600;
+const POINTS_MAX: usize = 600;
 /// Size limit of a text file, bytes.
 const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
-/// A part of a report that another room writes, from the folder of the run and its summary.
-pub type Section = fn(&mut Page, &Path, &Value);
-
-/// The report of the run in `folder` as HTML, with `sections` about its photos. `progress(done, all)` is called after each of its
-/// pictures.
+/// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its pictures.
 ///
 /// # Errors
 /// The folder holds no metrics, or a picture cannot be decoded.
-pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<String> {
+pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
     let scene = summary["scene"].as_str().unwrap_or("").to_string();
@@ -55,7 +52,10 @@ pub fn run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, 
         page.heading("Memory and disk");
         page.charts(&tiers);
     }
-    sections.iter().for_each(|add| add(&mut page, folder, &summary));
+    for kind in KINDS {
+        let file = kind.file.and_then(|name| read_json(&folder.join(name))).unwrap_or(Value::Null);
+        (kind.finding)(&file, &summary).into_iter().for_each(|finding| add_finding(&mut page, finding));
+    }
     add_page_map(&mut page, &folder.join(PAGES_FILE));
     add_views(&mut page, folder, progress)?;
     page.heading("Config");
@@ -82,12 +82,30 @@ fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
 }
 
-/// Writes the report of the run in `folder` into the folder; returns its path. `sections` and `progress` as for [`run_report`].
+/// What the run has learnt of its photos.
+fn add_finding(page: &mut Page, Finding { title, text, table, curve }: Finding) {
+    page.heading(title);
+    if !text.is_empty() {
+        page.paragraph(&text);
+    }
+    if let Some((head, rows)) = table {
+        let cell = |value: &Value| value.as_str().map_or_else(|| Cell::number(value.as_f64(), 2), Cell::text);
+        page.table(head, rows.iter().map(|row| row.iter().map(cell).collect()));
+    }
+    if let Some(curve) = curve {
+        let stride = curve.values.len().div_ceil(POINTS_MAX);
+        let points = curve.values.iter().enumerate().step_by(stride).map(|(i, &value)| (i as f64, value)).collect();
+        let chart = Chart::new(curve.title, "photo, by name", curve.unit).with("", points, Mark::LineAndDots);
+        page.charts(&[(chart.svg(), curve.caption)]);
+    }
+}
+
+/// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].
 ///
 /// # Errors
 /// As [`run_report`], or the folder cannot be written.
-pub fn write_run_report(folder: &Path, sections: &[Section], progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
-    let html = run_report(folder, sections, progress)?;
+pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
+    let html = run_report(folder, progress)?;
     let path = folder.join(REPORT_FILE);
     write_whole(&path, html.as_bytes())?;
     Ok(path)
@@ -99,7 +117,7 @@ pub(super) fn read_text(path: &Path) -> Option<String> {
 }
 
 /// A file of a run; `None` if it is missing, too large, or no JSON.
-pub fn read_json(path: &Path) -> Option<Value> {
+pub(super) fn read_json(path: &Path) -> Option<Value> {
     serde_json::from_str(&read_text(path)?).ok()
 }
 
@@ -120,52 +138,39 @@ pub(super) fn curve(metrics: &[Value], x: &str, y: impl Fn(&Value) -> Option<f64
 }
 
 fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
-    let mut tiles = Vec::new();
     let last = metrics.last().unwrap_or(&Value::Null);
-    let number = |name: &str| summary[name].as_f64().or(last[name].as_f64());
-    if let Some(psnr) = summary["test"]["psnr"].as_f64() {
-        tiles.push((format!("{psnr:.2} dB"), "PSNR, held-out views"));
-    }
-    if let Some(ssim) = summary["test"]["ssim"].as_f64() {
-        tiles.push((format!("{ssim:.3}"), "SSIM, held-out views"));
-    }
-    let corrected = &summary["test"]["color_corrected"];
-    if let Some(psnr) = corrected["cc_psnr"].as_f64() {
-        let label = match corrected["method"].as_str() {
-            Some("affine") => "colour-corrected PSNR (affine)",
-            _ => "colour-corrected PSNR (quadratic)",
-        };
-        tiles.push((format!("{psnr:.2} dB"), label));
-    }
-    let half = &summary["test"]["half_fitted"];
-    if let Some(psnr) = half["right_psnr"].as_f64() {
-        tiles.push((format!("{psnr:.2} dB"), "PSNR, right halves as they are"));
-    }
-    if let Some(psnr) = half["fitted_right_psnr"].as_f64() {
-        let label = match half["model"].as_str() {
-            Some("exposure") => "PSNR, right halves (exposure fitted on the left)",
-            _ => "PSNR, right halves (appearance fitted on the left)",
-        };
-        tiles.push((format!("{psnr:.2} dB"), label));
-    }
-    if let Some(n) = number("gaussians") {
-        tiles.push((short(n), "Gaussians"));
-    }
-    if let Some(steps) = summary["steps"].as_f64().or(last["step"].as_f64()) {
-        tiles.push((short(steps), "steps"));
-    }
-    if let Some(seconds) = summary["train_seconds"].as_f64().or(last["seconds"].as_f64()) {
-        tiles.push((format!("{seconds:.0} s"), "training"));
-    }
-    if let Some(bytes) = number("host_bytes_peak") {
-        tiles.push((format_bytes(bytes as u64), "peak memory"));
-    }
-    for (name, label) in [("bytes_read", "read from disk"), ("bytes_written", "written to disk")] {
-        if let Some(bytes) = number(name).filter(|&b| b > 0.0) {
-            tiles.push((format_bytes(bytes as u64), label));
-        }
-    }
-    tiles
+    let either = |name: &str, of_line: &str| summary[name].as_f64().or(last[of_line].as_f64());
+    let decibels = |value: &Value| value.as_f64().map(|psnr| format!("{psnr:.2} dB"));
+    let bytes = |name: &str| either(name, name).map(|bytes| format_bytes(bytes as u64));
+    let moved = |name: &str| either(name, name).filter(|&bytes| bytes > 0.0).and_then(|_| bytes(name));
+    let test = &summary["test"];
+    let (corrected, half) = (&test["color_corrected"], &test["half_fitted"]);
+    let tiles = [
+        (decibels(&test["psnr"]), "PSNR, held-out views"),
+        (test["ssim"].as_f64().map(|ssim| format!("{ssim:.3}")), "SSIM, held-out views"),
+        (
+            decibels(&corrected["cc_psnr"]),
+            match corrected["method"].as_str() {
+                Some("affine") => "colour-corrected PSNR (affine)",
+                _ => "colour-corrected PSNR (quadratic)",
+            },
+        ),
+        (decibels(&half["right_psnr"]), "PSNR, right halves as they are"),
+        (
+            decibels(&half["fitted_right_psnr"]),
+            match half["model"].as_str() {
+                Some("exposure") => "PSNR, right halves (exposure fitted on the left)",
+                _ => "PSNR, right halves (appearance fitted on the left)",
+            },
+        ),
+        (either("gaussians", "gaussians").map(short), "Gaussians"),
+        (either("steps", "step").map(short), "steps"),
+        (either("train_seconds", "seconds").map(|seconds| format!("{seconds:.0} s")), "training"),
+        (bytes("host_bytes_peak"), "peak memory"),
+        (moved("bytes_read"), "read from disk"),
+        (moved("bytes_written"), "written to disk"),
+    ];
+    tiles.into_iter().filter_map(|(value, label)| Some((value?, label))).collect()
 }
 
 fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
@@ -184,16 +189,17 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     charts.push((chart.svg(), format!("PSNR of the view of each logged step{mean}{of}.")));
     let (chart, mean) = with_smooth(Chart::new("Loss", "step", "loss"), "training view", curve(metrics, "step", loss));
     charts.push((chart.zero_based().svg(), format!("Loss of the view of each logged step{mean}.")));
-    let rows = curve(metrics, "step", |m| m["gaussians"].as_f64());
-    let chart = Chart::new("Gaussians", "step", "").with("", rows, Mark::Line).zero_based();
-    charts.push((chart.svg(), "Gaussians in the scene.".to_string()));
-    let seconds = curve(metrics, "step", |m| m["seconds"].as_f64());
-    let chart = Chart::new("Time", "step", "seconds of training").with("", seconds, Mark::Line).zero_based();
-    charts.push((
-        chart.svg(),
-        "Seconds of training, without evaluation. It bends upwards as the scene grows.".to_string(),
-    ));
+    let rows = over_steps(metrics, "Gaussians", "", |m| m["gaussians"].as_f64());
+    charts.push((rows.svg(), "Gaussians in the scene.".to_string()));
+    let seconds = over_steps(metrics, "Time", "seconds of training", |m| m["seconds"].as_f64());
+    let caption = "Seconds of training, without evaluation. It bends upwards as the scene grows.";
+    charts.push((seconds.svg(), caption.to_string()));
     charts
+}
+
+/// A chart from zero of one value of the logged steps.
+fn over_steps(metrics: &[Value], title: &str, unit: &str, y: impl Fn(&Value) -> Option<f64>) -> Chart {
+    Chart::new(title, "step", unit).with("", curve(metrics, "step", y), Mark::Line).zero_based()
 }
 
 /// Adds a noisy curve in a pale colour and, where it has enough points, its running mean in front. Also returns the words
@@ -209,46 +215,41 @@ fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> (Chart, &'s
 /// Charts of memory and of the traffic between the tiers, if the run logged them.
 fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     let mib = |name: &'static str| move |m: &Value| m[name].as_f64().map(|b| b / MIB);
-    let mut charts = Vec::new();
-    let mut add = |chart: Chart, caption: &str| {
-        if !chart.is_empty() {
-            charts.push((chart.svg(), caption.to_string()));
-        }
-    };
-    let mut memory = Chart::new("Host memory", "step", "MiB").zero_based();
-    memory = memory.with("peak", curve(metrics, "step", mib("host_bytes_peak")), Mark::Line);
+    let has = |name: &str| metrics.iter().any(|m| m[name].as_f64().is_some_and(|b| b > 0.0));
+    let peak = curve(metrics, "step", mib("host_bytes_peak"));
+    let mut memory = Chart::new("Host memory", "step", "MiB").zero_based().with("peak", peak, Mark::Line);
     let budget = curve(metrics, "step", mib("host_bytes_budget"));
     if !budget.is_empty() {
         memory = memory.with("budget", budget, Mark::Line);
     }
-    add(memory, "Largest resident size so far, and the limit of --host-mem if given.");
-    if metrics.iter().any(|m| m["bytes_read"].as_f64().is_some_and(|b| b > 0.0)) {
-        let chart = Chart::new("Disk traffic", "step", "MiB since the start").zero_based();
-        let chart = chart.with("read", curve(metrics, "step", mib("bytes_read")), Mark::Line);
-        add(
-            chart.with("written", curve(metrics, "step", mib("bytes_written")), Mark::Line),
-            "Bytes of pages read from and written to the spill directory.",
-        );
-        let chart = Chart::new("Waiting for pages", "step", "seconds since the start").zero_based();
-        add(
-            chart.with("", curve(metrics, "step", |m| m["stall_seconds"].as_f64()), Mark::Line),
-            "Time in which a step waited for a page.",
-        );
-        let chart = Chart::new("Page hits", "step", "share").zero_based();
+    let mut charts = vec![(memory, "Largest resident size so far, and the limit of --host-mem if given.")];
+    if has("bytes_read") {
+        let [read, written] = ["bytes_read", "bytes_written"].map(|name| curve(metrics, "step", mib(name)));
+        let traffic = Chart::new("Disk traffic", "step", "MiB since the start").zero_based();
+        let traffic = traffic.with("read", read, Mark::Line).with("written", written, Mark::Line);
+        let waiting = |m: &Value| m["stall_seconds"].as_f64();
         let share = |m: &Value| {
             let (hits, misses) = (m["page_hits"].as_f64()?, m["page_misses"].as_f64()?);
             (hits + misses > 0.0).then(|| hits / (hits + misses))
         };
-        add(
-            chart.with("", curve(metrics, "step", share), Mark::Line),
-            "Share of needed pages that were already in memory, since the start.",
-        );
+        charts.extend([
+            (traffic, "Bytes of pages read from and written to the spill directory."),
+            (
+                over_steps(metrics, "Waiting for pages", "seconds since the start", waiting),
+                "Time in which a step waited for a page.",
+            ),
+            (
+                over_steps(metrics, "Page hits", "share", share),
+                "Share of needed pages that were already in memory, since the start.",
+            ),
+        ]);
     }
-    if metrics.iter().any(|m| m["device_bytes_peak"].as_f64().is_some_and(|b| b > 0.0)) {
-        let chart = Chart::new("Device memory", "step", "MiB").zero_based();
-        add(chart.with("", curve(metrics, "step", mib("device_bytes_peak")), Mark::Line), "Peak device memory so far.");
+    if has("device_bytes_peak") {
+        let device = over_steps(metrics, "Device memory", "MiB", mib("device_bytes_peak"));
+        charts.push((device, "Peak device memory so far."));
     }
-    charts
+    let drawn = charts.into_iter().filter(|(chart, _)| !chart.is_empty());
+    drawn.map(|(chart, caption)| (chart.svg(), caption.to_string())).collect()
 }
 
 /// Of a run whose scene doubled on trial.
@@ -310,7 +311,7 @@ fn add_page_map(page: &mut Page, path: &Path) {
     page.heading("Pages");
     let caption =
         "The pages of the scene, seen along its shortest axis, coloured by the training views that need them.";
-    page.charts_with_legend(&svg, &page_map_legend(&tiles), caption);
+    page.charts(&[(svg + &page_map_legend(&tiles), caption.to_string())]);
 }
 
 /// PSNR and SSIM of a view for its caption; empty where they are not known.

@@ -2,12 +2,10 @@
 //!
 //! Every value of a setting is a mean over seeds. A list says which figures are shown ([`View`]).
 
-use super::bars::Bars;
-use super::chart::{Chart, Mark};
-use super::figures::Figure;
+use super::chart::{Bars, Chart, Mark};
 use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
-use super::html::{Cell, Column, Page};
-use super::record::RunRecord;
+use super::html::{Cell, Page};
+use super::record::{Figure, RunRecord};
 use serde::Deserialize;
 
 /// Number of the front's colour, grey.
@@ -56,16 +54,11 @@ pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) 
     page.heading("All figures");
     let (names, rows) = cells(view, &settings);
     let last = names.len() - 1;
-    let cell = |i: usize| {
-        move |row: &Vec<String>| match i {
-            _ if i == 0 || i == last => Cell::text(&row[i]),
-            _ => Cell::Number(row[i].clone()),
-        }
-    };
-    let cells: Vec<_> = (0..names.len()).map(cell).collect();
-    let columns: Vec<Column<'_, Vec<String>>> =
-        names.iter().zip(&cells).map(|(name, cell)| (name.as_str(), cell as &dyn Fn(&Vec<String>) -> Cell)).collect();
-    page.table(&rows, &columns);
+    let cell = |(i, text): (usize, String)| if i == 0 || i == last { Cell::Text(text) } else { Cell::Number(text) };
+    page.table(
+        names.iter().map(String::as_str),
+        rows.into_iter().map(|row| row.into_iter().enumerate().map(cell).collect()),
+    );
     page.finish()
 }
 

@@ -3,7 +3,6 @@
 
 use crate::support::browser::in_a_browser;
 use crate::support::workdir::{Workdir, says};
-use gsscale::photos::sections;
 use gsscale::report::compare_report::compare_report;
 use gsscale::report::run_files::PAGES_FILE;
 use gsscale::report::run_report::run_report;
@@ -39,7 +38,7 @@ fn every_run_ends_with_a_report_that_stands_alone() {
     let metrics = work.text("run/metrics.jsonl");
     std::fs::write(cut.join("metrics.jsonl"), &metrics[..metrics.len() - 20]).unwrap();
     std::fs::write(cut.join(PAGES_FILE), r#"[{"lo":[0,0],"hi":[2,1],"rows":5,"views":3,"resident":true}]"#).unwrap();
-    let html = run_report(&cut, &sections(), &|_, _| {}).unwrap();
+    let html = run_report(&cut, &|_, _| {}).unwrap();
     assert!(html.contains("cut &lt;b&gt;") && html.contains("<h2>Pages</h2>"));
-    assert!(run_report(&work.path(""), &sections(), &|_, _| {}).unwrap_err().to_string().contains("metrics.jsonl"));
+    assert!(run_report(&work.path(""), &|_, _| {}).unwrap_err().to_string().contains("metrics.jsonl"));
 }

@@ -40,9 +40,7 @@ impl Ours {
             summary,
         }
     }
-}
 
-impl Ours {
     fn costs(&self) -> String {
         let Summary { gaussians, steps, train_seconds, host_bytes_peak, .. } = self.summary;
         format!(
@@ -98,9 +96,6 @@ impl Row {
         cells
     }
 }
-
-/// Makes the cell of a column from a row.
-type MakeCell = Box<dyn Fn(&Vec<String>) -> Cell>;
 
 /// The input of the report.
 pub struct Comparison<'a> {
@@ -219,16 +214,11 @@ impl Comparison<'_> {
         let tier = self.tier.unwrap_or("none");
         let title = format!("gsscale: {} beside the published figures", self.run.facts.title);
         let mut page = Page::new(&title, &format!("{}, tier {tier}", self.data.display()));
-        let rows: Vec<Vec<String>> = self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())).collect();
-        let cell = |column: usize| -> MakeCell {
-            match column {
-                0 => Box::new(|row| Cell::text(&row[0])),
-                _ => Box::new(move |row| Cell::Number(row[column].clone())),
-            }
+        let row = |row: &Row| {
+            let mut cells = row.cells(self.with_defaults.is_some()).into_iter();
+            cells.next().map(Cell::Text).into_iter().chain(cells.map(Cell::Number)).collect()
         };
-        let cells: Vec<_> = (0..self.head().len()).map(cell).collect();
-        let columns: Vec<_> = self.head().into_iter().zip(cells.iter().map(AsRef::as_ref)).collect();
-        page.table(&rows, &columns);
+        page.table(self.head(), self.rows().iter().map(row));
         self.facts().iter().for_each(|fact| page.paragraph(fact));
         if !self.caveats.is_empty() {
             page.heading("Not the published run");

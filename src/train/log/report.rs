@@ -3,7 +3,6 @@
 //! Invariants: 1. every number written is finite, because JSON has neither infinity nor NaN (see [`json_psnr`]); 2.
 //! whole files appear by rename, so a reader never sees a partial file.
 
-use crate::appearance::AppearanceMode;
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::process_cpu_seconds;
 use crate::base::whole_file::write_whole;
@@ -14,6 +13,7 @@ use crate::exchange::sink::LEVELS_MAX;
 use crate::exchange::tensorboard::EventFile;
 use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
+use crate::photos::exposure::AppearanceMode;
 use crate::render::color_correct::ColorCorrect;
 use crate::train::step::device_slots::SlotTraffic;
 use serde::{Deserialize, Serialize};

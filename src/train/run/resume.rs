@@ -28,7 +28,6 @@ use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
 use crate::page::tool::uncommitted::is_uncommitted;
 use crate::paging::pager::Pager;
-use crate::photos;
 use crate::render::Renderer;
 use crate::report::live::Live;
 use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
@@ -391,7 +390,7 @@ fn finished_outcome(
         // An earlier process of the run may have created the folder in its results; it is empty now.
         let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
-    write_run_report(&request.out, &photos::sections(), &|_, _| {})?;
+    write_run_report(&request.out, &|_, _| {})?;
     if !request.quiet {
         let more = if is_kept { "" } else { " from its PLY" };
         let (out, steps) = (request.out.display(), summary.steps);

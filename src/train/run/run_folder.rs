@@ -26,7 +26,6 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
-use crate::photos;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
@@ -382,7 +381,7 @@ fn write_report(request: &RunRequest) -> InputResult<()> {
         let count = || Count::new("pictures put into the report", all as u32, request.quiet);
         shown.get_or_init(count).show(done as u32);
     };
-    write_run_report(&request.out, &photos::sections(), &show)?;
+    write_run_report(&request.out, &show)?;
     Ok(())
 }
 

@@ -4,14 +4,14 @@
 //! affine or quadratic colour correction ([`ColorCorrected`]), and of the right halves after a fit of appearance to the left
 //! halves ([`HalfFitted`]).
 
-use crate::appearance::AppearanceMode;
-use crate::appearance::fit::Pair;
-use crate::appearance::picture::{Lens, Look};
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_rows::write_rgb_rows;
 use crate::base::whole_file::{write_whole, write_whole_with};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::photos::exposure::AppearanceMode;
+use crate::photos::exposure::fit::Pair;
+use crate::photos::exposure::picture::{Lens, Look};
 use crate::render::RenderOptions;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::{InputRange, Lpips};

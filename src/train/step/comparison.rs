@@ -82,7 +82,7 @@ fn target_of<'p>(
 mod tests {
     use super::*;
     use crate::page::format::encoding::EncodingError;
-    use crate::photos::saved::{Encoded, ValuesError};
+    use crate::photos::parameter::{Encoded, ValuesError};
     use crate::render::RenderOptions;
     use crate::render::cpu::CpuRenderer;
     use crate::scene::camera::Camera;

@@ -228,8 +228,8 @@ impl Pair<'_> {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::appearance::picture::Lens;
     use crate::base::rng::mix64;
+    use crate::photos::exposure::picture::Lens;
 
     const WIDTH: u32 = 64;
     const HEIGHT: u32 = 48;
@@ -308,7 +308,7 @@ mod tests {
         // a1, a2, a3 trade places under the weights, so compare the falloff where the photo has pixels.
         for at in [[0.2, 0.1], [0.5, 0.5], [0.7, 0.4]] {
             let [got, want] =
-                [look.falloff[1], falloff[1]].map(|values| crate::appearance::model::falloff(&values, at));
+                [look.falloff[1], falloff[1]].map(|values| crate::photos::exposure::model::falloff(&values, at));
             assert!((got - want).abs() < 0.02, "{got}, not {want} at {at:?}");
         }
     }

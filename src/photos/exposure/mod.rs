@@ -1,33 +1,84 @@
-//! Exposure and colours of photos, vignetting of cameras (`--appearance`): [`crate::appearance`] in the steps of a run.
+//! Appearance (`--appearance`): what differs between the photos of one scene besides the pose. An exposure and a colour homography per
+//! photo, and vignetting per camera, act on the rendered picture before the loss.
 //!
-//! Not here: the correction and its values.
+//! The model is that of PPISP (arXiv 2601.18336) without its response curve: the picture is multiplied by 2^dt and by the
+//! falloff of the lens, then a homography changes chromaticities ([`model`]). Scene and correction share a freedom: a
+//! brighter scene under darker exposures gives the same pictures. So what acts on a photo is its value less the mean over
+//! the photos seen ([`state`]), and small weights pull it towards no change.
+//!
+//! Values follow one damped Gauss-Newton step per sighting ([`fit`]) instead of Adam. A run of 1,500 steps sees each of
+//! 150 photos ten times; Adam at a rate of .002 would move an exposure by .02 stops in that time. The nine values of a
+//! photo are well determined by one sighting, so their optimum is computed. Later sightings count less, so that the values
+//! settle.
+//!
+//! Invariants: 1. sums over pixels are f64 in row order, so the bits are the same for any number of threads; 2. no value
+//! that is not finite, or out of bounds, is stored; 3. masked pixels count nowhere.
+//!
+//! Not here: the exposures that evaluation fits without a run (`train::state::eval`).
+
+pub mod fit;
+pub mod model;
+pub mod picture;
+pub mod state;
 
 use super::PhotoOptions;
-use super::parameter::{Kind, PhotoOutcome, PhotoParameter, PhotoStep, views_by_name, write_values};
-use super::saved::{Encoded, ValuesError};
-use crate::appearance::AppearanceMode;
-use crate::appearance::first_values::first_exposures;
-use crate::appearance::fit::Pair;
-use crate::appearance::model::CHANNEL_VALUES;
-use crate::appearance::picture::Look;
-use crate::appearance::state::{AppearanceState, Found, camera_groups, find};
+use super::parameter::{Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError};
+use super::parameter::{views_by_name, write_values};
 use crate::base::error::InputResult;
 use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
-use crate::report::chart::{Chart, Mark};
-use crate::report::html::Page;
-use crate::report::run_report::{POINTS_MAX, read_json};
 use crate::scene::image::Target;
+use fit::Pair;
+use model::CHANNEL_VALUES;
+use picture::Look;
 use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::Value;
+use state::{AppearanceState, Found, camera_groups, find, first_exposures};
 use std::path::Path;
+
+/// Which corrections are trained.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AppearanceMode {
+    /// None.
+    #[default]
+    Off,
+    /// An exposure per photo.
+    Exposure,
+    /// Exposure and colour homography per photo, vignetting per camera.
+    Full,
+}
+
+impl AppearanceMode {
+    /// Whether anything is corrected.
+    pub fn is_on(self) -> bool {
+        self != AppearanceMode::Off
+    }
+
+    /// The name in files and on the command line.
+    pub fn name(self) -> &'static str {
+        match self {
+            AppearanceMode::Off => "off",
+            AppearanceMode::Exposure => "exposure",
+            AppearanceMode::Full => "full",
+        }
+    }
+
+    /// How many of a photo's values are trained, from the first.
+    pub fn image_values(self) -> usize {
+        match self {
+            AppearanceMode::Off => 0,
+            AppearanceMode::Exposure => 1,
+            AppearanceMode::Full => model::IMAGE_VALUES,
+        }
+    }
+}
 
 /// Exposure and colours of each photo, vignetting of each camera.
 const FILE: &str = "appearance.json";
 
-pub(super) const KIND: Kind = Kind { name: "appearance", file: Some(FILE), first, check, section };
+pub(super) const KIND: Kind = Kind { name: "appearance", file: Some(FILE), first, check, finding };
 
 /// Photos that a warning names.
 const NAMED: usize = 3;
@@ -199,7 +250,7 @@ impl PhotoParameter for Appearance {
     }
 }
 
-/// The file. The model is that of [`crate::appearance::model`].
+/// The file.
 #[derive(Debug, Serialize)]
 struct AppearanceFile {
     /// `exposure` or `full`.
@@ -234,25 +285,17 @@ struct CameraValues {
     vignetting: [[f64; CHANNEL_VALUES]; 3],
 }
 
-/// A chart of the exposures of the photos, if the run has trained them.
-fn section(page: &mut Page, folder: &Path, _: &Value) {
-    let values = read_json(&folder.join(FILE)).unwrap_or(Value::Null);
-    let images = values["images"].as_array().map_or(&[][..], Vec::as_slice);
-    let stops = |(i, image): (usize, &Value)| Some((i as f64, image["exposure"].as_f64()?));
-    let points: Vec<(f64, f64)> = images.iter().enumerate().filter_map(stops).collect();
-    if points.is_empty() {
-        return;
-    }
-    page.heading("Appearance");
-    let stride = points.len().div_ceil(POINTS_MAX);
-    let points = points.into_iter().step_by(stride).collect();
-    let chart = Chart::new("Exposure", "photo, by name", "stops").with("", points, Mark::LineAndDots);
-    let first = match values["exposures_from_exif"].as_u64() {
+/// The exposures of the photos, if the run has trained them.
+fn finding(file: &Value, _: &Value) -> Option<Finding> {
+    let images = file["images"].as_array().map_or(&[][..], Vec::as_slice);
+    let values: Vec<f64> = images.iter().filter_map(|image| image["exposure"].as_f64()).collect();
+    let first = match file["exposures_from_exif"].as_u64() {
         None | Some(0) => String::new(),
         Some(count) => format!(" {count} exposures started from EXIF data."),
     };
     let caption = format!(
         "Exposure of each training photo against the mean of all, as trained.{first} appearance.json has the numbers."
     );
-    page.charts(&[(chart.svg(), caption)]);
+    let curve = (!values.is_empty()).then_some(Curve { title: "Exposure", unit: "stops", values, caption })?;
+    Some(Finding { title: "Appearance", curve: Some(curve), ..Finding::default() })
 }

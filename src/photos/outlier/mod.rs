@@ -1,19 +1,16 @@
 //! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
-//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by the [`residuals`] of blocks, with their
-//! [`rims`].
+//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by their residuals on a [`grid`].
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
-//! Invariants: 1. every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
-//! of threads, frames and budgets, and a resumed run goes on with the values of its commit; 2. nothing here changes a
-//! picture, a photo or a gradient: `train` does, as far as the user asked for it.
-//!
-//! Not here: which step leaves out what (`train`), and the bytes of a commit (`checkpoint`).
+//! Invariant: every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
+//! of threads, frames and budgets, and a resumed run goes on with the values of its commit.
 
 pub mod blocks;
-pub mod residuals;
-pub mod rims;
+mod grid;
 pub mod views;
+
+use crate::scene::image::Target;
 
 /// Median absolute deviation of a normal distribution, in standard deviations.
 const MAD_OF_NORMAL: f64 = 0.674_489_75;
@@ -24,4 +21,9 @@ fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
     let median = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
     values.iter_mut().for_each(|value| *value = (*value - median).abs());
     Some((median, *values.select_nth_unstable_by(middle, f64::total_cmp).1))
+}
+
+/// Whether a pixel (y * width + x) of a photo is not masked.
+fn is_used(photo: &Target, pixel: usize) -> bool {
+    photo.mask.as_ref().is_none_or(|mask| mask[pixel] != 0)
 }
