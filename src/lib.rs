@@ -53,7 +53,7 @@
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
 //!    ([`config::key::Class`]). `hidden` behind the class keeps it out of help: it is for work on the program, and `configs/README.md`
 //!    names it. `common` also shows it in `-h` ([`config::key::Shown`]).
-//! 2. `config/check.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
+//! 2. `check` in `config/file.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
 //! 3. `config/limits.rs`: puts the value into the options of the module that uses it. No module but `train` sees the config.
 //! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
 //!    file again, also after a change of a help text. Tests read the words of enumerations from
@@ -67,7 +67,7 @@
 //! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
 //!    event kind in `scene/events.rs` if a round needs other values than today's. `densify/mod.rs` names the file.
 //! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
-//!    strategy from the keys. `config/check.rs`: which keys it needs, and whether an optimizer on the device can do without it.
+//!    strategy from the keys. `check` in `config/file.rs`: which keys it needs, and whether an optimizer on the device can do without it.
 //! 3. What acts on the rows of a view in every step: [`densify::strategy::Strategy::add_gradients`] and
 //!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
@@ -80,7 +80,7 @@
 //!    for the same bits on any number of threads. `save` gives `Encoded::of(&())`. The test of `train/step/comparison.rs` has
 //!    a small example. `first` returns `None` where the weight is 0, so that nothing changes.
 //! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `config/check.rs` for its range. `CHANGELOG.md` names it.
+//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `check` there for its range. `CHANGELOG.md` names it.
 //! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
 //!    shaders. A run with such a kind records no steps ahead on a device: recorded steps compute the built-in
 //!    loss alone.
@@ -92,7 +92,7 @@
 //!    forecast, `summary.json` and the report follow. `photos/exposure/` acts on pictures, `photos/pose.rs` on
 //!    cameras, `photos/outlier/blocks.rs` on photos.
 //! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `config/check.rs` says if an optimizer on the device cannot do without gradients on the host.
+//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `check` in `config/file.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's `Format` (`exchange/sink.rs`), of which a [`exchange::sink::GaussianSink`] is made;

@@ -27,6 +27,7 @@ use gsscale::config::choice::Choice;
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
+use gsscale::config::new_run;
 use gsscale::config::published::BUILT_IN;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
@@ -102,7 +103,7 @@ fn doctor(_: &[OsString], _: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
 
 /// The checked config of a measurement; starts the worker threads.
 fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, TrainError> {
-    let config = TrainConfig::of_new_run(file, keys)?;
+    let config = new_run::of_new_run(file, keys)?;
     config.check()?;
     if !simd_path(&config).is_supported() {
         let problem = format!("this machine cannot run {}", config.simd.word());

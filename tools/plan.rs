@@ -14,6 +14,7 @@ use gsscale::base::units::format_bytes;
 use gsscale::config::choice::Chosen;
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides};
+use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;
 use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
@@ -213,7 +214,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let run_config = args.scene.join(CONFIG_FILE);
     let is_run = run_config.is_file();
     let config_path = args.config.clone().or_else(|| is_run.then(|| run_config.clone()));
-    let config = TrainConfig::of_new_run(config_path.as_deref(), &args.keys)?;
+    let config = new_run::of_new_run(config_path.as_deref(), &args.keys)?;
     config.check()?;
     set_up(&config)?;
     if config.optimizer == Method::Dense {

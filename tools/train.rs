@@ -8,6 +8,7 @@ use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::command_line::parse_command_line;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::new_run;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
@@ -166,7 +167,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     }
     let config = match (&args.config, args.demo) {
         (None, true) => demo_config(&args.keys)?,
-        (file, _) => TrainConfig::of_new_run(file.as_deref(), &args.keys)?,
+        (file, _) => new_run::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
     let out = args.out.unwrap_or_else(|| default_out(args.scene.as_deref()));
@@ -196,7 +197,7 @@ fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
         eval_every: keys.eval_every.or(Some(1000)),
         ..keys.clone()
     };
-    TrainConfig::of_new_run(None, &keys)
+    new_run::of_new_run(None, &keys)
 }
 
 /// Refuses an output folder of a demo that holds more than the city of an earlier demo.

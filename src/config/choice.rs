@@ -5,7 +5,6 @@
 //! the same message; 3. this file holds no defaults and no meanings; 4. [`choices`] lists every such key: tests of words go
 //! through the list, so that a new key or word is named here alone.
 
-use super::schedule::Schedule;
 use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -75,6 +74,15 @@ pub enum LogFormat {
     Json,
     /// TensorBoard event files as well.
     Tensorboard,
+}
+
+/// The value of `--schedule`: what keys become that are not given ([`super::new_run`]).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Schedule {
+    /// Shares of the steps.
+    RunLength,
+    /// The values for 30,000 steps, whatever the number of steps.
+    Classic,
 }
 
 /// Every key whose value is a word, with the words that a user may write.

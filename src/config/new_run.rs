@@ -1,36 +1,64 @@
 //! The config of a new run. Flags override the config file, which overrides the defaults. The length of the run sets some
-//! of the keys that neither gives ([`super::schedule`]), and `poor-points` some more.
+//! of the keys that neither gives, and `poor-points` some more.
+//!
+//! The defaults of the 3D Gaussian Splatting code are for 30,000 steps. A run of 3,000 steps would raise its SH degree
+//! to 3 only at its end, and its Gaussians would not get far. [`Schedule::RunLength`] makes these lengths shares of
+//! `--steps`:
+//!
+//! | key | value | from the classic value on, at |
+//! | --- | --- | --- |
+//! | `sh-every` | a tenth of the steps | 10,000 steps |
+//! | `refine-start` | a sixth of the steps | 3,000 steps |
+//! | `refine-every` | a thirtieth of the steps, at least 10 | 3,000 steps |
+//! | `refine-stop` | four fifths of the steps | 18,750 steps |
+//! | `means-lr` | times the square root of 30,000 / steps, at most times 3 | 30,000 steps |
+//! | `scales-lr`, `quats-lr` and `shn-lr`, with the strategy `long-axis` | times the same factor | 30,000 steps |
+//! | `others-lr-final`, with the strategy `long-axis` | a tenth | never |
+//!
+//! The factor of the rates has a reason: a value whose gradients have changing signs moves like a random walk under
+//! Adam, as far as its rate times the square root of the steps. The factor keeps this distance. The limit of 3 is the
+//! largest factor that was measured (`benches/RESULTS.md`). `reset-every` stays as it is, because opacities take a number
+//! of steps to recover, not a share; `refine-stop` ends resets too, and none comes shortly before the end of a run
+//! ([`crate::densify::default`]).
 //!
 //! Invariants: 1. a given key is never changed, unless photos are few and it has the value that the length of the run gives; 2. the
 //! result is written to the config of the run as if every key had been given, so a resumed run keeps its values whatever its new
-//! length.
+//! length; 3. at 30,000 steps and more every value but `others-lr-final` is the default; 4. no value jumps between lengths.
 
+use super::choice::Schedule;
 use super::file::{TrainConfig, TrainOverrides};
-use super::schedule::{Lengths, Schedule};
 use crate::base::error::InputResult;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use std::collections::BTreeSet;
 use std::path::Path;
 
-/// A key of the schedule: its field, its place in a config, and its value in lengths.
-type LengthKey<T> = (&'static str, fn(&mut TrainConfig) -> &mut T, fn(&Lengths) -> T);
+/// A key of the schedule: its field, and its place in a config.
+type LengthKey<T> = (&'static str, fn(&mut TrainConfig) -> &mut T);
 
 /// The keys of the schedule that count steps.
 const STEP_KEYS: [LengthKey<u32>; 4] = [
-    ("sh_every", |config| &mut config.sh_every, |lengths| lengths.sh_every),
-    ("refine_start", |config| &mut config.refine_start, |lengths| lengths.refine_start),
-    ("refine_every", |config| &mut config.refine_every, |lengths| lengths.refine_every),
-    ("refine_stop", |config| &mut config.refine_stop, |lengths| lengths.refine_stop),
+    ("sh_every", |config| &mut config.sh_every),
+    ("refine_start", |config| &mut config.refine_start),
+    ("refine_every", |config| &mut config.refine_every),
+    ("refine_stop", |config| &mut config.refine_stop),
 ];
 /// The keys of the schedule that are rates.
 const RATE_KEYS: [LengthKey<f64>; 5] = [
-    ("means_lr", |config| &mut config.means_lr, |lengths| lengths.means_lr),
-    ("scales_lr", |config| &mut config.scales_lr, |lengths| lengths.scales_lr),
-    ("quats_lr", |config| &mut config.quats_lr, |lengths| lengths.quats_lr),
-    ("shn_lr", |config| &mut config.shn_lr, |lengths| lengths.shn_lr),
-    ("others_lr_final", |config| &mut config.others_lr_final, |lengths| lengths.others_lr_final),
+    ("means_lr", |config| &mut config.means_lr),
+    ("scales_lr", |config| &mut config.scales_lr),
+    ("quats_lr", |config| &mut config.quats_lr),
+    ("shn_lr", |config| &mut config.shn_lr),
+    ("others_lr_final", |config| &mut config.others_lr_final),
 ];
+/// Steps for which the defaults were made.
+const CLASSIC_STEPS: u32 = 30_000;
+/// Largest factor of a learning rate.
+const RATE_FACTOR_MOST: f64 = 3.0;
+/// Fraction of the rates that is left at the end of a run of the strategy `long-axis`.
+const SETTLED: f64 = 0.1;
+/// Fewest steps between rounds that follow from the number of steps.
+const REFINE_EVERY_LEAST: u32 = 10;
 /// Most steps of a schedule for each training photo. Held-out photos of a small scene are best after 100 to 200 steps a photo
 /// (`benches/RESULTS.md`, "Long runs on a small scene").
 const PHOTO_STEPS_MOST: u64 = 150;
@@ -44,129 +72,136 @@ const POOR_INIT_SCALE: f64 = 2.0;
 /// With `poor-points`: the share of Gaussians that a round at the cap moves to a better place.
 const POOR_RECYCLE: f64 = 0.05;
 
-impl TrainConfig {
-    /// The config of a new run, not checked yet.
-    ///
-    /// # Errors
-    /// The file cannot be read.
-    pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
-        let (mut config, given) = TrainConfig::with_given(file, keys)?;
-        config.set_open_keys(&given);
-        Ok(config)
-    }
+/// The config of a new run, not checked yet.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
+    let (mut config, given) = with_given(file, keys)?;
+    set_open_keys(&mut config, &given);
+    Ok(config)
+}
 
-    /// As [`TrainConfig::of_new_run`], of the given keys.
-    ///
-    /// # Errors
-    /// A key or a word is unknown.
-    pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
-        let given = keys.keys().map(|key| key.replace('-', "_")).collect();
-        let mut config: TrainConfig = keys.try_into().map_err(|e: toml::de::Error| e.to_string())?;
-        config.set_open_keys(&given);
-        Ok(config)
-    }
+/// As [`of_new_run`], of the given keys.
+///
+/// # Errors
+/// A key or a word is unknown.
+pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
+    let given = keys.keys().map(|key| key.replace('-', "_")).collect();
+    let mut config: TrainConfig = keys.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+    set_open_keys(&mut config, &given);
+    Ok(config)
+}
 
-    /// The keys that a config file and flags give.
-    ///
-    /// # Errors
-    /// The file cannot be read.
-    pub fn given(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<toml::Table> {
-        let (config, given) = TrainConfig::with_given(file, keys)?;
-        let all = toml::Table::try_from(&config).unwrap_or_default();
-        Ok(all.into_iter().filter(|(key, _)| given.contains(&key.replace('-', "_"))).collect())
-    }
+/// The keys that a config file and flags give.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn given_keys(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<toml::Table> {
+    let (config, given) = with_given(file, keys)?;
+    let all = toml::Table::try_from(&config).unwrap_or_default();
+    Ok(all.into_iter().filter(|(key, _)| given.contains(&key.replace('-', "_"))).collect())
+}
 
-    /// The keys of a config file and flags over the defaults, and the names of their fields.
-    fn with_given(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<(TrainConfig, BTreeSet<String>)> {
-        let (mut config, mut given) = match file {
-            Some(path) => TrainConfig::read_with_keys(path)?,
-            None => (TrainConfig::default(), BTreeSet::new()),
-        };
-        given.extend(keys.given().into_iter().map(str::to_string));
-        keys.clone().apply(&mut config);
-        Ok((config, given))
-    }
+/// The keys of a config file and flags over the defaults, and the names of their fields.
+fn with_given(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<(TrainConfig, BTreeSet<String>)> {
+    let (mut config, mut given) = match file {
+        Some(path) => TrainConfig::read_with_keys(path)?,
+        None => (TrainConfig::default(), BTreeSet::new()),
+    };
+    given.extend(keys.given().into_iter().map(str::to_string));
+    keys.clone().apply(&mut config);
+    Ok((config, given))
+}
 
-    /// Sets the keys that the length of the run and `poor-points` decide, but for those in `given` (names of fields).
-    fn set_open_keys(&mut self, given: &BTreeSet<String>) {
-        self.follow_length(given);
-        if self.poor_points {
-            self.adapt_to_poor_points(|field| !given.contains(field));
+/// Sets the keys that the length of the run and `poor-points` decide, but for those in `given` (names of fields). The values of
+/// `poor-points` were chosen by the PSNR of held-out photos of two scenes with a tenth of their points and with random ones, see
+/// "Few or random points" in `benches/RESULTS.md`.
+fn set_open_keys(config: &mut TrainConfig, given: &BTreeSet<String>) {
+    let mut of_length = with_lengths(config, config.steps);
+    set_keys(&STEP_KEYS, config, &mut of_length, |(field, _), _| !given.contains(*field));
+    set_keys(&RATE_KEYS, config, &mut of_length, |(field, _), _| !given.contains(*field));
+    if !config.poor_points {
+        return;
+    }
+    let is_open = |field: &str| !given.contains(field);
+    if is_open("means_lr") {
+        config.means_lr *= POOR_MEANS_LR;
+    }
+    if is_open("init_scale") {
+        config.init_scale = POOR_INIT_SCALE;
+    }
+    if is_open("recycle") {
+        config.recycle = POOR_RECYCLE;
+    }
+    if is_open("growth_score") {
+        config.growth_score = GrowthScore::Mixed;
+    }
+}
+
+/// Gives the open ones of these keys their values in `from`.
+fn set_keys<T: Copy>(
+    keys: &[LengthKey<T>],
+    config: &mut TrainConfig,
+    from: &mut TrainConfig,
+    mut is_open: impl FnMut(&LengthKey<T>, &mut TrainConfig) -> bool,
+) {
+    for key in keys {
+        if is_open(key, config) {
+            *key.1(config) = *key.1(from);
         }
     }
+}
 
-    /// Sets the fields of `poor-points` that are open. The values were chosen by the PSNR of held-out photos of two scenes with a tenth
-    /// of their points and with random ones, see "Few or random points" in `benches/RESULTS.md`.
-    pub fn adapt_to_poor_points(&mut self, is_open: impl Fn(&str) -> bool) {
-        if is_open("means_lr") {
-            self.means_lr *= POOR_MEANS_LR;
-        }
-        if is_open("init_scale") {
-            self.init_scale = POOR_INIT_SCALE;
-        }
-        if is_open("recycle") {
-            self.recycle = POOR_RECYCLE;
-        }
-        if is_open("growth_score") {
-            self.growth_score = GrowthScore::Mixed;
-        }
+/// The config with the values that the keys of the schedule have in a run of this many steps.
+fn with_lengths(config: &TrainConfig, steps: u32) -> TrainConfig {
+    let classic = TrainConfig::default();
+    let follows = config.schedule == Schedule::RunLength;
+    let (share, factor) = match follows {
+        true => (steps, (f64::from(CLASSIC_STEPS) / f64::from(steps.max(1))).sqrt().clamp(1.0, RATE_FACTOR_MOST)),
+        false => (u32::MAX, 1.0),
+    };
+    let (of_strategy, others_lr_final) = match follows && config.strategy == StrategyName::LongAxis {
+        true => (factor, SETTLED),
+        false => (1.0, classic.others_lr_final),
+    };
+    TrainConfig {
+        steps,
+        sh_every: (share / 10).clamp(1, classic.sh_every),
+        refine_start: (share / 6).min(classic.refine_start),
+        refine_every: (share / 30).clamp(REFINE_EVERY_LEAST, classic.refine_every),
+        refine_stop: (u64::from(share) * 4 / 5).min(u64::from(classic.refine_stop)) as u32,
+        means_lr: classic.means_lr * factor,
+        scales_lr: classic.scales_lr * of_strategy,
+        quats_lr: classic.quats_lr * of_strategy,
+        shn_lr: classic.shn_lr * of_strategy,
+        others_lr_final,
+        ..config.clone()
     }
+}
 
-    /// Sets the keys of the schedule that are not in `given` (names of fields) by `--schedule` and `--steps`.
-    fn follow_length(&mut self, given: &BTreeSet<String>) {
-        let lengths = match self.schedule {
-            Schedule::RunLength => Lengths::of_run(self.steps, self.strategy),
-            Schedule::Classic => Lengths::CLASSIC,
-        };
-        self.set_lengths(&lengths, |field| !given.contains(field));
+/// Ends the schedule of a run with the strategy `long-axis` after 150 steps for each of its training photos, unless
+/// `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos. A key
+/// that has its value by the length of the run gets the one by the length of the schedule. Returns the steps of the schedule
+/// if it ends before the run.
+pub fn adapt_schedule(config: &mut TrainConfig, photos: usize) -> Option<u32> {
+    let steps = (photos as u64).saturating_mul(PHOTO_STEPS_MOST).max(1);
+    let follows_length = config.schedule == Schedule::RunLength && config.strategy == StrategyName::LongAxis;
+    if !follows_length || config.schedule_steps != 0 || steps >= u64::from(config.steps) {
+        return None;
     }
-
-    /// Ends the schedule of a run with the strategy `long-axis` after 150 steps for each of its training photos, unless
-    /// `schedule-steps` is given or `schedule` is classic: further steps at full rates would fit the noise of few photos. A key
-    /// that has its value by the length of the run gets the one by the length of the schedule. Returns the steps of the schedule
-    /// if it ends before the run.
-    pub fn adapt_schedule(&mut self, photos: usize) -> Option<u32> {
-        let steps = (photos as u64).saturating_mul(PHOTO_STEPS_MOST).max(1);
-        let follows_length = self.schedule == Schedule::RunLength && self.strategy == StrategyName::LongAxis;
-        if !follows_length || self.schedule_steps != 0 || steps >= u64::from(self.steps) {
-            return None;
-        }
-        self.schedule_steps = steps as u32;
-        let mut of_run = self.of_length(self.steps);
-        let mut of_schedule = TrainConfig { others_lr_final: STILL, ..self.of_length(self.schedule_steps) };
-        self.exchange(&STEP_KEYS, &mut of_run, &mut of_schedule);
-        self.exchange(&RATE_KEYS, &mut of_run, &mut of_schedule);
-        Some(self.schedule_steps)
-    }
-
-    /// Gives the keys that have their values as in `old` those of `new`.
-    fn exchange<T: PartialEq + Copy>(&mut self, keys: &[LengthKey<T>], old: &mut TrainConfig, new: &mut TrainConfig) {
-        for (_, place, _) in keys {
-            if *place(self) == *place(old) {
-                *place(self) = *place(new);
-            }
-        }
-    }
-
-    /// A config of this strategy and this many steps in which no key of the schedule is given.
-    fn of_length(&self, steps: u32) -> TrainConfig {
-        let mut config = TrainConfig { steps, ..self.clone() };
-        config.follow_length(&BTreeSet::new());
-        if config.poor_points {
-            config.adapt_to_poor_points(|_| true);
-        }
-        config
-    }
-
-    /// Sets the keys of the schedule whose fields are open.
-    fn set_lengths(&mut self, lengths: &Lengths, is_open: impl Fn(&str) -> bool) {
-        for (_, place, value) in STEP_KEYS.iter().filter(|(field, ..)| is_open(field)) {
-            *place(self) = value(lengths);
-        }
-        for (_, place, value) in RATE_KEYS.iter().filter(|(field, ..)| is_open(field)) {
-            *place(self) = value(lengths);
-        }
-    }
+    config.schedule_steps = steps as u32;
+    // As if no key was given.
+    let of_length = |steps: u32| {
+        let mut all = TrainConfig { steps, ..config.clone() };
+        set_open_keys(&mut all, &BTreeSet::new());
+        all
+    };
+    let (mut of_run, mut of_schedule) = (of_length(config.steps), of_length(config.schedule_steps));
+    of_schedule.others_lr_final = STILL;
+    set_keys(&STEP_KEYS, config, &mut of_schedule, |(_, place), config| *place(config) == *place(&mut of_run));
+    set_keys(&RATE_KEYS, config, &mut of_schedule, |(_, place), config| *place(config) == *place(&mut of_run));
+    Some(config.schedule_steps)
 }
 
 #[cfg(test)]
@@ -174,7 +209,7 @@ mod tests {
     use super::*;
 
     fn of_flags(keys: &TrainOverrides) -> TrainConfig {
-        TrainConfig::of_new_run(None, keys).unwrap_or_default()
+        of_new_run(None, keys).unwrap_or_default()
     }
 
     #[test]
@@ -210,29 +245,29 @@ mod tests {
         let keys = TrainOverrides { means_lr: Some(1e-4), refine_every: Some(50), ..TrainOverrides::default() };
         let (before, mut config) = (of_flags(&keys), of_flags(&keys));
         assert_eq!(
-            (config.adapt_schedule(200), config.adapt_schedule(usize::MAX)),
+            (adapt_schedule(&mut config, 200), adapt_schedule(&mut config, usize::MAX)),
             (None, None),
             "150 steps a photo or fewer"
         );
         assert_eq!(config, before);
-        assert_eq!(config.adapt_schedule(28), Some(4200));
-        let short = Lengths::of_run(4200, StrategyName::LongAxis);
+        assert_eq!(adapt_schedule(&mut config, 28), Some(4200));
+        let short = with_lengths(&TrainConfig::default(), 4200);
         assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
         assert_eq!(config.others_lr_final, 0.01);
         // Few photos and poor points: both factors of the rate of positions hold.
         let poor = TrainOverrides { poor_points: Some(true), ..TrainOverrides::default() };
         let mut of_both = of_flags(&poor);
-        assert_eq!(of_both.adapt_schedule(28), Some(4200));
+        assert_eq!(adapt_schedule(&mut of_both, 28), Some(4200));
         assert!((of_both.means_lr / (short.means_lr * POOR_MEANS_LR) - 1.0).abs() < 1e-12, "{}", of_both.means_lr);
-        assert!(config.adapt_schedule(5).is_none() && config.check().is_ok(), "its schedule is given now");
+        assert!(adapt_schedule(&mut config, 5).is_none() && config.check().is_ok(), "its schedule is given now");
         for keys in [
             TrainOverrides { schedule_steps: Some(30_000), ..keys.clone() },
             TrainOverrides { schedule: Some(Schedule::Classic), ..keys.clone() },
             TrainOverrides { strategy: Some(StrategyName::Default), ..keys },
         ] {
             let mut config = of_flags(&keys);
-            assert_eq!((config.adapt_schedule(28), config == of_flags(&keys)), (None, true));
+            assert_eq!((adapt_schedule(&mut config, 28), config == of_flags(&keys)), (None, true));
         }
     }
 
@@ -260,7 +295,58 @@ mod tests {
     fn keys_of_a_file_are_given() {
         let parsed = TrainConfig::parse_with_keys("steps = 3000\nmeans-lr = 1.6e-4\n[resolved]\nrefine-stop = 1\n");
         let (mut config, given) = parsed.unwrap_or_default();
-        config.follow_length(&given);
+        set_open_keys(&mut config, &given);
         assert_eq!((config.means_lr, config.sh_every, config.refine_stop), (1.6e-4, 300, 2400));
+    }
+
+    #[test]
+    fn long_runs_keep_the_classic_values_and_short_runs_follow_their_length() {
+        let of_run = |steps: u32, strategy| with_lengths(&TrainConfig { strategy, ..TrainConfig::default() }, steps);
+        for steps in [30_000, 30_001, 200_000, u32::MAX] {
+            for strategy in [StrategyName::Default, StrategyName::Mcmc, StrategyName::None] {
+                assert_eq!(of_run(steps, strategy), TrainConfig { steps, strategy, ..TrainConfig::default() });
+            }
+            let settled = TrainConfig { steps, others_lr_final: 0.1, ..TrainConfig::default() };
+            assert_eq!(of_run(steps, StrategyName::LongAxis), settled);
+        }
+        for (steps, [sh_every, refine_start, refine_every, refine_stop]) in
+            [(3000, [300, 500, 100, 2400]), (300, [30, 50, 10, 240])]
+        {
+            let means_lr = 3.0 * 1.6e-4;
+            let lengths = TrainConfig { sh_every, refine_start, refine_every, refine_stop, ..TrainConfig::default() };
+            let want = TrainConfig { steps, means_lr, strategy: StrategyName::Default, ..lengths };
+            assert_eq!(of_run(steps, StrategyName::Default), want);
+            let faster = TrainConfig {
+                strategy: StrategyName::LongAxis,
+                scales_lr: 3.0 * want.scales_lr,
+                quats_lr: 3.0 * want.quats_lr,
+                shn_lr: 3.0 * want.shn_lr,
+                others_lr_final: 0.1,
+                ..want
+            };
+            assert_eq!(of_run(steps, StrategyName::LongAxis), faster);
+        }
+    }
+
+    #[test]
+    fn nothing_jumps_between_lengths() {
+        let mut last = with_lengths(&TrainConfig::default(), 1);
+        for steps in (2..32_000).step_by(37) {
+            let now = with_lengths(&TrainConfig::default(), steps);
+            // 37 steps more move no length by more than that, and no rate by more than 1 %.
+            let rates = |of: &TrainConfig| [of.means_lr, of.scales_lr, of.quats_lr, of.shn_lr];
+            for (now, last) in rates(&now).into_iter().zip(rates(&last)) {
+                assert!(now <= last && now > 0.99 * last, "{steps}");
+            }
+            for (now, last) in [
+                (now.sh_every, last.sh_every),
+                (now.refine_start, last.refine_start),
+                (now.refine_every, last.refine_every),
+                (now.refine_stop, last.refine_stop),
+            ] {
+                assert!(now >= last && now - last <= 37, "{steps}: {last} to {now}");
+            }
+            last = now;
+        }
     }
 }

@@ -1,9 +1,10 @@
-//! Values of keys that are no single word or number: byte sizes, colours, and which way is up.
+//! Values of keys that are no single word or number: byte sizes, colours, which way is up, where pages live.
 //!
 //! Invariant: a value that is written reads back the same.
 
 use crate::base::units::parse_bytes;
 use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
 
 /// A number of bytes, written as `4GiB`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -99,6 +100,37 @@ impl<'de> Deserialize<'de> for Up {
     fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
         String::deserialize(d)?.parse().map_err(serde::de::Error::custom)
     }
+}
+
+/// Where the pages of a run live, by `--spill-dir` and `--frames`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Residence<'a> {
+    /// All pages in memory; the run commits to its output folder.
+    Memory,
+    /// In `--frames` frames over a store in memory, without commits; for comparisons.
+    Frames,
+    /// In frames over this spill directory, which is also the checkpoint of the run.
+    SpillDir(&'a Path),
+}
+
+impl<'a> Residence<'a> {
+    /// The spill directory, if any.
+    pub fn spill_dir(self) -> Option<&'a Path> {
+        match self {
+            Residence::SpillDir(folder) => Some(folder),
+            Residence::Memory | Residence::Frames => None,
+        }
+    }
+
+    /// The folder of the checkpoint of a run with the output folder `out`.
+    pub fn checkpoint_folder(self, out: &Path) -> PathBuf {
+        self.spill_dir().map_or_else(|| checkpoint_folder(out), Path::to_path_buf)
+    }
+}
+
+/// The folder of the checkpoint of a run without a spill directory.
+pub fn checkpoint_folder(out: &Path) -> PathBuf {
+    out.join("checkpoint")
 }
 
 #[cfg(test)]

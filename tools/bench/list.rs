@@ -12,6 +12,7 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::text::read_text;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig};
 use gsscale::config::limits::load_options;
+use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::disturb::{Disturbance, plan};
 use gsscale::dataset::loader::Dataset;
@@ -272,7 +273,7 @@ fn over(a: &Table, b: &Table) -> Table {
 }
 
 fn config_of(name: &str, keys: Table) -> InputResult<TrainConfig> {
-    TrainConfig::of_given(keys)
+    new_run::of_given(keys)
         .map_err(|e| InputError::new(name, e, "see configs/default.toml for every key and its meaning"))
 }
 

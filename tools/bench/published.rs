@@ -9,6 +9,7 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::read_options;
+use gsscale::config::new_run;
 use gsscale::config::published::{BUILT_IN, PublishedRun, differences};
 use gsscale::dataset::layout::{Layout, find_layout};
 use gsscale::dataset::model::{RawScene, Split};
@@ -256,7 +257,7 @@ fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, Exit
     keys.test_after.get_or_insert(published.test_after);
     keys.init_ply.get_or_insert_with(|| published.init_ply.clone());
     keys.ssim_variant.get_or_insert(published.ssim_variant);
-    let config = TrainConfig::of_new_run(None, &keys)?;
+    let config = new_run::of_new_run(None, &keys)?;
     config.check()?;
     if !args.quiet {
         gsscale::tell!("run     the same photos with the defaults of gsscale, into {}", out.display());

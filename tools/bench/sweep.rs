@@ -8,6 +8,7 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::new_run;
 use gsscale::dataset::disturb::write_disturbed;
 use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::sweep_page::{sweep_page, sweep_table};
@@ -98,7 +99,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
         let remedy = "use --share 25, or 0 for all pages in memory";
         return Err(InputError::new("--share", "the value must be 0 or more, and below 100", remedy).into());
     }
-    let given = TrainConfig::given(args.config.as_deref(), &args.keys)?;
+    let given = new_run::given_keys(args.config.as_deref(), &args.keys)?;
     super::settle(args.config.as_deref(), &args.keys)?;
     let mut plans: Vec<(Place, Plan)> = Vec::new();
     for scene in &args.scenes {

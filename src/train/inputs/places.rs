@@ -1,5 +1,5 @@
 //! Folders of a run: the drive of its spill directory, and a folder for temporary files. For the checkpoint folder see
-//! [`crate::config::residence`].
+//! [`crate::config::values::Residence`].
 
 use std::path::{Path, PathBuf};
 

@@ -14,7 +14,7 @@ use super::probe::rows_at_most;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
-use crate::config::residence::Residence;
+use crate::config::values::Residence;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
@@ -363,7 +363,8 @@ fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
 mod tests {
     use super::*;
     use crate::base::units::GIB;
-    use crate::config::schedule::Lengths;
+    use crate::config::file::TrainOverrides;
+    use crate::config::new_run::of_new_run;
 
     /// Pixels of photos that limit no guess.
     const PIXELS: u64 = 1 << 40;
@@ -436,7 +437,8 @@ mod tests {
             (1000, 7_395, 256_525),
         ] {
             let mut run = TrainConfig { steps, ..config() };
-            let Lengths { refine_start, refine_every, refine_stop, .. } = Lengths::of_run(steps, StrategyName::Default);
+            let keys = TrainOverrides { steps: Some(steps), ..TrainOverrides::default() };
+            let TrainConfig { refine_start, refine_every, refine_stop, .. } = of_new_run(None, &keys).unwrap();
             (run.refine_start, run.refine_every, run.refine_stop) = (refine_start, refine_every, refine_stop);
             let (guessed, _) = reach(&run, first, PIXELS, 0, &[]);
             let factor = guessed as f64 / f64::from(reached);

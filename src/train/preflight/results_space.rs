@@ -8,7 +8,7 @@ use super::forecast::{Forecast, ply_bytes};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::config::file::TrainConfig;
-use crate::config::residence::Residence;
+use crate::config::values::Residence;
 use crate::exchange::format::ExportFormat;
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::train::inputs::places::drive_of;

@@ -15,8 +15,8 @@ use crate::checkpoint::run_state::DatasetPrint;
 use crate::config::choice::Device;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
-use crate::config::residence::Residence;
-use crate::config::values::Up;
+use crate::config::new_run;
+use crate::config::values::{Residence, Up};
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::drive_rate::DriveRate;
@@ -79,7 +79,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
 fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     let mut request = request.clone();
     let photos = start.dataset.train_views().len();
-    if let Some(steps) = request.config.adapt_schedule(photos).filter(|_| !request.quiet) {
+    if let Some(steps) = new_run::adapt_schedule(&mut request.config, photos).filter(|_| !request.quiet) {
         crate::say!(
             "photos  {photos} to train on: the rates fall until step {steps}, and stay low (see --schedule-steps)"
         );

@@ -21,7 +21,7 @@ use crate::config::choice::Chosen;
 use crate::config::facts::{Resolved, read_resolved};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::{self, RunOptions};
-use crate::config::residence::checkpoint_folder;
+use crate::config::values::checkpoint_folder;
 use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;

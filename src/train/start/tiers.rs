@@ -5,7 +5,7 @@
 
 use crate::base::error::InputResult;
 use crate::config::file::TrainConfig;
-use crate::config::residence::{Residence, checkpoint_folder};
+use crate::config::values::{Residence, checkpoint_folder};
 use crate::optim::moments::Moments;
 use crate::page::engine::memory::MemoryEngine;
 use crate::page::engine::open::{DEPTH, open_engine};
