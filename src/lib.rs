@@ -80,7 +80,7 @@
 //!    for the same bits on any number of threads. `save` gives `Encoded::of(&())`. The test of `train/step/comparison.rs` has
 //!    a small example. `first` returns `None` where the weight is 0, so that nothing changes.
 //! 2. `photos/mod.rs`: the kind as the last of [`photos::KINDS`], and its weight in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, `photo_options` in `config/limits.rs`, `check` there for its range. `CHANGELOG.md` names it.
+//! 3. The key, as above: `config/file.rs`, `photos` in `config/limits.rs`, `check` of the keys for its range. `CHANGELOG.md` names it.
 //! 4. Where the time of the term matters, the stage itself instead: `kernels/image_loss.rs` and `image_loss.wgsl` among the
 //!    shaders. A run with such a kind records no steps ahead on a device: recorded steps compute the built-in
 //!    loss alone.
@@ -92,7 +92,7 @@
 //!    forecast, `summary.json` and the report follow. `photos/exposure/` acts on pictures, `photos/pose.rs` on
 //!    cameras, `photos/outlier/blocks.rs` on photos.
 //! 2. `photos/mod.rs`: its place in [`photos::KINDS`], and what the user asks for in [`photos::PhotoOptions`].
-//! 3. The key, as above: `config/file.rs`, and `photo_options` in `config/limits.rs`. `check` in `config/file.rs` says if an optimizer on the device cannot do without gradients on the host.
+//! 3. The key, as above: `config/file.rs`, and `photos` in `config/limits.rs`. `check` in `config/file.rs` says if an optimizer on the device cannot do without gradients on the host.
 //!
 //! **An output format**
 //! 1. `exchange/` gets a file with the format's `Format` (`exchange/sink.rs`), of which a [`exchange::sink::GaussianSink`] is made;

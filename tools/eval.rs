@@ -84,7 +84,8 @@ fn start(args: Args) -> Result<(), TrainError> {
         Some(scene) => (scene, run_config),
         None => scene_of(&ply).map(|(scene, config)| (scene, Some(config)))?,
     };
-    let mut config = read_config(args.config.as_deref().or(run_config.as_deref()))?;
+    let file = args.config.as_deref().or(run_config.as_deref());
+    let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.apply(&mut config);
     config.check()?;
     let extras = EvalExtras {
@@ -154,8 +155,4 @@ fn scene_of(file: &Path) -> InputResult<(PathBuf, PathBuf)> {
     }
     let remedy = format!("if it was moved: gsscale-eval {} SCENE", file.display());
     Err(InputError::new(&scene, "the scene of this run is missing", remedy))
-}
-
-fn read_config(path: Option<&Path>) -> InputResult<TrainConfig> {
-    path.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)
 }

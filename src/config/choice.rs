@@ -5,6 +5,7 @@
 //! the same message; 3. this file holds no defaults and no meanings; 4. [`choices`] lists every such key: tests of words go
 //! through the list, so that a new key or word is named here alone.
 
+use super::values::as_text;
 use crate::base::simd::SimdPath;
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -51,16 +52,8 @@ pub fn parse_choice<T: Choice>(word: &str) -> Result<T, String> {
 }
 
 fn unknown<T: Choice>(flag: &str, word: &str) -> String {
-    format!("unknown --{flag} '{word}': use {}", listed(T::WORDS))
-}
-
-/// `a, b or c`.
-fn listed(words: &[&str]) -> String {
-    match words {
-        [] => String::new(),
-        [word] => word.to_string(),
-        [first @ .., last] => format!("{} or {last}", first.join(", ")),
-    }
+    let (last, first) = T::WORDS.split_last().unwrap_or((&"", &[]));
+    format!("unknown --{flag} '{word}': use {} or {last}", first.join(", "))
 }
 
 /// An optional choice. `None` is written `auto`, or `off` for a feature.
@@ -122,7 +115,7 @@ macro_rules! choices {
 
 /// Reading and writing in config files, and parsing of flags, of a type that implements [`Choice`].
 macro_rules! reading_and_writing {
-    ($type:ident) => {
+    ($type:ty) => {
         impl Serialize for $type {
             fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
                 s.serialize_str(&self.word())
@@ -203,6 +196,8 @@ macro_rules! open_choices {
                 self.0.map_or(Cow::Borrowed($none), |value| Cow::Owned($to(value)))
             }
         }
+
+        reading_and_writing!(Chosen<$type>);
     )+
 
         const OPEN_CHOICES: &[(&str, &[&str])] = &[$(($key, <Chosen<$type> as Choice>::WORDS)),+];
@@ -228,35 +223,6 @@ open_choices! {
 
 fn parsed<T: std::str::FromStr>(word: &str) -> Option<T> {
     word.parse().ok()
-}
-
-impl<T> Serialize for Chosen<T>
-where
-    Chosen<T>: Choice,
-{
-    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
-        s.serialize_str(&self.word())
-    }
-}
-
-impl<'de, T> Deserialize<'de> for Chosen<T>
-where
-    Chosen<T>: Choice,
-{
-    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        deserialize_choice(d)
-    }
-}
-
-impl<T> ValueParserFactory for Chosen<T>
-where
-    Chosen<T>: Choice,
-{
-    type Parser = ChoiceParser<Chosen<T>>;
-
-    fn value_parser() -> ChoiceParser<Chosen<T>> {
-        ChoiceParser(PhantomData)
-    }
 }
 
 fn deserialize_choice<'de, T: Choice, D: Deserializer<'de>>(d: D) -> Result<T, D::Error> {
@@ -334,17 +300,7 @@ impl std::fmt::Display for Device {
     }
 }
 
-impl Serialize for Device {
-    fn serialize<S: Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
-        s.collect_str(self)
-    }
-}
-
-impl<'de> Deserialize<'de> for Device {
-    fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        String::deserialize(d)?.parse().map_err(serde::de::Error::custom)
-    }
-}
+as_text!(Device);
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test

@@ -492,14 +492,6 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_reads_back_the_same() {
-        let mut config = TrainConfig { image_cache: ByteSize(12345), ..TrainConfig::default() };
-        config.background = Rgb([0.5, 0.25, 1.0]);
-        let text = toml::to_string(&config).unwrap_or_default();
-        assert_eq!(TrainConfig::parse(&text), Ok(config));
-    }
-
-    #[test]
     fn values_out_of_range_are_refused_by_name() {
         let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
@@ -526,19 +518,5 @@ mod tests {
         let on_device = TrainConfig { optimizer_on: Chosen(Some(OptimizerPlace::Device)), ..capped };
         let refusal = on_device.check().err().map(|e| e.to_string()).unwrap_or_default();
         assert!(refusal.contains("leave out --strategy mcmc, or --optimizer-on host"), "{refusal}");
-    }
-
-    #[test]
-    fn the_residence_follows_from_both_keys() {
-        let of =
-            |spill_dir: &str, frames| TrainConfig { spill_dir: spill_dir.into(), frames, ..TrainConfig::default() };
-        assert_eq!(of("", 0).residence(), Residence::Memory);
-        assert_eq!(of("", 7).residence(), Residence::Frames);
-        for frames in [0, 7] {
-            let config = of("pages", frames);
-            assert_eq!(config.residence(), Residence::SpillDir(Path::new("pages")));
-            assert_eq!(config.residence().checkpoint_folder(Path::new("out")), Path::new("pages"));
-        }
-        assert_eq!(of("", 7).residence().checkpoint_folder(Path::new("out")), Path::new("out/checkpoint"));
     }
 }

@@ -79,7 +79,6 @@ pub struct RunOptions {
 impl RunOptions {
     /// Options of a checked config for a scene of this scale (local units).
     pub fn new(config: &TrainConfig, scene_scale: f32) -> RunOptions {
-        let simd = simd_path(config);
         RunOptions {
             steps: config.steps,
             seed: config.seed,
@@ -92,7 +91,7 @@ impl RunOptions {
                 sh_degree: config.sh_degree,
                 max_alpha: config.max_alpha as f32,
                 background: config.background.0.map(|c| c as f32),
-                simd,
+                simd: simd_path(config),
                 ..RenderOptions::default()
             },
             loss: loss_options(config),
@@ -105,7 +104,14 @@ impl RunOptions {
             scene_scale,
             ssim_variant: config.ssim_variant,
             color_correct: config.color_correct.0,
-            photos: photo_options(config, scene_scale),
+            photos: PhotoOptions {
+                appearance: config.appearance,
+                robust_views: config.robust_views,
+                robust_pixels: config.robust_pixels,
+                refine_poses: config.refine_poses,
+                steps: config.steps,
+                scene_scale,
+            },
             export_frame: config.export_frame,
             up: match config.up {
                 Up::Along(up) => Some(up),
@@ -122,18 +128,6 @@ impl RunOptions {
     pub fn sh_degree_at(&self, step: u32) -> u8 {
         let raised = step.checked_div(self.sh_every).unwrap_or(u32::MAX);
         raised.max(u32::from(self.sh_degree_start)).min(u32::from(self.sh_degree)) as u8
-    }
-}
-
-/// What a config asks to be learnt of each photo.
-fn photo_options(config: &TrainConfig, scene_scale: f32) -> PhotoOptions {
-    PhotoOptions {
-        appearance: config.appearance,
-        robust_views: config.robust_views,
-        robust_pixels: config.robust_pixels,
-        refine_poses: config.refine_poses,
-        steps: config.steps,
-        scene_scale,
     }
 }
 
@@ -154,29 +148,40 @@ fn rates(config: &TrainConfig, scene_scale: f32) -> Rates {
 
 /// The strategy of a config.
 fn strategy(config: &TrainConfig, scene_scale: f32) -> Arc<dyn Strategy> {
+    let or_never = |n: u32| if n == 0 { u32::MAX } else { n };
+    let rounds = RoundSteps { start: config.refine_start, stop: config.refine_stop, every: config.refine_every };
+    let prune_opa = config.prune_opa as f32;
+    let max_gaussians = if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians };
     match config.strategy {
         StrategyName::None => Arc::new(NoStrategy),
-        StrategyName::Default => Arc::new(default_strategy(config)),
-        StrategyName::LongAxis => Arc::new(long_axis_strategy(config)),
-        StrategyName::Mcmc => Arc::new(mcmc_strategy(config, scene_scale)),
-    }
-}
-
-fn round_steps(config: &TrainConfig) -> RoundSteps {
-    RoundSteps { start: config.refine_start, stop: config.refine_stop, every: config.refine_every }
-}
-
-fn default_strategy(config: &TrainConfig) -> DefaultStrategy {
-    let never_if_zero = |n: u32| if n == 0 { u32::MAX } else { n };
-    DefaultStrategy {
-        grow_grad2d: config.grow_grad2d as f32,
-        grow_scale3d: config.grow_scale3d as f32,
-        prune_opa: config.prune_opa as f32,
-        prune_scale3d: config.prune_scale3d as f32,
-        rounds: round_steps(config),
-        reset_every: never_if_zero(config.reset_every),
-        schedule_steps: schedule_steps(config),
-        max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
+        StrategyName::Default => Arc::new(DefaultStrategy {
+            grow_grad2d: config.grow_grad2d as f32,
+            grow_scale3d: config.grow_scale3d as f32,
+            prune_opa,
+            prune_scale3d: config.prune_scale3d as f32,
+            rounds,
+            reset_every: or_never(config.reset_every),
+            schedule_steps: schedule_steps(config),
+            max_gaussians,
+        }),
+        StrategyName::LongAxis => Arc::new(LongAxisStrategy {
+            score: config.growth_score,
+            recycle: config.recycle,
+            prune_opa,
+            rounds,
+            checks: rounds,
+            shares_room: false,
+            max_gaussians,
+            growth: growth_rule(config),
+        }),
+        StrategyName::Mcmc => Arc::new(McmcStrategy {
+            dead_opacity: prune_opa,
+            rounds,
+            max_gaussians: config.max_gaussians,
+            seed: config.seed,
+            scene_scale: f64::from(scene_scale),
+            rates: rates(config, scene_scale),
+        }),
     }
 }
 
@@ -189,30 +194,6 @@ fn loss_options(config: &TrainConfig) -> LossOptions {
 impl Default for LossOptions {
     fn default() -> LossOptions {
         loss_options(&TrainConfig::default())
-    }
-}
-
-fn long_axis_strategy(config: &TrainConfig) -> LongAxisStrategy {
-    LongAxisStrategy {
-        score: config.growth_score,
-        recycle: config.recycle,
-        prune_opa: config.prune_opa as f32,
-        rounds: round_steps(config),
-        checks: round_steps(config),
-        shares_room: false,
-        max_gaussians: if config.max_gaussians == 0 { u64::MAX } else { config.max_gaussians },
-        growth: growth_rule(config),
-    }
-}
-
-fn mcmc_strategy(config: &TrainConfig, scene_scale: f32) -> McmcStrategy {
-    McmcStrategy {
-        dead_opacity: config.prune_opa as f32,
-        rounds: round_steps(config),
-        max_gaussians: config.max_gaussians,
-        seed: config.seed,
-        scene_scale: f64::from(scene_scale),
-        rates: rates(config, scene_scale),
     }
 }
 

@@ -283,15 +283,6 @@ mod tests {
     }
 
     #[test]
-    fn flags_are_left_alone() {
-        let keys = TrainOverrides { steps: Some(3000), sh_every: Some(1000), ..TrainOverrides::default() };
-        let config = of_flags(&keys);
-        assert_eq!((config.sh_every, config.refine_stop, config.reset_every), (1000, 2400, 3000));
-        let shortest = TrainOverrides { steps: Some(1), ..TrainOverrides::default() };
-        assert!(of_flags(&shortest).check().is_ok());
-    }
-
-    #[test]
     fn keys_of_a_file_are_given() {
         let parsed = TrainConfig::parse_with_keys("steps = 3000\nmeans-lr = 1.6e-4\n[resolved]\nrefine-stop = 1\n");
         let (mut config, given) = parsed.unwrap_or_default();

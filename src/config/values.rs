@@ -6,6 +6,25 @@ use crate::base::units::parse_bytes;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
+/// Reading and writing in config files of a type that is written as text.
+macro_rules! as_text {
+    ($type:ty) => {
+        impl serde::Serialize for $type {
+            fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
+                s.collect_str(self)
+            }
+        }
+
+        impl<'de> serde::Deserialize<'de> for $type {
+            fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
+                let text = <String as serde::Deserialize>::deserialize(d)?;
+                text.parse().map_err(serde::de::Error::custom)
+            }
+        }
+    };
+}
+pub(super) use as_text;
+
 /// A number of bytes, written as `4GiB`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ByteSize(pub u64);
@@ -17,25 +36,19 @@ impl std::str::FromStr for ByteSize {
     }
 }
 
-impl Serialize for ByteSize {
-    fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
-        let units = [(1u64 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB")];
-        let text = units
-            .iter()
-            .find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit))
-            .map(|(unit, name)| format!("{}{name}", self.0 / unit));
+impl std::fmt::Display for ByteSize {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let units = [(1u64 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"), (1, "B")];
         // Zero needs no unit.
-        let text = text.unwrap_or_else(|| if self.0 == 0 { "0".to_string() } else { format!("{}B", self.0) });
-        s.serialize_str(&text)
+        let unit = units.iter().find(|(unit, _)| self.0 > 0 && self.0.is_multiple_of(*unit));
+        match unit {
+            Some((unit, name)) => write!(f, "{}{name}", self.0 / unit),
+            None => f.write_str("0"),
+        }
     }
 }
 
-impl<'de> Deserialize<'de> for ByteSize {
-    fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        let text = String::deserialize(d)?;
-        text.parse().map_err(serde::de::Error::custom)
-    }
-}
+as_text!(ByteSize);
 
 /// A colour: three numbers in 0..1, in the file `[0.0, 0.0, 0.0]`, on the command line `0,0,0`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -44,12 +57,15 @@ pub struct Rgb(pub [f64; 3]);
 impl std::str::FromStr for Rgb {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
-        let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse::<f64>()).collect();
-        match values.as_deref() {
-            Ok(&[r, g, b]) => Ok(Rgb([r, g, b])),
-            _ => Err(format!("'{text}' is not a colour; write R,G,B with numbers in 0..1")),
-        }
+        let unknown = || format!("'{text}' is not a colour; write R,G,B with numbers in 0..1");
+        three_numbers(text).map(Rgb).ok_or_else(unknown)
     }
+}
+
+/// The numbers of `1,2,3`.
+fn three_numbers(text: &str) -> Option<[f64; 3]> {
+    let values: Option<Vec<f64>> = text.split(',').map(|v| v.trim().parse().ok()).collect();
+    values?.try_into().ok()
 }
 
 /// Which way is up in results: the value of `--up`.
@@ -66,16 +82,15 @@ pub enum Up {
 impl std::str::FromStr for Up {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
-        let unknown = || format!("'{text}' is not a direction; write auto, keep or X,Y,Z, such as 0,0,1");
+        let is_direction = |v: &[f64; 3]| v.iter().all(|x| x.is_finite()) && *v != [0.0; 3];
         match text {
-            "auto" => return Ok(Up::Auto),
-            "keep" => return Ok(Up::Keep),
-            _ => {}
+            "auto" => Ok(Up::Auto),
+            "keep" => Ok(Up::Keep),
+            _ => three_numbers(text)
+                .filter(is_direction)
+                .map(Up::Along)
+                .ok_or_else(|| format!("'{text}' is not a direction; write auto, keep or X,Y,Z, such as 0,0,1")),
         }
-        let values: Result<Vec<f64>, _> = text.split(',').map(|v| v.trim().parse::<f64>()).collect();
-        let Ok(&[x, y, z]) = values.as_deref() else { return Err(unknown()) };
-        let is_direction = [x, y, z].iter().all(|v| v.is_finite()) && [x, y, z] != [0.0; 3];
-        if is_direction { Ok(Up::Along([x, y, z])) } else { Err(unknown()) }
     }
 }
 
@@ -90,17 +105,7 @@ impl std::fmt::Display for Up {
     }
 }
 
-impl Serialize for Up {
-    fn serialize<S: serde::Serializer>(&self, s: S) -> Result<S::Ok, S::Error> {
-        s.collect_str(self)
-    }
-}
-
-impl<'de> Deserialize<'de> for Up {
-    fn deserialize<D: serde::Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
-        String::deserialize(d)?.parse().map_err(serde::de::Error::custom)
-    }
-}
+as_text!(Up);
 
 /// Where the pages of a run live, by `--spill-dir` and `--frames`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

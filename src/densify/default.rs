@@ -5,7 +5,7 @@
 //! are reset so late in the planned run that they cannot recover.
 
 use super::ops::{child_log_scale, sigma};
-use super::stats::{GradHistogram, promised_growth};
+use super::stats::{GradHistogram, bin_above, rows_from_bin};
 use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
@@ -132,11 +132,11 @@ impl Round for RoundThresholds {
     }
 
     fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
-        histogram.promised(self.grow_grad2d)
+        histogram.rows_from_bin(bin_above(self.grow_grad2d))
     }
 
     fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
-        promised_growth(rows, self.grow_grad2d)
+        rows_from_bin(rows, bin_above(self.grow_grad2d))
     }
 }
 

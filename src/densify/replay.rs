@@ -30,7 +30,7 @@ pub struct PageRound {
     pub event: usize,
     /// Rows after the round minus rows before.
     pub rows_change: i64,
-    /// Growth of this page that [`super::stats::GradHistogram::promised`] counted when the round was logged.
+    /// Growth of this page that [`Round::promised`] counted when the round was logged.
     pub promised: u64,
     /// Numbers of edited rows.
     pub counts: RoundCounts,

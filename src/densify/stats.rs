@@ -157,19 +157,11 @@ impl GradHistogram {
         }
         least
     }
-
-    /// Upper bound of the rows above a threshold from [`GradHistogram::threshold`]: whole bins. Equals the sum of
-    /// [`promised_growth`] over all pages.
-    pub fn promised(&self, threshold: f32) -> u64 {
-        self.bins[bin(threshold.next_up())..BINS].iter().map(|&n| u64::from(n)).sum()
-    }
 }
 
-/// The rows of a view that [`GradHistogram::promised`] counted, if their statistics are unchanged since the round.
-pub fn promised_growth(rows: &Rows<'_>, threshold: f32) -> u64 {
-    let first = bin(threshold.next_up());
-    let is_counted = |&(&grad2d, &count): &(&f32, &u32)| count > 0 && bin(mean_grad2d(grad2d, count)) >= first;
-    rows.grad2d.iter().zip(rows.count).filter(is_counted).count() as u64
+/// The first bin whose rows may all lie above a threshold of [`GradHistogram::threshold`].
+pub fn bin_above(threshold: f32) -> u32 {
+    bin(threshold.next_up()) as u32
 }
 
 /// The rows of a view that [`GradHistogram::rows_from_bin`] counted, if their statistics are unchanged since the round.
@@ -181,13 +173,7 @@ pub fn rows_from_bin(rows: &Rows<'_>, bin: u32) -> u64 {
 /// Whether a view drew a row with these statistics, and its mean score lies in this bin or above.
 #[inline(always)]
 pub fn reaches_bin(grad2d: f32, count: u32, bin: u32) -> bool {
-    count > 0 && score_bin(grad2d, count) >= bin
-}
-
-/// Bin of the mean score of a row with these statistics.
-#[inline(always)]
-pub fn score_bin(grad2d: f32, count: u32) -> u32 {
-    bin(mean_grad2d(grad2d, count)) as u32
+    count > 0 && self::bin(mean_grad2d(grad2d, count)) as u32 >= bin
 }
 
 /// Bin of the mean weight of a row; `None` if fewer than [`WEIGHED_VIEWS`] views drew it or none weighed it.

@@ -467,14 +467,6 @@ mod tests {
     }
 
     #[test]
-    fn a_curve_of_one_point_is_a_dot() {
-        let dots = |points: Vec<(f64, f64)>| {
-            Chart::new("a", "b", "c").with("", points, Mark::Line).svg().matches("<circle").count()
-        };
-        assert_eq!([dots(vec![(60.0, 1.0)]), dots(vec![(60.0, 1.0), (61.0, 2.0)])], [1, 0]);
-    }
-
-    #[test]
     fn a_long_legend_stays_inside_the_chart() {
         let mut chart = Chart::new("a", "b", "c").wide();
         let name = |i: usize| format!("resolution-1-2-seed{i}-0123&{i:04}");

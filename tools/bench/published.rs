@@ -123,7 +123,12 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     setting.caveats.extend(differences(&setting.published, &config));
     check_photos(args, &config, &mut setting)?;
     if !args.quiet {
-        describe(args, &setting, &config);
+        let (name, title, data) = (&setting.run.name, &setting.run.facts.title, args.data.display());
+        let (tier, layout) = (setting.run.tier_of(&config).unwrap_or("none"), setting.layout.name());
+        gsscale::tell!("run     {name} ({title}), tier {tier}, {data} laid out as {layout}");
+        for caveat in &setting.caveats {
+            gsscale::tell!("warning: not the published run: {caveat}");
+        }
     }
     let trained =
         if args.no_train { Ok(read_summary(&setting.out)?) } else { train(args, (&setting, &setting.out), &config)? };
@@ -142,7 +147,23 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
         },
         false => None,
     };
-    report(args, &setting, &config, (&ours, with_defaults.as_ref()), print)?;
+    let comparison = Comparison {
+        run: &setting.run,
+        tier: setting.run.tier_of(&config),
+        layout: setting.layout.name(),
+        data: &args.data,
+        out: &setting.out,
+        caveats: &setting.caveats,
+        ours: &ours,
+        with_defaults: with_defaults.as_ref(),
+    };
+    let json = comparison.json();
+    write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;
+    write_whole(&setting.out.join("published.html"), comparison.page().as_bytes())?;
+    if !args.quiet {
+        gsscale::tell!("{}", comparison.text());
+    }
+    print(&json);
     Ok(ExitCode::SUCCESS)
 }
 
@@ -201,20 +222,6 @@ fn held_out(raw: &RawScene, config: &TrainConfig) -> usize {
     };
     let is_test = |(i, split): (usize, Option<Split>)| split.map_or_else(|| by_index(i), |s| s == Split::Test);
     raw.views.iter().map(|view| view.split).enumerate().filter(|v| is_test(*v)).count()
-}
-
-fn describe(args: &Args, setting: &Setting, config: &TrainConfig) {
-    let tier = setting.run.tier_of(config).unwrap_or("none");
-    gsscale::tell!(
-        "run     {} ({}), tier {tier}, {} laid out as {}",
-        setting.run.name,
-        setting.run.facts.title,
-        args.data.display(),
-        setting.layout.name()
-    );
-    for caveat in &setting.caveats {
-        gsscale::tell!("warning: not the published run: {caveat}");
-    }
 }
 
 /// Trains to the end, into `out`. A dry run and a stopped run return only an exit code.
@@ -286,31 +293,4 @@ fn measure(args: &Args, out: &Path, config: &TrainConfig, summary: Summary) -> R
         (ours.test, ours.lpips_variant) = (report.test, report.lpips_variant);
     }
     Ok(ours)
-}
-
-fn report(
-    args: &Args,
-    setting: &Setting,
-    config: &TrainConfig,
-    (ours, with_defaults): (&Ours, Option<&Ours>),
-    print: &mut dyn FnMut(&Value),
-) -> InputResult<()> {
-    let comparison = Comparison {
-        run: &setting.run,
-        tier: setting.run.tier_of(config),
-        layout: setting.layout.name(),
-        data: &args.data,
-        out: &setting.out,
-        caveats: &setting.caveats,
-        ours,
-        with_defaults,
-    };
-    let json = comparison.json();
-    write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;
-    write_whole(&setting.out.join("published.html"), comparison.page().as_bytes())?;
-    if !args.quiet {
-        gsscale::tell!("{}", comparison.text());
-    }
-    print(&json);
-    Ok(())
 }

@@ -185,7 +185,12 @@ impl Sweep {
     /// The program is missing or was interrupted, or results cannot be written. A failed run is a result.
     pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<()> {
         let key = planned.key(&self.surroundings);
-        let before = self.pace_before_run()?;
+        if self.pace_after_last_run.is_none() {
+            // The first training also brings the photos into memory.
+            self.measure_pace()?;
+            self.pace_after_last_run = self.measure_pace()?;
+        }
+        let before = self.pace_after_last_run.take();
         let mut record = self.train(planned, &key)?;
         let after = self.measure_pace();
         // An interrupted pace does not take the run with it.
@@ -199,16 +204,6 @@ impl Sweep {
             print(&serde_json::to_value(&record).unwrap_or_default());
         }
         Ok(())
-    }
-
-    /// The pace of the machine before a run.
-    fn pace_before_run(&mut self) -> InputResult<Option<Pace>> {
-        if self.pace_after_last_run.is_none() {
-            // The first training also brings the photos into memory.
-            self.measure_pace()?;
-            self.pace_after_last_run = self.measure_pace()?;
-        }
-        Ok(self.pace_after_last_run.take())
     }
 
     /// The pace of a short training of the reference; `None` if it is not wanted. A training that fails is the last one.
@@ -242,7 +237,19 @@ impl Sweep {
             make_folder(&self.spill)?;
             config.spill_dir = spill.display().to_string();
         }
-        let mut record = self.record(planned, key);
+        let mut record = RunRecord {
+            key: key.to_string(),
+            scene: self.scene.display().to_string(),
+            name: planned.name.clone(),
+            settings: changes(&self.base, &planned.config),
+            seed: planned.config.seed,
+            steps: planned.config.steps,
+            version: env!("CARGO_PKG_VERSION").to_string(),
+            threads: rayon::current_num_threads() as u64,
+            cpu: cpu_model(),
+            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
+            ..RunRecord::default()
+        };
         let file = self.out.join("runs").join(format!("{name}.part.toml"));
         write_config(&file, &config)?;
         let began = Instant::now();
@@ -252,8 +259,7 @@ impl Sweep {
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
             // Before the folders are removed: an interrupted run keeps its checkpoint.
-            refuse_interrupted(&output)?;
-            record.problem = Some(problem(&output));
+            record.problem = Some(problem(&output)?);
         } else {
             self.read_figures(&mut record, &config, &part)?;
         }
@@ -266,22 +272,6 @@ impl Sweep {
             None => std::fs::rename(&part, &folder).map_err(|e| InputError::io(&folder, "naming the run", &e))?,
         }
         Ok(record)
-    }
-
-    fn record(&self, planned: &Planned, key: &str) -> RunRecord {
-        RunRecord {
-            key: key.to_string(),
-            scene: self.scene.display().to_string(),
-            name: planned.name.clone(),
-            settings: changes(&self.base, &planned.config),
-            seed: planned.config.seed,
-            steps: planned.config.steps,
-            version: env!("CARGO_PKG_VERSION").to_string(),
-            threads: rayon::current_num_threads() as u64,
-            cpu: cpu_model(),
-            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
-            ..RunRecord::default()
-        }
     }
 
     /// Reads the figures from the run's folder and removes the PLY, which is large.
@@ -312,8 +302,7 @@ impl Sweep {
             let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
             let output = self.spawn("gsscale-eval", &arguments, &BTreeMap::new())?;
             if !output.status.success() {
-                refuse_interrupted(&output)?;
-                record.problem = Some(problem(&output));
+                record.problem = Some(problem(&output)?);
                 return Ok(());
             }
             let report: Value = read_json(&json)?;
@@ -394,20 +383,18 @@ fn lock(out: &Path) -> InputResult<File> {
     }
 }
 
-/// An interrupted run is not a result: the sweep ends too, and the next call repeats this run.
-fn refuse_interrupted(output: &Output) -> InputResult<()> {
-    match output.status.code() {
-        Some(130 | 143) => Err(InputError::new("the sweep", "was interrupted", "start it again to continue")),
-        _ => Ok(()),
-    }
-}
-
 /// The last error message of a failed program, or its exit status.
-fn problem(output: &Output) -> String {
+///
+/// # Errors
+/// The program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
+fn problem(output: &Output) -> InputResult<String> {
+    if let Some(130 | 143) = output.status.code() {
+        return Err(InputError::new("the sweep", "was interrupted", "start it again to continue"));
+    }
     let said = String::from_utf8_lossy(&output.stderr);
     let errors = said.rfind("error: ").map_or(said.trim(), |at| said[at..].trim());
     let text = if errors.is_empty() { output.status.to_string() } else { errors.replace('\n', " ") };
-    text.chars().take(PROBLEM_MAX).collect()
+    Ok(text.chars().take(PROBLEM_MAX).collect())
 }
 
 fn digest(path: &Path) -> InputResult<String> {

@@ -247,20 +247,6 @@ mod tests {
         assert!((found[6] - step * (2.0f64 / 9.0).sqrt()).abs() < 1e-9 && (found[7] - 0.5 * step).abs() < 1e-9);
     }
 
-    #[test]
-    fn blocks_know_their_neighbours() {
-        let grid = BlockGrid::of(12, 12);
-        let sorted = |of: &mut dyn Iterator<Item = usize>| {
-            let mut blocks: Vec<usize> = of.collect();
-            blocks.sort_unstable();
-            blocks
-        };
-        assert_eq!(sorted(&mut grid.neighbours(4)), [1, 3, 5, 7]);
-        assert_eq!(sorted(&mut grid.neighbours(2)), [1, 5]);
-        assert_eq!(sorted(&mut grid.around(4)), (0..9).collect::<Vec<_>>());
-        assert_eq!(sorted(&mut grid.around(6)), [3, 4, 6, 7]);
-    }
-
     const SIZE: usize = 16;
 
     /// A photo of 4 x 4 blocks with a bright object of 6 x 6 pixels from (4, 4) on, and the picture of the grey scene behind it.

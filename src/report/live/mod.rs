@@ -9,8 +9,6 @@
 //! request gets the picture of its own camera; 4. the run never draws for a page that was closed before the picture was begun.
 
 #[cfg(feature = "serve")]
-mod patient;
-#[cfg(feature = "serve")]
 mod server;
 
 use crate::base::error::{InputError, InputResult};

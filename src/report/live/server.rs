@@ -10,7 +10,6 @@
 //! Invariant: whatever peers do, they hold at most [`CONNECTIONS_MOST`] connections, [`METRICS_MOST`] answers of metrics and
 //! [`PICTURES_MOST`] pictures in memory, each for a bounded time.
 
-use super::patient::Patient;
 use super::{Live, Orbit};
 use axum::Router;
 use axum::body::Bytes;
@@ -23,13 +22,17 @@ use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use serde::Deserialize;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::net::{IpAddr, SocketAddr, TcpListener};
 use std::path::Path;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::{Context, Poll, ready};
 use std::time::{Duration, Instant};
+use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
+use tokio::net::TcpStream;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
-use tokio::time::sleep;
+use tokio::time::{Sleep, sleep};
 
 /// Longest time that a page waits for a picture: steps of large scenes, commits and evaluations take seconds.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -70,7 +73,7 @@ impl AsRef<[u8]> for Held {
 }
 
 /// Serves on a thread of its own for as long as the process lives.
-pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
+pub(super) fn spawn(live: Live, listener: TcpListener) -> io::Result<()> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_io().enable_time().build()?;
     let app = Router::new()
         .route("/", get(async || Html(include_str!("page.html"))))
@@ -92,13 +95,13 @@ pub(super) fn spawn(live: Live, listener: TcpListener) -> std::io::Result<()> {
 }
 
 /// Accepts connections for ever. A connection that cannot be accepted, for example because no file handle is left, is tried again.
-async fn serve(listener: TcpListener, app: Router) -> std::io::Result<()> {
+async fn serve(listener: TcpListener, app: Router) -> io::Result<()> {
     let listener = tokio::net::TcpListener::from_std(listener)?;
     let places = Arc::new(Semaphore::new(CONNECTIONS_MOST));
     let mut http = http1::Builder::new();
     http.timer(TokioTimer::new()).header_read_timeout(HEAD_PATIENCE).max_buf_size(HEAD_BYTES);
     loop {
-        let place = Arc::clone(&places).acquire_owned().await.map_err(std::io::Error::other)?;
+        let place = Arc::clone(&places).acquire_owned().await.map_err(io::Error::other)?;
         let Ok((stream, _)) = listener.accept().await else {
             sleep(ACCEPT_AGAIN).await;
             continue;
@@ -167,7 +170,7 @@ async fn metrics(State(served): State<Served>, Query(From { from }): Query<From>
 
 /// The whole lines of a file from a byte on, at most [`METRICS_BYTES`], and the length of the file. A run that goes back to its last
 /// commit makes the file shorter: a page that has read further then begins again.
-fn lines_from(file: &Path, from: u64) -> std::io::Result<(Vec<u8>, u64)> {
+fn lines_from(file: &Path, from: u64) -> io::Result<(Vec<u8>, u64)> {
     let mut file = std::fs::File::open(file)?;
     let length = file.metadata()?.len();
     file.seek(SeekFrom::Start(from))?;
@@ -191,6 +194,82 @@ async fn picture(State(served): State<Served>, Query(orbit): Query<Orbit>) -> Re
         }
     }
     (StatusCode::SERVICE_UNAVAILABLE, "the run has drawn no picture in time: it may be busy").into_response()
+}
+
+/// Longest time that an answer waits for its peer.
+const WRITE_PATIENCE: Duration = Duration::from_secs(if cfg!(test) { 1 } else { 15 });
+/// Each so many bytes that the peer takes win a second of patience again.
+const RATE_LEAST: f64 = 16384.0;
+
+/// A connection whose peer must read what it asked for: a peer that reads nothing is dropped after [`WRITE_PATIENCE`] of waiting for
+/// it, and one that reads slower than [`RATE_LEAST`] when that has used it up.
+struct Patient {
+    stream: TcpStream,
+    /// What is left of the patience.
+    left: Duration,
+    /// Since when a write waits, and the end of the patience with it.
+    waits: Option<(tokio::time::Instant, Pin<Box<Sleep>>)>,
+}
+
+impl Patient {
+    fn new(stream: TcpStream) -> Patient {
+        Patient { stream, left: WRITE_PATIENCE, waits: None }
+    }
+
+    /// Judges a write: the peer has taken bytes, or does not yet.
+    fn track_progress(
+        &mut self,
+        context: &mut Context<'_>,
+        written: Poll<io::Result<usize>>,
+    ) -> Poll<io::Result<usize>> {
+        let Poll::Ready(written) = written else {
+            let left = self.left;
+            let (_, end) = self.waits.get_or_insert_with(|| (tokio::time::Instant::now(), Box::pin(sleep(left))));
+            ready!(end.as_mut().poll(context));
+            return Poll::Ready(Err(io::ErrorKind::TimedOut.into()));
+        };
+        if let Some((since, _)) = self.waits.take() {
+            self.left = self.left.saturating_sub(since.elapsed());
+        }
+        let won = Duration::from_secs_f64(*written.as_ref().unwrap_or(&0) as f64 / RATE_LEAST);
+        self.left = (self.left + won).min(WRITE_PATIENCE);
+        Poll::Ready(written)
+    }
+}
+
+impl AsyncRead for Patient {
+    fn poll_read(mut self: Pin<&mut Self>, context: &mut Context<'_>, into: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_read(context, into)
+    }
+}
+
+impl AsyncWrite for Patient {
+    fn poll_write(mut self: Pin<&mut Self>, context: &mut Context<'_>, bytes: &[u8]) -> Poll<io::Result<usize>> {
+        let written = Pin::new(&mut self.stream).poll_write(context, bytes);
+        self.track_progress(context, written)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        context: &mut Context<'_>,
+        parts: &[io::IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        let written = Pin::new(&mut self.stream).poll_write_vectored(context, parts);
+        self.track_progress(context, written)
+    }
+
+    /// True: the server then holds an answer's own bytes until they are written, not a copy.
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(context)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(context)
+    }
 }
 
 #[cfg(test)]
