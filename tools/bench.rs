@@ -8,18 +8,26 @@ mod compare;
 mod doctor;
 #[path = "bench/facts.rs"]
 mod facts;
+#[path = "bench/front.rs"]
+mod front;
 #[path = "bench/list.rs"]
 mod list;
 #[path = "bench/published.rs"]
 mod published;
 #[path = "bench/published_table.rs"]
 mod published_table;
+#[path = "bench/record.rs"]
+mod record;
+#[path = "bench/results_log.rs"]
+mod results_log;
 #[path = "bench/run.rs"]
 mod run;
 #[path = "bench/runs.rs"]
 mod runs;
 #[path = "bench/sweep.rs"]
 mod sweep;
+#[path = "bench/sweep_page.rs"]
+mod sweep_page;
 
 use clap::Parser;
 use gsscale::base::error::InputError;

@@ -5,13 +5,9 @@
 
 pub mod chart;
 pub mod compare_report;
-pub mod front;
 pub mod html;
 pub mod live;
 pub mod page_map;
 pub mod picture;
-pub mod record;
-pub mod results_log;
 pub mod run_files;
 pub mod run_report;
-pub mod sweep_page;

@@ -8,6 +8,7 @@
 
 use super::facts::Facts;
 use super::runs::{MadeScene, Place, Planned, Surroundings, use_drive};
+use super::sweep_page::View;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::text::read_text;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig};
@@ -16,7 +17,6 @@ use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::disturb::{Disturbance, plan};
 use gsscale::dataset::loader::Dataset;
-use gsscale::report::sweep_page::View;
 use gsscale::train::error::TrainError;
 use serde::Deserialize;
 use std::collections::{BTreeMap, BTreeSet};

@@ -5,6 +5,8 @@
 //! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
 //! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
+use super::record::{Pace, RunRecord, convert_to_one_pace};
+use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
@@ -13,8 +15,6 @@ use gsscale::config::file::TrainConfig;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::disturb::Disturbance;
 use gsscale::photos::outlier::views;
-use gsscale::report::record::{Pace, RunRecord, convert_to_one_pace};
-use gsscale::report::results_log::{ResultsLog, successful_run};
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
 use gsscale::train::log::report::Summary;
 use serde_json::Value;

@@ -3,15 +3,15 @@
 //! Not here: the list and its runs ([`super::list`]), the processes and the log ([`super::runs`]).
 
 use super::list::{List, Plan};
+use super::results_log::{ResultsLog, successful_run};
 use super::runs::{Place, Planned, RESULTS, Surroundings, Sweep, remove};
+use super::sweep_page::{sweep_page, sweep_table};
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
 use gsscale::dataset::disturb::write_disturbed;
-use gsscale::report::results_log::{ResultsLog, successful_run};
-use gsscale::report::sweep_page::{sweep_page, sweep_table};
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::path::{Path, PathBuf};

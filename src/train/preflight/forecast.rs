@@ -360,6 +360,7 @@ fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::units::GIB;

@@ -150,7 +150,7 @@ pub fn pareto_front(points: &[(f64, f64)]) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::base::rng::{Purpose, Stream};
+    use gsscale::base::rng::{Purpose, Stream};
 
     #[test]
     fn the_front_is_what_brute_force_finds() {

@@ -2,10 +2,10 @@
 //!
 //! Every value of a setting is a mean over seeds. A list says which figures are shown ([`View`]).
 
-use super::chart::{Bars, Chart, Mark};
 use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
-use super::html::{Cell, Page};
 use super::record::{Figure, RunRecord};
+use gsscale::report::chart::{Bars, Chart, Mark};
+use gsscale::report::html::{Cell, Page};
 use serde::Deserialize;
 
 /// Number of the front's colour, grey.

@@ -5,7 +5,7 @@
 //! sweep locks its output folder.
 
 use super::record::RunRecord;
-use crate::base::error::{InputError, InputResult};
+use gsscale::base::error::{InputError, InputResult};
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};

@@ -9,7 +9,7 @@
 //! `pace`, which two other runs measured; 2. only paces of one training are compared; 3. times of computing change in proportion to the
 //! pace. Time that a run waited for the drive, bytes, counts and quality stay as measured.
 
-use crate::base::units::format_bytes;
+use gsscale::base::units::format_bytes;
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::collections::BTreeMap;
