@@ -232,12 +232,12 @@ struct InPages<'a> {
 fn facts_of(state: &SceneState, adam: &DeferredAdam) -> PageFacts {
     let rows = state.view();
     let means = rows.grad2d.iter().zip(rows.count).map(|(&grad2d, &count)| mean_grad2d(grad2d, count));
-    let sigma_max = page_bounds(&adam, &rows, &SplitLimits::NEVER).sigma_max;
+    let sigma_max = page_bounds(adam, &rows, &SplitLimits::NEVER).sigma_max;
     let weights = rows.count.iter().filter(|&&word| views(word) >= WEIGHED_VIEWS).filter_map(|&word| mean_weight(word));
     PageFacts {
         largest_mean: means.fold(0.0, f32::max),
         least_weight: weights.fold(f32::INFINITY, f32::min),
-        extremes: Extremes { lowest_opacity: lowest_opacity(&adam, &rows), sigma_max },
+        extremes: Extremes { lowest_opacity: lowest_opacity(adam, &rows), sigma_max },
         sh_degree: state.sh_degree(),
     }
 }
@@ -477,7 +477,7 @@ fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
                 *g = (draws.normal() * libm::pow(10.0, -draws.range(0.0, 17.0))) as f32;
             });
         }
-        take_step(&adam, &mut state, &listed, &grads, step);
+        take_step(adam, &mut state, &listed, &grads, step);
         let v_means2d: Vec<[f32; 2]> = listed.iter().map(|_| [(draws.normal() * 3e-5) as f32, 0.0]).collect();
         accumulate(&mut state.view_mut(), &listed, &v_means2d, &vec![[1, 1]; listed.len()], [20, 20], &mut histogram);
     }
@@ -552,7 +552,7 @@ fn tightest_bounds(adam: &DeferredAdam, limits: &SplitLimits) -> f64 {
     let (mut children, mut at_edge, mut tightest) = (0, 0, f64::INFINITY);
     for key in 0..60 {
         let state = moving_page(37, adam, key);
-        let bounds = page_bounds(&adam, &state.view(), limits);
+        let bounds = page_bounds(adam, &state.view(), limits);
         let last = state.stamp.iter().copied().max().unwrap();
         let log = random_log(key, last, limits);
         let mut exact = [f32::INFINITY, f32::NEG_INFINITY];
