@@ -542,40 +542,21 @@ fn write(out: &Path, about: &AdapterSummary, checks: &[Check], advice: &str, all
         Verdict::Good => "good",
         Verdict::Failed => "FAILED",
     };
-    page.table(
-        checks,
-        &[
-            ("check", &|c| Cell::text(c.name)),
-            ("", &|c| Cell::text(word(c))),
-            ("found", &|c| Cell::text(c.found.clone())),
-        ],
-    );
-    let steps = checks.iter().find(|c| c.name == "steps").and_then(|c| c.figures.as_array());
-    if let Some(sizes) = steps {
+    let found = |c: &Check| vec![Cell::text(c.name), Cell::text(word(c)), Cell::text(c.found.clone())];
+    page.table(["check", "", "found"], checks.iter().map(found));
+    if let Some(sizes) = checks.iter().find(|c| c.name == "steps").and_then(|c| c.figures.as_array()) {
         page.heading("Time of a step");
-        let ms = |of: &Value, name: &str| Cell::number(of[name].as_f64().map(|s| 1e3 * s), 1);
-        page.table(
-            sizes,
-            &[
-                ("Gaussians", &|s| Cell::number(s["gaussians"].as_f64(), 0)),
-                ("CPU, ms", &|s| ms(s, "cpu_seconds")),
-                ("GPU, ms", &|s| ms(s, "host_form_seconds")),
-                ("pages on the GPU, ms", &|s| ms(s, "device_form_seconds")),
-            ],
-        );
-        let stages: Vec<(String, f64)> =
-            sizes.last().and_then(|s| s["stage_seconds"].as_object()).map_or(Vec::new(), |s| {
-                s.iter().filter_map(|(name, seconds)| Some((name.clone(), seconds.as_f64()?))).collect()
-            });
-        if !stages.is_empty() {
+        let ms = |seconds: &Value| Cell::number(seconds.as_f64().map(|s| 1e3 * s), 1);
+        let times = ["cpu_seconds", "host_form_seconds", "device_form_seconds"];
+        let row = |size: &Value| {
+            let rows = Cell::number(size["gaussians"].as_f64(), 0);
+            std::iter::once(rows).chain(times.iter().map(|name| ms(&size[*name]))).collect()
+        };
+        page.table(["Gaussians", "CPU, ms", "GPU, ms", "pages on the GPU, ms"], sizes.iter().map(row));
+        if let Some(stages) = sizes.last().and_then(|s| s["stage_seconds"].as_object()).filter(|s| !s.is_empty()) {
             page.heading("Stages of a view, the largest size");
-            page.table(
-                &stages,
-                &[
-                    ("stage", &|(name, _)| Cell::text(name.clone())),
-                    ("ms", &|(_, seconds)| Cell::number(Some(1e3 * seconds), 3)),
-                ],
-            );
+            let row = |(stage, seconds): (&String, &Value)| vec![Cell::text(stage.clone()), ms(seconds)];
+            page.table(["stage", "ms"], stages.iter().map(row));
         }
     }
     page.folded("doctor.json", &text);
