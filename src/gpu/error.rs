@@ -8,104 +8,54 @@
 pub enum GpuError {
     /// `auto` was requested and there is no hardware GPU: the caller uses the CPU renderer.
     #[error("no hardware GPU was found (found: {found})")]
-    NoHardwareGpu {
-        /// The adapters found, or "none".
-        found: String,
-    },
+    NoHardwareGpu { found: String },
     /// The requested device does not exist or cannot be used.
     #[error("no usable GPU matches {wanted:?}; found: {found}\n  remedy: choose one of `gsscale-train --list-devices`")]
     NoSuchDevice {
-        /// The user's request.
         wanted: String,
         /// The adapters found, each with the reason if it cannot be used.
         found: String,
     },
     /// The driver refused to open the device.
     #[error("{device} could not be opened: {message}")]
-    Open {
-        /// Name of the adapter.
-        device: String,
-        message: String,
-    },
+    Open { device: String, message: String },
     /// The variable that asks for an emulated bus holds something else.
     #[error(
         "{variable}: {text:?} is not a rate and a latency\n  remedy: write for example {variable}=12GB/s,20us, or unset it"
     )]
-    EmulatedBus {
-        variable: &'static str,
-        /// What it holds.
-        text: String,
-    },
+    EmulatedBus { variable: &'static str, text: String },
     /// The budget of `--device-mem` cannot hold a buffer.
     #[error(
         "{what} needs {need} bytes of device memory, but {in_use} of the {budget} allowed are in use\n  remedy: raise \
          --device-mem, or train with smaller pictures (--data-factor)"
     )]
-    OutOfBudget {
-        /// Label of the buffer.
-        what: String,
-        /// Bytes that the buffer needs.
-        need: u64,
-        /// Bytes in use by other buffers.
-        in_use: u64,
-        /// Bytes allowed in total.
-        budget: u64,
-    },
+    OutOfBudget { what: String, need: u64, in_use: u64, budget: u64 },
     /// The device itself has no memory left.
     #[error("{stage}: the device is out of memory ({message})\n  remedy: lower --device-mem")]
-    OutOfMemory {
-        /// Stage or buffer.
-        stage: String,
-        message: String,
-    },
+    OutOfMemory { stage: String, message: String },
     /// The device has no memory for a buffer.
     #[error(
         "the device has no memory for {what}: {need} bytes beside the {in_use} in use\n  remedy: close other programs that \
          use the device"
     )]
-    DeviceFull {
-        /// Label of the buffer.
-        what: String,
-        /// Bytes that the buffer needs.
-        need: u64,
-        /// Bytes in use by other buffers.
-        in_use: u64,
-    },
+    DeviceFull { what: String, need: u64, in_use: u64 },
     /// One buffer is larger than the device allows.
     #[error("{what} needs one buffer of {need} bytes; the device allows {limit}")]
     BufferTooLarge {
-        /// Label of the buffer.
         what: String,
-        /// Bytes that the buffer needs.
         need: u64,
         /// Largest buffer of the device, bytes.
         limit: u64,
     },
     /// One binding is larger than the device, or the test's limit, allows.
     #[error("{stage}: binding {binding} would span {need} bytes; the device allows {limit} in one binding")]
-    BindingTooLarge {
-        stage: String,
-        /// Name of the variable in the shader.
-        binding: String,
-        /// Bytes of the view.
-        need: u64,
-        /// Bytes allowed.
-        limit: u64,
-    },
+    BindingTooLarge { stage: String, binding: String, need: u64, limit: u64 },
     /// The views do not match the shader, or a copy does not match its source or target.
     #[error("{stage}: {problem}")]
-    Bindings {
-        stage: String,
-        /// The mismatch.
-        problem: String,
-    },
+    Bindings { stage: String, problem: String },
     /// A shader does not preprocess, parse or validate.
     #[error("shader {shader}: {problem}")]
-    Shader {
-        /// Name of the shader.
-        shader: String,
-        problem: String,
-    },
+    Shader { shader: String, problem: String },
     /// The API refused a call: a bug in this program.
     #[error("{stage}: the graphics API refused the work: {message}")]
     Validation { stage: String, message: String },

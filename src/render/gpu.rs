@@ -1,8 +1,8 @@
 //! [`GpuRenderer`]: the stages of a view on a GPU, forward and backward, one view at a time.
 //!
 //! Not here: the picture and its validity (`gpu_picture`), loss and gradients (`gpu_back`), the recording of each stage (`gpu_rows`,
-//! `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`), the
-//! picture in ranges of tiles (`gpu_ranges`), steps without waits (`gpu_recorded`), the device and its memory (`crate::gpu`).
+//! `gpu_tiles`, `gpu_tiles_bwd`, `gpu_loss`), rows in chunks (`gpu_segments`, `gpu_gradients`), pages on the device (`gpu_paged`,
+//! `gpu_update`), the picture in ranges of tiles (`gpu_ranges`), steps without waits (`gpu_recorded`), the device (`crate::gpu`).
 //!
 //! # Memory
 //! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
@@ -31,19 +31,13 @@
 //! one submission and one wait.
 //!
 //! A view of one batch keeps its rows on the device, and its depth sort is recorded in `rows_in`. A view of several batches
-//! uploads the rows of each batch twice, and sorts the splats of each range of tiles.
+//! uploads the rows of each batch twice, and sorts the splats of each range of tiles. The device is idle only between two steps: the
+//! optimizer has just rewritten every row in view, and the cull of the next view reads the new means.
 //!
-//! The device is therefore idle only between two steps. The optimizer has just rewritten every row in view, and the
-//! cull of the next view reads the new means, so the next upload cannot start earlier. Rows of the next view that the
-//! current view does not see have known values (a function of the stored state and the step), but their list also needs
-//! the cull. The next photo is known, but its upload in `loss` already costs no time.
-//!
-//! All of this holds while the host has the rows. A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some
-//! 50 KB of tables and uniforms, and the payloads that it lacks; it downloads 52 bytes a page, and the payloads of pages that leave their
-//! slots. It waits for the number of listed rows, the two counts, and the results of the pages. For a view of one batch,
-//! payloads of the next view go up while it computes gradients, and payloads that leave come down behind the picture (`train`). A step
-//! that is recorded without waiting (`gpu_recorded`) has three submissions and two read-backs, which the host waits for once it has
-//! submitted the next step.
+//! A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some 50 KB of tables and uniforms, and the payloads that it
+//! lacks; it downloads 52 bytes a page, and the payloads of pages that leave their slots. It waits for the number of listed rows, the
+//! two counts, and the results of the pages. A step that is recorded without waiting (`gpu_recorded`) has three submissions and two
+//! read-backs, which the host waits for once it has submitted the next step.
 //!
 //! # Errors
 //! Functions of the `gpu_*` files fail where the device failed or has no memory left, constructors of stages also where the device

@@ -135,65 +135,31 @@ pub enum RowBatches {
 pub enum RenderError {
     /// A side of the picture is longer than [`Grid::SIDE_MAX`]: tile numbers have 24 bits.
     #[error("an image of {width}x{height} is too large: each side may have at most {} pixels", Grid::SIDE_MAX)]
-    ImageTooLarge {
-        /// Pixels.
-        width: u32,
-        /// Pixels.
-        height: u32,
-    },
+    ImageTooLarge { width: u32, height: u32 },
     /// A view has more rows than 32-bit row numbers can count.
     #[error("{0} Gaussians are too many for one view: the limit is {max}", max = u32::MAX - 1)]
     TooManyRows(usize),
     /// The options ask for a higher SH degree than the rows hold.
     #[error("SH degree {asked} was requested, but the rows are stored with degree {stored}")]
-    ShDegree {
-        /// Degree of the options.
-        asked: u8,
-        /// Degree of the rows.
-        stored: u8,
-    },
+    ShDegree { asked: u8, stored: u8 },
     /// The photo and the picture differ in size.
     #[error("the target is {}x{}, the picture {}x{}", .target.0, .target.1, .image.0, .image.1)]
-    TargetSize {
-        /// Width and height of the target.
-        target: (u32, u32),
-        /// Width and height of the picture.
-        image: (u32, u32),
-    },
+    TargetSize { target: (u32, u32), image: (u32, u32) },
     /// A stage was called before a stage that it depends on.
     #[error("the stage {call} must follow {needs}")]
-    OutOfOrder {
-        /// The stage that was called.
-        call: &'static str,
-        /// The stage or state that must come before.
-        needs: &'static str,
-    },
+    OutOfOrder { call: &'static str, needs: &'static str },
     /// The view has no such batch, or the batch had another number of rows on the way in.
     #[error("this view has no batch {batch} with {given} rows")]
-    BatchRows {
-        /// Number of the batch, from 0.
-        batch: usize,
-        /// Rows that the caller gave.
-        given: usize,
-    },
+    BatchRows { batch: usize, given: usize },
     /// The gradient of the picture and the picture differ in size.
     #[error("the gradient of the picture must have the size of the picture, {pixels} pixels")]
-    GradientSize {
-        /// Pixels of the picture.
-        pixels: usize,
-    },
+    GradientSize { pixels: usize },
     /// Pages or an optimizer were asked of a backend that has neither.
     #[error("the {backend} backend holds no pages of this run")]
-    NoPages {
-        /// Name of the backend.
-        backend: &'static str,
-    },
+    NoPages { backend: &'static str },
     /// The device has no memory for a single page.
     #[error("the device has no memory for a page of {bytes} bytes beside a view")]
-    NoSlots {
-        /// Bytes of a page.
-        bytes: u64,
-    },
+    NoSlots { bytes: u64 },
     /// The device failed, or the view exceeds a limit of the device. The error names the stage or buffer.
     #[error(transparent)]
     Device(#[from] GpuError),
@@ -332,9 +298,6 @@ pub trait Renderer: Send {
     /// then compares the corrected picture, and the gradient is that of the corrected picture. The caller must
     /// propagate the gradient through the correction, in [`Renderer::picture_gradient`]. On a device the picture
     /// crosses the bus twice.
-    ///
-    /// # Errors
-    /// As [`Renderer::image`].
     fn picture_mut(&mut self) -> Result<&mut [f32], RenderError>;
 
     /// Computes the loss of the picture against `target` and the gradient of the picture. Replaces an earlier gradient.
@@ -347,9 +310,6 @@ pub trait Renderer: Send {
     /// [`Renderer::picture_back`] starts from the values that the caller leaves here. A second loss term adds its
     /// gradient here, and a correction of the picture propagates the gradient here. On a device the gradient crosses
     /// the bus twice.
-    ///
-    /// # Errors
-    /// As [`Renderer::image`].
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError>;
 
     /// Propagates the gradient of the picture back to the splats of the view.
@@ -376,15 +336,9 @@ pub trait Renderer: Send {
     fn unusable_splats(&mut self) -> Result<u64, RenderError>;
 
     /// The value of the last [`Renderer::loss`]. On a device, a call after `rows_out` does not wait.
-    ///
-    /// # Errors
-    /// The view has no loss.
     fn loss_value(&mut self) -> Result<LossValue, RenderError>;
 
     /// Runs the stages of a one-batch view up to the picture.
-    ///
-    /// # Errors
-    /// The errors of the stages.
     fn draw(&mut self, rows: &Columns, camera: &Camera, options: &RenderOptions) -> Result<(), RenderError> {
         self.begin_view(camera, options, RowBatches::One)?;
         self.rows_in(rows)?;
@@ -392,9 +346,6 @@ pub trait Renderer: Send {
     }
 
     /// Runs the stages of a one-batch view from the gradient of the picture back to the rows.
-    ///
-    /// # Errors
-    /// The errors of the stages.
     fn backpropagate(&mut self, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError> {
         self.picture_back()?;
         self.rows_out(0, rows, grads)

@@ -95,11 +95,11 @@ pub struct StepDone {
 /// record_picture ──> record_update ─ ─ ─ ─ ─ > finish_step
 ///                         └──> record_picture ──> record_update ─ ─ > finish_step
 /// ```
+///
+/// # Errors
+/// Calls fail where the device failed or has no memory, where no pages are held, and out of order. Their comments name other errors.
 pub trait PageRenderer: Renderer {
     /// Prepares the device for pages of a run. Slots that exist are given up.
-    ///
-    /// # Errors
-    /// Device memory is exhausted.
     fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError>;
 
     /// Device memory that slots and views can still take, bytes; drops the view.
@@ -110,36 +110,21 @@ pub trait PageRenderer: Renderer {
 
     /// Makes up to `wanted` more slots, numbered on from those that exist; returns how many. Fewer than wanted, even none, where
     /// the device has no more memory.
-    ///
-    /// # Errors
-    /// The device failed, or holds no pages.
     fn add_slots(&mut self, wanted: usize) -> Result<usize, RenderError>;
 
     /// Copies payloads into slots.
-    ///
-    /// # Errors
-    /// The device failed.
     fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError>;
 
     /// Copies slots into payloads. Waits.
-    ///
-    /// # Errors
-    /// The device failed.
     fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
 
     /// Begins to copy slots back, each with the bytes of its payload, as they are after the work submitted so far; returns how many, from
     /// the first. Fewer than all, even none, where memory is short. Does not wait. The slots may be given other payloads at once: the
     /// device copies in the order of the calls.
-    ///
-    /// # Errors
-    /// The device failed.
     fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError>;
 
     /// Ends the copies that [`PageRenderer::begin_reads`] began first, into payloads in the same order. Waits for the copies, not for work
     /// submitted after them. Whatever happens, none of these copies is under way afterwards.
-    ///
-    /// # Errors
-    /// The device failed.
     fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
 
     /// As [`Renderer::rows_in`], for the rows of `pages` that the view's camera may draw, evaluated at the step. Returns how many.
@@ -163,27 +148,16 @@ pub trait PageRenderer: Renderer {
     fn begin_update(&mut self, batch: usize, pages: &[SlotPage], collects: bool) -> Result<(), RenderError>;
 
     /// Waits for the update that [`PageRenderer::begin_update`] began. Returns what it did to each page.
-    ///
-    /// # Errors
-    /// No update has begun, or the device failed.
     fn finish_update(&mut self) -> Result<Vec<PageResult>, RenderError>;
 
     /// What decides whether a round edits rows of these pages, which have all steps so far. Waits.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory; no pages are held.
     fn survey(&mut self, pages: &[SlotPage]) -> Result<Vec<PageSurvey>, RenderError>;
 
     /// Clears the statistics of all rows of these pages. Does not wait.
-    ///
-    /// # Errors
-    /// The device failed, or has no memory; no pages are held. No page is changed then.
+    /// No page is changed where that fails.
     fn clear_statistics(&mut self, pages: &[SlotPage]) -> Result<(), RenderError>;
 
     /// Takes the change of the number of rows by bin of the mean growth score since the last call, modulo 2^32. Waits.
-    ///
-    /// # Errors
-    /// The device failed.
     fn take_bins(&mut self) -> Result<Vec<u32>, RenderError>;
 
     /// Records a step of one batch up to its picture, without waiting. False where memory is short or the sizes of its lists cannot be
@@ -201,14 +175,8 @@ pub trait PageRenderer: Renderer {
     fn record_update(&mut self, update: &RecordedUpdate<'_>) -> Result<bool, RenderError>;
 
     /// Waits for the first step in flight.
-    ///
-    /// # Errors
-    /// The device failed, or no step is in flight.
     fn finish_step(&mut self) -> Result<StepDone, RenderError>;
 
     /// Opens the gate again, once every step in flight is finished.
-    ///
-    /// # Errors
-    /// The device failed, or a step is in flight.
     fn open_gate(&mut self) -> Result<(), RenderError>;
 }

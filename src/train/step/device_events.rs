@@ -15,42 +15,15 @@
 //! Invariants: 1. a page is cleared by the device only if the host would have changed nothing else; 2. where the device has no memory for
 //! a survey, the host applies the events.
 
-use super::device_slots::{SlotCache, device_of};
+use super::device_slots::{SlotCache, best_facts, device_of, facts};
 use super::pages::PagedScene;
 use crate::base::ids::PageNo;
 use crate::base::trace;
 use crate::densify::replay::PageFacts;
-use crate::densify::strategy::Extremes;
-use crate::kernels::uniforms::PageSurvey;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::SlotPage;
 use crate::render::{Renderer, none_if_out_of_memory};
-use crate::scene::page_meta::PageMeta;
-use crate::scene::sightings::WEIGHT_MOST;
 use crate::train::error::TrainError;
-
-/// What a device found out about a page, with what the index of pages says.
-fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
-    let [lowest_opacity, least_weight] = [survey.lowest_opacity, survey.least_weight].map(f32::from_bits);
-    PageFacts {
-        largest_mean: f32::from_bits(survey.largest_mean),
-        least_weight: if least_weight > WEIGHT_MOST { f32::INFINITY } else { least_weight },
-        extremes: Extremes { lowest_opacity, sigma_max: page.bounds.sigma_max },
-        sh_degree: page.sh_degree,
-    }
-}
-
-/// What a page would be like that no round edits.
-fn best_facts(page: &PageMeta) -> PageFacts {
-    let [lowest_opacity, least_weight] = [f32::INFINITY.to_bits(); 2];
-    facts(page, &PageSurvey { largest_mean: 0, lowest_opacity, least_weight, pad: 0 })
-}
-
-/// Whether the events that a page is behind in certainly edit its rows, so that its payload in a slot serves no step any more.
-pub(super) fn are_edits_due(scene: &PagedScene, page: PageNo) -> bool {
-    let page = &scene.pager.index()[page.index()];
-    scene.rules.is_behind(page) && !scene.rules.pending().only_clears(page.events_applied as usize, &best_facts(page))
-}
 
 /// Prepares pinned pages for the events that they are behind in: the device clears the statistics of those of which nothing else
 /// changes, and they are behind no more; the others are copied back, and their slots given up.

@@ -41,11 +41,13 @@
 //! leaving is pinned in the pager and in no slot, and neither held nor released before its frame is filled; 6. copies end in the
 //! order in which they began; 7. no page of the next view is evicted for a payload of that view.
 
-use super::device_events::are_edits_due;
 use super::pages::PagedScene;
 use crate::base::error::InputError;
 use crate::base::ids::PageNo;
 use crate::base::trace;
+use crate::densify::replay::PageFacts;
+use crate::densify::strategy::Extremes;
+use crate::kernels::uniforms::PageSurvey;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::frames::evict::{Candidate, EvictPolicy, NEVER};
@@ -56,6 +58,8 @@ use crate::paging::plan::bound::FewestReads;
 use crate::render::pages::{DeviceSlot, PageRenderer, SlotPage};
 use crate::render::{RenderError, Renderer};
 use crate::scene::page_layout::PageLayout;
+use crate::scene::page_meta::PageMeta;
+use crate::scene::sightings::WEIGHT_MOST;
 use crate::train::error::TrainError;
 use serde::{Deserialize, Serialize};
 use std::cmp::Reverse;
@@ -185,6 +189,29 @@ fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
 
 fn payload(page: &PinnedPage) -> &[u8] {
     &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]
+}
+
+/// What a device found out about a page, with what the index of pages says.
+pub(super) fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
+    let [lowest_opacity, least_weight] = [survey.lowest_opacity, survey.least_weight].map(f32::from_bits);
+    PageFacts {
+        largest_mean: f32::from_bits(survey.largest_mean),
+        least_weight: if least_weight > WEIGHT_MOST { f32::INFINITY } else { least_weight },
+        extremes: Extremes { lowest_opacity, sigma_max: page.bounds.sigma_max },
+        sh_degree: page.sh_degree,
+    }
+}
+
+/// What a page would be like that no round edits.
+pub(super) fn best_facts(page: &PageMeta) -> PageFacts {
+    let [lowest_opacity, least_weight] = [f32::INFINITY.to_bits(); 2];
+    facts(page, &PageSurvey { largest_mean: 0, lowest_opacity, least_weight, pad: 0 })
+}
+
+/// Whether the events that a page is behind in certainly edit its rows, so that its payload in a slot serves no step any more.
+fn are_edits_due(scene: &PagedScene, page: PageNo) -> bool {
+    let page = &scene.pager.index()[page.index()];
+    scene.rules.is_behind(page) && !scene.rules.pending().only_clears(page.events_applied as usize, &best_facts(page))
 }
 
 impl SlotCache {
