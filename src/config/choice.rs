@@ -18,7 +18,7 @@ use crate::optim::moments::Moments;
 use crate::page::engine::open::IoEngine;
 use crate::page::format::codec::Codec;
 use crate::paging::frames::evict::EvictPolicy;
-use crate::paging::timing::Transfers;
+use crate::paging::prefetch::Transfers;
 use crate::photos::exposure::AppearanceMode;
 use crate::render::SsimPadding;
 use crate::render::color_correct::ColorCorrect;

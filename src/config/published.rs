@@ -208,7 +208,7 @@ mod tests {
     use super::super::values::ByteSize;
     use super::*;
     use crate::checkpoint::interval::CommitEvery;
-    use crate::paging::timing::Transfers;
+    use crate::paging::prefetch::Transfers;
 
     #[test]
     fn keys_that_never_change_results_make_no_difference() {

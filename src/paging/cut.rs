@@ -4,17 +4,16 @@
 //! that are needed next first. A step that needs a frozen page earlier waits until the page is written, since the step may change
 //! it. So a commit costs the steps after it a part of their pages at most, not all that memory holds.
 //!
-//! Not here: the writes themselves (`transfers`), and the calls of the trainer (`commit`).
+//! Not here: the writes themselves (`tier`), and the calls of the trainer (`pager`).
 //!
 //! Invariants: 1. a page is written for the generation of the cut as it was at the cut, and everything else for the next
 //! generation; 2. only an acknowledged commit counts as the last one, but pages of commits that were not acknowledged are taken
 //! away by the next commit if they are gone by then; 3. a cut that is given up leaves versions like others, and the commit before
 //! it stands.
 
-use super::frames::frame::FrameState;
-use super::frames::table::FrameTable;
+use super::frames::table::{FrameState, FrameTable};
 use super::index::PageIndex;
-use super::label::label;
+use super::stored::label;
 use crate::base::ids::{PageId, PageNo};
 use crate::page::format::slot_header::SlotRef;
 use crate::page::map::commit::{CommitError, PageChange};

@@ -9,25 +9,21 @@
 //! | `index` | the entry of every page, and the slot of its version on the drive |
 //! | `mover` | transfers between frames and the store: what is in flight, and what failed |
 //! | `cut` | which pages the last commit names, and the pages of a commit beside training |
-//! | [`pager`] | the parts together: hands out the pages of a view and takes them back |
-//!
-//! The pager's calls that need several parts stand in `fetch`, [`batches`], `prefetch`, `transfers` and `commit`.
+//! | `tier` | these together: pages that move between memory and drive, and the frames that they leave |
+//! | `fetch`, [`prefetch`] | pages that a caller waits for, and pages that the coming steps will wait for |
+//! | [`pager`] | hands out the pages of a view and takes them back; commits |
 
-pub mod batches;
-mod commit;
 mod cut;
 pub mod error;
 mod fetch;
 pub mod frames;
 mod index;
-pub mod label;
 mod mover;
 pub mod pager;
 pub mod pinned;
 pub mod plan;
-mod prefetch;
+pub mod prefetch;
 pub mod simulation;
 pub mod stats;
 pub mod stored;
-pub mod timing;
-mod transfers;
+mod tier;

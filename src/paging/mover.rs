@@ -1,15 +1,15 @@
 //! The mover: reads and write-backs between frames and the store. It counts what is in flight, keeps what is ahead of its need
 //! within bytes, and remembers writes that failed while nobody waited for them.
 //!
-//! Not here: which page moves (`fetch`, `prefetch`, `commit`), and what an end means for frames and index (`transfers`).
+//! Not here: which page moves (`fetch`, `prefetch`), and what an end means for frames and index (`tier`).
 //!
 //! Invariants: 1. every buffer that goes to the store comes back, however the transfer ends; 2. transfers begin
 //! ahead of their need while [`Mover::may_read_ahead`] and [`Mover::may_write_ahead`] allow it, and a cut writes a few pages beyond; 3. after a failed write no other write begins ahead of its need until a step
 //! asks for pages again; 4. a mover without a store, of a run that stays in memory, moves nothing.
 
 use super::error::PagingError;
-use super::label::label;
 use super::stats::SlotSpace;
+use super::stored::label;
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{SlotRef, StoredAs};
@@ -49,9 +49,9 @@ pub(super) struct Ended {
 pub(super) struct Mover {
     /// `None` for a pager whose pages never leave memory.
     store: Option<PagedStore>,
-    frame_bytes: usize,
-    /// Limit of `ahead`.
-    ahead_max: usize,
+    pub frame_bytes: usize,
+    /// The most bytes that may be in flight ahead of their need, reads and writes each.
+    pub ahead_max: usize,
     /// Reads and writes in flight that were started ahead of their need, bytes.
     ahead: [usize; 2],
     /// A write that failed while nobody waited for it.
@@ -70,11 +70,6 @@ impl Mover {
     pub fn attach(&mut self, store: PagedStore) {
         assert!(self.store.is_none(), "a pager has one store for life");
         self.store = Some(store);
-    }
-
-    /// Sets the bytes that may be in flight ahead of their need, reads and writes each.
-    pub fn set_ahead_max(&mut self, bytes: usize) {
-        self.ahead_max = bytes;
     }
 
     /// Whether there is a store.
@@ -202,17 +197,15 @@ impl Mover {
         }
     }
 
-    /// No more writes until a step asks for pages again. The error goes to the caller that waits (`waits`), or to the next step.
-    ///
-    /// # Errors
-    /// `error`, if the caller waits.
-    pub fn stop_writes(&mut self, error: PagingError, waits: bool) -> Result<(), PagingError> {
+    /// No more writes until a step asks for pages again.
+    pub fn refuse_writes(&mut self) {
         self.writes_stopped = true;
-        if waits {
-            return Err(error);
-        }
+    }
+
+    /// No more writes until a step asks for pages again, which gets the error.
+    pub fn stop_writes(&mut self, error: PagingError) {
+        self.refuse_writes();
         self.keep_failure(error);
-        Ok(())
     }
 
     /// Keeps an error for the next step; the first one counts.
@@ -302,8 +295,9 @@ mod tests {
     fn a_failed_write_stops_others_and_its_error_waits_for_the_next_step() {
         let (mut mover, _) = mover();
         let error = || PagingError::WorkingSet { what: "a test".to_string(), pages: 1, frames: 0, frame_bytes: 1 };
-        assert!(mover.stop_writes(error(), true).is_err() && mover.take_failure().is_none());
-        mover.stop_writes(error(), false).unwrap();
+        mover.refuse_writes();
+        assert!(!mover.may_write_ahead() && mover.take_failure().is_none());
+        mover.stop_writes(error());
         assert!(mover.are_writes_stopped() && !mover.may_write_ahead());
         mover.resume_writes();
         assert!(mover.may_write_ahead() && mover.take_failure().is_some() && mover.take_failure().is_none());

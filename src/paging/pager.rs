@@ -1,36 +1,44 @@
-//! The pager hands out the pages of a view and takes them back.
+//! The pager hands out the pages of a view and takes them back, and makes them durable.
 //!
-//! The pager composes parts that know nothing of each other: `index` (entries and slots of the pages), `frames` (which
-//! pages are in memory), `plan` (what the coming steps need), `mover` (transfers), `cut` (commits). Calls that need several
-//! parts stand in files of their own: `fetch` reads the pages of the current step, `prefetch` those of coming steps,
-//! `batches` walks a view that is larger than the frames, `transfers` begins and ends reads and write-backs, `commit` makes
-//! the pages durable.
+//! The pager composes parts that do not know it: `tier` (which pages are in memory, and what moves), `look_ahead`
+//! (what the coming steps need), `fetch` (brings pages in for a caller who waits), `prefetch` (reads ahead of steps).
+//!
+//! A commit is either done at once, between two steps ([`Pager::flush`], [`Pager::commit`]), or beside training
+//! ([`Pager::freeze`] to [`Pager::commit_frozen`]; `cut` says how). A view that is larger than the frames is pinned part by part:
+//! [`Pager::begin_view`] lists the pages, and [`super::plan::batches`] says how many of them are pinned at once.
 //!
 //! Invariants: 1. `acquire` gives every page that the view may see by the bounds as they are now, whatever was planned;
 //! 2. a page's buffer is in one place: in its frame, with the mover, or with the caller who pinned it; 3. what a step
 //! reads and writes never depends on frames, plan or store; 4. a page with rows that is not in memory has a slot, and the
-//! slot holds exactly what was last released.
+//! slot holds exactly what was last released; 5. after [`Pager::flush`] nothing is in flight and no page in memory is dirty;
+//! 6. a commit names every page with rows, by exactly the version that was last released; 7. a frozen page is never pinned, so what is
+//! written is what the page was at the cut; 8. when a write fails, the cut is given up; 9. entries from a store are taken over only
+//! if their slots can hold what they say.
 
-use super::cut::Cuts;
+use super::cut::{Cuts, Frozen, nowhere};
 use super::error::PagingError;
+use super::fetch::Fetch;
 use super::frames::evict::EvictPolicy;
-use super::frames::frame::FrameState;
-use super::frames::table::FrameTable;
+use super::frames::table::{FrameState, FrameTable};
 use super::index::PageIndex;
 use super::mover::Mover;
 use super::pinned::PinnedPage;
-use super::plan::look_ahead::LookAhead;
+use super::plan::batches::pages_per_batch;
+use super::plan::look_ahead::{LookAhead, UseInStep};
+use super::prefetch::{Prefetch, Transfers};
 use super::stats::{Counters, PagerStats, SlotSpace};
-use super::timing::{Asker, Transfers};
+use super::stored::PageLimits;
+use super::tier::{Asker, Tier};
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
+use crate::page::map::commit::{CommitError, Commits, Cut};
+use crate::page::map::opening::StoredPage;
 use crate::page::versions::paged_store::PagedStore;
 use crate::scene::camera::Camera;
 use crate::scene::page_layout::capacity_bytes;
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
-use std::collections::BTreeMap;
 
 /// Sizes of a pager. None of them changes a bit of the rows.
 #[derive(Debug, Clone, Copy)]
@@ -65,55 +73,66 @@ impl PagerConfig {
 /// The pages of a scene: the parts that hold, move and plan them.
 #[derive(Debug)]
 pub struct Pager {
-    pub(super) config: PagerConfig,
-    pub(super) index: PageIndex,
-    pub(super) frames: FrameTable<PageBuffer>,
-    pub(super) look_ahead: LookAhead,
-    pub(super) mover: Mover,
-    pub(super) cuts: Cuts,
-    pub(super) counters: Counters,
-    pub(super) transfers: Transfers,
-    /// Next uses of the pages that the present step still needs, where it walks its view in batches.
-    pub(super) uses_in_step: BTreeMap<PageNo, u32>,
-    /// Pinned pages that no batch uses: a tier above has newer bytes of them.
-    pub(super) held: usize,
+    config: PagerConfig,
+    tier: Tier,
+    look_ahead: LookAhead,
+    transfers: Transfers,
 }
 
 impl Pager {
     /// A pager with `config.frames` frames over a store whose slots are as large as the frames.
     pub fn new(config: PagerConfig, store: PagedStore) -> Pager {
         let mut pager = Pager::in_memory(config);
-        pager.mover.attach(store);
+        pager.tier.mover.attach(store);
         pager
     }
 
     /// A pager that keeps every page in memory, in as many frames as needed.
     pub fn in_memory(config: PagerConfig) -> Pager {
-        Pager {
+        let tier = Tier {
             index: PageIndex::default(),
             frames: FrameTable::new(config.frames, config.policy),
-            look_ahead: LookAhead::new(config.policy, config.plan_bytes),
             mover: Mover::new(config.frame_bytes(), config.prefetch_bytes),
             cuts: Cuts::default(),
             counters: Counters::default(),
-            transfers: Transfers::default(),
-            uses_in_step: BTreeMap::new(),
-            held: 0,
-            config,
+        };
+        let look_ahead = LookAhead::new(config.policy, config.plan_bytes);
+        Pager { tier, look_ahead, transfers: Transfers::default(), config }
+    }
+
+    /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
+    ///
+    /// # Errors
+    /// An entry contradicts itself or its slot.
+    pub fn open(
+        config: PagerConfig,
+        store: PagedStore,
+        pages: &[StoredPage],
+        events: usize,
+    ) -> Result<Pager, CommitError> {
+        let mut pager = Pager::new(config, store);
+        for stored in pages {
+            let limits = PageLimits { page_rows: config.page_rows, sh_degree: config.sh_degree, events };
+            let meta = limits
+                .meta_of(stored.page, &stored.slot, &stored.label)
+                .map_err(|what| CommitError::Contradiction(format!("page {}: {what}", stored.page)))?;
+            pager.tier.index.push(meta, Some(stored.slot));
+            pager.tier.cuts.add_committed(stored.page, stored.slot.generation);
         }
+        Ok(pager)
     }
 
     /// Gives a pager whose pages never left memory a store of its frames' size, which is empty: from here on the pager can be
     /// committed. Nothing is written before that.
     pub fn attach(&mut self, store: PagedStore) {
-        self.mover.attach(store);
+        self.tier.mover.attach(store);
         // These pages are in memory: no cache would have had to read them.
-        (0..self.index.metas().len()).for_each(|page| self.counters.bound.add(PageNo(page as u32)));
+        (0..self.index().len()).for_each(|page| self.tier.counters.bound.add(PageNo(page as u32)));
     }
 
     /// Continues the counters of an earlier life of the run.
     pub fn restore_stats(&mut self, past: PagerStats) {
-        self.counters.stats = past;
+        self.tier.counters.stats = past;
     }
 
     /// Adds an initial page. `fill` writes its rows into the payload space (all of it is given; see
@@ -123,36 +142,34 @@ impl Pager {
     /// The store failed while a frame was emptied.
     pub fn insert(&mut self, meta: PageMeta, fill: impl FnOnce(&mut [u8])) -> Result<PageNo, PagingError> {
         if meta.rows == 0 {
-            return Ok(self.add_entry(meta));
+            return Ok(self.tier.add_entry(meta));
         }
-        self.write_behind()?;
-        let mut buffer = self.frame_for(Asker::Other)?;
+        self.tier.write_behind()?;
+        let mut buffer = self.tier.frame_for(Asker::Other)?;
         fill(&mut buffer.as_mut_slice()[HEADER_BYTES..]);
-        let page = self.add_entry(meta);
-        self.frames.adopt(page);
-        self.frames.unpin(page, buffer, true);
+        let page = self.tier.add_entry(meta);
+        self.tier.frames.adopt(page);
+        self.tier.frames.unpin(page, buffer, true);
         Ok(page)
     }
 
     /// Raises the number of frames, once the memory that is left for them is known.
     pub fn allow_frames(&mut self, frames: usize) {
-        self.frames.allow_frames(frames);
-        self.config.frames = self.frames.frames_max();
+        self.tier.frames.allow_frames(frames);
     }
 
     /// Lowers the number of frames to `frames`. To be called between steps: pages are evicted, and dirty pages written back,
     /// until no frame is in excess; the time counts as waited. If a page cannot be written, the next step gets the error, and the
     /// frame is given up once the page is written.
     pub fn limit_frames(&mut self, frames: usize) {
-        self.frames.limit_frames(frames);
-        self.config.frames = self.frames.frames_max();
-        while self.frames.excess() > 0 {
-            match self.make_room(0, Asker::Step) {
+        self.tier.frames.limit_frames(frames);
+        while self.tier.frames.excess() > 0 {
+            match self.tier.make_room(0, Asker::Step) {
                 Ok(true) => {}
-                Ok(false) if self.mover.in_flight() == 0 => return,
-                Ok(false) => self.poll_completions(true),
+                Ok(false) if self.tier.mover.in_flight() == 0 => return,
+                Ok(false) => self.tier.poll(true),
                 Err(error) => {
-                    self.mover.keep_failure(error);
+                    self.tier.mover.keep_failure(error);
                     return;
                 }
             }
@@ -162,9 +179,9 @@ impl Pager {
     /// Begins to move pages between memory and the store: for a pager whose pages were all in memory, and whose store holds all
     /// of them. The sizes are those of [`PagerConfig`].
     pub fn begin_paging(&mut self, frames: usize, prefetch_bytes: usize, plan_bytes: usize) {
-        assert!(self.mover.has_store(), "pages that leave memory have a store to go to");
-        self.config = PagerConfig { prefetch_bytes, plan_bytes, ..self.config };
-        self.mover.set_ahead_max(prefetch_bytes);
+        assert!(self.tier.mover.has_store(), "pages that leave memory have a store to go to");
+        self.tier.mover.ahead_max = prefetch_bytes;
+        self.config.plan_bytes = plan_bytes;
         self.look_ahead = LookAhead::new(self.config.policy, plan_bytes);
         self.limit_frames(frames);
     }
@@ -185,11 +202,11 @@ impl Pager {
     /// Lists the pages of some coming steps anew, by the bounds as they are now, for a tier above. Where pages leave memory, prefetch does
     /// it.
     pub fn refresh_plan(&mut self, step: u32) {
-        if self.config.plan_bytes > 0 && self.frames.frames_max() == usize::MAX {
-            self.look_ahead.refresh(step, self.index.metas());
+        if self.config.plan_bytes > 0 && self.frames_max() == usize::MAX {
+            self.look_ahead.refresh(step, self.tier.index.metas());
         }
-        self.look_ahead.refresh_near(step, self.index.metas());
-        self.apply_changed_uses();
+        self.look_ahead.refresh_near(step, self.tier.index.metas());
+        self.look_ahead.apply_changed(&mut self.tier.frames);
     }
 
     /// Sets when pages move.
@@ -199,32 +216,37 @@ impl Pager {
 
     /// The most bytes that [`Pager::prefetch`] has in flight, reads and writes together.
     pub fn prefetch_bytes(&self) -> usize {
-        2 * self.config.prefetch_bytes
+        2 * self.tier.mover.ahead_max
     }
 
     /// Memory of buffers for encoded pages, bytes: the most that was ever in use at once. The limit is
     /// [`Pager::prefetch_bytes`], but a few pages are always allowed, and some more where nothing is read ahead.
     pub fn staging_bytes(&self) -> u64 {
-        self.mover.staging_bytes()
+        self.tier.mover.staging_bytes()
     }
 
     /// Bytes of one frame.
     pub fn frame_bytes(&self) -> usize {
-        self.config.frame_bytes()
+        self.tier.mover.frame_bytes
     }
 
     /// The metas of all pages, by number.
     pub fn index(&self) -> &[PageMeta] {
-        self.index.metas()
+        self.tier.index.metas()
     }
 
     /// Plans the coming views: `cameras[i]` at step `first_step + i`. Replaces the plan before; views that are planned already
     /// cost nothing.
     pub fn look_ahead(&mut self, first_step: u32, cameras: &[&Camera]) {
-        if self.mover.has_store() || self.config.plan_bytes > 0 {
-            self.look_ahead.views.renew(first_step, cameras, self.index.metas());
-            self.apply_changed_uses();
+        if self.tier.mover.has_store() || self.config.plan_bytes > 0 {
+            self.look_ahead.views.renew(first_step, cameras, self.tier.index.metas());
+            self.look_ahead.apply_changed(&mut self.tier.frames);
         }
+    }
+
+    /// The next use of a page: in the present step if it walks its view in batches, else the first planned step.
+    pub fn next_use(&self, page: PageNo) -> u32 {
+        self.look_ahead.next_use(page)
     }
 
     /// Pins every page with rows that `camera` may see by the bounds as they are now, ascending by id: a view of one batch.
@@ -244,39 +266,67 @@ impl Pager {
     /// # Errors
     /// A page could not be written since the last call.
     pub fn begin_view(&mut self, step: u32, camera: &Camera) -> Result<Vec<PageNo>, PagingError> {
-        self.mover.resume_writes();
-        if let Some(error) = self.mover.take_failure() {
+        self.tier.mover.resume_writes();
+        if let Some(error) = self.tier.mover.take_failure() {
             return Err(error);
         }
         let pages = self.pages_of_view(camera);
         let planned = self.look_ahead.views.pages(step).map(<[PageNo]>::to_vec);
         self.look_ahead.views.pass(step.saturating_add(1));
-        self.look_ahead.views.add_pages(self.index.metas());
-        self.apply_changed_uses();
-        self.frames.begin_step(step);
+        self.look_ahead.views.add_pages(self.tier.index.metas());
+        self.look_ahead.apply_changed(&mut self.tier.frames);
+        self.tier.frames.begin_step(step);
         if let Some(planned) = planned {
-            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && self.frames.state(**p).is_none();
-            self.counters.stats.late_misses += pages.iter().filter(missed).count() as u64;
+            let missed = |p: &&PageNo| planned.binary_search(p).is_err() && !self.is_in_memory(**p);
+            self.tier.counters.stats.late_misses += pages.iter().filter(missed).count() as u64;
         }
         Ok(pages)
     }
 
-    /// Adds a batch of a step to the bound on reads.
-    pub(super) fn count_bound(&mut self, pages: &[PageNo]) {
-        if !self.mover.has_store() {
-            return;
-        }
-        let (index, frames) = (&self.index, self.frames.frames_max());
-        self.counters.bound.step(frames, pages.iter().map(|&page| (page, index.transfer_bytes(page))));
+    /// The most pages of a view of `pages` pages that a step pins at once.
+    pub fn pages_per_batch(&self, pages: usize) -> usize {
+        pages_per_batch(pages, self.frames_max())
     }
 
     /// Pages with rows that `camera` may see by the bounds as they are now, ascending by id.
     pub fn pages_of_view(&self, camera: &Camera) -> Vec<PageNo> {
-        let mut pages = Vec::new();
-        visible_pages(self.index.metas(), camera, &mut pages);
-        pages.retain(|&p| self.index.has_rows(p));
-        pages.sort_unstable_by_key(|&p| self.index.meta(p).id);
+        let (mut pages, index) = (Vec::new(), &self.tier.index);
+        visible_pages(index.metas(), camera, &mut pages);
+        pages.retain(|&p| index.has_rows(p));
+        pages.sort_unstable_by_key(|&p| index.meta(p).id);
         pages
+    }
+
+    /// Pins the next batch of a step's view, in this order, leaving out pages without rows. Blocks only for pages that are not
+    /// in memory.
+    ///
+    /// # Errors
+    /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
+    pub fn pin_batch(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        self.pin_batch_for(step, pages, Asker::Step)
+    }
+
+    /// As [`Pager::pin_batch`], for a step that has changed rows already: a failed write is left to the next step.
+    ///
+    /// # Errors
+    /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
+    pub fn pin_batch_again(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
+        self.pin_batch_for(step, pages, Asker::RestOfStep)
+    }
+
+    fn pin_batch_for(&mut self, step: u32, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
+        let what = format!("the view of step {step}");
+        let pinned = match Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker) {
+            // The failed write that left no frame says more than the lack of frames.
+            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.tier.mover.take_failure().unwrap_or(error)),
+            pinned => pinned?,
+        };
+        if self.tier.mover.has_store() {
+            let Tier { index, frames, counters, .. } = &mut self.tier;
+            let pages = pinned.iter().map(|p| (p.page, index.transfer_bytes(p.page)));
+            counters.bound.step(frames.frames_max(), pages);
+        }
+        Ok(pinned)
     }
 
     /// Pins the listed pages (none of them pinned already, none twice) in this order, leaving out those without rows:
@@ -286,8 +336,7 @@ impl Pager {
     /// # Errors
     /// As [`Pager::acquire`], but without earlier failures.
     pub fn acquire_pages(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
-        self.fetch("a list of pages", &pages, Asker::Other)
+        Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::Other)
     }
 
     /// As [`Pager::acquire_pages`], for the rest of a step that has changed rows already: hits, reads and the time waited
@@ -296,111 +345,264 @@ impl Pager {
     /// # Errors
     /// As [`Pager::acquire_pages`].
     pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        let pages: Vec<PageNo> = pages.iter().copied().filter(|&p| self.index.has_rows(p)).collect();
-        self.fetch("a list of pages", &pages, Asker::RestOfStep)
+        Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::RestOfStep)
+    }
+
+    /// Says how the present step, which walks its view in batches, still uses these pages.
+    pub fn set_use_in_step(&mut self, step: u32, pages: impl IntoIterator<Item = PageNo>, how: UseInStep) {
+        self.look_ahead.set_use_in_step(step, pages, how, &mut self.tier.frames);
+    }
+
+    /// The step has ended, well or not: it uses no page any more.
+    pub fn end_batches(&mut self) {
+        self.look_ahead.end_step(&mut self.tier.frames);
+    }
+
+    /// Makes sure that the drive has room for everything that may be written back before `pages` pages of the present step are
+    /// updated: these pages, the dirty pages in memory, and the pages of a cut.
+    ///
+    /// # Errors
+    /// The drive is full.
+    pub fn reserve_slots(&mut self, pages: usize) -> Result<(), PagingError> {
+        let Tier { frames, mover, .. } = &mut self.tier;
+        let pages = (pages + frames.held().filter(|(_, held)| frames.is_dirty(held.page)).count()) as u64;
+        let reserved = mover.store_mut().map_or(Ok(()), |store| store.reserve(pages));
+        reserved.map_err(|source| PagingError::Room { pages, source })
+    }
+
+    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
+    /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
+    pub fn prefetch(&mut self, step: u32) {
+        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+            self.tier.poll(false);
+            let transfers = self.transfers;
+            self.prefetching().coming_steps(step, transfers);
+        }
+    }
+
+    /// Begins to read the pages of the next batch of the present step, as far as frames of pages that the step does not need
+    /// earlier can be had, and bytes in flight allow it. Never blocks. Calling it again continues.
+    pub fn prefetch_batch(&mut self, pages: &[PageNo]) {
+        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+            self.prefetching().listed(pages, Asker::Step);
+        }
+    }
+
+    /// As [`Pager::prefetch_batch`], between steps: of pages that are acquired next.
+    pub fn prefetch_pages(&mut self, pages: impl Iterator<Item = PageNo>) {
+        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+            let pages: Vec<PageNo> = pages.collect();
+            // So that none of them is evicted for another one.
+            self.set_use_in_step(0, pages.iter().copied(), UseInStep::Coming);
+            self.prefetching().listed(&pages, Asker::Other);
+            self.end_batches();
+        }
+    }
+
+    fn prefetching(&mut self) -> Prefetch<'_> {
+        Prefetch { tier: &mut self.tier, look_ahead: &mut self.look_ahead }
+    }
+
+    /// A frame for the upper half of a page that splits; its bytes are whatever was there before. Goes back by
+    /// [`Pager::add_split`] or [`Pager::return_frame`]. A step that has begun to change pages is seen through where only
+    /// space is missing, with a frame more than allowed: the next step gets the error.
+    ///
+    /// # Errors
+    /// Every frame is pinned, or the store failed while one was emptied.
+    pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
+        let error = match self.tier.frame_for(Asker::Step) {
+            Err(error) => error,
+            frame => return frame,
+        };
+        let cause = self.tier.mover.take_failure().unwrap_or(error);
+        if !cause.is_out_of_space() {
+            return Err(cause);
+        }
+        self.tier.mover.keep_failure(cause);
+        self.tier.frames.add_frame();
+        self.tier.frame_for(Asker::Step)
     }
 
     /// Gives back a frame that was taken and is not needed.
     pub fn return_frame(&mut self, buffer: PageBuffer) {
-        self.frames.take_back(buffer);
+        self.tier.frames.take_back(buffer);
     }
 
     /// Adds the upper half of a page that split: the half gets a number, is pinned and dirty. The lower half keeps the number of
     /// the page; [`Pager::release`] takes its new meta over.
     pub fn add_split(&mut self, meta: PageMeta, buffer: PageBuffer) -> PinnedPage {
-        let page = self.add_entry(meta);
-        self.frames.adopt(page);
-        self.count_pinned();
+        let page = self.tier.add_entry(meta);
+        self.tier.frames.adopt(page);
+        self.tier.counters.count_pinned(self.tier.frames.count(FrameState::Pinned));
         PinnedPage { page, meta, dirty: true, buffer }
     }
 
     /// Unpins pages: all that a step has pinned, or some of them. Metas and dirty flags are taken over. A page
     /// that has lost all rows gives up its frame and its slot.
     pub fn release(&mut self, pages: Vec<PinnedPage>) {
-        for PinnedPage { page, meta, dirty, buffer } in pages {
-            debug_assert!(meta == *self.index.meta(page) || dirty, "a page whose entry changes is dirty");
-            self.index.set_meta(page, meta);
+        for pinned in pages {
+            self.note_meta(&pinned);
+            let (PinnedPage { page, meta, dirty, buffer }, tier) = (pinned, &mut self.tier);
             if meta.rows > 0 {
-                self.frames.unpin(page, buffer, dirty);
-            } else {
-                self.frames.drop_pinned(page, buffer);
-                self.free_slot(page);
+                tier.frames.unpin(page, buffer, dirty);
+                continue;
+            }
+            tier.frames.drop_pinned(page, buffer);
+            if let Some(slot) = tier.index.set_slot(page, None) {
+                tier.mover.free(&slot, None);
             }
         }
     }
 
     /// Takes over the entry of a page that stays pinned: its new bounds count from now on.
     pub fn note_meta(&mut self, pinned: &PinnedPage) {
-        debug_assert!(
-            pinned.dirty || pinned.meta == *self.index.meta(pinned.page),
-            "a page whose entry changes is dirty"
-        );
-        self.index.set_meta(pinned.page, pinned.meta);
+        let PinnedPage { page, meta, dirty, .. } = *pinned;
+        debug_assert!(meta == *self.tier.index.meta(page) || dirty, "a page whose entry changes is dirty");
+        self.tier.index.set_meta(page, meta);
     }
 
     /// Says how many pinned pages no batch uses: the largest number of pinned pages is counted without them.
     pub fn set_held(&mut self, pages: usize) {
-        self.held = pages;
+        self.tier.counters.held = pages;
     }
 
     /// The counters, over all lives of the run.
     pub fn stats(&self) -> PagerStats {
-        self.counters.total(self.mover.traffic())
+        self.tier.counters.total(self.tier.mover.traffic())
     }
 
     /// Frames in use.
     pub fn frames(&self) -> usize {
-        self.frames.frames()
+        self.tier.frames.frames()
     }
 
     /// The limit on frames; `usize::MAX` for no limit.
     pub fn frames_max(&self) -> usize {
-        self.frames.frames_max()
+        self.tier.frames.frames_max()
     }
 
     /// Seconds that steps lost to commits beside them: they waited for frozen pages, or spent the time on writing them.
     pub fn commit_seconds(&self) -> f64 {
-        self.counters.commit_seconds
+        self.tier.counters.commit_seconds
     }
 
     /// Whether a page has a frame.
     pub fn is_in_memory(&self, page: PageNo) -> bool {
-        self.frames.state(page).is_some()
+        self.tier.frames.state(page).is_some()
     }
 
     /// The payload in the frame of a page, without the header; `None` for a page that is not in memory, is pinned, or is
     /// moving.
     pub fn payload(&self, page: PageNo) -> Option<&[u8]> {
-        self.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
+        self.tier.frames.memory(page).map(|buffer| &buffer.as_slice()[HEADER_BYTES..])
     }
 
     /// How full the store is; `None` for a pager without a store.
     pub fn slot_space(&self) -> Option<SlotSpace> {
-        self.mover.slot_space()
+        self.tier.mover.slot_space()
     }
 
-    fn add_entry(&mut self, meta: PageMeta) -> PageNo {
-        let page = self.index.push(meta, None);
-        if self.mover.has_store() {
-            self.counters.bound.add(page);
+    /// Writes every dirty page back and waits until nothing is in flight. To be called between steps, when no page is pinned. A cut
+    /// that is not committed is given up.
+    ///
+    /// # Errors
+    /// A page could not be written. It is still in memory, and the call may be repeated.
+    pub fn flush(&mut self) -> Result<(), PagingError> {
+        let tier = &mut self.tier;
+        debug_assert_eq!(tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
+        tier.cuts.abort();
+        // Pages whose write failed are still dirty: they are written again here.
+        tier.mover.take_failure();
+        tier.mover.resume_writes();
+        tier.wait_until_below(1)?;
+        let mut dirty: Vec<PageNo> =
+            tier.frames.held().map(|(_, held)| held.page).filter(|&p| tier.frames.is_dirty(p)).collect();
+        dirty.sort_unstable();
+        let mut dirty = dirty.into_iter();
+        tier.write_all(|_| dirty.next())
+    }
+
+    /// Commits the pages as they are, right after [`Pager::flush`], under the name `pin` if there is one; returns the
+    /// generation, `None` for a pager without a store.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`].
+    pub fn commit(
+        &mut self,
+        commits: &mut Commits,
+        run_state: &[u8],
+        note: &[u8],
+        pin: Option<&str>,
+    ) -> Result<Option<u64>, CommitError> {
+        let Tier { index, mover, cuts, .. } = &mut self.tier;
+        debug_assert!(mover.in_flight() == 0, "a commit comes after a flush");
+        let Some(store) = mover.store_mut() else { return Ok(None) };
+        let (changes, now) = cuts.changes(index)?;
+        let cut = Cut { changes: &changes, run_state, note, pin };
+        let result = commits.commit(store, &mut Vec::new(), &cut);
+        cuts.end_commit(now, result).map(Some)
+    }
+
+    /// Freezes the pages as they are. To be called between steps, when no page is pinned. An earlier cut that was not committed is
+    /// given up. Without a store nothing is frozen.
+    ///
+    /// # Errors
+    /// A write that ended meanwhile had failed.
+    pub fn freeze(&mut self) -> Result<(), PagingError> {
+        debug_assert_eq!(self.tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
+        self.abort_cut();
+        self.tier.collect_writes(None)?;
+        let Tier { index, frames, mover, cuts, .. } = &mut self.tier;
+        let Some(store) = mover.store_mut() else { return Ok(()) };
+        cuts.freeze(store.cut(), index, frames);
+        Ok(())
+    }
+
+    /// Gives up a cut that is not committed.
+    pub fn abort_cut(&mut self) {
+        self.tier.cuts.abort();
+    }
+
+    /// Whether there is a cut that is not committed yet; a failed write has given it up.
+    pub fn is_frozen(&self) -> bool {
+        self.tier.cuts.is_frozen()
+    }
+
+    /// Whether every page of the cut is written.
+    pub fn is_frozen_written(&self) -> bool {
+        self.tier.cuts.is_written()
+    }
+
+    /// Writes what is left of the cut, and waits until nothing is in flight.
+    ///
+    /// # Errors
+    /// A page could not be written: the cut is given up.
+    pub fn finish_frozen(&mut self) -> Result<(), PagingError> {
+        self.tier.write_all(|tier| tier.cuts.next_waiting())
+    }
+
+    /// Commits the cut, right after [`Pager::finish_frozen`]; returns its generation and the bytes that were written for
+    /// it, `None` where nothing is frozen.
+    ///
+    /// # Errors
+    /// As [`Commits::commit`]: the cut is given up.
+    pub fn commit_frozen(
+        &mut self,
+        commits: &mut Commits,
+        run_state: &[u8],
+        note: &[u8],
+    ) -> Result<Option<(u64, u64)>, CommitError> {
+        let Tier { mover, cuts, .. } = &mut self.tier;
+        debug_assert!(mover.in_flight() == 0, "a commit comes after its writes");
+        let Some(frozen) = cuts.take() else { return Ok(None) };
+        let Frozen { generation, mut changes, now, bytes, nowhere: lost, .. } = frozen;
+        if let Some(page) = lost {
+            return Err(nowhere(page));
         }
-        page
-    }
-
-    pub(super) fn count_pinned(&mut self) {
-        let pinned = self.frames.count(FrameState::Pinned).saturating_sub(self.held);
-        self.counters.stats.pinned_max = self.counters.stats.pinned_max.max(pinned);
-    }
-
-    /// The next use of a page: in the present step if it walks its view in batches, else the first planned step.
-    pub fn next_use(&self, page: PageNo) -> u32 {
-        self.uses_in_step.get(&page).copied().unwrap_or_else(|| self.look_ahead.views.next_use(page))
-    }
-
-    /// Tells the frame table of next uses that changed.
-    pub(super) fn apply_changed_uses(&mut self) {
-        for page in self.look_ahead.views.take_changed() {
-            self.frames.set_next_use(page, self.next_use(page));
-        }
+        changes.extend(cuts.removed_since(&now));
+        let Some(store) = mover.store_mut() else { return Ok(None) };
+        let cut = Cut { changes: &changes, run_state, note, pin: None };
+        let result = commits.commit_cut(store, &mut Vec::new(), generation, &cut);
+        cuts.end_commit(now, result).map(|generation| Some((generation, bytes)))
     }
 }

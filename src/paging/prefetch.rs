@@ -10,53 +10,67 @@
 //! step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes
 //! what a step gets; 5. the look-ahead runs once for each step, and further calls in the same step cost what they begin.
 
-use super::frames::frame::FrameState;
-use super::frames::table::Victim;
-use super::pager::Pager;
+use super::frames::table::{FrameState, Victim};
 use super::plan::cache_model::FAR_STEPS;
-use super::plan::look_ahead::Admit;
-use super::timing::Transfers;
-use super::transfers::Failure;
+use super::plan::look_ahead::{Admit, COMING, LookAhead};
+use super::tier::{Asker, Tier};
+use crate::base::ids::PageNo;
 use std::collections::VecDeque;
 
-impl Pager {
-    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
-    /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
-    pub fn prefetch(&mut self, step: u32) {
-        if self.transfers == Transfers::Demand {
-            return;
-        }
-        self.poll_completions(false);
-        if !self.mover.has_store() {
-            return;
-        }
-        self.write_frozen();
+/// When pages move. No choice changes what a step gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Transfers {
+    /// Ahead of their step, while steps compute.
+    #[default]
+    Overlap,
+    /// Ahead of their step, but every call waits until its pages have moved: the plan without the overlap, for comparison.
+    Ahead,
+    /// When a step needs them: neither plan nor overlap, for comparison.
+    Demand,
+}
+
+/// What a prefetch works on.
+pub(super) struct Prefetch<'a> {
+    pub tier: &'a mut Tier,
+    pub look_ahead: &'a mut LookAhead,
+}
+
+impl Prefetch<'_> {
+    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them.
+    pub fn coming_steps(&mut self, step: u32, transfers: Transfers) {
+        self.tier.write_frozen();
         // Without a limit on the frames nothing is read or evicted.
-        if self.frames.frames_max() < usize::MAX && self.look_ahead.is_due(step) {
+        if self.tier.frames.frames_max() < usize::MAX && self.look_ahead.is_due(step) {
             // By what is known now; a page that this step moves into the next one's view is a late miss at most.
-            self.look_ahead.refresh(step, self.index.metas());
-            self.apply_changed_uses();
-            self.look_ahead.play(step, self.index.metas(), &self.frames);
+            self.look_ahead.refresh(step, self.tier.index.metas());
+            self.look_ahead.apply_changed(&mut self.tier.frames);
+            self.look_ahead.play(step, self.tier.index.metas(), &self.tier.frames);
         }
         let admits = self.look_ahead.take_admits();
         let mut clean = self.leaving(&admits);
         let mut lacking = 0;
         for admit in &admits {
-            if !self.mover.may_read_ahead() {
+            if !self.tier.mover.may_read_ahead() {
                 break;
             }
-            if self.frames.state(admit.page).is_none()
-                && !self.begin_prefetch(admit, &mut clean, step)
+            if self.tier.frames.state(admit.page).is_none()
+                && !self.begin_read(admit, &mut clean, step)
                 && admit.step == step + 1
             {
                 lacking += 1;
             }
         }
-        self.clean_for_next_step(lacking, step);
+        // Write-backs of pages that are not needed for long, one for each frame that the next step lacks.
+        while self.tier.frames.count(FrameState::Writing) < lacking
+            && self.tier.mover.may_write_ahead()
+            && let Some(victim) = self.tier.frames.dirty_victim().filter(|v| is_far(v, step))
+        {
+            self.tier.write_back_early(victim.page);
+        }
         self.look_ahead.return_admits(admits);
-        self.mover.begin_writes();
-        while self.transfers == Transfers::Ahead && self.mover.in_flight() > 0 {
-            self.poll_completions(true);
+        self.tier.mover.begin_writes();
+        while transfers == Transfers::Ahead && self.tier.mover.in_flight() > 0 {
+            self.tier.poll(true);
         }
     }
 
@@ -65,10 +79,10 @@ impl Pager {
     fn leaving(&mut self, admits: &[Admit]) -> VecDeque<Victim> {
         let mut clean = VecDeque::new();
         for Admit { leaves, step, .. } in admits {
-            let now = leaves.and_then(|page| self.frames.as_victim(page)).filter(|v| v.next_use > *step);
+            let now = leaves.and_then(|page| self.tier.frames.as_victim(page)).filter(|v| v.next_use > *step);
             match now {
                 Some(victim) if !victim.dirty => clean.push_back(victim),
-                Some(victim) if self.mover.may_write_ahead() => self.write_back_early(victim),
+                Some(victim) if self.tier.mover.may_write_ahead() => self.tier.write_back_early(victim.page),
                 _ => {}
             }
         }
@@ -76,34 +90,50 @@ impl Pager {
     }
 
     /// Begins to read a coming page, into a free frame or that of an evicted page; `false` if there is neither.
-    fn begin_prefetch(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
-        if !self.frames.has_free() {
+    fn begin_read(&mut self, admit: &Admit, clean: &mut VecDeque<Victim>, step: u32) -> bool {
+        if !self.tier.frames.has_free() {
             let leaves = std::iter::from_fn(|| clean.pop_front()).find(|v| v.next_use > admit.step);
             // The next step may also evict any page that is not needed for long. That page may be read once more than by a cache
             // that knows the future, but waiting costs more.
             let is_next = admit.step == step + 1;
-            let other = || self.frames.clean_victim().filter(|v| is_next && is_far(v, step));
+            let other = || self.tier.frames.clean_victim().filter(|v| is_next && is_far(v, step));
             let Some(victim) = leaves.or_else(other) else { return false };
-            self.evict(victim.page);
+            self.tier.evict(victim.page);
         }
-        self.begin_read(admit.page, true)
+        self.tier.begin_read(admit.page, self.look_ahead.next_use(admit.page), true)
     }
 
-    /// Begins write-backs of pages that are not needed for long, one for each frame that the next step lacks.
-    fn clean_for_next_step(&mut self, lacking: usize, step: u32) {
-        while self.frames.count(FrameState::Writing) < lacking
-            && self.mover.may_write_ahead()
-            && let Some(victim) = self.frames.dirty_victim().filter(|v| is_far(v, step))
-        {
-            self.write_back_early(victim);
+    /// Begins to read the listed pages, as far as frames of pages that the present step does not need earlier can be had, and
+    /// bytes in flight allow it.
+    pub fn listed(&mut self, pages: &[PageNo], asker: Asker) {
+        self.tier.poll(false);
+        self.tier.write_frozen();
+        let mut lacking = 0;
+        for &page in pages {
+            if !self.tier.index.has_rows(page) || self.tier.frames.state(page).is_some() {
+                continue;
+            }
+            if !self.tier.mover.may_read_ahead() {
+                break;
+            }
+            if !self.tier.frames.has_free() {
+                match self.tier.frames.victim().filter(|victim| victim.next_use > COMING) {
+                    Some(victim) if !victim.dirty => self.tier.evict(victim.page),
+                    Some(victim) => {
+                        lacking += 1;
+                        if self.tier.frames.count(FrameState::Writing) < lacking && self.tier.mover.may_write_ahead() {
+                            self.tier.write_back_early(victim.page);
+                        }
+                        continue;
+                    }
+                    None => break,
+                }
+            }
+            if self.tier.begin_read(page, self.look_ahead.next_use(page), true) {
+                self.tier.count_read(page, asker);
+            }
         }
-    }
-
-    pub(super) fn write_back_early(&mut self, victim: Victim) {
-        if let Err(Failure { error, .. }) = self.begin_write(victim.page, true) {
-            // The next step gets the error.
-            let _ = self.mover.stop_writes(error, false);
-        }
+        self.tier.mover.begin_writes();
     }
 }
 

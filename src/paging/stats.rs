@@ -59,9 +59,16 @@ pub(super) struct Counters {
     pub commit_seconds: f64,
     /// What a cache that knows the future would have read for the steps of this life.
     pub bound: FewestReads,
+    /// Pinned pages that no batch uses: a tier above has newer bytes of them.
+    pub held: usize,
 }
 
 impl Counters {
+    /// Notes that this many pages are pinned.
+    pub fn count_pinned(&mut self, pinned: usize) {
+        self.stats.pinned_max = self.stats.pinned_max.max(pinned.saturating_sub(self.held));
+    }
+
     /// The counters over all lives, with what the store moved in this one.
     pub fn total(&self, traffic: PageTraffic) -> PagerStats {
         PagerStats {

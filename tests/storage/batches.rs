@@ -226,7 +226,7 @@ fn a_pass_between_steps_reads_no_page_twice() {
 /// A walk of other batches than the pager's own, with uses that are told to it: what comes back is evicted last.
 #[test]
 fn pages_that_return_stay_longer_than_pages_that_are_done() {
-    use gsscale::paging::batches::UseInStep;
+    use gsscale::paging::plan::look_ahead::UseInStep;
     let mut scene = scene(Some(&Faults::new()));
     let pager = &mut scene.pager;
     let pages = pager.begin_view(0, &camera()).unwrap();

@@ -1,5 +1,4 @@
 //! The frames of one tier of memory: which pages they hold, in what state, and which page is evicted next. Moves no bytes.
 
 pub mod evict;
-pub mod frame;
 pub mod table;

@@ -7,14 +7,62 @@
 //! Invariants: 1. a page is in at most one frame; 2. there are at most as many frames as allowed, and each keeps its memory:
 //! memory moves between frame, mover and caller, and is never copied. When the limit is lowered, free frames give their memory
 //! back at once and others as they become free; 3. exactly the resident frames are in the eviction order; 4. only clean pages
-//! are evicted: a dirty page is written back first.
+//! are evicted: a dirty page is written back first; 5. a frame has its memory exactly when it is free or resident. Otherwise somebody
+//! else has the memory: the mover (loading, writing), the caller (pinned, lent), or the system (retired).
 
-use super::evict::{Candidate, EvictOrder, EvictPolicy};
-use super::frame::{Frame, FrameState};
+use super::evict::{Candidate, EvictOrder, EvictPolicy, NEVER};
 use crate::base::ids::PageNo;
 
 /// In `frame_from_page`: not in memory.
 const ABSENT: u32 = u32::MAX;
+
+/// What a frame is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameState {
+    /// Holds no page.
+    Free,
+    /// Reserved for a page that has no number yet; the caller has the memory.
+    Lent,
+    /// The page is being read into the memory.
+    Loading,
+    /// Holds a page that can be pinned, written or evicted.
+    Resident,
+    /// The caller has the page's memory.
+    Pinned,
+    /// The page is being written back; it can be neither pinned nor evicted until the write ends.
+    Writing,
+    /// Has no memory: the memory was given back to the system, and may be allocated again.
+    Retired,
+}
+
+impl FrameState {
+    const COUNT: usize = FrameState::Retired as usize + 1;
+}
+
+/// A frame and what the table knows of its page.
+#[derive(Debug)]
+struct Frame<M> {
+    state: FrameState,
+    /// The page; meaningless for free, lent and retired frames.
+    page: PageNo,
+    /// Whether the page differs from its version in the tier below.
+    dirty: bool,
+    /// The next planned step that needs the page, or [`NEVER`].
+    next_use: u32,
+    /// Time of the last pin.
+    last_use: u32,
+    memory: Option<M>,
+}
+
+impl<M> Frame<M> {
+    fn lent() -> Frame<M> {
+        Frame { state: FrameState::Lent, page: PageNo(0), dirty: false, next_use: NEVER, last_use: 0, memory: None }
+    }
+
+    fn candidate(&self) -> Candidate {
+        Candidate { page: self.page, next_use: self.next_use, last_use: self.last_use }
+    }
+}
 
 /// A resident page that could be evicted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -367,7 +415,6 @@ impl<M> FrameTable<M> {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
-    use super::super::evict::NEVER;
     use super::*;
 
     /// A frame's memory here is one number.

@@ -3,16 +3,20 @@
 //! The look-ahead steps a [`CacheModel`] through the planned steps, starting with the pages that are in memory now. It decides
 //! nothing that a simulation would not decide: both step the same model.
 //!
-//! Invariants: 1. the steps are played once for each step of the run; 2. nothing here moves a page.
+//! In the middle of a step that walks its view in batches, the plan of the coming steps does not know which pages this step
+//! still needs. So the step says so ([`UseInStep`]), and pages that it still needs are evicted after all others.
+//!
+//! Invariants: 1. the steps are played once for each step of the run; 2. nothing here moves a page; 3. pages that a step needs
+//! again are evicted only for pages that it needs earlier.
 
 use super::batches::pages_per_batch;
 use super::cache_model::{CacheModel, STEPS_AHEAD, StepChange};
 use super::views::ViewPlan;
 use crate::base::ids::PageNo;
 use crate::paging::frames::evict::EvictPolicy;
-use crate::paging::frames::frame::FrameState;
-use crate::paging::frames::table::FrameTable;
+use crate::paging::frames::table::{FrameState, FrameTable};
 use crate::scene::page_meta::PageMeta;
+use std::collections::BTreeMap;
 
 /// Steps whose page lists are made anew before the look-ahead, by the bounds as they are now, counted from the present step: the
 /// next step, the last one that is played, and one far enough for pages to be kept for it. Pages may have been planned two
@@ -21,6 +25,20 @@ use crate::scene::page_meta::PageMeta;
 const REFRESHED: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
 /// Bounds of pages that [`LookAhead::refresh_near`] tests for a step: some .3 ms.
 const NEAR_BOUNDS: usize = 50_000;
+
+/// Next use of a page that a coming batch of the present step needs: before every step.
+pub(in crate::paging) const COMING: u32 = 0;
+
+/// How the present step, which walks its view in batches, still uses a page.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum UseInStep {
+    /// A batch that is still to come in the present pass needs the page.
+    Coming,
+    /// The page has been in, and the pass out needs the page again.
+    Returning,
+    /// The step is done with the page.
+    Done,
+}
 
 /// A page that a coming step will have to read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,6 +53,8 @@ pub(in crate::paging) struct Admit {
 #[derive(Debug)]
 pub(in crate::paging) struct LookAhead {
     pub views: ViewPlan,
+    /// Next uses of the pages that the present step still needs, where it walks its view in batches.
+    in_step: BTreeMap<PageNo, u32>,
     /// The step that was played last.
     played: Option<u32>,
     admits: Vec<Admit>,
@@ -46,10 +66,48 @@ impl LookAhead {
     pub fn new(policy: EvictPolicy, plan_bytes: usize) -> LookAhead {
         LookAhead {
             views: ViewPlan::new(plan_bytes),
+            in_step: BTreeMap::new(),
             played: None,
             admits: Vec::new(),
             model: CacheModel::new(0, policy).reading_ahead(),
         }
+    }
+
+    /// The next use of a page: in the present step if it walks its view in batches, else the first planned step.
+    pub fn next_use(&self, page: PageNo) -> u32 {
+        self.in_step.get(&page).copied().unwrap_or_else(|| self.views.next_use(page))
+    }
+
+    /// Tells the frame table of next uses that changed.
+    pub fn apply_changed<M>(&mut self, frames: &mut FrameTable<M>) {
+        self.views.take_changed().into_iter().for_each(|page| frames.set_next_use(page, self.next_use(page)));
+    }
+
+    /// Notes how the present step still uses these pages.
+    pub fn set_use_in_step<M>(
+        &mut self,
+        step: u32,
+        pages: impl IntoIterator<Item = PageNo>,
+        how: UseInStep,
+        frames: &mut FrameTable<M>,
+    ) {
+        if how == UseInStep::Done && self.in_step.is_empty() {
+            return;
+        }
+        for page in pages {
+            match how {
+                UseInStep::Coming => self.in_step.insert(page, COMING),
+                UseInStep::Returning => self.in_step.insert(page, step),
+                UseInStep::Done => self.in_step.remove(&page),
+            };
+            frames.set_next_use(page, self.next_use(page));
+        }
+    }
+
+    /// The present step has ended: it uses no page any more.
+    pub fn end_step<M>(&mut self, frames: &mut FrameTable<M>) {
+        let pages = std::mem::take(&mut self.in_step);
+        pages.into_keys().for_each(|page| frames.set_next_use(page, self.next_use(page)));
     }
 
     /// Whether the steps after `step` are still to be played.

@@ -4,6 +4,6 @@
 pub mod batches;
 pub mod bound;
 pub mod cache_model;
-pub(super) mod look_ahead;
+pub mod look_ahead;
 pub mod steps;
 pub(super) mod views;

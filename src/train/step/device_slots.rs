@@ -51,7 +51,7 @@ use crate::kernels::uniforms::PageSurvey;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::error::PagingError;
 use crate::paging::frames::evict::{Candidate, EvictPolicy, NEVER};
-use crate::paging::frames::frame::FrameState;
+use crate::paging::frames::table::FrameState;
 use crate::paging::frames::table::FrameTable;
 use crate::paging::pinned::PinnedPage;
 use crate::paging::plan::bound::FewestReads;

@@ -22,7 +22,7 @@ use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::versions::slots::SlotLayout;
-use crate::paging::label::label;
+use crate::paging::stored::label;
 use crate::scene::columns::Columns;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use crate::scene::partition::first_fill;

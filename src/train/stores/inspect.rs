@@ -11,7 +11,7 @@ use crate::densify::strategy::{Effect, effect_of};
 use crate::page::engine::segment_files::segment_file_name;
 use crate::page::format::slot_header::StoredAs;
 use crate::page::tool::reading::Access;
-use crate::paging::label::meta_from_label;
+use crate::paging::stored::meta_from_label;
 use crate::paging::stored::{check_values, layout_of};
 use crate::scene::events::EventKind;
 use crate::scene::rows::Rows;

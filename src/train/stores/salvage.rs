@@ -32,8 +32,8 @@ use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, fo
 use crate::page::tool::scan::{Scan, scan_slots};
 use crate::page::tool::slot_reader::SlotReader;
 use crate::page::versions::slots::SlotLayout;
-use crate::paging::label::{label, meta_from_label};
 use crate::paging::stored::{check_values, layout_of};
+use crate::paging::stored::{label, meta_from_label};
 use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;

@@ -13,7 +13,7 @@ use gsscale::page::format::slot_header::{
 use gsscale::page::format::spill_format::{FORMAT_BYTES, SpillFormat};
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore, PagedStoreConfig};
 use gsscale::page::versions::slots::SlotLayout;
-use gsscale::paging::label::{label, meta_from_label};
+use gsscale::paging::stored::{label, meta_from_label};
 use gsscale::scene::page_layout::PageLayout;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
 
