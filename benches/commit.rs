@@ -18,7 +18,8 @@ use gsscale::page::engine::segment_files::segment_file_name;
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::{SlotRef, StoredAs};
-use gsscale::page::map::commit::{CommitConfig, CommitError, Commits, Cut, PageChange};
+use gsscale::page::map::commit::{CommitConfig, CommitError, Cut, PageChange};
+use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
 use gsscale::page::versions::slots::SlotLayout;
 use std::path::PathBuf;
@@ -75,7 +76,7 @@ fn write_pages(store: &mut PagedStore, pages: u32, bytes: usize) -> Vec<PageChan
 pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTime, CommitError> {
     let at = folder("commit");
     let engine = open_engine(IoEngine::Auto, &at, 8).expect("an engine works here").store;
-    let opened = Commits::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let opened = Opened::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
     let mut store = opened.paged_store(engine, layout(bytes), Codec::Raw)?;
     let mut commits = opened.commits;
     let mut present: Vec<PageChange> = Vec::new();
@@ -99,7 +100,7 @@ pub fn commit_seconds(pages: u32, bytes: usize, times: usize) -> Result<CommitTi
 /// Seconds to open a store whose map has `pages` pages.
 pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
     let (at, layout) = (folder("open"), layout(PAGE_BYTES));
-    let opened = Commits::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let opened = Opened::create(Box::new(DriveFolder::new(&at)), CONFIG)?;
     let mut store = opened.paged_store(Box::new(MemoryEngine::new()), layout, Codec::Raw)?;
     let change = |page: u32| {
         let (place, checksum) = (layout.place(u64::from(page)), u128::from(page) << 64);
@@ -117,7 +118,7 @@ pub fn open_seconds(pages: u32) -> Result<f64, CommitError> {
         made.and_then(|file| file.set_len(layout.segment_bytes())).expect("the drive takes a file of holes");
     }
     let began = Instant::now();
-    let opened = Commits::open(Box::new(DriveFolder::new(&at)), CONFIG)?;
+    let opened = Opened::open(Box::new(DriveFolder::new(&at)), CONFIG)?;
     let engine = open_engine(IoEngine::Pread, &at, 8).expect("plain reads work everywhere").store;
     opened.paged_store(engine, layout, Codec::Raw)?;
     let seconds = began.elapsed().as_secs_f64();

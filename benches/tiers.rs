@@ -19,7 +19,7 @@ use gsscale::config::limits::RunOptions;
 use gsscale::config::values::ByteSize;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::page::folder::drive_rate::DriveRate;
+use gsscale::page::folder::measure::DriveRate;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::simulation::auto::automatic_order;
 use gsscale::paging::simulation::replay::{DriveModel, ReplayOptions, replay};

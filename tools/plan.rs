@@ -18,7 +18,7 @@ use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;
 use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
-use gsscale::page::folder::drive_rate::DriveRate;
+use gsscale::page::folder::measure::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};

@@ -170,9 +170,7 @@ impl RunState {
     }
 
     /// Encodes the state.
-    ///
-    /// # Errors
-    /// The state is not valid; a valid one never fails.
+    /// Errors: the state is not valid; a valid one never fails.
     pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
         let mut bytes = VERSION.to_le_bytes().to_vec();
         bytes.extend(self.encode()?);
@@ -180,9 +178,7 @@ impl RunState {
     }
 
     /// Decodes a state.
-    ///
-    /// # Errors
-    /// The bytes are not a run state, or have another version.
+    /// Errors: the bytes are not a run state, or have another version.
     pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
         let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
@@ -226,9 +222,7 @@ impl RunState {
     }
 
     /// The events as a log.
-    ///
-    /// # Errors
-    /// The events are out of order.
+    /// Errors: the events are out of order.
     pub fn event_log(&self) -> Result<EventLog, RunStateError> {
         EventLog::from_events(self.events.clone()).ok_or(RunStateError::Impossible("its events are out of order"))
     }

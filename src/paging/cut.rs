@@ -146,9 +146,7 @@ impl Cuts {
 
     /// What differs from the last commit, and all pages with the generations of their versions, when every page is on the drive. A
     /// page that is written again after a commit belongs to a later generation, so the number tells versions of one page apart.
-    ///
-    /// # Errors
-    /// A page with rows was never written.
+    /// Errors: a page with rows was never written.
     pub fn changes(&self, index: &PageIndex) -> Result<(Vec<PageChange>, Versions), CommitError> {
         let mut changes = Vec::new();
         let mut now = Versions::new();
@@ -169,9 +167,7 @@ impl Cuts {
     }
 
     /// A commit of the pages `now` ended with `result`.
-    ///
-    /// # Errors
-    /// Those of `result`.
+    /// Errors: those of `result`.
     pub fn end_commit(&mut self, now: Versions, result: Result<u64, CommitError>) -> Result<u64, CommitError> {
         if result.is_ok() {
             self.committed = now;
@@ -192,79 +188,4 @@ impl Cuts {
 /// A page with rows of which the drive has nothing: a commit without it would take it away.
 pub(super) fn nowhere(page: PageId) -> CommitError {
     CommitError::Contradiction(format!("page {page} has rows and was never written"))
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use crate::page::engine::page_engine::Place;
-    use crate::page::format::slot_header::StoredAs;
-    use crate::paging::frames::evict::EvictPolicy;
-    use crate::scene::page_meta::PageBounds;
-
-    fn slot(generation: u64) -> SlotRef {
-        let place = Place { segment: 0, offset: 0 };
-        SlotRef { place, stored_bytes: 9, payload_bytes: 9, generation, checksum: 0, codec: StoredAs::Raw }
-    }
-
-    fn named(changes: &[PageChange]) -> Vec<PageId> {
-        changes.iter().map(|change| change.page).collect()
-    }
-
-    /// Four pages of which the last commit names 0 and 9, which is gone. Page 0 is as committed and on the drive alone; page 1 is
-    /// written and not committed; pages 2 and 3 are dirty in memory, 3 is needed first.
-    fn world() -> (Cuts, PageIndex, FrameTable<()>) {
-        let (mut cuts, mut index) = (Cuts::default(), PageIndex::default());
-        let mut frames = FrameTable::new(4, EvictPolicy::default());
-        let bounds = PageBounds { lo: [0.0; 3], hi: [1.0; 3], sigma_max: 0.1 };
-        for (number, slot) in [(0, Some(slot(1))), (1, Some(slot(2))), (2, None), (3, None)] {
-            let id = PageId::initial(number);
-            index.push(PageMeta { id, rows: 1, sh_degree: 0, events_applied: 0, bounds }, slot);
-        }
-        for (number, next_use) in [(2, 9), (3, 5)].map(|(page, next_use)| (PageNo(page), next_use)) {
-            frames.lend(|| ()).unwrap();
-            frames.adopt(number);
-            frames.set_next_use(number, next_use);
-            frames.unpin(number, (), true);
-        }
-        [0, 9].into_iter().for_each(|page| cuts.add_committed(PageId::initial(page), 1));
-        (cuts, index, frames)
-    }
-
-    #[test]
-    fn a_cut_writes_what_differs_in_the_order_of_its_need() {
-        let (mut cuts, mut index, frames) = world();
-        cuts.freeze(2, &index, &frames);
-        assert!(cuts.is_frozen() && !cuts.is_written() && !cuts.holds(PageNo(1)));
-        for page in [PageNo(3), PageNo(2)] {
-            assert!(cuts.holds(page) && cuts.next_waiting() == Some(page));
-            assert_eq!((cuts.begin_write(page), cuts.begin_write(page)), (Some(2), None));
-            assert!(!cuts.holds(page) && cuts.delays([page].into_iter()) && cuts.writing() == 1);
-            assert_eq!(cuts.end_write(page, index.meta(page), slot(2)), Some(2));
-            assert_eq!(cuts.end_write(page, index.meta(page), slot(3)), None, "a later write is not the cut's");
-            index.set_slot(page, Some(slot(2)));
-        }
-        assert!(cuts.is_written() && cuts.next_waiting().is_none());
-        let Frozen { generation, mut changes, now, nowhere, .. } = cuts.take().unwrap();
-        changes.extend(cuts.removed_since(&now));
-        assert_eq!((generation, nowhere, now.len()), (2, None, 4));
-        assert_eq!(named(&changes), [1, 3, 2, 9].map(PageId::initial));
-        // A commit at once names the same pages.
-        assert_eq!(named(&cuts.changes(&index).unwrap().0), [1, 2, 3, 9].map(PageId::initial));
-        cuts.end_commit(now, Ok(2)).unwrap();
-        assert!(cuts.changes(&index).unwrap().0.is_empty());
-    }
-
-    #[test]
-    fn a_page_that_was_never_written_cannot_be_committed() {
-        let (mut cuts, index, _) = world();
-        assert!(cuts.changes(&index).is_err());
-        let frames: FrameTable<()> = FrameTable::new(4, EvictPolicy::default());
-        cuts.freeze(2, &index, &frames);
-        assert_eq!(cuts.take().unwrap().nowhere, Some(PageId::initial(3)));
-        cuts.freeze(2, &index, &frames);
-        cuts.abort();
-        assert!(!cuts.is_frozen() && !cuts.is_written());
-    }
 }

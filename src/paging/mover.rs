@@ -144,9 +144,7 @@ impl Mover {
     }
 
     /// Begins to write a page back, for the generation of a cut or else for the current one.
-    ///
-    /// # Errors
-    /// The store accepts no write; the buffer comes back.
+    /// Errors: the store accepts no write; the buffer comes back.
     pub fn write(
         &mut self,
         page: PageNo,
@@ -235,78 +233,4 @@ impl Mover {
 
 fn token(page: PageNo, direction: Direction, is_ahead: bool) -> u64 {
     u64::from(page.0) | if is_ahead { AHEAD } else { 0 } | if direction == Direction::Read { READ } else { 0 }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-    use crate::base::ids::PageId;
-    use crate::page::engine::memory::MemoryEngine;
-    use crate::page::format::codec::Codec;
-    use crate::page::format::slot_header::{HEADER_BYTES, transfer_bytes};
-    use crate::page::versions::paged_store::PagedStoreConfig;
-    use crate::page::versions::slots::SlotLayout;
-    use crate::scene::page_layout::capacity_bytes;
-    use crate::scene::page_meta::PageBounds;
-
-    const PAGE: PageNo = PageNo(7);
-
-    fn meta() -> PageMeta {
-        let bounds = PageBounds { lo: [0.0; 3], hi: [1.0; 3], sigma_max: 0.1 };
-        PageMeta { id: PageId::initial(7), rows: 2, sh_degree: 0, events_applied: 0, bounds }
-    }
-
-    /// A mover that may have one page ahead each way, and the bytes of a frame.
-    fn mover() -> (Mover, usize) {
-        let bytes = capacity_bytes(4, 0);
-        let layout = SlotLayout::new(bytes, 4);
-        let config = PagedStoreConfig { store: 1, layout, codec: Codec::Raw, generation: 1, serial: 1 };
-        let frame_bytes = transfer_bytes(bytes);
-        let mut mover = Mover::new(frame_bytes, frame_bytes);
-        mover.attach(PagedStore::new(Box::new(MemoryEngine::new()), config));
-        (mover, frame_bytes)
-    }
-
-    fn end_of(mover: &mut Mover) -> Ended {
-        mover.begin_writes();
-        mover.complete(true).pop().unwrap()
-    }
-
-    #[test]
-    fn a_page_comes_back_as_it_was_written_and_counts_as_ahead_until_its_end() {
-        let (mut mover, frame_bytes) = mover();
-        let mut buffer = PageBuffer::zeroed(frame_bytes);
-        buffer.as_mut_slice()[HEADER_BYTES] = 77;
-        mover.write(PAGE, &meta(), None, buffer, true).unwrap();
-        assert_eq!((mover.in_flight(), mover.writes_ahead(), mover.may_write_ahead()), (1, 1, false));
-        let written = end_of(&mut mover);
-        assert_eq!((written.page, written.direction), (PAGE, Direction::Write));
-        assert_eq!((mover.in_flight(), mover.writes_ahead(), mover.may_write_ahead()), (0, 0, true));
-        let Ok(PageMoved::Written(slot)) = written.result else { panic!("{:?}", written.result) };
-        mover.read(PAGE, &meta(), &slot, PageBuffer::zeroed(frame_bytes), true);
-        assert!(!mover.may_read_ahead() && mover.may_write_ahead());
-        let read = end_of(&mut mover);
-        assert!(read.result.is_ok() && mover.may_read_ahead());
-        assert_eq!((read.page, read.direction, read.buffer.as_slice()[HEADER_BYTES]), (PAGE, Direction::Read, 77));
-    }
-
-    #[test]
-    fn a_failed_write_stops_others_and_its_error_waits_for_the_next_step() {
-        let (mut mover, _) = mover();
-        let error = || PagingError::WorkingSet { what: "a test".to_string(), pages: 1, frames: 0, frame_bytes: 1 };
-        mover.refuse_writes();
-        assert!(!mover.may_write_ahead() && mover.take_failure().is_none());
-        mover.stop_writes(error());
-        assert!(mover.are_writes_stopped() && !mover.may_write_ahead());
-        mover.resume_writes();
-        assert!(mover.may_write_ahead() && mover.take_failure().is_some() && mover.take_failure().is_none());
-    }
-
-    #[test]
-    fn a_mover_without_a_store_moves_nothing() {
-        let mut mover = Mover::new(4096, 0);
-        assert!(!mover.has_store() && mover.has_staging() && mover.slot_space().is_none());
-        assert!(mover.complete(true).is_empty() && mover.in_flight() == 0);
-    }
 }

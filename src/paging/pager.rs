@@ -101,9 +101,7 @@ impl Pager {
     }
 
     /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
-    ///
-    /// # Errors
-    /// An entry contradicts itself or its slot.
+    /// Errors: an entry contradicts itself or its slot.
     pub fn open(
         config: PagerConfig,
         store: PagedStore,
@@ -137,9 +135,7 @@ impl Pager {
 
     /// Adds an initial page. `fill` writes its rows into the payload space (all of it is given; see
     /// [`crate::scene::page_layout::write_page`]), in the layout that `meta` names.
-    ///
-    /// # Errors
-    /// The store failed while a frame was emptied.
+    /// Errors: the store failed while a frame was emptied.
     pub fn insert(&mut self, meta: PageMeta, fill: impl FnOnce(&mut [u8])) -> Result<PageNo, PagingError> {
         if meta.rows == 0 {
             return Ok(self.tier.add_entry(meta));
@@ -251,10 +247,8 @@ impl Pager {
 
     /// Pins every page with rows that `camera` may see by the bounds as they are now, ascending by id: a view of one batch.
     /// `step` is the 0-based step that uses them. Blocks only for pages that are not in memory.
-    ///
-    /// # Errors
-    /// The working set is larger than the frames; a page cannot be read; a page could not be written, now or since the
-    /// last call. Nothing is pinned then, and every page keeps what it holds.
+    /// Errors: the working set is larger than the frames; a page cannot be read; a page could not be written, now or
+    /// since the last call. Nothing is pinned then, and every page keeps what it holds.
     pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
         let pages = self.begin_view(step, camera)?;
         self.pin_batch(step, &pages)
@@ -262,9 +256,7 @@ impl Pager {
 
     /// Begins 0-based `step` on the view of `camera`; returns every page with rows that the camera may see by the bounds as
     /// they are now, ascending by id. [`Pager::pin_batch`] pins them.
-    ///
-    /// # Errors
-    /// A page could not be written since the last call.
+    /// Errors: a page could not be written since the last call.
     pub fn begin_view(&mut self, step: u32, camera: &Camera) -> Result<Vec<PageNo>, PagingError> {
         self.tier.mover.resume_writes();
         if let Some(error) = self.tier.mover.take_failure() {
@@ -299,17 +291,13 @@ impl Pager {
 
     /// Pins the next batch of a step's view, in this order, leaving out pages without rows. Blocks only for pages that are not
     /// in memory.
-    ///
-    /// # Errors
-    /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
+    /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
     pub fn pin_batch(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         self.pin_batch_for(step, pages, Asker::Step)
     }
 
     /// As [`Pager::pin_batch`], for a step that has changed rows already: a failed write is left to the next step.
-    ///
-    /// # Errors
-    /// As [`Pager::acquire`]. Nothing of this batch is pinned then.
+    /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
     pub fn pin_batch_again(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         self.pin_batch_for(step, pages, Asker::RestOfStep)
     }
@@ -332,18 +320,14 @@ impl Pager {
     /// Pins the listed pages (none of them pinned already, none twice) in this order, leaving out those without rows:
     /// for evaluation and export. The pins do not count as uses. After failed writes the call still works, at least for one page
     /// at a time.
-    ///
-    /// # Errors
-    /// As [`Pager::acquire`], but without earlier failures.
+    /// Errors: as [`Pager::acquire`], but without earlier failures.
     pub fn acquire_pages(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::Other)
     }
 
     /// As [`Pager::acquire_pages`], for the rest of a step that has changed rows already: hits, reads and the time waited
     /// count as the step's.
-    ///
-    /// # Errors
-    /// As [`Pager::acquire_pages`].
+    /// Errors: as [`Pager::acquire_pages`].
     pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
         Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::RestOfStep)
     }
@@ -360,9 +344,7 @@ impl Pager {
 
     /// Makes sure that the drive has room for everything that may be written back before `pages` pages of the present step are
     /// updated: these pages, the dirty pages in memory, and the pages of a cut.
-    ///
-    /// # Errors
-    /// The drive is full.
+    /// Errors: the drive is full.
     pub fn reserve_slots(&mut self, pages: usize) -> Result<(), PagingError> {
         let Tier { frames, mover, .. } = &mut self.tier;
         let pages = (pages + frames.held().filter(|(_, held)| frames.is_dirty(held.page)).count()) as u64;
@@ -406,9 +388,7 @@ impl Pager {
     /// A frame for the upper half of a page that splits; its bytes are whatever was there before. Goes back by
     /// [`Pager::add_split`] or [`Pager::return_frame`]. A step that has begun to change pages is seen through where only
     /// space is missing, with a frame more than allowed: the next step gets the error.
-    ///
-    /// # Errors
-    /// Every frame is pinned, or the store failed while one was emptied.
+    /// Errors: every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
         let error = match self.tier.frame_for(Asker::Step) {
             Err(error) => error,
@@ -504,9 +484,7 @@ impl Pager {
 
     /// Writes every dirty page back and waits until nothing is in flight. To be called between steps, when no page is pinned. A cut
     /// that is not committed is given up.
-    ///
-    /// # Errors
-    /// A page could not be written. It is still in memory, and the call may be repeated.
+    /// Errors: a page could not be written. It is still in memory, and the call may be repeated.
     pub fn flush(&mut self) -> Result<(), PagingError> {
         let tier = &mut self.tier;
         debug_assert_eq!(tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
@@ -524,9 +502,7 @@ impl Pager {
 
     /// Commits the pages as they are, right after [`Pager::flush`], under the name `pin` if there is one; returns the
     /// generation, `None` for a pager without a store.
-    ///
-    /// # Errors
-    /// As [`Commits::commit`].
+    /// Errors: as [`Commits::commit`].
     pub fn commit(
         &mut self,
         commits: &mut Commits,
@@ -545,9 +521,7 @@ impl Pager {
 
     /// Freezes the pages as they are. To be called between steps, when no page is pinned. An earlier cut that was not committed is
     /// given up. Without a store nothing is frozen.
-    ///
-    /// # Errors
-    /// A write that ended meanwhile had failed.
+    /// Errors: a write that ended meanwhile had failed.
     pub fn freeze(&mut self) -> Result<(), PagingError> {
         debug_assert_eq!(self.tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
         self.abort_cut();
@@ -574,18 +548,14 @@ impl Pager {
     }
 
     /// Writes what is left of the cut, and waits until nothing is in flight.
-    ///
-    /// # Errors
-    /// A page could not be written: the cut is given up.
+    /// Errors: a page could not be written: the cut is given up.
     pub fn finish_frozen(&mut self) -> Result<(), PagingError> {
         self.tier.write_all(|tier| tier.cuts.next_waiting())
     }
 
     /// Commits the cut, right after [`Pager::finish_frozen`]; returns its generation and the bytes that were written for
     /// it, `None` where nothing is frozen.
-    ///
-    /// # Errors
-    /// As [`Commits::commit`]: the cut is given up.
+    /// Errors: as [`Commits::commit`]: the cut is given up.
     pub fn commit_frozen(
         &mut self,
         commits: &mut Commits,

@@ -52,9 +52,7 @@ pub struct PageLimits {
 
 impl PageLimits {
     /// The entry of a page from its label.
-    ///
-    /// # Errors
-    /// What contradicts the label, the slot or the run, for people.
+    /// Errors: what contradicts the label, the slot or the run, for people.
     pub fn meta_of(&self, page: PageId, slot: &SlotRef, label: &[u8]) -> Result<PageMeta, String> {
         let meta = meta_from_label(page, label).ok_or("its label is none")?;
         if meta.rows == 0 || meta.rows as usize > self.page_rows || meta.sh_degree > self.sh_degree {
@@ -80,9 +78,7 @@ pub fn layout_of(meta: &PageMeta) -> PageLayout {
 
 /// Checks that training can produce every value in at most `step` steps: values are finite, second moments and statistics are not
 /// negative, no row is newer.
-///
-/// # Errors
-/// The first value that is not.
+/// Errors: the first value that is not.
 pub fn check_values(rows: &Rows<'_>, step: u32) -> Result<(), String> {
     let Rows { columns, exp_avg, exp_avg_sq, stamp, grad2d, .. } = rows;
     for (table, name, least) in [

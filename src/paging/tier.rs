@@ -185,9 +185,7 @@ impl Tier {
     }
 
     /// As [`Tier::collect`], for a caller whom failed reads do not concern: such a page is read when it is needed.
-    ///
-    /// # Errors
-    /// The first write that failed.
+    /// Errors: the first write that failed.
     pub fn collect_writes(&mut self, wait: Option<Asker>) -> Result<(), PagingError> {
         let failures = self.collect(wait, &mut Vec::new()).into_iter();
         failures.filter(|f| f.is_write).map(|f| Err(f.error)).next().unwrap_or(Ok(()))
@@ -201,9 +199,7 @@ impl Tier {
     }
 
     /// Waits until fewer than `most` transfers are in flight and another page may be encoded.
-    ///
-    /// # Errors
-    /// The first write that failed.
+    /// Errors: the first write that failed.
     pub fn wait_until_below(&mut self, most: usize) -> Result<(), PagingError> {
         let mut first = Ok(());
         while self.mover.in_flight() >= most || !self.mover.has_staging() {
@@ -213,9 +209,7 @@ impl Tier {
     }
 
     /// Writes pages and waits until nothing is in flight.
-    ///
-    /// # Errors
-    /// A page could not be written. It is still in memory.
+    /// Errors: a page could not be written. It is still in memory.
     pub fn write_all(&mut self, mut next: impl FnMut(&mut Tier) -> Option<PageNo>) -> Result<(), PagingError> {
         while let Some(page) = next(self) {
             self.wait_until_below(WRITES_IN_FLIGHT)?;
@@ -262,9 +256,7 @@ impl Tier {
     }
 
     /// No more writes until a step asks for pages again. An asker that fails on it gets the error, else the next step.
-    ///
-    /// # Errors
-    /// `error`, if it ends the call of `asker`.
+    /// Errors: `error`, if it ends the call of `asker`.
     pub fn stop_writes(&mut self, error: PagingError, asker: Asker) -> Result<(), PagingError> {
         if asker.fails_on_write_error() {
             self.mover.refuse_writes();

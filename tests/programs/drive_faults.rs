@@ -18,7 +18,8 @@ use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::{CommitConfig, Commits, RESERVE_NAME};
+use gsscale::page::map::commit::{CommitConfig, RESERVE_NAME};
+use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
@@ -120,7 +121,7 @@ impl World {
         let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS as usize, config.sh_degree), 100);
         let spill = SpillDir::create(&spill_dir, layout, false)?;
         let of_commits = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 1 << 20 };
-        let opened = Commits::create(Box::new(DriveFolder::new(&spill_dir)), of_commits)?;
+        let opened = Opened::create(Box::new(DriveFolder::new(&spill_dir)), of_commits)?;
         let engine = open_engine(IoEngine::Pread, &spill_dir, 4)?.store;
         let engine = Box::new(FaultyEngine::new(engine, faults.clone()));
         let store = opened.paged_store(engine, layout, Codec::Raw)?;

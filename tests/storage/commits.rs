@@ -27,11 +27,11 @@ const CONFIG: CommitConfig = CommitConfig { store: 77, cache_bytes: 1 << 20, res
 const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
 
 fn create(folder: &Path) -> Result<Opened, CommitError> {
-    Commits::create(Box::new(DriveFolder::new(folder)), CONFIG)
+    Opened::create(Box::new(DriveFolder::new(folder)), CONFIG)
 }
 
 fn open(folder: &Path) -> Result<Opened, CommitError> {
-    Commits::open(Box::new(DriveFolder::new(folder)), CONFIG)
+    Opened::open(Box::new(DriveFolder::new(folder)), CONFIG)
 }
 
 fn pages_of(opened: &Opened, folder: &Path) -> PagedStore {
@@ -130,7 +130,7 @@ fn a_segment_without_kept_pages_may_be_gone() {
     let at = parent.path().join("store");
     let spill = SpillDir::create(&at, LAYOUT, false).unwrap();
     let config = commit_config(spill.format().store);
-    let opened = Commits::create(Box::new(DriveFolder::new(&at)), config).unwrap();
+    let opened = Opened::create(Box::new(DriveFolder::new(&at)), config).unwrap();
     let mut store = pages_of(&opened, &at);
     let mut commits = opened.commits;
     let mut slots: Vec<SlotRef> = (0..5).map(|page| write(&mut store, page, 7)).collect();
@@ -154,7 +154,7 @@ fn a_segment_without_kept_pages_may_be_gone() {
     assert!(pages.iter().all(|page| page.slot.place.segment > 0), "{pages:?}");
     assert!(reader.paged_store(&pages, 1).is_ok() && !first.exists(), "a reader writes nothing");
     drop(reader);
-    let opened = Commits::open(Box::new(DriveFolder::new(&at)), config).unwrap();
+    let opened = Opened::open(Box::new(DriveFolder::new(&at)), config).unwrap();
     let engine = open_engine(IoEngine::Pread, &at, 2).unwrap().store;
     opened.check_segments(&*engine, LAYOUT).unwrap();
     assert!(!first.exists(), "a check writes nothing");
@@ -225,7 +225,7 @@ fn hostile_maps_are_refused() {
         commits.commit(&mut store, &mut Vec::new(), &cut).unwrap();
         // The map is in memory twice only while it is read.
         let folder = Box::new(DriveFolder::new(at));
-        let again = Commits::open(folder, CONFIG).unwrap();
+        let again = Opened::open(folder, CONFIG).unwrap();
         let engine = open_engine(IoEngine::Pread, at, 2).unwrap().store;
         let error = again.paged_store(engine, LAYOUT, Codec::Raw).unwrap_err();
         assert!(matches!(&error, CommitError::Segments(what) if what.contains("seg-")), "{error}");
@@ -248,7 +248,7 @@ fn hostile_maps_cost_readers_nothing() {
     let at = parent.path().join("store");
     let spill = SpillDir::create(&at, LAYOUT, false).unwrap();
     let config = commit_config(spill.format().store);
-    let opened = Commits::create(Box::new(DriveFolder::new(&at)), config).unwrap();
+    let opened = Opened::create(Box::new(DriveFolder::new(&at)), config).unwrap();
     let mut store = pages_of(&opened, &at);
     let mut commits = opened.commits;
     let good = write(&mut store, 0, 7);
@@ -307,10 +307,10 @@ fn a_reserve_that_was_not_filled_is_filled_again() {
     let at = folder.path();
     drop(create(at).unwrap());
     let config = CommitConfig { reserve_bytes: 3 << 20, ..CONFIG };
-    let mut killed = Commits::open(Box::new(Interrupted(DriveFolder::new(at))), config).unwrap().commits;
+    let mut killed = Opened::open(Box::new(Interrupted(DriveFolder::new(at))), config).unwrap().commits;
     assert!(killed.fill_reserve().is_err());
     drop(killed);
-    let mut commits = Commits::open(Box::new(DriveFolder::new(at)), config).unwrap().commits;
+    let mut commits = Opened::open(Box::new(DriveFolder::new(at)), config).unwrap().commits;
     assert!(commits.fill_reserve().unwrap());
     let bytes = std::fs::read(at.join(RESERVE_NAME)).unwrap();
     assert!(bytes.len() == 3 << 20 && bytes.iter().all(|&byte| byte == 0x5a), "it is hollow");
@@ -353,7 +353,7 @@ fn another_stores_map_and_a_missing_witness_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     drop(create(folder.path()).unwrap());
     let other = CommitConfig { store: 78, ..CONFIG };
-    assert!(Commits::open(Box::new(DriveFolder::new(folder.path())), other).is_err());
+    assert!(Opened::open(Box::new(DriveFolder::new(folder.path())), other).is_err());
     std::fs::remove_file(folder.path().join(WITNESS_NAME)).unwrap();
     let error = open(folder.path()).unwrap_err().to_string();
     assert!(error.contains("witness") && error.contains("remedy"), "{error}");

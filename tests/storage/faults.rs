@@ -72,11 +72,11 @@ impl Store {
     }
 
     fn create(at: &Path) -> Store {
-        Store::new(at, Commits::create(Box::new(DriveFolder::new(at)), CONFIG).unwrap())
+        Store::new(at, Opened::create(Box::new(DriveFolder::new(at)), CONFIG).unwrap())
     }
 
     fn open(at: &Path) -> Result<Store, CommitError> {
-        Ok(Store::new(at, Commits::open(Box::new(DriveFolder::new(at)), CONFIG)?))
+        Ok(Store::new(at, Opened::open(Box::new(DriveFolder::new(at)), CONFIG)?))
     }
 
     fn write(&mut self, page: u32, fill: u8) -> Result<(), PageError> {

@@ -118,25 +118,3 @@ impl std::fmt::Debug for PageBuffer {
         write!(f, "PageBuffer({} bytes)", self.len)
     }
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn buffers_are_aligned_wherever_they_go() {
-        for make in [PageBuffer::zeroed, PageBuffer::mapped] {
-            let buffers: Vec<PageBuffer> = [0, 1, 4096, 749_568].map(make).into();
-            for (buffer, len) in buffers.iter().zip([0, 4096, 4096, 749_568]) {
-                assert_eq!(buffer.len(), len);
-                assert!(!buffer.is_mapped() || len >= MAPPED_LEAST);
-                assert_eq!(buffer.as_slice().as_ptr().align_offset(ALIGNMENT), 0);
-                assert!(buffer.as_slice().iter().all(|&b| b == 0));
-            }
-            let mut boxed = Box::new(buffers);
-            boxed[3].as_mut_slice()[749_567] = 7;
-            assert_eq!(boxed[3].as_slice().as_ptr().align_offset(ALIGNMENT), 0);
-            assert_eq!(boxed[3].as_slice()[749_567], 7);
-        }
-    }
-}

@@ -47,9 +47,7 @@ impl SegmentMaps {
     }
 
     /// Copies the bytes of a transfer out of the map of its file, and unmaps their pages.
-    ///
-    /// # Errors
-    /// The bytes lie beyond the end of the file, or cannot be read.
+    /// Errors: the bytes lie beyond the end of the file, or cannot be read.
     pub fn copy_out(&self, file: &File, transfer: &mut Transfer) -> io::Result<()> {
         let map = self.of(transfer.place.segment, file)?;
         let out = &mut transfer.buffer.as_mut_slice()[..transfer.bytes];

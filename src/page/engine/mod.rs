@@ -5,13 +5,11 @@ pub mod buffer;
 pub mod memory;
 pub(in crate::page) mod mmap;
 pub mod open;
-pub(in crate::page) mod page_cache;
 pub mod page_engine;
 #[cfg(target_os = "linux")]
 pub(in crate::page) mod registered;
 pub mod segment_files;
 pub(in crate::page) mod short_transfers;
 pub mod threaded;
-pub(in crate::page) mod transfer_pool;
 #[cfg(target_os = "linux")]
 pub mod uring;

@@ -59,16 +59,12 @@ pub trait PageEngine: Send {
 
     /// Creates segment `segment` with `bytes` bytes of allocated space, so that writes into it cannot run out of space.
     /// An existing segment of that size stays unchanged.
-    ///
-    /// # Errors
-    /// No space, or the folder cannot be written.
+    /// Errors: no space, or the folder cannot be written.
     fn create_segment(&mut self, segment: u32, bytes: u64) -> io::Result<()>;
 
     /// Checks that segment `segment` exists with exactly `bytes` bytes. An engine that cannot lose segments always
     /// succeeds.
-    ///
-    /// # Errors
-    /// The segment is missing, has another length, or is not a file of this store.
+    /// Errors: the segment is missing, has another length, or is not a file of this store.
     fn check_segment(&self, segment: u32, bytes: u64) -> io::Result<()> {
         let _ = (segment, bytes);
         Ok(())
@@ -84,8 +80,6 @@ pub trait PageEngine: Send {
     fn in_flight(&self) -> usize;
 
     /// Makes the writes of completed transfers durable. No write may be in flight.
-    ///
-    /// # Errors
-    /// The drive reported an error; unsynced writes are lost.
+    /// Errors: the drive reported an error; unsynced writes are lost.
     fn sync(&mut self) -> io::Result<()>;
 }

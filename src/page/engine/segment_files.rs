@@ -1,5 +1,6 @@
 //! Segment files: allocated so that writes cannot run out of space, opened without following links, and with a bounded
-//! number open at once. Shared by the engines that use files.
+//! number open at once. Shared by the engines that use files. Bytes of theirs that go through the system's page cache are dropped
+//! from it ([`WriteBehind`]), or memory would fill with second copies of the pages that frames hold.
 //!
 //! Knows neither slots nor pages. Invariants: 1. when [`SegmentFiles::create`] returns, the segment's full length is
 //! allocated, and the file and its folder entry are durable; 2. a file opened for writing is synced before it is closed
@@ -10,11 +11,11 @@
 use crate::base::error::is_too_many_files;
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::{Direction, Transfer};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Weak};
 
 const PREFIX: &str = "seg-";
 const SUFFIX: &str = ".dat";
@@ -58,9 +59,7 @@ pub struct SegmentFiles {
 impl SegmentFiles {
     /// The segments in `folder`. With `direct`, files bypass the page cache if the file system allows it;
     /// [`SegmentFiles::is_direct`] tells.
-    ///
-    /// # Errors
-    /// The folder cannot be read.
+    /// Errors: the folder cannot be read.
     pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
         // Other systems cannot open folders; there a file's entry is durable with the file.
         let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
@@ -90,9 +89,7 @@ impl SegmentFiles {
 
     /// Creates a segment of `bytes` bytes, durably. An existing segment of that size stays unchanged; a shorter one (a
     /// crash during creation) is extended.
-    ///
-    /// # Errors
-    /// No space; the folder cannot be written; the file is longer, a link, or not a file.
+    /// Errors: no space; the folder cannot be written; the file is longer, a link, or not a file.
     pub fn create(&mut self, segment: u32, bytes: u64) -> io::Result<()> {
         self.refuse_if_read_only()?;
         let path = self.path(segment);
@@ -118,9 +115,7 @@ impl SegmentFiles {
     }
 
     /// Checks that the file of a segment exists with exactly `bytes` bytes, without opening it.
-    ///
-    /// # Errors
-    /// The file is missing, shorter, longer, a link, or not a file.
+    /// Errors: the file is missing, shorter, longer, a link, or not a file.
     pub fn check(&self, segment: u32, bytes: u64) -> io::Result<()> {
         let there = std::fs::symlink_metadata(self.path(segment))?;
         let wrong = |what: String| Err(io::Error::new(io::ErrorKind::InvalidData, what));
@@ -132,9 +127,7 @@ impl SegmentFiles {
     }
 
     /// The file of a segment, for reading.
-    ///
-    /// # Errors
-    /// The file does not exist or cannot be opened.
+    /// Errors: the file does not exist or cannot be opened.
     pub fn file(&mut self, segment: u32) -> io::Result<Arc<File>> {
         self.clock += 1;
         if let Some(open) = self.open.get_mut(&segment) {
@@ -151,9 +144,7 @@ impl SegmentFiles {
     }
 
     /// The file of a segment, for writing: it counts as dirty until [`SegmentFiles::sync`].
-    ///
-    /// # Errors
-    /// The file does not exist or cannot be opened.
+    /// Errors: the file does not exist or cannot be opened.
     pub fn file_for_write(&mut self, segment: u32) -> io::Result<Arc<File>> {
         self.refuse_if_read_only()?;
         let file = self.file(segment)?;
@@ -164,10 +155,8 @@ impl SegmentFiles {
     }
 
     /// The file of `transfer`. A write makes it dirty until the next sync.
-    ///
-    /// # Errors
-    /// `NotFound` if the segment does not exist, `UnexpectedEof` for a place beyond its end, `InvalidInput` for a
-    /// length that is not a whole number of blocks within the buffer.
+    /// Errors: `NotFound` if the segment does not exist, `UnexpectedEof` for a place beyond its end, `InvalidInput` for
+    /// a length that is not a whole number of blocks within the buffer.
     pub fn file_of(&mut self, transfer: &Transfer) -> io::Result<Arc<File>> {
         let (offset, bytes) = (transfer.place.offset, transfer.bytes);
         let whole = offset.is_multiple_of(ALIGNMENT as u64) && bytes.is_multiple_of(ALIGNMENT);
@@ -187,9 +176,7 @@ impl SegmentFiles {
     }
 
     /// Makes completed writes durable.
-    ///
-    /// # Errors
-    /// The drive lost a write, now or before an earlier sync. Nothing unsynced may be trusted.
+    /// Errors: the drive lost a write, now or before an earlier sync. Nothing unsynced may be trusted.
     pub fn sync(&mut self) -> io::Result<()> {
         if let Some((kind, what)) = &self.lost {
             return Err(io::Error::new(*kind, format!("an earlier sync failed: {what}")));
@@ -234,9 +221,7 @@ fn sync_data(file: &File, lost: &mut Option<(io::ErrorKind, String)>) -> io::Res
 }
 
 /// Opens a file of the store for reading, without following links.
-///
-/// # Errors
-/// The file does not exist or cannot be read.
+/// Errors: the file does not exist or cannot be read.
 pub fn open_for_reading(path: &Path) -> io::Result<File> {
     with_safe_flags(OpenOptions::new().read(true)).open(path)
 }
@@ -329,22 +314,59 @@ fn open_files_max() -> usize {
     256 + FILES_OF_OTHERS as usize
 }
 
+/// Written bytes that may wait before being dropped: enough to keep a drive busy.
+const BEHIND_BYTES: u64 = 64 << 20;
+
+/// Starts write-back of the dirty bytes of a range and drops its clean ones. A second call, later, therefore drops what
+/// the first began to write. `bytes` 0 means to the end of the file.
+pub fn drop_cached(file: &File, offset: u64, bytes: u64) {
+    #[cfg(any(target_os = "linux", target_os = "android", target_os = "freebsd"))]
+    // If refused, the cached copy only costs memory.
+    let _ = rustix::fs::fadvise(file, offset, std::num::NonZeroU64::new(bytes), rustix::fs::Advice::DontNeed);
+    #[cfg(not(any(target_os = "linux", target_os = "android", target_os = "freebsd")))]
+    let _ = (file, offset, bytes);
+}
+
+/// Drops written bytes from the page cache some time after the write, when the drive has them.
+#[derive(Debug, Default)]
+pub struct WriteBehind {
+    /// Weak, because a file may be synced and closed before its turn.
+    ranges: VecDeque<(Weak<File>, u64, u64)>,
+    bytes: u64,
+}
+
+impl WriteBehind {
+    /// Records a completed write and starts its write-back.
+    pub fn record_write(&mut self, file: &Arc<File>, offset: u64, bytes: u64) {
+        drop_cached(file, offset, bytes);
+        self.ranges.push_back((Arc::downgrade(file), offset, bytes));
+        self.bytes += bytes;
+        while self.bytes > BEHIND_BYTES {
+            self.drop_oldest();
+        }
+    }
+
+    /// Drops all recorded ranges; call after a sync.
+    pub fn drop_all(&mut self) {
+        while !self.ranges.is_empty() {
+            self.drop_oldest();
+        }
+    }
+
+    fn drop_oldest(&mut self) {
+        if let Some((file, offset, bytes)) = self.ranges.pop_front() {
+            if let Some(file) = file.upgrade() {
+                drop_cached(&file, offset, bytes);
+            }
+            self.bytes -= bytes;
+        }
+    }
+}
+
 #[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_round_trip_and_others_are_not_segments() {
-        for segment in [0, 1, 99_999_999, 100_000_000, u32::MAX] {
-            assert_eq!(segment_from_file_name(&segment_file_name(segment)), Some(segment));
-        }
-        for name in
-            ["seg-1.dat", "seg-+0000001.dat", "seg-00000001.dat2", "seg-000000001.dat", "seg-99999999999.dat", ""]
-        {
-            assert_eq!(segment_from_file_name(name), None, "{name}");
-        }
-    }
 
     #[test]
     fn segments_are_allocated_private_and_left_alone_when_they_exist() {

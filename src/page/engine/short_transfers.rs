@@ -36,9 +36,7 @@ pub struct Resume {
 impl Resume {
     /// Applies the outcome of the request for the bytes from `self.done` to `total`. Returns whether all bytes have
     /// moved.
-    ///
-    /// # Errors
-    /// The outcome's error if a retry cannot help; `UnexpectedEof` or `WriteZero` at the end of the file.
+    /// Errors: the outcome's error if a retry cannot help; `UnexpectedEof` or `WriteZero` at the end of the file.
     pub fn advance(&mut self, direction: Direction, outcome: io::Result<usize>, total: usize) -> io::Result<bool> {
         let error = match outcome {
             Ok(0) if self.done < total => {
@@ -78,9 +76,7 @@ fn is_transient(error: &io::Error) -> bool {
 }
 
 /// Carries out a whole transfer with blocking calls.
-///
-/// # Errors
-/// The drive's I/O errors; `UnexpectedEof` if the file ends too early.
+/// Errors: the drive's I/O errors; `UnexpectedEof` if the file ends too early.
 pub fn move_bytes(file: &File, transfer: &mut Transfer) -> io::Result<()> {
     move_parts(transfer, |direction, bytes, at| match direction {
         #[cfg(unix)]

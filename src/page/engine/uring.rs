@@ -18,10 +18,9 @@
 
 use crate::base::error::is_too_many_files;
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::engine::page_cache::{WriteBehind, drop_cached};
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
-use crate::page::engine::segment_files::SegmentFiles;
+use crate::page::engine::segment_files::{SegmentFiles, WriteBehind, drop_cached};
 use crate::page::engine::short_transfers::Resume;
 use io_uring::{IoUring, opcode, squeue, types};
 use slab::Slab;
@@ -82,9 +81,7 @@ struct Request {
 impl UringEngine {
     /// Opens a folder of segments with a ring of `entries` requests (rounded up to a power of two, at most 4096).
     /// `direct` bypasses the page cache where the file system allows it.
-    ///
-    /// # Errors
-    /// The kernel refuses the ring (too old, or forbidden as in many containers), or the folder cannot be used.
+    /// Errors: the kernel refuses the ring (too old, or forbidden as in many containers), or the folder cannot be used.
     pub fn open(folder: &Path, entries: usize, direct: bool) -> io::Result<UringEngine> {
         let entries = entries.clamp(1, 4096).next_power_of_two();
         let ring = working_ring(entries as u32)?;

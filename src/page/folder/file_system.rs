@@ -49,9 +49,7 @@ impl FileSystem {
     }
 
     /// The kind of a folder's file system.
-    ///
-    /// # Errors
-    /// The system does not tell.
+    /// Errors: the system does not tell.
     #[cfg(target_os = "linux")]
     pub fn of(folder: &Path) -> io::Result<FileSystem> {
         // The number has 32 bits; the field is wider and signed on some machines.
@@ -59,9 +57,7 @@ impl FileSystem {
     }
 
     /// The kind of a folder's file system.
-    ///
-    /// # Errors
-    /// Never on this system.
+    /// Errors: never on this system.
     #[cfg(not(target_os = "linux"))]
     pub fn of(_folder: &Path) -> io::Result<FileSystem> {
         Ok(FileSystem::Local)
@@ -69,9 +65,7 @@ impl FileSystem {
 }
 
 /// Bytes that this user may still write to the drive of `folder`; `None` if the system does not tell.
-///
-/// # Errors
-/// The system call fails.
+/// Errors: the system call fails.
 pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
     #[cfg(unix)]
     {
@@ -97,22 +91,5 @@ pub fn is_same_drive(a: &Path, b: &Path) -> bool {
     {
         let _ = (a, b);
         true
-    }
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-
-    #[cfg(target_os = "linux")]
-    #[test]
-    fn memory_is_distinguished_from_drives() {
-        assert!(FileSystem::of(Path::new("/nowhere")).is_err());
-        assert!(free_bytes(&std::env::temp_dir()).unwrap().is_some_and(|bytes| bytes > 0));
-        let memory = Path::new("/dev/shm");
-        if memory.is_dir() && std::fs::read_to_string("/proc/mounts").unwrap().contains(" /dev/shm tmpfs ") {
-            assert_eq!(FileSystem::of(memory).unwrap(), FileSystem::Memory);
-        }
     }
 }

@@ -1,6 +1,5 @@
 //! The folder of a store: creation, checks, lock, clean-up; and the drive that the folder is on: its kind, its speed.
 
-pub mod drive_rate;
 pub mod file_system;
 pub mod measure;
 pub mod protocol_files;

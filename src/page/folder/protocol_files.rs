@@ -26,33 +26,23 @@ pub const RESERVE_NEW_NAME: &str = "reserve.new";
 /// Files of one folder.
 pub trait Folder: Send {
     /// Opens the file `name` for reading and writing; `None` if it does not exist.
-    ///
-    /// # Errors
-    /// The file exists and cannot be opened.
+    /// Errors: the file exists and cannot be opened.
     fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>>;
 
     /// Creates an empty file `name`, replacing an existing one.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     fn create(&self, name: &str) -> io::Result<Arc<dyn StorageBackend>>;
 
     /// Renames the file `from` to `to`, replacing an existing one.
-    ///
-    /// # Errors
-    /// The file does not exist, or the folder cannot be written.
+    /// Errors: the file does not exist, or the folder cannot be written.
     fn rename(&self, from: &str, to: &str) -> io::Result<()>;
 
     /// Removes the file `name`, if it exists.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     fn remove(&self, name: &str) -> io::Result<()>;
 
     /// Makes the entries of the folder durable.
-    ///
-    /// # Errors
-    /// The drive reported an error: entries changed since the last sync may be lost.
+    /// Errors: the drive reported an error: entries changed since the last sync may be lost.
     fn sync(&self) -> io::Result<()>;
 }
 

@@ -13,7 +13,7 @@ use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
     MAP_NAME, MAP_NEW_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME, ignore_not_found,
 };
-use crate::page::format::slot_header::{HEADER_BYTES, SlotHeader};
+use crate::page::format::slot_header::{HEADER_BYTES, KNOWN_COMPATIBLE, SlotHeader};
 use crate::page::format::spill_format::{FORMAT_BYTES, FormatError, SlotLayout, SpillFormat};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
@@ -42,10 +42,8 @@ pub struct SpillDir {
 impl SpillDir {
     /// Creates a spill directory in a folder that does not exist (its parent does) or is empty. With `allow_remote`,
     /// also on a network file system.
-    ///
-    /// # Errors
-    /// The folder is a link, not empty, another user's, in use, left over from another run, read-only, or on a network
-    /// file system.
+    /// Errors: the folder is a link, not empty, another user's, in use, left over from another run, read-only, or on a
+    /// network file system.
     pub fn create(folder: &Path, layout: SlotLayout, allow_remote: bool) -> InputResult<SpillDir> {
         let made_folder = make_folder(folder)?;
         let result = SpillDir::create_in(folder, layout, allow_remote, made_folder);
@@ -65,15 +63,13 @@ impl SpillDir {
         }
         make_private(folder)?;
         sign_lock(folder, &lock)?;
-        let format = SpillFormat { store: draw_identity(), layout };
+        let format = SpillFormat { store: draw_identity(), layout, compatible: KNOWN_COMPATIBLE };
         write_format(folder, &format)?;
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, lock })
     }
 
     /// Opens an existing spill directory.
-    ///
-    /// # Errors
-    /// As for [`SpillDir::create`]; also if there is none, or it is damaged or of a newer version.
+    /// Errors: as for [`SpillDir::create`]; also if there is none, or it is damaged or of a newer version.
     pub fn open(folder: &Path, allow_remote: bool) -> InputResult<SpillDir> {
         check_folder(folder)?;
         let warnings = check_file_system(folder, allow_remote)?;
@@ -120,17 +116,13 @@ impl SpillDir {
     }
 
     /// Bytes that may still be written to the drive; `None` if the system does not tell.
-    ///
-    /// # Errors
-    /// The folder no longer exists.
+    /// Errors: the folder no longer exists.
     pub fn free_bytes(&self) -> InputResult<Option<u64>> {
         free_bytes(&self.folder).map_err(|e| InputError::io(&self.folder, "reading the free space", &e))
     }
 
     /// Numbers of the existing segment files, ascending.
-    ///
-    /// # Errors
-    /// The folder cannot be read.
+    /// Errors: the folder cannot be read.
     pub fn segments(&self) -> InputResult<Vec<u32>> {
         Ok(segments_in(&self.folder)?.into_iter().map(|(segment, _)| segment).collect())
     }
@@ -150,9 +142,7 @@ impl SpillDir {
 
     /// Removes the files of this store, and the folder if this process created it. Returns the names of files that stay
     /// because they do not belong to this store.
-    ///
-    /// # Errors
-    /// Another store has replaced this one (then nothing is removed), or a file cannot be removed.
+    /// Errors: another store has replaced this one (then nothing is removed), or a file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         self.check_identity()?;
         let mut foreign = Vec::new();
@@ -198,9 +188,7 @@ impl SpillDir {
 
 /// Checks a folder in which a spill directory is to be created, and changes nothing. A store that is there already passes. Returns
 /// warnings about the drive.
-///
-/// # Errors
-/// As [`SpillDir::create`], but for a store of another run and a lock.
+/// Errors: as [`SpillDir::create`], but for a store of another run and a lock.
 pub(in crate::page) fn check_new(folder: &Path, allow_remote: bool) -> InputResult<Vec<String>> {
     let is_there = std::fs::symlink_metadata(folder).is_ok();
     if !is_there {
@@ -335,9 +323,7 @@ fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
 }
 
 /// Numbers and lengths of the segment files in `folder`, ascending.
-///
-/// # Errors
-/// The folder cannot be read.
+/// Errors: the folder cannot be read.
 pub fn segments_in(folder: &Path) -> InputResult<Vec<(u32, u64)>> {
     let failed = |e: io::Error| InputError::io(folder, "reading the folder", &e);
     let mut segments = Vec::new();

@@ -1,10 +1,13 @@
 //! Codecs of payloads: raw, halves, or shuffled and compressed.
 //!
+//! Halves are for payloads in which many 32-bit words have an empty lower half, such as numbers rounded to 16 bits but kept in 32. The
+//! stored form: one bit per 64-byte line (1: stored as the upper halves of its words), padded to a line; then the lines in order, 32 or
+//! 64 bytes each; then the rest of an incomplete last line.
+//!
 //! Invariants: 1. decoding yields exactly the length that the index states or an error, for any bytes, and takes no
 //! more memory than that; 2. a payload that compression does not shorten is stored raw, so the stored form is never
 //! longer than the payload; 3. the same payload gives the same bytes on every machine and for any number of threads.
 
-use crate::page::format::halves;
 use crate::page::format::slot_header::StoredAs;
 #[cfg(feature = "zstd")]
 use std::cell::RefCell;
@@ -78,23 +81,19 @@ thread_local! {
 
 /// Encodes `payload` into `stored`, which is at least as long; returns the length and the form. `None` for
 /// [`Codec::Raw`], or if the result would not be shorter.
-///
-/// # Errors
-/// zstd refuses the level, or runs out of memory.
+/// Errors: zstd refuses the level, or runs out of memory.
 pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<Option<(usize, StoredAs)>> {
     match codec {
         Codec::Raw => Ok(None),
         Codec::Zstd { level } => Ok(encode(payload, level, stored)?.map(|bytes| (bytes, StoredAs::ShuffledZstd))),
-        Codec::Halves if halves::encoded_bytes(payload) >= payload.len().min(stored.len()) => Ok(None),
-        Codec::Halves => Ok(Some((halves::encode(payload, stored), StoredAs::Halves))),
+        Codec::Halves if halved_bytes(payload) >= payload.len().min(stored.len()) => Ok(None),
+        Codec::Halves => Ok(Some((halve(payload, stored), StoredAs::Halves))),
     }
 }
 
 /// Shuffles and compresses `payload` into `stored`, which is at least as long; returns the length. `None` if the result
 /// would not be shorter (`stored` then holds garbage).
-///
-/// # Errors
-/// zstd refuses the level, or runs out of memory.
+/// Errors: zstd refuses the level, or runs out of memory.
 #[cfg(feature = "zstd")]
 fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<usize>> {
     SCRATCH.with_borrow_mut(|scratch| {
@@ -115,15 +114,13 @@ fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<us
 }
 
 /// Decodes `stored` so that it fills `payload`.
-///
-/// # Errors
-/// The bytes are damaged, or do not decode to `payload.len()` bytes.
+/// Errors: the bytes are damaged, or do not decode to `payload.len()` bytes.
 pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<()> {
     let wrong = |what: &str| io::Error::new(io::ErrorKind::InvalidData, what.to_string());
     match codec {
         StoredAs::Raw if stored.len() == payload.len() => payload.copy_from_slice(stored),
         StoredAs::Raw => return Err(wrong("the stored length differs from the payload's")),
-        StoredAs::Halves => halves::decode(stored, payload)?,
+        StoredAs::Halves => unhalve(stored, payload)?,
         StoredAs::ShuffledZstd => decode_zstd(stored, payload)?,
     }
     Ok(())
@@ -181,6 +178,87 @@ fn unshuffle(from: &[u8], to: &mut [u8]) {
         word.copy_from_slice(&[a[i], b[i], c[i], d[i]]);
     }
     to[words * WORD..].copy_from_slice(rest);
+}
+
+/// Bytes of a line, the unit of halving.
+const LINE: usize = 64;
+
+fn table_bytes(payload: usize) -> usize {
+    (payload / LINE).div_ceil(8).next_multiple_of(LINE)
+}
+
+/// Longest encoding of a payload of `payload` bytes.
+fn halved_bytes_max(payload: usize) -> usize {
+    table_bytes(payload) + payload
+}
+
+/// Length of the encoding of `payload`.
+fn halved_bytes(payload: &[u8]) -> usize {
+    let halved = payload.chunks_exact(LINE).filter(|line| is_halvable(line)).count();
+    halved_bytes_max(payload.len()) - halved * LINE / 2
+}
+
+/// Encodes `payload` into the front of `out`, which has at least [`halved_bytes`] bytes; returns the length.
+fn halve(payload: &[u8], out: &mut [u8]) -> usize {
+    let (table, data) = out.split_at_mut(table_bytes(payload.len()));
+    table.fill(0);
+    let lines = payload.chunks_exact(LINE);
+    let rest = lines.remainder();
+    let mut at = 0;
+    for (i, line) in lines.enumerate() {
+        if is_halvable(line) {
+            table[i / 8] |= 1 << (i % 8);
+            for (half, word) in data[at..at + LINE / 2].chunks_exact_mut(2).zip(line.chunks_exact(4)) {
+                half.copy_from_slice(&word[2..]);
+            }
+            at += LINE / 2;
+        } else {
+            data[at..at + LINE].copy_from_slice(line);
+            at += LINE;
+        }
+    }
+    data[at..at + rest.len()].copy_from_slice(rest);
+    table.len() + at + rest.len()
+}
+
+fn is_halvable(line: &[u8]) -> bool {
+    let lower = line.chunks_exact(4).fold(0, |any, word| any | word[0] | word[1]);
+    lower == 0
+}
+
+/// Decodes into `payload`, whose length is that of the original.
+/// Errors: `stored` is not an encoding of a payload of that length.
+fn unhalve(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
+    let table_len = table_bytes(payload.len());
+    let wrong = |expected: usize| {
+        let what = format!("the halves codec expected {expected} stored bytes and found {}", stored.len());
+        io::Error::new(io::ErrorKind::InvalidData, what)
+    };
+    if stored.len() < table_len {
+        return Err(wrong(table_len));
+    }
+    let (table, data) = stored.split_at(table_len);
+    let lines = payload.len() / LINE;
+    let halved = (0..lines).filter(|i| table[i / 8] >> (i % 8) & 1 == 1).count();
+    let expected = payload.len() - halved * LINE / 2;
+    if data.len() != expected {
+        return Err(wrong(table_len + expected));
+    }
+    let mut at = 0;
+    let mut lines = payload.chunks_exact_mut(LINE);
+    for (i, line) in lines.by_ref().enumerate() {
+        if table[i / 8] >> (i % 8) & 1 == 1 {
+            for (word, half) in line.chunks_exact_mut(4).zip(data[at..at + LINE / 2].chunks_exact(2)) {
+                word.copy_from_slice(&[0, 0, half[0], half[1]]);
+            }
+            at += LINE / 2;
+        } else {
+            line.copy_from_slice(&data[at..at + LINE]);
+            at += LINE;
+        }
+    }
+    lines.into_remainder().copy_from_slice(&data[at..]);
+    Ok(())
 }
 
 #[cfg(all(test, feature = "zstd"))]
@@ -265,5 +343,30 @@ mod tests {
         payload.fill(0x55);
         assert_eq!(encode_as(Codec::Halves, &payload, &mut stored).unwrap(), None);
         assert_eq!(encode_as(Codec::Raw, &payload, &mut stored).unwrap(), None);
+    }
+
+    use crate::base::rng::{Purpose, Stream};
+
+    #[test]
+    fn every_byte_round_trips_and_halved_lines_take_half() {
+        for len in [0, 1, 63, 64, 65, 4096, 64 * 513 + 7, 700_000] {
+            for halved in [0u64, 1, 2, 3] {
+                let mut draws = Stream::new(1, Purpose::Test, len as u64, halved);
+                let mut payload: Vec<u8> = (0..len).map(|_| draws.next_u64() as u8).collect();
+                let mut pattern = 0;
+                for line in payload.chunks_exact_mut(LINE) {
+                    if draws.below(3) < halved {
+                        pattern += 1;
+                        line.chunks_exact_mut(4).for_each(|word| word[..2].fill(0));
+                    }
+                }
+                let mut out = vec![0xaa; halved_bytes_max(len)];
+                let stored = halve(&payload, &mut out);
+                assert_eq!(stored, table_bytes(len) + len - pattern * LINE / 2);
+                let mut back = vec![0x55; len];
+                assert!(unhalve(&out[..stored], &mut back).is_ok());
+                assert!(back == payload);
+            }
+        }
     }
 }

@@ -17,9 +17,8 @@ pub struct EncodingError(String);
 pub const VALUE_BYTES_MAX: usize = 2 << 30;
 
 /// Encodes a value.
-///
-/// # Errors
-/// The type contains something that cannot be encoded, such as a list of unknown length, or the value is too long to be decoded again.
+/// Errors: the type contains something that cannot be encoded, such as a list of unknown length, or the value is too
+/// long to be decoded again.
 pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
     let bytes = bincode::serde::encode_to_vec(value, bincode::config::legacy());
     let bytes = bytes.map_err(|e| EncodingError(e.to_string()))?;
@@ -30,9 +29,7 @@ pub fn to_bytes<T: Serialize>(value: &T) -> Result<Vec<u8>, EncodingError> {
 }
 
 /// Decodes the bytes of [`to_bytes`].
-///
-/// # Errors
-/// The bytes are not exactly one value of the type.
+/// Errors: the bytes are not exactly one value of the type.
 pub fn from_bytes<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, EncodingError> {
     // The decoder trusts lengths inside the bytes up to a limit that is a compile-time constant: take the smallest of
     // these limits that holds the bytes.

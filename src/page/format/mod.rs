@@ -2,8 +2,6 @@
 
 pub mod codec;
 pub mod encoding;
-pub mod halves;
-pub mod seal;
 pub mod slot_header;
 pub mod spill_format;
 pub mod verify;

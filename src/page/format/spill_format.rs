@@ -6,9 +6,7 @@
 
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::Place;
-use crate::page::format::slot_header::{
-    FORMAT_VERSION, HEADER_BYTES, KNOWN_COMPATIBLE, KNOWN_FEATURES, checksum, transfer_bytes,
-};
+use crate::page::format::slot_header::{FORMAT_VERSION, HEADER_BYTES, KNOWN_FEATURES, checksum, transfer_bytes};
 use bytemuck::{Pod, Zeroable};
 
 /// Length of the file.
@@ -95,15 +93,6 @@ pub struct SpillFormat {
     pub store: u128,
     /// Sizes of slots and segments.
     pub layout: SlotLayout,
-}
-
-/// Version and features of a store.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct FormatFeatures {
-    /// Version of the layout.
-    pub version: u32,
-    /// Feature bits that a reader must know.
-    pub incompatible: u32,
     /// Feature bits that a reader may ignore.
     pub compatible: u32,
 }
@@ -155,7 +144,7 @@ impl SpillFormat {
             slots_per_segment: self.layout.slots_per_segment,
             kind: KIND,
             unused: [0; 3],
-            compatible: KNOWN_COMPATIBLE,
+            compatible: self.compatible,
         };
         let mut bytes = [0; FORMAT_BYTES];
         bytes[..size_of::<Front>()].copy_from_slice(bytemuck::bytes_of(&front));
@@ -164,9 +153,7 @@ impl SpillFormat {
     }
 
     /// Decodes the file.
-    ///
-    /// # Errors
-    /// The bytes are not a FORMAT file of this version.
+    /// Errors: the bytes are not a FORMAT file of this version.
     pub fn from_bytes(bytes: &[u8]) -> Result<SpillFormat, FormatError> {
         let front = front_of(bytes)?;
         let (found, features) = (front.version, front.incompatible);
@@ -180,17 +167,8 @@ impl SpillFormat {
         if front.kind != KIND || !layout.is_possible() {
             return Err(FormatError::Sizes);
         }
-        Ok(SpillFormat { store: front.store, layout })
+        Ok(SpillFormat { store: front.store, layout, compatible: front.compatible })
     }
-}
-
-/// Version and features in the bytes of a FORMAT file of any version.
-///
-/// # Errors
-/// The bytes are not a FORMAT file, or damaged.
-pub fn features_of(bytes: &[u8]) -> Result<FormatFeatures, FormatError> {
-    let front = front_of(bytes)?;
-    Ok(FormatFeatures { version: front.version, incompatible: front.incompatible, compatible: front.compatible })
 }
 
 /// The front of the file, if its length, magic and checksum are right.
@@ -237,7 +215,7 @@ mod tests {
     }
 
     fn sample() -> SpillFormat {
-        SpillFormat { store: 1 << 100, layout: SlotLayout::new(745_472, 1000) }
+        SpillFormat { store: 1 << 100, layout: SlotLayout::new(745_472, 1000), compatible: 0 }
     }
 
     #[test]
@@ -262,12 +240,8 @@ mod tests {
 
     #[test]
     fn unknown_compatible_features_are_ignored() {
-        let bytes = with(49, 0x80);
-        assert_eq!(SpillFormat::from_bytes(&bytes), Ok(sample()));
-        let features = FormatFeatures { version: FORMAT_VERSION, incompatible: 0, compatible: 0x8000 };
-        assert_eq!(features_of(&bytes), Ok(features));
-        // Also for a store that this program cannot read.
-        assert_eq!(features_of(&with(8, 9)).map(|f| f.version), Ok(9));
+        let compatible = 0x8000;
+        assert_eq!(SpillFormat::from_bytes(&with(49, 0x80)), Ok(SpillFormat { compatible, ..sample() }));
     }
 
     #[test]

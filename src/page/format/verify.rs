@@ -9,9 +9,7 @@ use crate::page::mutants::{Mutant, active};
 
 /// Verifies that the bytes of a slot are version `slot` of `page` in `store`, unchanged. Decodes an encoded payload to
 /// `payload`, a buffer with header room; a raw payload stays where it is.
-///
-/// # Errors
-/// The mismatch, as text for users.
+/// Errors: the mismatch, as text for users.
 pub fn verify(
     store: u128,
     page: PageId,

@@ -12,17 +12,17 @@
 //!
 //! One process at a time owns the store; the caller holds the lock on its folder.
 
-use crate::base::error::is_out_of_space;
+use crate::base::error::{REMEDY_TOO_MANY_FILES, is_out_of_space, is_too_many_files};
 use crate::base::ids::PageId;
 use crate::page::folder::protocol_files::Folder;
 pub use crate::page::folder::protocol_files::{MAP_NAME, RESERVE_NAME, RESERVE_NEW_NAME, WITNESS_NAME};
 use crate::page::format::slot_header::SlotRef;
-pub use crate::page::map::commit_error::CommitError;
 use crate::page::map::entries::{MapBatch, MapError};
 use crate::page::map::generations::Generations;
 use crate::page::map::manifest::Manifest;
 use crate::page::map::witness::Witness;
 use crate::page::mutants::{Mutant, active};
+use crate::page::versions::page_error::PageError;
 use crate::page::versions::paged_store::{PageDone, PagedStore};
 use std::io;
 
@@ -90,10 +90,8 @@ impl Commits {
 
     /// Commits, and returns the number of the generation, which is then durable. Page writes that ended meanwhile are
     /// in `done`.
-    ///
-    /// # Errors
-    /// Nothing was acknowledged. Unless [`CommitError::is_out_of_space`], this process commits nothing more; the store
-    /// then opens at the last acknowledged generation or at this one.
+    /// Errors: nothing was acknowledged. Unless [`CommitError::is_out_of_space`], this process commits nothing more;
+    /// the store then opens at the last acknowledged generation or at this one.
     pub fn commit(
         &mut self,
         store: &mut PagedStore,
@@ -105,9 +103,7 @@ impl Commits {
 
     /// As [`Commits::commit`], for a generation that was [cut](PagedStore::cut) earlier and whose pages have been
     /// written since.
-    ///
-    /// # Errors
-    /// As [`Commits::commit`].
+    /// Errors: as [`Commits::commit`].
     pub fn commit_cut(
         &mut self,
         store: &mut PagedStore,
@@ -167,9 +163,7 @@ impl Commits {
     }
 
     /// Pins kept generations under names and removes pins; frees what only the removed pins kept.
-    ///
-    /// # Errors
-    /// A generation is not kept; otherwise as [`Commits::commit`].
+    /// Errors: a generation is not kept; otherwise as [`Commits::commit`].
     pub fn pin(&mut self, store: &mut PagedStore, put: &[(String, u64)], drop: &[String]) -> Result<(), CommitError> {
         if let Some((_, generation)) = put.iter().find(|(_, generation)| !self.generations.is_kept(*generation)) {
             return Err(CommitError::NotKept(*generation));
@@ -183,9 +177,7 @@ impl Commits {
     }
 
     /// Makes a kept generation the latest again, drops the later ones with their pins, and closes the store.
-    ///
-    /// # Errors
-    /// The generation is not kept; otherwise as [`Commits::commit`].
+    /// Errors: the generation is not kept; otherwise as [`Commits::commit`].
     pub fn rollback(mut self, generation: u64) -> Result<(), CommitError> {
         self.refuse_if_poisoned()?;
         self.check_kept(generation)?;
@@ -194,9 +186,7 @@ impl Commits {
     }
 
     /// The run state of a kept generation.
-    ///
-    /// # Errors
-    /// The generation is not kept, or cannot be read.
+    /// Errors: the generation is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
         self.check_kept(generation)?;
         let manifest = self.manifest.as_ref().ok_or(MapError::Poisoned)?;
@@ -208,9 +198,7 @@ impl Commits {
     }
 
     /// Creates the reserve, if missing; returns whether it exists now.
-    ///
-    /// # Errors
-    /// Creation failed for a reason other than space.
+    /// Errors: creation failed for a reason other than space.
     pub fn fill_reserve(&mut self) -> Result<bool, CommitError> {
         let bytes = self.config.reserve_bytes;
         match fill_reserve(self.folder.as_ref(), bytes) {
@@ -224,9 +212,7 @@ impl Commits {
     }
 
     /// Deletes the reserve: its space is free for segments and the map. Returns whether there was one.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     pub fn give_up_reserve(&mut self) -> Result<bool, CommitError> {
         let error = CommitError::file(RESERVE_NAME);
         let mut was_there = false;
@@ -360,4 +346,67 @@ fn fill_reserve(folder: &dyn Folder, bytes: u64) -> io::Result<()> {
     drop(file);
     folder.rename(RESERVE_NEW_NAME, RESERVE_NAME)?;
     folder.sync()
+}
+
+/// Why a store cannot be created, opened, or committed to.
+#[derive(Debug, thiserror::Error)]
+pub enum CommitError {
+    /// Pages could not be made durable.
+    #[error(transparent)]
+    Pages(#[from] PageError),
+    #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
+    Map(#[from] MapError),
+    /// No space. Nothing is lost; the commit may be repeated once there is space.
+    #[error(
+        "there is no space for a commit: {0}\n  remedy: free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
+    )]
+    Full(io::Error),
+    /// A file beside the map cannot be used.
+    #[error("{name} cannot be used: {source}\n  remedy: {}", file_remedy(.source))]
+    File {
+        /// Name of the file in the store's folder.
+        name: &'static str,
+        source: io::Error,
+    },
+    /// An earlier error ended all commits of this process.
+    #[error("commits stopped after a drive error ({0})\n  remedy: check the drive, then start again")]
+    Poisoned(String),
+    /// The folder contains no store.
+    #[error("there is no page map in this folder")]
+    NoStore,
+    /// The map is undamaged, but its content is impossible.
+    #[error("the page map contradicts itself: {0}\n  remedy: `gsscale-ckpt salvage` can rebuild it from the pages")]
+    Contradiction(String),
+    /// Segments are missing or have another length.
+    #[error(
+        "pages are missing: {0}\n  remedy: restore the segment files; `gsscale-ckpt salvage` recovers the remaining pages"
+    )]
+    Segments(String),
+    /// The requested generation is not kept.
+    #[error("generation {0} is not kept\n  remedy: `gsscale-ckpt ls` lists the kept generations")]
+    NotKept(u64),
+}
+
+/// The remedy when a file beside the map cannot be used.
+fn file_remedy(source: &io::Error) -> &'static str {
+    match is_too_many_files(source) {
+        true => REMEDY_TOO_MANY_FILES,
+        false => "check the drive; `gsscale-ckpt salvage` can rebuild the map",
+    }
+}
+
+impl CommitError {
+    /// The error of the system about the file `name`.
+    pub(in crate::page) fn file(name: &'static str) -> impl Fn(io::Error) -> CommitError {
+        move |source| CommitError::File { name, source }
+    }
+
+    /// Whether the error is only a lack of space: a later attempt may succeed.
+    pub fn is_out_of_space(&self) -> bool {
+        match self {
+            CommitError::Full(_) | CommitError::Map(MapError::Full(_)) => true,
+            CommitError::Pages(error) => error.is_out_of_space(),
+            _ => false,
+        }
+    }
 }

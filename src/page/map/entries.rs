@@ -1,6 +1,7 @@
 //! What the page map consists of: tables of sealed entries, and the transaction that changes them.
 //!
-//! Every value is preceded by a checksum bound to its key; the counters hold the number of entries and the sum of their
+//! Every value is preceded by a checksum that also covers the store's identity, the table and the key, so that a value from the wrong
+//! place or with a flipped bit is recognised (accidents, not forgery); the counters hold the number of entries and the sum of their
 //! checksums, which reveals a missing or doubled entry.
 //!
 //! Invariant: every entry added or removed by `Writer` changes the counters of the same transaction.
@@ -8,11 +9,11 @@
 use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
-use crate::page::format::seal::{SealBroken, SealScope};
 use crate::page::mutants::{Mutant, active};
 use redb::{Key, ReadTransaction, Table, TableDefinition, WriteTransaction};
 use std::collections::BTreeMap;
 use std::io;
+use xxhash_rust::xxh3::Xxh3;
 
 /// A table: its name, its number in seals, and the word for its entries in messages.
 pub(in crate::page) struct Entries<K: Key + 'static> {
@@ -24,6 +25,26 @@ pub(in crate::page) struct Entries<K: Key + 'static> {
 impl<K: Key + 'static> Entries<K> {
     const fn new(name: &'static str, seal: u8, what: &'static str) -> Entries<K> {
         Entries { table: TableDefinition::new(name), seal, what }
+    }
+
+    fn scope(&self, store: u128) -> SealScope {
+        SealScope { store, table: self.seal }
+    }
+
+    /// The body and the checksum of a sealed value.
+    pub(in crate::page) fn unseal<'a>(
+        &self,
+        store: u128,
+        key: &impl SealKey,
+        sealed: &'a [u8],
+    ) -> Result<(&'a [u8], u64), Fault> {
+        match self.scope(store).unseal(bound(&key.bytes()), sealed) {
+            Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
+                let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(self.what, "too short"))?;
+                Ok((body, u64::from_le_bytes(*checksum)))
+            }
+            result => result.map_err(|e| damaged(self.what, e)),
+        }
     }
 }
 
@@ -178,28 +199,6 @@ fn bound(key: &[u8]) -> &[u8] {
     if active(Mutant::ValuesNotBoundToKeys) { &[] } else { key }
 }
 
-impl<K: Key + 'static> Entries<K> {
-    fn scope(&self, store: u128) -> SealScope {
-        SealScope { store, table: self.seal }
-    }
-
-    /// The body and the checksum of a sealed value.
-    pub(in crate::page) fn unseal<'a>(
-        &self,
-        store: u128,
-        key: &impl SealKey,
-        sealed: &'a [u8],
-    ) -> Result<(&'a [u8], u64), Fault> {
-        match self.scope(store).unseal(bound(&key.bytes()), sealed) {
-            Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
-                let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(self.what, "too short"))?;
-                Ok((body, u64::from_le_bytes(*checksum)))
-            }
-            result => result.map_err(|e| damaged(self.what, e)),
-        }
-    }
-}
-
 /// Reads the entries of a map and adds them up.
 pub(in crate::page) struct Reader<'a> {
     pub store: u128,
@@ -312,5 +311,50 @@ impl Writer {
     fn subtract(&mut self, checksum: u64) {
         self.counters.entries = self.counters.entries.wrapping_sub(1);
         self.counters.tally = self.counters.tally.wrapping_sub(checksum);
+    }
+}
+
+/// Bytes that a seal adds before the body.
+pub const SEAL_BYTES: usize = 8;
+
+/// The value was not sealed under this scope and key, or has changed since.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("its checksum does not match")]
+pub struct SealBroken;
+
+/// The store and table that a seal is bound to, beside the key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SealScope {
+    /// Identity of the store.
+    pub store: u128,
+    /// Number of the table.
+    pub table: u8,
+}
+
+impl SealScope {
+    /// Checksum of `body` under `key`.
+    pub fn checksum(self, key: &[u8], body: &[u8]) -> u64 {
+        let mut hash = Xxh3::with_seed(u64::from(self.table));
+        hash.update(&self.store.to_le_bytes());
+        hash.update(&(key.len() as u64).to_le_bytes());
+        hash.update(key);
+        hash.update(body);
+        hash.digest()
+    }
+
+    /// `body` preceded by its checksum.
+    pub fn seal(self, key: &[u8], body: &[u8]) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(SEAL_BYTES + body.len());
+        bytes.extend_from_slice(&self.checksum(key, body).to_le_bytes());
+        bytes.extend_from_slice(body);
+        bytes
+    }
+
+    /// The body of a sealed value, and its checksum.
+    /// Errors: the value was not sealed under this scope and key, or has changed since.
+    pub fn unseal<'a>(self, key: &[u8], sealed: &'a [u8]) -> Result<(&'a [u8], u64), SealBroken> {
+        let (checksum, body) = sealed.split_first_chunk::<SEAL_BYTES>().ok_or(SealBroken)?;
+        let checksum = u64::from_le_bytes(*checksum);
+        if checksum == self.checksum(key, body) { Ok((body, checksum)) } else { Err(SealBroken) }
     }
 }

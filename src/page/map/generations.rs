@@ -118,15 +118,14 @@ impl Generations {
             versions.retain(|v| v.value.is_some());
         }
         let (note, run_state) = texts;
-        MapBatch {
+        self.drop_unseen(MapBatch {
             put_versions: versions,
             put_generation: Some((generation, note, run_state)),
             put_pins: pin.map(|name| (name.to_string(), generation)).into_iter().collect(),
             latest: generation,
             next: generation + 1,
             ..self.plan_with(self.kept_with(generation, &pins), generation)
-        }
-        .with_unseen_dropped(self)
+        })
     }
 
     /// Plans the transaction that pins and unpins generations.
@@ -139,12 +138,11 @@ impl Generations {
         let previous = self.kept.range(..self.latest).next_back().copied();
         let mut kept = self.kept_with(self.latest, &pins);
         kept.extend(previous);
-        MapBatch {
+        self.drop_unseen(MapBatch {
             put_pins: put.to_vec(),
             drop_pins: drop.iter().filter(|name| self.pins.contains_key(*name)).cloned().collect(),
             ..self.plan_with(kept, self.latest)
-        }
-        .with_unseen_dropped(self)
+        })
     }
 
     /// Plans the transaction that makes the kept generation `to` the latest again; later ones are dropped with their
@@ -204,28 +202,27 @@ impl Generations {
         let drop_generations = self.kept.difference(&kept).copied().collect();
         MapBatch { drop_generations, latest, next: self.next, ..MapBatch::default() }
     }
-}
 
-impl MapBatch {
     /// Adds the entries that no kept generation sees after this transaction to those to drop.
-    fn with_unseen_dropped(mut self, before: &Generations) -> MapBatch {
-        let mut kept = before.kept.clone();
-        kept.extend(self.put_generation.iter().map(|(generation, ..)| *generation));
-        self.drop_generations.iter().for_each(|g| {
+    fn drop_unseen(&self, mut batch: MapBatch) -> MapBatch {
+        let mut kept = self.kept.clone();
+        kept.extend(batch.put_generation.iter().map(|(generation, ..)| *generation));
+        batch.drop_generations.iter().for_each(|g| {
             kept.remove(g);
         });
-        let newly = self.put_versions.iter().filter_map(|v| {
-            before.last_entry(v.page).map(|from| Superseded { page: v.page, from, until: v.generation })
-        });
+        let newly = batch
+            .put_versions
+            .iter()
+            .filter_map(|v| self.last_entry(v.page).map(|from| Superseded { page: v.page, from, until: v.generation }));
         let (seen, needless): (Vec<_>, Vec<_>) =
-            before.superseded.iter().copied().chain(newly).partition(|s| s.is_seen(&kept));
-        self.drop_versions.extend(needless.iter().map(|s| (s.page, s.from)));
+            self.superseded.iter().copied().chain(newly).partition(|s| s.is_seen(&kept));
+        batch.drop_versions.extend(needless.iter().map(|s| (s.page, s.from)));
         let with_past: BTreeSet<PageId> = seen.iter().map(|s| s.page).collect();
-        self.put_versions.retain(|v| v.value.is_some() || with_past.contains(&v.page));
-        let put: BTreeSet<PageId> = self.put_versions.iter().map(|v| v.page).collect();
-        let gone = before.gone.iter().filter(|(page, _)| !with_past.contains(page) && !put.contains(page));
-        self.drop_versions.extend(gone.map(|(page, from)| (*page, *from)));
-        self.drop_versions.sort_unstable();
-        self
+        batch.put_versions.retain(|v| v.value.is_some() || with_past.contains(&v.page));
+        let put: BTreeSet<PageId> = batch.put_versions.iter().map(|v| v.page).collect();
+        let gone = self.gone.iter().filter(|(page, _)| !with_past.contains(page) && !put.contains(page));
+        batch.drop_versions.extend(gone.map(|(page, from)| (*page, *from)));
+        batch.drop_versions.sort_unstable();
+        batch
     }
 }

@@ -51,9 +51,7 @@ pub struct Manifest {
 
 impl Manifest {
     /// Creates a map in an empty file, durable when this returns. The caller syncs the folder.
-    ///
-    /// # Errors
-    /// The file cannot be written.
+    /// Errors: the file cannot be written.
     pub fn create(file: Arc<dyn StorageBackend>, store: u128, cache_bytes: usize) -> Result<Manifest, MapError> {
         let file = MapFile::new(file);
         let database = guarded(|| Ok(builder(cache_bytes).create_with_backend(file.clone())?))?;
@@ -64,10 +62,8 @@ impl Manifest {
     }
 
     /// Opens the map in `file`, verifies all of it and reads its content. On failure `file` stays unchanged.
-    ///
-    /// # Errors
-    /// The map is damaged, older than transaction `acknowledged`, or cannot be read or written. [`MapError::Full`]: the
-    /// file is in the state after a crash and may be reopened.
+    /// Errors: the map is damaged, older than transaction `acknowledged`, or cannot be read or written.
+    /// [`MapError::Full`]: the file is in the state after a crash and may be reopened.
     pub fn open(
         file: Arc<dyn StorageBackend>,
         store: u128,
@@ -81,9 +77,7 @@ impl Manifest {
     }
 
     /// As [`Manifest::open`], but read-only: `file` never changes, and the map accepts no transaction.
-    ///
-    /// # Errors
-    /// As [`Manifest::open`].
+    /// Errors: as [`Manifest::open`].
     pub fn open_read_only(
         file: Arc<dyn StorageBackend>,
         store: u128,
@@ -111,9 +105,7 @@ impl Manifest {
     }
 
     /// Runs one transaction; durable when this returns.
-    ///
-    /// # Errors
-    /// The transaction may or may not be durable; only reopening the map tells. The map accepts no more calls.
+    /// Errors: the transaction may or may not be durable; only reopening the map tells. The map accepts no more calls.
     pub fn apply(&mut self, batch: &MapBatch) -> Result<(), MapError> {
         if self.poisoned && !active(Mutant::PoisonIgnored) {
             return Err(MapError::Poisoned);
@@ -141,9 +133,7 @@ impl Manifest {
     }
 
     /// The run state of a kept generation.
-    ///
-    /// # Errors
-    /// The run state is missing, damaged or cannot be read.
+    /// Errors: the run state is missing, damaged or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, MapError> {
         let database = self.database.as_ref().ok_or(MapError::Poisoned)?;
         guarded(|| {

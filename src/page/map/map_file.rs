@@ -50,9 +50,7 @@ impl MapFile {
     }
 
     /// A file that holds writes back until [`MapFile::release_held`].
-    ///
-    /// # Errors
-    /// The length of the file cannot be read.
+    /// Errors: the length of the file cannot be read.
     pub fn with_deferred_writes(file: Arc<dyn StorageBackend>) -> io::Result<MapFile> {
         let len = file.len()?;
         let map = MapFile::new(file);
@@ -61,9 +59,7 @@ impl MapFile {
     }
 
     /// Carries out the held-back operations; from now on everything passes through.
-    ///
-    /// # Errors
-    /// The first operation that failed; the file is then shut.
+    /// Errors: the first operation that failed; the file is then shut.
     pub fn release_held(&self) -> io::Result<()> {
         let operations = self.held_back().take().map(|held| held.operations).unwrap_or_default();
         for operation in operations {

@@ -2,7 +2,6 @@
 //! generation.
 
 pub mod commit;
-pub mod commit_error;
 pub mod entries;
 pub mod generations;
 pub mod manifest;

@@ -9,8 +9,7 @@ use crate::page::engine::segment_files::segment_file_name;
 use crate::page::folder::protocol_files::{Folder, MAP_NAME, MAP_NEW_NAME, WITNESS_NAME};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
-use crate::page::map::commit::{CommitConfig, Commits};
-use crate::page::map::commit_error::CommitError;
+use crate::page::map::commit::{CommitConfig, CommitError, Commits};
 use crate::page::map::entries::{MapContent, MapVersion};
 use crate::page::map::generations::Generations;
 use crate::page::map::manifest::Manifest;
@@ -61,12 +60,10 @@ pub struct Opened {
     past: Vec<Past>,
 }
 
-impl Commits {
+impl Opened {
     /// Creates an empty store in `folder`, durable when this returns. Overwrites the remains of an interrupted
     /// creation.
-    ///
-    /// # Errors
-    /// The folder cannot be written, or contains a store already.
+    /// Errors: the folder cannot be written, or contains a store already.
     pub fn create(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
         let (map_error, witness_error) = (CommitError::file(MAP_NAME), CommitError::file(WITNESS_NAME));
         if folder.open(MAP_NAME).map_err(&map_error)?.is_some() {
@@ -81,14 +78,12 @@ impl Commits {
         // store.
         let named = sync_entries(folder.as_ref()).and_then(|()| folder.rename(MAP_NEW_NAME, MAP_NAME));
         named.and_then(|()| sync_entries(folder.as_ref())).map_err(map_error)?;
-        Commits::open(folder, config)
+        Opened::open(folder, config)
     }
 
     /// Opens the store in `folder`: verifies the whole map and finds the last generation. Reads no page data.
-    ///
-    /// # Errors
-    /// There is no store, it is damaged or older than the last acknowledged commit, or it cannot be read or written.
-    /// The files of a refused store stay unchanged.
+    /// Errors: there is no store, it is damaged or older than the last acknowledged commit, or it cannot be read or
+    /// written. The files of a refused store stay unchanged.
     pub fn open(folder: Box<dyn Folder>, config: CommitConfig) -> Result<Opened, CommitError> {
         let file = folder.open(MAP_NAME).map_err(CommitError::file(MAP_NAME))?.ok_or(CommitError::NoStore)?;
         let witness_error = CommitError::file(WITNESS_NAME);
@@ -112,36 +107,24 @@ impl Commits {
         let past = past_slots(&content.versions, &pages)?;
         Ok(Opened { commits, pages, run_state, content, past })
     }
-}
 
-fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
-    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
-}
-
-impl Opened {
     /// Pages of a kept generation, ascending by id.
-    ///
-    /// # Errors
-    /// The generation is not kept.
+    /// Errors: the generation is not kept.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
         self.commits.check_kept(generation)?;
         pages_at(&self.content.versions, generation)
     }
 
     /// Checks that the segments with kept pages exist; changes nothing.
-    ///
-    /// # Errors
-    /// A segment with kept pages is missing or has another length.
+    /// Errors: a segment with kept pages is missing or has another length.
     pub fn check_segments(&self, engine: &dyn PageEngine, layout: SlotLayout) -> Result<(), CommitError> {
         let used = self.pages.iter().map(|page| &page.slot).chain(self.past.iter().map(|past| &past.slot));
         check_segments(engine, layout, used).map(drop)
     }
 
     /// The paged store on an engine that has the segments of this store. Segments that are gone and hold no kept page are created again.
-    ///
-    /// # Errors
-    /// Segments with kept pages are missing or have another length; the map names an impossible slot, or a slot twice; no
-    /// space for a segment that is created again.
+    /// Errors: segments with kept pages are missing or have another length; the map names an impossible slot, or a slot
+    /// twice; no space for a segment that is created again.
     pub fn paged_store(
         &self,
         mut engine: Box<dyn PageEngine>,
@@ -172,6 +155,10 @@ impl Opened {
     }
 }
 
+fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
+    if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
+}
+
 /// The segments of a store.
 pub(in crate::page) struct Segments {
     /// Their number: up to the last one with a kept page.
@@ -182,9 +169,7 @@ pub(in crate::page) struct Segments {
 
 /// Checks the segments of the `used` slots, and those before them. Stops after a few wrong segments, so that a map naming an
 /// absurdly high segment costs neither time nor memory.
-///
-/// # Errors
-/// A segment of a used slot, or more than a few of the others, are missing or have another length.
+/// Errors: a segment of a used slot, or more than a few of the others, are missing or have another length.
 pub(in crate::page) fn check_segments<'a>(
     engine: &dyn PageEngine,
     layout: SlotLayout,

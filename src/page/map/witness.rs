@@ -7,7 +7,7 @@
 //! The file has two slots of 4 KiB, written alternately, each synced before the other is touched. After a crash at
 //! least one is valid, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
-use crate::page::format::seal::{SEAL_BYTES, SealScope};
+use crate::page::map::entries::{SEAL_BYTES, SealScope};
 use crate::page::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::io;
@@ -31,9 +31,7 @@ pub struct Witness {
 
 impl Witness {
     /// Fills the empty `file` and syncs it. The caller syncs the folder.
-    ///
-    /// # Errors
-    /// The file cannot be written.
+    /// Errors: the file cannot be written.
     pub fn create(file: Arc<dyn StorageBackend>, store: u128) -> io::Result<Witness> {
         file.set_len(SLOTS * SLOT_BYTES as u64)?;
         let mut witness = Witness { file, store, sequence: 0 };
@@ -42,9 +40,7 @@ impl Witness {
     }
 
     /// Reads `file`; an invalid slot is ignored.
-    ///
-    /// # Errors
-    /// The file cannot be read, or has no valid slot: [`io::ErrorKind::InvalidData`].
+    /// Errors: the file cannot be read, or has no valid slot: [`io::ErrorKind::InvalidData`].
     pub fn open(file: Arc<dyn StorageBackend>, store: u128) -> io::Result<Witness> {
         let mut sequence = None;
         for slot in 0..SLOTS {
@@ -67,9 +63,7 @@ impl Witness {
     }
 
     /// Writes `sequence` durably.
-    ///
-    /// # Errors
-    /// The file cannot be written; it then holds the old or the new number.
+    /// Errors: the file cannot be written; it then holds the old or the new number.
     pub fn record(&mut self, sequence: u64) -> io::Result<()> {
         let slot = if active(Mutant::WitnessInOneSlot) { 0 } else { sequence % SLOTS };
         let mut body = MAGIC.to_vec();

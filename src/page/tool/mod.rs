@@ -2,6 +2,5 @@
 
 pub mod new_store;
 pub mod reading;
-pub mod scan;
 pub mod slot_reader;
 pub mod uncommitted;

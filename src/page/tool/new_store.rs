@@ -44,9 +44,7 @@ pub struct NewStore {
 }
 
 /// The `.part` name for `target`, if neither exists.
-///
-/// # Errors
-/// One of them exists.
+/// Errors: one of them exists.
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
     let mut name = target.as_os_str().to_os_string();
     name.push(PART_SUFFIX);
@@ -61,15 +59,13 @@ pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
 
 impl NewStore {
     /// Starts a store for `target`, which does not exist.
-    ///
-    /// # Errors
-    /// `target` exists, or the drive fails.
+    /// Errors: `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
         let part = refuse_existing(target)?;
         let spill = SpillDir::create(&part, layout, false)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
             let opened: Opened =
-                Commits::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
+                Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
             let engine = open_engine(IoEngine::Auto, &part, IN_FLIGHT)?;
             let store = opened.paged_store(engine.store, layout, codec)?;
             Ok((opened.commits, store))
@@ -88,9 +84,7 @@ impl NewStore {
     }
 
     /// Writes a version of `page` into the next generation.
-    ///
-    /// # Errors
-    /// The drive fails.
+    /// Errors: the drive fails.
     pub fn put(&mut self, page: PageId, label: &[u8], payload: &[u8]) -> Result<(), ReadError> {
         while self.store.in_flight() >= IN_FLIGHT {
             self.collect_completed(true)?;
@@ -116,9 +110,7 @@ impl NewStore {
     }
 
     /// Commits the pages written since the last commit, pinned under `names`; returns the generation.
-    ///
-    /// # Errors
-    /// The drive fails.
+    /// Errors: the drive fails.
     pub fn commit(&mut self, run_state: &[u8], note: &[u8], names: &[String]) -> Result<u64, ReadError> {
         while self.store.in_flight() > 0 {
             self.collect_completed(true)?;
@@ -137,9 +129,7 @@ impl NewStore {
     }
 
     /// Renames the store to its target.
-    ///
-    /// # Errors
-    /// The target exists by now, or the drive fails.
+    /// Errors: the target exists by now, or the drive fails.
     pub fn finish(mut self) -> Result<(), ReadError> {
         let failed = |e: std::io::Error| InputError::io(&self.target, "renaming the store to its final name", &e);
         if std::fs::symlink_metadata(&self.target).is_ok() {

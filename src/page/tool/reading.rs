@@ -16,7 +16,7 @@ use crate::page::folder::protocol_files::DriveFile;
 use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, segments_in};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
-use crate::page::format::spill_format::{FormatFeatures, SpillFormat, features_of};
+use crate::page::format::spill_format::SpillFormat;
 use crate::page::map::commit::{CommitConfig, CommitError, MAP_NAME, WITNESS_NAME};
 use crate::page::map::entries::{MapContent, MapError};
 use crate::page::map::generations::Generations;
@@ -79,7 +79,6 @@ pub enum WitnessRule {
 pub struct StoreReader {
     folder: PathBuf,
     format: SpillFormat,
-    features: FormatFeatures,
     manifest: Manifest,
     content: MapContent,
     generations: Generations,
@@ -104,11 +103,10 @@ pub struct GenerationUse {
 
 impl StoreReader {
     /// Opens the store in `folder` and verifies its whole map. Reads no page data.
-    ///
-    /// # Errors
-    /// There is no store, it has another version, its map is damaged, or it is in use and `access` includes pages.
+    /// Errors: there is no store, it has another version, its map is damaged, or it is in use and `access` includes
+    /// pages.
     pub fn open(folder: &Path, access: Access, rule: WitnessRule) -> Result<StoreReader, ReadError> {
-        let (format, features) = format_at(folder)?;
+        let format = format_at(folder)?;
         let (lock, used_by) = match lock_for_reading(folder)? {
             Ok(lock) => (lock, None),
             Err(who) => (None, Some(who)),
@@ -122,7 +120,7 @@ impl StoreReader {
         };
         let generations = Generations::of(&content);
         let folder = folder.to_path_buf();
-        Ok(StoreReader { folder, format, features, manifest, content, generations, used_by, _lock: lock })
+        Ok(StoreReader { folder, format, manifest, content, generations, used_by, _lock: lock })
     }
 
     pub fn folder(&self) -> &Path {
@@ -132,11 +130,6 @@ impl StoreReader {
     /// Identity of the store and sizes of its slots.
     pub fn format(&self) -> &SpillFormat {
         &self.format
-    }
-
-    /// Format version and features.
-    pub fn features(&self) -> FormatFeatures {
-        self.features
     }
 
     /// The process that uses the store, as its lock file says.
@@ -160,9 +153,7 @@ impl StoreReader {
     }
 
     /// The kept generation of this number or pin; the latest if `None`.
-    ///
-    /// # Errors
-    /// No such generation is kept; the message lists the kept ones.
+    /// Errors: no such generation is kept; the message lists the kept ones.
     pub fn find(&self, generation: Option<&str>) -> InputResult<u64> {
         let refuse = |problem: String| {
             let pins = self.generations.pins().iter().map(|(name, g)| format!("{g} ({name})"));
@@ -181,18 +172,14 @@ impl StoreReader {
     }
 
     /// Pages of a kept generation, ascending by id.
-    ///
-    /// # Errors
-    /// The generation is not kept, or the map contradicts itself.
+    /// Errors: the generation is not kept, or the map contradicts itself.
     pub fn pages_at(&self, generation: u64) -> Result<Vec<StoredPage>, CommitError> {
         self.check_kept(generation)?;
         pages_at(&self.content.versions, generation)
     }
 
     /// The run state of a kept generation.
-    ///
-    /// # Errors
-    /// The run state is not kept, or cannot be read.
+    /// Errors: the run state is not kept, or cannot be read.
     pub fn run_state(&self, generation: u64) -> Result<Vec<u8>, CommitError> {
         self.check_kept(generation)?;
         Ok(self.manifest.run_state(generation)?)
@@ -208,9 +195,7 @@ impl StoreReader {
     }
 
     /// Every kept generation with its disk use, ascending.
-    ///
-    /// # Errors
-    /// The map contradicts itself.
+    /// Errors: the map contradicts itself.
     pub fn disk_use(&self) -> Result<Vec<GenerationUse>, CommitError> {
         let kept: Vec<u64> = self.generations.kept().collect();
         let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
@@ -235,9 +220,7 @@ impl StoreReader {
     }
 
     /// Every version that a kept generation sees, each once, ordered by place.
-    ///
-    /// # Errors
-    /// The map contradicts itself.
+    /// Errors: the map contradicts itself.
     pub fn live_versions(&self) -> Result<Vec<(PageId, SlotRef, Vec<u8>)>, CommitError> {
         let mut live: BTreeMap<Place, (PageId, SlotRef, Vec<u8>)> = BTreeMap::new();
         for version in &self.content.versions {
@@ -249,9 +232,7 @@ impl StoreReader {
     }
 
     /// Numbers and lengths of the existing segment files, ascending.
-    ///
-    /// # Errors
-    /// The folder cannot be read.
+    /// Errors: the folder cannot be read.
     pub fn segments(&self) -> InputResult<Vec<(u32, u64)>> {
         segments_in(&self.folder)
     }
@@ -262,10 +243,8 @@ impl StoreReader {
     }
 
     /// A paged store of `pages` on an engine that cannot write.
-    ///
-    /// # Errors
-    /// The map names an impossible slot; a segment that `pages` use, or many before it, are missing or have another
-    /// length; or the engine cannot be started.
+    /// Errors: the map names an impossible slot; a segment that `pages` use, or many before it, are missing or have
+    /// another length; or the engine cannot be started.
     pub fn paged_store(&self, pages: &[StoredPage], threads: usize) -> Result<PagedStore, ReadError> {
         let engine = ThreadedEngine::pread_read_only(&self.folder, threads)
             .map_err(|e| InputError::io(&self.folder, "opening the pages", &e))?;
@@ -285,33 +264,26 @@ pub fn commit_config(store: u128) -> CommitConfig {
 }
 
 /// The last generation in the map of `store` in `folder`, 0 before the first commit. The caller holds the lock.
-///
-/// # Errors
-/// The map is missing, damaged, or older than its witness.
+/// Errors: the map is missing, damaged, or older than its witness.
 pub(in crate::page) fn latest_generation(folder: &Path, store: u128) -> Result<u64, ReadError> {
     let (_, content) = open_map(folder, store, WitnessRule::Obeyed, false)?;
     Ok(content.counters.latest)
 }
 
 /// Content of the FORMAT file of `folder`.
-///
-/// # Errors
-/// The file is missing, damaged, or of another version.
-pub fn format_at(folder: &Path) -> InputResult<(SpillFormat, FormatFeatures)> {
+/// Errors: the file is missing, damaged, or of another version.
+pub fn format_at(folder: &Path) -> InputResult<SpillFormat> {
     let no_store = || {
         let remedy = "name a run's output folder or its spill directory; if its FORMAT file was lost, gsscale-ckpt \
                       salvage can still find its pages";
         InputError::new(folder, "it is not a store: it has no FORMAT file", remedy)
     };
     let bytes = format_bytes_of(folder)?.ok_or_else(no_store)?;
-    let read = SpillFormat::from_bytes(&bytes).and_then(|format| Ok((format, features_of(&bytes)?)));
-    read.map_err(|error| bad_format(folder, &error))
+    SpillFormat::from_bytes(&bytes).map_err(|error| bad_format(folder, &error))
 }
 
 /// Refuses a folder that a process is using.
-///
-/// # Errors
-/// The store is in use, or its lock cannot be read.
+/// Errors: the store is in use, or its lock cannot be read.
 pub fn refuse_if_in_use(folder: &Path) -> InputResult<Option<File>> {
     lock_for_reading(folder)?.map_err(|who| in_use(folder, &who))
 }

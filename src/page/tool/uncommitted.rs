@@ -12,18 +12,14 @@ use crate::page::folder::spill_dir::{SpillDir, check_new, of_another_run, segmen
 use crate::page::tool::reading::{format_at, latest_generation, refuse_if_in_use};
 use std::path::Path;
 
-impl SpillDir {
-    /// Whether the store certainly holds no commit: its map says so, or it has neither a map nor a segment (a process
-    /// was killed while it created or removed the store).
-    ///
-    /// # Errors
-    /// The folder cannot be read.
-    pub fn holds_no_commit(&self) -> InputResult<bool> {
-        holds_no_commit(self.folder(), self.format().store)
-    }
+/// Whether an open store certainly holds no commit: its map says so, or it has neither a map nor a segment (a process
+/// was killed while it created or removed the store).
+/// Errors: the folder cannot be read.
+pub fn holds_no_commit(spill: &SpillDir) -> InputResult<bool> {
+    no_commit_in(spill.folder(), spill.format().store)
 }
 
-fn holds_no_commit(folder: &Path, store: u128) -> InputResult<bool> {
+fn no_commit_in(folder: &Path, store: u128) -> InputResult<bool> {
     if std::fs::symlink_metadata(folder.join(MAP_NAME)).is_err() {
         return Ok(segments_in(folder)?.is_empty());
     }
@@ -31,19 +27,14 @@ fn holds_no_commit(folder: &Path, store: u128) -> InputResult<bool> {
 }
 
 /// Whether the store in `folder` certainly holds no commit. Changes nothing.
-///
-/// # Errors
-/// There is no store, or the folder cannot be read.
+/// Errors: there is no store, or the folder cannot be read.
 pub fn is_uncommitted(folder: &Path) -> InputResult<bool> {
-    let (format, _) = format_at(folder)?;
-    holds_no_commit(folder, format.store)
+    no_commit_in(folder, format_at(folder)?.store)
 }
 
 /// Checks whether a new run may put its store into `folder`, and changes nothing: the refusals of [`SpillDir::create`] after
 /// [`remove_uncommitted`].
-///
-/// # Errors
-/// The folder is not empty or cannot be used, or the store in it holds commits, cannot be opened, or is in use.
+/// Errors: the folder is not empty or cannot be used, or the store in it holds commits, cannot be opened, or is in use.
 pub fn check_usable(folder: &Path, allow_remote: bool) -> InputResult<()> {
     check_new(folder, allow_remote)?;
     if !SpillDir::exists_in(folder) {
@@ -58,13 +49,11 @@ pub fn check_usable(folder: &Path, allow_remote: bool) -> InputResult<()> {
 
 /// Removes the store in `folder` if it holds no commit, so that a run can create its own there. Returns whether it did.
 /// Everything else stays unchanged: no store, a checkpoint, a store that cannot be opened or is in use.
-///
-/// # Errors
-/// A file of the store cannot be removed.
+/// Errors: a file of the store cannot be removed.
 pub fn remove_uncommitted(folder: &Path, allow_remote: bool) -> InputResult<bool> {
     // Creating a store in this folder will report why it cannot be used.
     let Ok(spill) = SpillDir::open(folder, allow_remote) else { return Ok(false) };
-    if !spill.holds_no_commit()? {
+    if !holds_no_commit(&spill)? {
         return Ok(false);
     }
     spill.remove()?;

@@ -2,5 +2,4 @@
 
 pub mod page_error;
 pub mod paged_store;
-pub(in crate::page) mod pending;
 pub mod slots;

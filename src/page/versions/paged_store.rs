@@ -17,13 +17,13 @@ use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
-use crate::page::format::codec::Codec;
-use crate::page::format::slot_header::{HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, transfer_bytes};
+use crate::page::format::codec::{self, Codec};
+use crate::page::format::slot_header::{
+    HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes,
+};
 use crate::page::format::verify::verify;
 use crate::page::mutants::{Mutant, active};
-use crate::page::versions::page_error::PageError;
-pub use crate::page::versions::pending::{PageDone, PageMoved, PageTraffic};
-use crate::page::versions::pending::{Pending, Waiting};
+use crate::page::versions::page_error::{PageError, SlotName};
 use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
@@ -72,9 +72,7 @@ impl PagedStore {
     }
 
     /// A store whose `segments` segments exist and hold the versions that an index names.
-    ///
-    /// # Errors
-    /// The index names a slot twice, or one that does not exist.
+    /// Errors: the index names a slot twice, or one that does not exist.
     pub fn open<'a>(
         engine: Box<dyn PageEngine>,
         config: PagedStoreConfig,
@@ -168,10 +166,8 @@ impl PagedStore {
     /// `payload_bytes` bytes after the header room of `buffer`. `label` is what the layer above needs to rebuild its
     /// index entry, at most [`LABEL_BYTES_MAX`] bytes. Header room and padding are overwritten; the payload is returned
     /// unchanged with the result.
-    ///
-    /// # Errors
-    /// No space, the store is poisoned, or payload or label are too long; the buffer is returned at once. Nothing is
-    /// then in flight, and no slot was taken.
+    /// Errors: no space, the store is poisoned, or payload or label are too long; the buffer is returned at once.
+    /// Nothing is then in flight, and no slot was taken.
     pub fn write(
         &mut self,
         token: u64,
@@ -185,9 +181,7 @@ impl PagedStore {
 
     /// As [`PagedStore::write`], for a given generation: the current one, or the last one [cut](PagedStore::cut) if it
     /// is not committed yet.
-    ///
-    /// # Errors
-    /// As [`PagedStore::write`].
+    /// Errors: as [`PagedStore::write`].
     pub fn write_for(
         &mut self,
         generation: u64,
@@ -229,9 +223,7 @@ impl PagedStore {
     }
 
     /// Waits for all reads and writes, then makes the writes durable.
-    ///
-    /// # Errors
-    /// The drive reported an error, now or earlier: the store is poisoned. Failed writes are in `done` as well.
+    /// Errors: the drive reported an error, now or earlier: the store is poisoned. Failed writes are in `done` as well.
     pub fn sync(&mut self, done: &mut Vec<PageDone>) -> Result<(), PageError> {
         while self.in_flight() > 0 {
             self.complete(true, done);
@@ -332,9 +324,7 @@ impl PagedStore {
     }
 
     /// Makes sure that `slots` slots are free, in new segments if need be: as many writes will find space on the drive.
-    ///
-    /// # Errors
-    /// The drive has no space for another segment.
+    /// Errors: the drive has no space for another segment.
     pub fn reserve(&mut self, slots: u64) -> Result<(), PageError> {
         while self.slots.free() < slots {
             self.add_segment()?;
@@ -495,5 +485,91 @@ impl PagedStore {
 impl std::fmt::Debug for PagedStore {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "PagedStore({}, {} slots, {} in flight)", self.engine.name(), self.slots.total(), self.in_flight())
+    }
+}
+
+/// What a successful transfer did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PageMoved {
+    /// The payload is in the buffer, behind its [`HEADER_BYTES`] of header room.
+    Read {
+        /// Bytes of the payload.
+        payload_bytes: usize,
+    },
+    /// The version is in this slot; durable after the next [`PagedStore::sync`].
+    Written(SlotRef),
+}
+
+/// A finished read or write.
+#[derive(Debug)]
+pub struct PageDone {
+    /// An identifier chosen by the caller.
+    pub token: u64,
+    pub page: PageId,
+    /// The caller's buffer. After a write it holds the payload unchanged; after a failed read, garbage.
+    pub buffer: PageBuffer,
+    pub result: Result<PageMoved, PageError>,
+}
+
+/// Bytes moved, headers and padding included.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PageTraffic {
+    pub bytes_read: u64,
+    pub bytes_written: u64,
+    /// Payload bytes of the pages written.
+    pub payload_bytes_written: u64,
+    /// Reads that were repeated.
+    pub reads_repeated: u64,
+}
+
+/// A transfer in flight.
+#[derive(Debug)]
+struct Pending {
+    pub token: u64,
+    pub page: PageId,
+    pub slot: SlotRef,
+    pub direction: Direction,
+    /// Whether this is the second and last attempt of a read.
+    pub is_repeated: bool,
+    /// The caller's buffer, while a staging buffer carries the encoded form.
+    pub payload: Option<PageBuffer>,
+}
+
+impl Pending {
+    pub fn name(&self) -> SlotName {
+        SlotName { page: self.page, place: self.slot.place, generation: self.slot.generation }
+    }
+
+    pub fn end(self, buffer: PageBuffer, result: Result<PageMoved, PageError>) -> PageDone {
+        PageDone { token: self.token, page: self.page, buffer, result }
+    }
+}
+
+/// A write waiting to be encoded and checksummed.
+#[derive(Debug)]
+struct Waiting {
+    pub pending: Pending,
+    pub label: Vec<u8>,
+    /// The caller's buffer, or the staging buffer that receives the encoded form.
+    pub buffer: PageBuffer,
+}
+
+impl Waiting {
+    /// Encodes, zero-pads and checksums the payload; sets codec, stored length and checksum in the slot reference.
+    pub fn seal(&mut self, codec: Codec) {
+        let Pending { slot, payload, .. } = &mut self.pending;
+        if let Some(caller) = payload {
+            let bytes = &caller.as_slice()[HEADER_BYTES..][..slot.payload_bytes as usize];
+            match codec::encode_as(codec, bytes, &mut self.buffer.as_mut_slice()[HEADER_BYTES..]) {
+                Ok(Some((stored_bytes, stored_as))) => {
+                    (slot.stored_bytes, slot.codec) = (stored_bytes as u32, stored_as);
+                }
+                // A payload that fails to encode for any reason is stored raw, from the caller's buffer.
+                _ => std::mem::swap(caller, &mut self.buffer),
+            }
+        }
+        let stored = &mut self.buffer.as_mut_slice()[HEADER_BYTES..slot.transfer_bytes()];
+        stored[slot.stored_bytes as usize..].fill(0);
+        slot.checksum = checksum(stored);
     }
 }

@@ -57,9 +57,7 @@ impl Slots {
     }
 
     /// The slots of `segments` existing segments; exactly the places in `used` are in use.
-    ///
-    /// # Errors
-    /// A place is not a slot, or is named twice.
+    /// Errors: a place is not a slot, or is named twice.
     pub fn with_used(
         layout: SlotLayout,
         segments: u32,

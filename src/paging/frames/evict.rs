@@ -175,23 +175,6 @@ mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
 
-    #[test]
-    fn policies_order_as_they_say() {
-        // (next use, last use) of pages 0..5.
-        let uses = [(5, 1), (NEVER, 4), (9, 2), (NEVER, 3), (9, 2)];
-        let order = |policy| {
-            let mut order = EvictOrder::new(policy);
-            for (page, (next_use, last_use)) in (0..).map(PageNo).zip(uses) {
-                order.insert(Candidate { page, next_use, last_use });
-            }
-            std::iter::from_fn(|| order.first().map(|c| c.page).filter(|&page| order.remove(page)))
-                .map(|page| page.0)
-                .collect::<Vec<_>>()
-        };
-        assert_eq!(order(EvictPolicy::FarthestNextUse), [3, 1, 2, 4, 0]);
-        assert_eq!(order(EvictPolicy::LeastRecentlyUsed), [0, 2, 4, 3, 1]);
-    }
-
     /// Against a search through all pages, over insertions, changes and removals.
     #[test]
     fn the_first_page_is_always_the_greatest_and_the_heap_stays_small() {

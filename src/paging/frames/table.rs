@@ -465,58 +465,6 @@ mod tests {
     }
 
     #[test]
-    fn frames_that_are_taken_away_give_their_memory_back_as_their_pages_leave() {
-        let mut cache = Cache::new(6, EvictPolicy::FarthestNextUse);
-        (0..5).for_each(|i| load(&mut cache, i, 10 + i, i as u8));
-        let lent = cache.lend(|| 0).unwrap();
-        cache.take_back(lent);
-        let pinned = cache.pin(PageNo(0), true).unwrap().0;
-        cache.limit_frames(3);
-        // The free one went at once.
-        assert_eq!((cache.frames(), cache.frames_max(), cache.excess(), cache.free_frames()), (5, 3, 2, 0));
-        cache.limit_frames(4);
-        assert_eq!(cache.frames_max(), 3, "a limit allows no more than before");
-        assert!(cache.lend(|| 0).is_none() && cache.begin_load(PageNo(9), 1, || 0).is_none());
-        cache.evict(PageNo(4));
-        cache.drop_pinned(PageNo(0), pinned);
-        assert_eq!((cache.frames(), cache.excess(), cache.free_frames(), cache.held().count()), (3, 0, 0, 3));
-        // From now on a page that leaves makes room for another.
-        cache.evict(PageNo(3));
-        assert_eq!((cache.frames(), cache.free_frames()), (3, 1));
-        load(&mut cache, 7, 1, 77);
-        // One frame more, although there was an excess: frames that have no memory get it again.
-        cache.limit_frames(1);
-        assert_eq!(cache.excess(), 2);
-        cache.add_frame();
-        assert_eq!((cache.excess(), cache.free_frames()), (0, 1));
-        load(&mut cache, 8, 2, 88);
-        cache.allow_frames(6);
-        (10..12).for_each(|i| load(&mut cache, i, 3, i as u8));
-        assert_eq!((cache.frames(), cache.free_frames(), cache.count(FrameState::Retired)), (6, 0, 0));
-        for (page, mark) in [(7, 77), (8, 88), (11, 11), (1, 1)] {
-            assert_eq!(cache.pin(PageNo(page), true).unwrap().0, mark);
-        }
-    }
-
-    #[test]
-    fn next_uses_and_last_uses_order_the_leaving() {
-        let mut cache = Cache::new(usize::MAX, EvictPolicy::FarthestNextUse);
-        (0..4).for_each(|i| load(&mut cache, i, NEVER, 0));
-        cache.set_next_use(PageNo(3), 5);
-        cache.begin_step(0);
-        let buffer = cache.pin(PageNo(1), true).unwrap().0;
-        cache.set_next_use(PageNo(1), NEVER - 1);
-        cache.set_next_use(PageNo(1), NEVER);
-        cache.unpin(PageNo(1), buffer, false);
-        let mut left = Vec::new();
-        while let Some(victim) = cache.victim() {
-            left.push(victim.page.0);
-            cache.evict(victim.page);
-        }
-        assert_eq!(left, [0, 2, 1, 3]);
-    }
-
-    #[test]
     #[should_panic(expected = "a dirty page is written before it is evicted")]
     fn dirty_pages_are_never_evicted() {
         let mut cache = Cache::new(1, EvictPolicy::LeastRecentlyUsed);

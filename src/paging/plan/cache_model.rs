@@ -126,9 +126,7 @@ impl CacheModel {
 
     /// Takes the cache through one step that needs `pages`, each named once. `next_use` tells the first step after this one
     /// that needs a page, as far as known. `change` is overwritten. Steps must ascend.
-    ///
-    /// # Errors
-    /// There are fewer frames than pages; nothing has changed then.
+    /// Errors: there are fewer frames than pages; nothing has changed then.
     pub fn step(
         &mut self,
         step: u32,
@@ -141,9 +139,7 @@ impl CacheModel {
 
     /// As [`CacheModel::step`], for one batch of `step`. Batches are counted over all steps, and next uses are numbers of
     /// batches. Last uses are numbers of steps, as in a run: all batches of a step use their pages at the same time.
-    ///
-    /// # Errors
-    /// There are fewer frames than pages; nothing has changed then.
+    /// Errors: there are fewer frames than pages; nothing has changed then.
     pub fn batch(
         &mut self,
         batch: u32,
@@ -189,9 +185,7 @@ impl CacheModel {
 
     /// What this cache, which stands before the first of `steps`, will do in these steps by `plan`, if nothing becomes known
     /// that is not known now. `steps` must begin with the plan, and end with it at the latest.
-    ///
-    /// # Errors
-    /// A step needs more frames than there are.
+    /// Errors: a step needs more frames than there are.
     pub fn changes(&self, plan: &Plan, steps: Range<u32>) -> Result<Vec<PlannedStep>, TooFewFrames> {
         let mut cache = self.clone();
         let mut planned = Vec::new();

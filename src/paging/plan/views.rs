@@ -225,22 +225,4 @@ mod tests {
             assert!((0..index.len()).all(|p| next_uses[p] == plan.next_use(PageNo(p as u32))), "all changes reported");
         }
     }
-
-    #[test]
-    fn plans_end_where_their_memory_does_and_can_jump() {
-        let index: Vec<PageMeta> = (0..40).map(|i| page(i, i as f32)).collect();
-        let cameras: Vec<Camera> = (0..30).map(|i| camera(i as f32)).collect();
-        let cameras: Vec<&Camera> = cameras.iter().collect();
-        let mut plan = ViewPlan::new(100 * super::super::steps::USE_BYTES);
-        plan.renew(0, &cameras, &index);
-        let planned = (0..30).filter(|&s| plan.pages(s).is_some()).count();
-        assert!((5..20).contains(&planned), "{planned}");
-        plan.renew(100, &cameras[..3], &index);
-        assert!(plan.pages(29).is_none() && plan.pages(100).is_some() && plan.pages(103).is_none());
-        plan.renew(50, &cameras[..3], &index);
-        assert!(plan.pages(50).is_some() && plan.pages(100).is_none());
-        plan.pass(60);
-        assert!((0..40).all(|p| plan.next_use(PageNo(p)) == NEVER) && plan.plan.uses() == 0);
-        assert_eq!(plan.next_use_after(PageNo(3), 60), None);
-    }
 }

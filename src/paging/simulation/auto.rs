@@ -25,9 +25,7 @@ const ENOUGH_SHARE: f64 = 0.15;
 
 /// The order for these views and a cache of `frames` frames for `pages` pages. `plan_bytes` bounds the memory that this
 /// takes.
-///
-/// # Errors
-/// A view needs more pages than there are frames.
+/// Errors: a view needs more pages than there are frames.
 pub fn automatic_order(
     views: &ViewPages,
     cameras: &[Camera],

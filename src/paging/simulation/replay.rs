@@ -78,9 +78,7 @@ pub struct Replay {
 
 /// Goes through the steps, each in the batches of [`walk`]. `page_bytes` are bytes on disk by page; pages that are needed but
 /// not listed count nothing.
-///
-/// # Errors
-/// There are no frames.
+/// Errors: there are no frames.
 pub fn replay(
     views: &ViewPages,
     page_bytes: &[u32],

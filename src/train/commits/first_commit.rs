@@ -8,6 +8,7 @@ use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::{CommitConfig, Commits};
+use crate::page::map::opening::Opened;
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::page::versions::paged_store::PagedStore;
 use crate::page::versions::slots::SlotLayout;
@@ -52,7 +53,7 @@ impl FirstCommit {
     fn make_in(&self, spill: &SpillDir, layout: SlotLayout) -> Result<(Commits, PagedStore), TrainError> {
         let engine = open_engine(self.io, &self.folder, DEPTH)?.store;
         let config = CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes: 0 };
-        let opened = Commits::create(Box::new(DriveFolder::new(&self.folder)), config)?;
+        let opened = Opened::create(Box::new(DriveFolder::new(&self.folder)), config)?;
         let store = opened.paged_store(engine, layout, self.codec)?;
         Ok((opened.commits, store))
     }

@@ -19,7 +19,7 @@ use crate::config::new_run;
 use crate::config::values::{Residence, Up};
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
-use crate::page::folder::drive_rate::DriveRate;
+use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;

@@ -14,7 +14,8 @@ use crate::page::folder::file_system::free_bytes;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::map::commit::{CommitError, Commits};
+use crate::page::map::commit::CommitError;
+use crate::page::map::opening::Opened;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -152,7 +153,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory.
     let (engine, codec) = tiers.take_spill(spill, config)?;
-    let opened = Commits::create(Box::new(folder), of_commits)?;
+    let opened = Opened::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, codec)?;
     let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, commit_options(config));
     checkpoint.fill_reserve()?;

@@ -9,7 +9,7 @@ use crate::page::engine::open::{IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::map::commit::Commits;
+use crate::page::map::opening::Opened;
 use crate::page::tool::reading::{Access, StoreReader, commit_config};
 use crate::train::error::TrainError;
 use serde::Serialize;
@@ -29,9 +29,7 @@ pub struct RolledBack {
 }
 
 /// Makes a kept generation the latest again; drops later generations with their names. Without `yes` nothing changes.
-///
-/// # Errors
-/// The store is in use or cannot be opened, or the generation is not kept.
+/// Errors: the store is in use or cannot be opened, or the generation is not kept.
 pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<RolledBack, TrainError> {
     let (generation, step, dropped, dropped_names, store) = {
         let store = place.open(Access::Pages)?;
@@ -44,7 +42,7 @@ pub fn rollback(place: &StorePlace, generation: &str, yes: bool) -> Result<Rolle
     let is_done = yes && !dropped.is_empty();
     if is_done {
         let spill = open_same(place, store)?;
-        let opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
+        let opened = Opened::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
         opened.commits.rollback(generation)?;
     }
     Ok(RolledBack { generation, step, dropped, dropped_names, is_done })
@@ -89,9 +87,7 @@ pub struct Pruned {
 }
 
 /// Removes names and frees the generations that only these names kept. The last two generations always stay.
-///
-/// # Errors
-/// The store is in use or cannot be opened, or a name does not exist.
+/// Errors: the store is in use or cannot be opened, or a name does not exist.
 pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, TrainError> {
     let before = place.open(Access::Pages)?;
     let pins = before.generations().pins();
@@ -132,7 +128,7 @@ pub fn prune(place: &StorePlace, request: &PruneRequest) -> Result<Pruned, Train
 
 fn write_pins(place: &StorePlace, store: u128, dropped_names: &[String]) -> Result<(), TrainError> {
     let spill = open_same(place, store)?;
-    let mut opened = Commits::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
+    let mut opened = Opened::open(Box::new(DriveFolder::new(&place.folder)), commit_config(spill.format().store))?;
     let engine = open_engine(IoEngine::Pread, &place.folder, 1)?;
     let mut store = opened.paged_store(engine.store, spill.format().layout, Codec::Raw)?;
     opened.commits.pin(&mut store, &[], dropped_names)?;

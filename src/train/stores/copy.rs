@@ -31,9 +31,8 @@ pub struct Copied {
 }
 
 /// Copies a store to the folder `to`, which does not exist.
-///
-/// # Errors
-/// The store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at `to` then.
+/// Errors: the store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at
+/// `to` then.
 pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> {
     refuse_existing(to)?;
     let store = place.open(Access::Pages)?;

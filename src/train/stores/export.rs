@@ -83,10 +83,8 @@ pub struct Exported {
 }
 
 /// Exports a generation.
-///
-/// # Errors
-/// The store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot be
-/// written.
+/// Errors: the store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot
+/// be written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
     let format = ExportFormat::of_path(&request.out)?;
     let store = place.open(Access::Pages)?;

@@ -74,10 +74,8 @@ pub struct Imported {
 }
 
 /// Imports a PLY.
-///
-/// # Errors
-/// The file cannot be read or holds no Gaussians, the budget is too small, or the folder cannot be written. No store is
-/// left then.
+/// Errors: the file cannot be read or holds no Gaussians, the budget is too small, or the folder cannot be written. No
+/// store is left then.
 pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     refuse_existing(&request.out)?;
     if !holds_gaussians(&request.file)? {

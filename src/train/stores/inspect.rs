@@ -9,7 +9,7 @@ use crate::config::choice::Choice;
 use crate::config::file::TrainConfig;
 use crate::densify::strategy::{Effect, effect_of};
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::format::slot_header::StoredAs;
+use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_FEATURES, StoredAs};
 use crate::page::tool::reading::Access;
 use crate::paging::stored::meta_from_label;
 use crate::paging::stored::{check_values, layout_of};
@@ -58,9 +58,7 @@ pub struct Inspected {
 }
 
 /// Inspects a generation.
-///
-/// # Errors
-/// The store cannot be opened, or the generation is not kept.
+/// Errors: the store cannot be opened, or the generation is not kept.
 pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected, TrainError> {
     let store = place.open(Access::Map)?;
     let generation = store.find(generation)?;
@@ -78,14 +76,14 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
             behind += u64::from((meta.events_applied as usize) < state.events.len());
         }
     }
-    let (format, features) = (store.format(), store.features());
+    let format = store.format();
     Ok(Inspected {
         store: place.folder.clone(),
         identity: format!("{:032x}", format.store),
         used_by: store.used_by().map(str::to_string),
-        format_version: features.version,
-        features_incompatible: features.incompatible,
-        features_compatible: features.compatible,
+        format_version: FORMAT_VERSION,
+        features_incompatible: KNOWN_FEATURES,
+        features_compatible: format.compatible,
         slot_bytes: format.layout.slot_bytes,
         slots_per_segment: format.layout.slots_per_segment,
         segments: segments.len() as u64,
@@ -197,9 +195,7 @@ pub struct PageInspected {
 }
 
 /// Inspects a page: its header and its rows as stored.
-///
-/// # Errors
-/// The store is in use or cannot be opened, or the page is missing or damaged.
+/// Errors: the store is in use or cannot be opened, or the page is missing or damaged.
 pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) -> Result<PageInspected, TrainError> {
     let store = place.open(Access::Pages)?;
     let generation = store.find(generation)?;

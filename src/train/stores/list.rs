@@ -41,9 +41,7 @@ pub struct Listed {
 }
 
 /// Lists the kept generations.
-///
-/// # Errors
-/// The store cannot be opened, or another version of the program wrote a run state.
+/// Errors: the store cannot be opened, or another version of the program wrote a run state.
 pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     let store = place.open(Access::Map)?;
     let mut generations = Vec::new();

@@ -63,9 +63,7 @@ pub struct StorePlace {
 
 impl StorePlace {
     /// Opens the store, which must belong to the named run.
-    ///
-    /// # Errors
-    /// The store cannot be opened, is in use (for access to pages), or holds the checkpoint of another run.
+    /// Errors: the store cannot be opened, is in use (for access to pages), or holds the checkpoint of another run.
     fn open(&self, access: Access) -> Result<StoreReader, TrainError> {
         let store = StoreReader::open(&self.folder, access, WitnessRule::Obeyed)?;
         self.check_owner(&store)?;
@@ -73,9 +71,7 @@ impl StorePlace {
     }
 
     /// Refuses the checkpoint of another run: the path in a run's config may lead to one by now.
-    ///
-    /// # Errors
-    /// The store belongs to another run.
+    /// Errors: the store belongs to another run.
     fn check_owner(&self, store: &StoreReader) -> Result<(), TrainError> {
         let latest = store.generations().latest();
         if latest == 0 || !self.id.is_known() {
@@ -86,9 +82,7 @@ impl StorePlace {
 }
 
 /// Finds the store of a run's output folder; `dir` may also be the spill directory itself.
-///
-/// # Errors
-/// There is no store.
+/// Errors: there is no store.
 pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if !dir.is_dir() {
         return Err(InputError::new(
@@ -118,9 +112,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
 }
 
 /// The run state of a generation.
-///
-/// # Errors
-/// The state cannot be read, or another version of the program wrote it.
+/// Errors: the state cannot be read, or another version of the program wrote it.
 pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, TrainError> {
     let bytes = store.run_state(generation)?;
     let wrong = |problem: String| InputError::new(store.folder(), problem, "use the program that made it");

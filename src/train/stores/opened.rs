@@ -8,8 +8,9 @@ use crate::checkpoint::run_state::RunState;
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::page::map::commit::{CommitConfig, CommitError, Commits};
+use crate::page::map::commit::{CommitConfig, CommitError};
 use crate::page::map::opening::Opened;
+use crate::page::tool::uncommitted::holds_no_commit;
 use crate::train::commits::first_commit::MAP_CACHE_BYTES;
 use crate::train::commits::full_drive::reserve_bytes;
 use crate::train::error::TrainError;
@@ -32,9 +33,7 @@ pub struct Stored {
 impl Stored {
     /// Opens the checkpoint in `folder` at its last commit; `None` for a store without commits. An empty folder is an
     /// error, since it may be the mount point of an unmounted drive. `allow_remote` allows network file systems.
-    ///
-    /// # Errors
-    /// There is no store, or it is damaged or in use.
+    /// Errors: there is no store, or it is damaged or in use.
     pub fn open(folder: &Path, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
         if !SpillDir::exists_in(folder) {
             let problem = "the checkpoint of this run is not there: it is removed when a run ends without \
@@ -44,10 +43,10 @@ impl Stored {
             return Err(InputError::new(folder, problem, remedy).into());
         }
         let spill = SpillDir::open(folder, allow_remote)?;
-        if spill.holds_no_commit()? {
+        if holds_no_commit(&spill)? {
             return Ok(None);
         }
-        let opened = match Commits::open(Box::new(DriveFolder::new(folder)), commit_config(&spill)) {
+        let opened = match Opened::open(Box::new(DriveFolder::new(folder)), commit_config(&spill)) {
             Err(error @ CommitError::NoStore) => {
                 let remedy = "gsscale-ckpt salvage rebuilds the map from the pages, in another folder";
                 return Err(InputError::new(folder, error.to_string(), remedy).into());
@@ -76,9 +75,7 @@ impl Stored {
     }
 
     /// Removes the checkpoint. Returns the names of files that stay because they do not belong to the store.
-    ///
-    /// # Errors
-    /// A file cannot be removed.
+    /// Errors: a file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         drop(self.opened);
         self.spill.remove()

@@ -26,7 +26,7 @@ use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::tool::reading::{Access, StoreReader, WitnessRule};
-use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
+use crate::page::tool::uncommitted::{holds_no_commit, is_uncommitted, remove_uncommitted};
 use crate::train::error::TrainError;
 use crate::train::inputs::places::absolute;
 use crate::train::stores::opened::Stored;
@@ -34,9 +34,7 @@ use crate::train::stores::run_state_of;
 use std::path::Path;
 
 /// Refuses the checkpoint of another run.
-///
-/// # Errors
-/// `of_store` and `run` are both known and differ.
+/// Errors: `of_store` and `run` are both known and differ.
 pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> InputResult<()> {
     if !of_store.id.is_known_to_differ(run) {
         return Ok(());
@@ -88,9 +86,7 @@ impl Claim<'_> {
 }
 
 /// Opens the checkpoint in `folder`; `None` if it has no commit.
-///
-/// # Errors
-/// The checkpoint belongs to another run, cannot be opened, or is in use.
+/// Errors: the checkpoint belongs to another run, cannot be opened, or is in use.
 pub(crate) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> Result<Option<Stored>, TrainError> {
     // Opening a map for writing changes its file, so check the owner by reading. An unreadable map is refused below.
     if let Ok(state) = last_state(folder, Access::Map) {
@@ -102,9 +98,7 @@ pub(crate) fn open_own(folder: &Path, claim: Claim<'_>, allow_remote: bool) -> R
 }
 
 /// The run state of the checkpoint in `folder`, without a change; `None` if it has no commit.
-///
-/// # Errors
-/// As [`open_own`], but a checkpoint in use is no error.
+/// Errors: as [`open_own`], but a checkpoint in use is no error.
 pub(crate) fn read_own(folder: &Path, claim: Claim<'_>) -> Result<Option<RunState>, TrainError> {
     if is_uncommitted(folder)? {
         return Ok(None);
@@ -115,18 +109,15 @@ pub(crate) fn read_own(folder: &Path, claim: Claim<'_>) -> Result<Option<RunStat
 }
 
 /// Reads the run state of the last commit without writing.
-///
-/// # Errors
-/// The store has no commit or cannot be opened.
+/// Errors: the store has no commit or cannot be opened.
 pub(crate) fn last_state(folder: &Path, access: Access) -> Result<RunState, TrainError> {
     let store = StoreReader::open(folder, access, WitnessRule::Obeyed)?;
     run_state_of(&store, store.find(None)?)
 }
 
 /// Removes the checkpoint that `run` left in its output folder, for a run that starts over there.
-///
-/// # Errors
-/// The checkpoint belongs to another run, cannot be opened, or is in use; it stays, and the new run must not begin.
+/// Errors: the checkpoint belongs to another run, cannot be opened, or is in use; it stays, and the new run must not
+/// begin.
 pub(crate) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
     check_removable(folder, run)?;
     if SpillDir::exists_in(folder) && !remove_uncommitted(folder, true)? {
@@ -138,11 +129,9 @@ pub(crate) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), Trai
 }
 
 /// Checks whether [`remove_checkpoint_in`] may remove the checkpoint.
-///
-/// # Errors
-/// As [`remove_checkpoint_in`].
+/// Errors: as [`remove_checkpoint_in`].
 pub(crate) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainError> {
-    if !SpillDir::exists_in(folder) || SpillDir::open(folder, true)?.holds_no_commit()? {
+    if !SpillDir::exists_in(folder) || holds_no_commit(&SpillDir::open(folder, true)?)? {
         return Ok(());
     }
     let by_hand = format!("if you do not need it, remove it (rm -r {}), or choose another --out", folder.display());

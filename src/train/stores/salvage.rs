@@ -29,8 +29,8 @@ use crate::page::format::spill_format::SpillFormat;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
-use crate::page::tool::scan::{Scan, scan_slots};
 use crate::page::tool::slot_reader::SlotReader;
+use crate::page::tool::slot_reader::{Scan, scan_slots};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::stored::{check_values, layout_of};
 use crate::paging::stored::{label, meta_from_label};
@@ -99,10 +99,8 @@ struct Source {
 }
 
 /// Rebuilds a store.
-///
-/// # Errors
-/// The store is in use or of another version, all of it is damaged, or the new folder cannot be written. No new store
-/// is left then.
+/// Errors: the store is in use or of another version, all of it is damaged, or the new folder cannot be written. No new
+/// store is left then.
 pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
     refuse_existing(&request.to)?;
     // Hold the lock until the end, so that no trainer writes meanwhile.
@@ -126,7 +124,7 @@ pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged,
             None
         }
     };
-    let format = format_at(&place.folder).ok().map(|(format, _)| format);
+    let format = format_at(&place.folder).ok();
     let scan = scan_slots(&place.folder, format.map(|f| f.layout))?;
     let source = source_of(place, format, scan, notes)?;
     match map {

@@ -31,9 +31,7 @@ pub struct StoredStart {
 
 impl StoredStart {
     /// Opens the last generation of the store in `dir`, which may be the output folder of a run.
-    ///
-    /// # Errors
-    /// The store cannot be opened or is in use, or 1/`share` of the budget is too small for it.
+    /// Errors: the store cannot be opened or is in use, or 1/`share` of the budget is too small for it.
     pub fn open(dir: &Path, host_mem: u64, share: u64) -> Result<StoredStart, TrainError> {
         let place = find_store(dir)?;
         let store = place.open(Access::Pages)?;
@@ -51,9 +49,7 @@ impl StoredStart {
     }
 
     /// Digest of the start: of the run state, from which the pages follow.
-    ///
-    /// # Errors
-    /// The state cannot be encoded.
+    /// Errors: the state cannot be encoded.
     pub fn digest(&self) -> InputResult<u64> {
         let bytes = self.state.to_bytes();
         let bytes = bytes.map_err(|e| InputError::new(&self.folder, e.to_string(), "report this as a bug"))?;
@@ -67,9 +63,7 @@ impl StoredStart {
 
     /// Passes first pages to `take`: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with at
     /// most `sh_degree` and with their uids. May be called repeatedly.
-    ///
-    /// # Errors
-    /// A page cannot be read or overflows f32 in the new frame, or `take` failed.
+    /// Errors: a page cannot be read or overflows f32 in the new frame, or `take` failed.
     pub fn for_each_page(
         &mut self,
         (origin, scale): ([f64; 3], f64),

@@ -46,9 +46,8 @@ pub struct Verdict {
 }
 
 /// Verifies a store.
-///
-/// # Errors
-/// The folder is not a store, has another format version, is in use, or cannot be read. Damage is not an error here.
+/// Errors: the folder is not a store, has another format version, is in use, or cannot be read. Damage is not an error
+/// here.
 pub fn verify(place: &StorePlace, deep: bool) -> Result<Verdict, TrainError> {
     let store = place.folder.clone();
     let mut verdict = Verdict { store, deep, generations: 0, versions: 0, bytes_read: 0, faults: Vec::new() };

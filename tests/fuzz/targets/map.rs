@@ -13,7 +13,7 @@ use gsscale::page::folder::protocol_files::Folder;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::encoding;
 use gsscale::page::format::slot_header::{SlotRef, StoredAs};
-use gsscale::page::map::commit::{CommitConfig, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
+use gsscale::page::map::commit::{CommitConfig, Cut, MAP_NAME, PageChange, WITNESS_NAME};
 use gsscale::page::map::entries::{MapBatch, MapVersion};
 use gsscale::page::map::manifest::Manifest;
 use gsscale::page::map::opening::Opened;
@@ -153,7 +153,7 @@ fn folder_of(input: &[u8]) -> Option<MemoryFolder> {
 
 fn run_map(input: &[u8]) {
     let Some(folder) = folder_of(input) else { return };
-    let Ok(opened) = Commits::open(Box::new(folder.clone()), CONFIG) else { return };
+    let Ok(opened) = Opened::open(Box::new(folder.clone()), CONFIG) else { return };
     let kept: Vec<u64> = opened.commits.generations().kept().collect();
     for &generation in &kept {
         let _ = opened.pages_at(generation);
@@ -163,7 +163,7 @@ fn run_map(input: &[u8]) {
         check_state(&state);
     }
     let to = kept.first().copied();
-    let again = || Commits::open(Box::new(folder.clone()), CONFIG);
+    let again = || Opened::open(Box::new(folder.clone()), CONFIG);
     use_pages(opened, false);
     if let Ok(opened) = again() {
         use_pages(opened, true);

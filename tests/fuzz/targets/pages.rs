@@ -71,7 +71,7 @@ pub fn label_of_a_page() -> Vec<u8> {
 pub fn slot_header() -> Target {
     let raw = slot(StoredAs::Raw, 700, 700);
     let layout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
-    let format = SpillFormat { store: STORE, layout };
+    let format = SpillFormat { store: STORE, layout, compatible: 0 };
     let parts: [&[u8]; 4] = [&header(raw)[..200], &raw.to_bytes(), &label_of_a_page(), &format.to_bytes()];
     let seeds = (0..8).map(|mode| with_mode(mode, parts[usize::from(mode) / 2])).collect();
     Target { name: "slot_header", run: run_header, seeds, words: &[], cases: 60_000, memory: [16 << 10, 1] }

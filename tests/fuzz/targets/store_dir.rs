@@ -9,7 +9,7 @@ use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::HEADER_BYTES;
-use gsscale::page::map::commit::{CommitConfig, Commits, Cut, PageChange};
+use gsscale::page::map::commit::{CommitConfig, Cut, PageChange};
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
 use gsscale::page::versions::slots::SlotLayout;
@@ -61,7 +61,7 @@ fn template() -> &'static Template {
         let parent = scratch();
         let folder = parent.path().join("store");
         let spill = SpillDir::create(&folder, LAYOUT, true).unwrap();
-        let opened = Commits::create(Box::new(DriveFolder::new(&folder)), config(&spill)).unwrap();
+        let opened = Opened::create(Box::new(DriveFolder::new(&folder)), config(&spill)).unwrap();
         let mut store = paged(&opened, &folder, LAYOUT).unwrap();
         let mut commits = opened.commits;
         let mut slots = BTreeMap::new();
@@ -161,7 +161,7 @@ fn run(input: &[u8]) {
     }
     make_private(folder);
     let Ok(spill) = SpillDir::open(folder, true) else { return };
-    let Ok(opened) = Commits::open(Box::new(DriveFolder::new(folder)), config(&spill)) else {
+    let Ok(opened) = Opened::open(Box::new(DriveFolder::new(folder)), config(&spill)) else {
         // A refused store is unchanged except for the lock and the witness.
         let after = contents(folder);
         for (name, bytes) in files.iter().filter(|(name, _)| !["LOCK", "witness"].contains(&name.as_str())) {

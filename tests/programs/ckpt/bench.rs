@@ -6,7 +6,7 @@ use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::Commits;
+use gsscale::page::map::opening::Opened;
 use gsscale::page::map::opening::StoredPage;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule, commit_config};
 use serde_json::Value;
@@ -151,7 +151,7 @@ pub fn generations(listed: &Value) -> Vec<u64> {
 /// Names generations, as the trainer does.
 pub fn pin(spill: &Path, names: &[(&str, u64)]) {
     let dir = SpillDir::open(spill, true).unwrap();
-    let mut opened = Commits::open(Box::new(DriveFolder::new(spill)), commit_config(dir.format().store)).unwrap();
+    let mut opened = Opened::open(Box::new(DriveFolder::new(spill)), commit_config(dir.format().store)).unwrap();
     let engine = open_engine(IoEngine::Pread, spill, 1).unwrap();
     let mut store = opened.paged_store(engine.store, dir.format().layout, Codec::Raw).unwrap();
     let names: Vec<(String, u64)> = names.iter().map(|(name, generation)| ((*name).to_string(), *generation)).collect();

@@ -4,7 +4,8 @@ use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
 use gsscale::checkpoint::run_state::RunState;
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
-use gsscale::page::map::commit::{CommitConfig, Commits};
+use gsscale::page::map::commit::CommitConfig;
+use gsscale::page::map::opening::Opened;
 
 /// Named checkpoints keep their steps and evaluations; a run returns to one of them.
 #[test]
@@ -18,7 +19,7 @@ fn saves_are_named_checkpoints() {
         let folder = bench.checkpoint(place);
         let spill = SpillDir::open(&folder, false).unwrap();
         let config = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 0 };
-        let commits = Commits::open(Box::new(DriveFolder::new(&folder)), config).unwrap().commits;
+        let commits = Opened::open(Box::new(DriveFolder::new(&folder)), config).unwrap().commits;
         let generations = commits.generations();
         let state = |generation| RunState::from_bytes(&commits.run_state(generation).unwrap()).unwrap().trainer;
         let saved = generations.pins().iter().map(|(name, &generation)| (name.as_str(), state(generation)));

@@ -8,14 +8,15 @@ use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::{CommitConfig, Commits, Cut};
+use gsscale::page::map::commit::{CommitConfig, Cut};
+use gsscale::page::map::opening::Opened;
 use std::path::Path;
 
 /// Commits the store in `folder` once more, with another path in its run state and the same pages. Returns the path that was there.
 fn rename_path(folder: &Path, simd: &str) -> String {
     let spill = SpillDir::open(folder, false).unwrap();
     let config = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 0 };
-    let opened = Commits::open(Box::new(DriveFolder::new(folder)), config).unwrap();
+    let opened = Opened::open(Box::new(DriveFolder::new(folder)), config).unwrap();
     let engine = open_engine(IoEngine::Pread, folder, 2).unwrap().store;
     let mut store = opened.paged_store(engine, spill.format().layout, Codec::Raw).unwrap();
     let mut state = RunState::from_bytes(&opened.run_state).unwrap();

@@ -5,7 +5,8 @@ use super::disk::{Disk, Rng};
 use super::life::{CONFIG, paged_store};
 use super::oracle::Oracle;
 use super::tamper;
-use gsscale::page::map::commit::{Commits, MAP_NAME};
+use gsscale::page::map::commit::MAP_NAME;
+use gsscale::page::map::opening::Opened;
 
 /// Damages a copy of the disk and opens it. Returns whether the damage was noticed; an error is wrong data or a commit
 /// lost without a word.
@@ -72,7 +73,7 @@ fn lost_write(disk: &Disk, past: &Disk, name: &str, rng: &mut Rng) -> String {
 /// Opens a damaged disk: the result is an error that names the damage, or exactly the acknowledged state.
 pub fn open_spoilt(disk: &Disk, oracle: &Oracle) -> Result<bool, String> {
     let before: Vec<(String, Vec<u8>)> = disk.names().into_iter().map(|n| (n.clone(), disk.contents(&n))).collect();
-    match Commits::open(Box::new(disk.clone()), CONFIG) {
+    match Opened::open(Box::new(disk.clone()), CONFIG) {
         Err(_) => {
             let changed = before.iter().find(|(name, bytes)| disk.contents(name) != *bytes);
             // Before a store is refused, only the witness may be updated.

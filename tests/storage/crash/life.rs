@@ -66,10 +66,10 @@ pub struct Life<'a> {
 
 /// Opens or creates the store; judges its state and compares its pages.
 pub fn open<'a>(disk: &Disk, oracle: &'a mut Oracle, seed: u64) -> Result<Life<'a>, End> {
-    let opened = match Commits::open(Box::new(disk.clone()), CONFIG) {
+    let opened = match Opened::open(Box::new(disk.clone()), CONFIG) {
         Err(CommitError::NoStore) if !oracle.is_created => {
             oracle.snapshots.insert(0, Snapshot::default());
-            Commits::create(Box::new(disk.clone()), CONFIG)
+            Opened::create(Box::new(disk.clone()), CONFIG)
         }
         Err(CommitError::NoStore) => return Err(End::Violation("the store is gone".to_string())),
         other => other,

@@ -5,7 +5,7 @@ use super::decay;
 use super::disk::{Disk, Fault, FaultPlan, Rng, Survival};
 use super::life::{CONFIG, End, end_of, open};
 use super::oracle::{Acknowledged, Oracle};
-use gsscale::page::map::commit::Commits;
+use gsscale::page::map::opening::Opened;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -169,7 +169,7 @@ fn live(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng) -> Result<(), End> {
 /// A tool rolls the store back; the power may fail during the rollback.
 fn roll_back(disk: &Disk, oracle: &mut Oracle, rng: &mut Rng, counts: &mut Counts) -> Result<(), String> {
     disk.forget_faults();
-    let opened = match Commits::open(Box::new(disk.clone()), CONFIG) {
+    let opened = match Opened::open(Box::new(disk.clone()), CONFIG) {
         Ok(opened) => opened,
         Err(_) if !oracle.is_created => return Ok(()),
         Err(error) => return Err(format!("before a rollback: {error}")),

@@ -9,7 +9,7 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::{CommitConfig, Commits};
+use gsscale::page::map::commit::CommitConfig;
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::paged_store::PagedStore;
 use gsscale::page::versions::slots::SlotLayout;
@@ -29,7 +29,7 @@ pub fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults
 
 /// Asserts that the store holds exactly the pages of `model` that have rows.
 pub fn opens_with(folder: &Path, model: &Model) {
-    let opened = Commits::open(Box::new(DriveFolder::new(folder)), COMMITS).unwrap();
+    let opened = Opened::open(Box::new(DriveFolder::new(folder)), COMMITS).unwrap();
     let store = paged_store(&opened, folder, Codec::Raw, &Faults::new());
     let mut pager = Pager::open(config(7), store, &opened.pages, 0).unwrap();
     let pages: Vec<PageNo> = (0..pager.index().len() as u32).map(PageNo).collect();
@@ -54,7 +54,7 @@ struct Done {
 fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> Result<Done, PagingError> {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let opened = Commits::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
+    let opened = Opened::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
     let pager = Pager::new(config(frames), paged_store(&opened, at, codec, faults));
     let mut commits = opened.commits;
     let mut run = Run::new(pager, seed, PAGES, STEPS)?;
@@ -95,7 +95,7 @@ fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> 
         if done.committed % 4 == 3 && draws.below(6) == 0 {
             drop(commits);
             opens_with(at, last.as_ref().unwrap());
-            commits = Commits::open(Box::new(DriveFolder::new(at)), COMMITS).unwrap().commits;
+            commits = Opened::open(Box::new(DriveFolder::new(at)), COMMITS).unwrap().commits;
         }
     }
     run.check_all(3)?;
@@ -133,7 +133,7 @@ fn a_cut_is_committed_as_it_was_whatever_the_steps_after_it_do() {
 fn a_failed_write_is_left_to_the_next_step_once_rows_have_changed() {
     let folder = tempfile::tempdir().unwrap();
     let faults = Faults::new();
-    let opened = Commits::create(Box::new(DriveFolder::new(folder.path())), COMMITS).unwrap();
+    let opened = Opened::create(Box::new(DriveFolder::new(folder.path())), COMMITS).unwrap();
     let pager = Pager::new(config(usize::MAX), paged_store(&opened, folder.path(), Codec::Raw, &faults));
     let mut run = Run::new(pager, 3, PAGES, STEPS).unwrap();
     (0..20).for_each(|_| run.step().unwrap());
@@ -152,7 +152,7 @@ fn a_failed_write_gives_the_cut_up_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let faults = Faults::new();
-    let opened = Commits::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
+    let opened = Opened::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
     let pager = Pager::new(config(usize::MAX), paged_store(&opened, at, Codec::Raw, &faults));
     let mut commits = opened.commits;
     let mut run = Run::new(pager, 3, PAGES, STEPS).unwrap();
@@ -168,7 +168,7 @@ fn a_failed_write_gives_the_cut_up_and_nothing_else() {
     assert!(error.is_out_of_space() && !run.pager.is_frozen(), "{error}");
     drop(commits);
     opens_with(at, &first);
-    let mut commits = Commits::open(Box::new(DriveFolder::new(at)), COMMITS).unwrap().commits;
+    let mut commits = Opened::open(Box::new(DriveFolder::new(at)), COMMITS).unwrap().commits;
     while (run.step as usize) < STEPS {
         // The failure was reported already, or is reported once more.
         if let Err(error) = run.step() {

@@ -10,6 +10,7 @@ use gsscale::base::ids::PageId;
 use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::map::commit::{CommitError, Commits, MAP_NAME};
+use gsscale::page::map::opening::Opened;
 use gsscale::paging::pager::Pager;
 use redb::StorageBackend;
 use std::io::{self, ErrorKind};
@@ -110,7 +111,7 @@ fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model
     (0..STEPS).for_each(|_| memory.step().unwrap());
     let frames = memory.pager.stats().pinned_max + 5;
     let folder = || Box::new(FolderOnDrive(DriveFolder::new(at), Arc::clone(shortage)));
-    let opened = Commits::create(folder(), COMMITS).unwrap();
+    let opened = Opened::create(folder(), COMMITS).unwrap();
     let pager = Pager::new(config(frames), paged_store(&opened, at, Codec::Raw, &Faults::new()));
     let mut commits = opened.commits;
     let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();
