@@ -10,7 +10,6 @@ use super::driver::Driver;
 const FILL_BYTES: u64 = 128 << 20;
 const FILL_BUFFERS: usize = 8192;
 
-/// Kind of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum FaultKind {
     /// The device is destroyed, as if unplugged or reset.
@@ -28,7 +27,6 @@ pub enum FaultKind {
 /// A fault at a given submission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct InjectedFault {
-    /// Kind of the fault.
     pub kind: FaultKind,
     /// Number of the submission, counted from 1 since the device was opened.
     pub submission: u64,

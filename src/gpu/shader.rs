@@ -15,7 +15,6 @@ use super::faults::lock;
 use super::injected::with_shader_fault;
 use super::sources::{Defines, Source, preprocess, switches};
 
-/// Kind of a binding.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BindingKind {
     /// `var<uniform>`
@@ -33,7 +32,6 @@ pub(super) struct Binding {
     pub(super) number: u32,
     /// Name of the variable.
     pub(super) name: String,
-    /// Kind of the binding.
     pub(super) kind: BindingKind,
     /// Least bytes that a view must span; for a runtime-sized array, one element.
     pub(super) min_size: u64,

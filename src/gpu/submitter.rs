@@ -108,7 +108,6 @@ pub(super) struct Job {
 pub(super) struct Waker(Ticket);
 
 impl Waker {
-    /// The one waker of a ticket.
     pub(super) fn of(ticket: &Ticket) -> Waker {
         Waker(ticket.clone())
     }

@@ -41,7 +41,6 @@ impl From<SsimPadding> for SsimVariant {
     }
 }
 
-/// Options of the loss.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LossOptions {
     /// Weight of 1 - SSIM; L1 has weight 1 - lambda.

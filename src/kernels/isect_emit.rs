@@ -37,7 +37,6 @@ impl Isect {
         u64::from(self.row) | first << 32 | last << 36 | u64::from(self.k) << 40
     }
 
-    /// Unpacks from 64 bits.
     #[inline(always)]
     pub fn unpack(bits: u64) -> Self {
         let pixel_rows = [(bits >> 32) as u8 & 15, (bits >> 36) as u8 & 15];

@@ -46,7 +46,6 @@ pub fn scatter<const W: usize>(src: &Lanes<W>, dst: &mut [f32]) {
     }
 }
 
-/// One lane of a block.
 #[inline(always)]
 pub fn lane<const W: usize>(block: &Lanes<W>, lane: usize) -> [f32; W] {
     std::array::from_fn(|c| block[c][lane])

@@ -60,7 +60,6 @@ pub struct Splat {
     pub b: f32,
     /// Coefficient of dy^2: -log2(e)/2 times the conic's yy.
     pub c: f32,
-    /// log2 of the opacity.
     pub log2_opacity: f32,
     pub color: [f32; 3],
     /// How far the exponent may fall before no contribution is possible; not positive if none is possible at all.

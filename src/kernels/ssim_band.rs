@@ -361,7 +361,6 @@ fn ssim_point<const FMA: bool>(mx: f32, my: f32, squares: f32, products: f32) ->
     [ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse]
 }
 
-/// `tap * v + sum`.
 #[inline(always)]
 fn add_scaled<const FMA: bool>(tap: f32, v: Lane, mut sum: Lane) -> Lane {
     for l in 0..LANES {

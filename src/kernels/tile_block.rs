@@ -23,7 +23,6 @@ pub(super) struct Local {
     pub bdy: Lane,
     /// c dy^2 + log2_opacity by row.
     pub cdy: Lane,
-    /// x of the mean.
     pub mean_x: f32,
     /// Coefficient of dx^2.
     pub a: f32,

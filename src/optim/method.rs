@@ -32,7 +32,6 @@ impl OptimizerPlace {
         }
     }
 
-    /// The place of a name.
     pub fn from_name(name: &str) -> Option<OptimizerPlace> {
         [OptimizerPlace::Host, OptimizerPlace::Device].into_iter().find(|place| place.name() == name)
     }

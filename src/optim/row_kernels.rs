@@ -37,7 +37,6 @@ const AHEAD: usize = 8;
 /// The sign bit of a float.
 const SIGN: u32 = 1 << 31;
 
-/// Counts of one step.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct StepCounts {
     /// Rows that were rewritten.

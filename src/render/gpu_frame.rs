@@ -106,7 +106,6 @@ pub struct Frame {
     pub blend: Blend,
     /// The tiles with lists.
     pub range: TileRange,
-    /// The part of the lists.
     pub part: ListPart,
     /// Capacity of the buffers, and longest list that the recorded segments cover.
     pub room: FrameRoom,

@@ -76,7 +76,6 @@ pub struct PagesView {
     camera: Camera,
     step: StepNumbers,
     recent: Buffer,
-    /// The batches that are in.
     pub batches: Vec<PageBatch>,
     /// The update that has begun and that nobody has waited for.
     pub(super) updating: Option<PendingResults>,

@@ -156,7 +156,6 @@ impl Tally {
         }
     }
 
-    /// Adds the parts of a tile.
     fn add_parts(&self, tile: PlannedRange, spans: &[DepthSpan], planned: &mut Vec<PlannedRange>) {
         let mut base = 0u32;
         for (i, span) in spans.iter().enumerate() {

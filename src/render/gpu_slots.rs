@@ -41,7 +41,6 @@ impl Slots {
         Slots { slot_bytes: (payload_bytes as u64).next_multiple_of(SLOT_STEP), ..Slots::default() }
     }
 
-    /// Bytes of a slot.
     pub fn slot_bytes(&self) -> u64 {
         self.slot_bytes
     }

@@ -34,7 +34,6 @@ pub(super) struct WholeRows {
 /// The buffer sizes that a frame needs. The picture is valid only if the frame had this room.
 #[derive(Debug)]
 pub(super) enum DemandState {
-    /// The readback is pending.
     Pending(Box<DemandReadback>),
     /// The host has read the demand.
     Known(Demand),
@@ -86,7 +85,6 @@ pub(super) struct View {
 pub(super) enum Unusable {
     /// No stage counts them yet.
     Uncounted,
-    /// The readback is pending.
     Pending(Readback),
     /// The host has read the number.
     Known(u64),
@@ -185,7 +183,6 @@ pub(super) enum LossSums {
     Stale,
     /// They stay on the device, for the gate of a step that is recorded without waiting.
     OnDevice(Buffer),
-    /// The readback is pending.
     Pending(Readback),
     /// The host has read the sums; zeros for a picture without pixels.
     Known([f32; 4]),

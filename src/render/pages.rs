@@ -17,7 +17,6 @@ use crate::scene::page_layout::PageLayout;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct DeviceSlot(pub u32);
 
-/// A page in its slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotPage {
     /// The slot that holds the payload.

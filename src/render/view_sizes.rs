@@ -3,7 +3,6 @@
 /// Most tiles that a row of a grown scene is expected to reach, on average over the rows in view.
 const ISECTS_PER_ROW: u64 = 32;
 
-/// The sizes of a view.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ViewSizes {
     /// Rows in view.

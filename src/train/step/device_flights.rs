@@ -74,7 +74,6 @@ enum Recorded {
     Short,
 }
 
-/// A step to record.
 #[derive(Debug, Clone, Copy)]
 pub struct StepToRecord<'a> {
     /// 0-based step.

@@ -152,7 +152,6 @@ pub(crate) struct SlotCache {
     edits_after: Option<u32>,
 }
 
-/// The device of a renderer.
 pub(super) fn device_of(renderer: &mut dyn Renderer) -> Result<&mut dyn PageRenderer, TrainError> {
     let name = renderer.name();
     renderer.pages().ok_or(TrainError::Render(RenderError::NoPages { backend: name }))
@@ -270,7 +269,6 @@ impl SlotCache {
         }
     }
 
-    /// Begins a step.
     pub(super) fn begin_step(
         &mut self,
         scene: &mut PagedScene,
@@ -678,7 +676,6 @@ impl SlotCache {
         scene.pager.release(others);
     }
 
-    /// Whether a page is leaving.
     pub(super) fn is_leaving(&self, page: PageNo) -> bool {
         self.leaving.iter().any(|leaving| leaving.page == page)
     }
