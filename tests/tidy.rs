@@ -64,6 +64,30 @@ const LAYERS: &[(&str, &[&str])] = &[
     ),
 ];
 
+/// For each room of src/train, the rooms that it may name.
+const TRAIN_ROOMS: &[(&str, &[&str])] = &[
+    ("error", &[]),
+    ("inputs", &[]),
+    ("step", &["error"]),
+    ("log", &["step"]),
+    ("memory", &["step"]),
+    ("state", &["error", "log", "memory", "step"]),
+    ("commits", &["error", "inputs", "log", "state"]),
+    ("stores", &["commits", "error", "inputs", "memory", "step"]),
+    ("start", &["commits", "error", "inputs", "memory", "step", "stores"]),
+    ("preflight", &["commits", "error", "inputs", "log", "memory", "start", "state", "step"]),
+    ("run", &["commits", "error", "inputs", "log", "memory", "preflight", "start", "state", "step", "stores"]),
+];
+
+/// Rooms of src/train that may name `TrainConfig`: past them, each function takes the settings that it uses.
+const START_UP_ROOMS: &[&str] = &["inputs", "preflight", "run", "start", "stores"];
+
+/// Types whose own methods stand in several files of a top folder: to become none.
+const SPREAD_TYPES: &[&str] = &["dataset World", "gpu Gpu", "scene Columns", "train Checkpoint"];
+
+/// Names that several types of src have: to become fewer.
+const SHARED_TYPE_NAMES_MAX: usize = 72;
+
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[
     "src/base/allocator.rs",
@@ -97,21 +121,53 @@ fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
     files
 }
 
-/// Layers that a source text names through `crate::<layer>` (also inside `crate::{a, b}`), tests included.
-fn named_layers(text: &str) -> Vec<String> {
-    let code: String = text.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n");
-    let mut names = Vec::new();
-    for (at, _) in code.match_indices("crate::") {
-        let rest = &code[at + "crate::".len()..];
-        if let Some(list) = rest.strip_prefix('{') {
-            let list = &list[..list.find('}').unwrap_or(list.len())];
-            names.extend(list.split(',').map(|n| n.trim().split("::").next().unwrap_or("").to_string()));
-        } else {
-            names.push(rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect());
-        }
+/// A source text without its comment lines.
+fn without_comments(text: &str) -> String {
+    text.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
+}
+
+/// A source text without its comment lines and its tests, which stand at its end.
+fn code_of(text: &str) -> String {
+    let code = without_comments(text);
+    code.split("\n#[cfg(test)]").next().unwrap_or("").to_string()
+}
+
+/// Adds the paths of the tree `text` begins with (`a::{b, c::{d, e}}` is `a::b`, `a::c::d`, `a::c::e`); gives its length.
+fn read_tree(text: &str, stem: &str, paths: &mut Vec<String>) -> usize {
+    let is_path = |c: char| c.is_alphanumeric() || "_:".contains(c);
+    let mut at = text.find(|c| !is_path(c)).unwrap_or(text.len());
+    let path = format!("{stem}{}", &text[..at]);
+    if !text[at..].starts_with('{') {
+        paths.push(path);
+        return at;
     }
-    names.retain(|n| LAYERS.iter().any(|(layer, _)| layer == n));
-    names
+    while let Some(next) = text[at..].find(|c| is_path(c) || c == '}').filter(|n| !text[at + n..].starts_with('}')) {
+        at += next;
+        at += read_tree(&text[at..], &path, paths);
+    }
+    at + text[at..].find('}').map_or(0, |end| end + 1)
+}
+
+/// Paths from the root of the crate that file `name` names through `crate::` and `super::`.
+fn named_paths(name: &str, code: &str) -> Vec<Vec<String>> {
+    let module = name.trim_start_matches("src/").trim_end_matches(".rs").trim_end_matches("/mod");
+    let (mut paths, mut at) = (Vec::new(), 0);
+    while let Some(next) = ["crate::", "super::"].iter().filter_map(|root| code[at..].find(root)).min() {
+        at += next;
+        at += read_tree(&code[at..], "", &mut paths);
+    }
+    let absolute = |path: String| {
+        let mut from: Vec<String> = module.split('/').map(str::to_string).collect();
+        for part in path.split("::") {
+            match part {
+                "crate" => from.clear(),
+                "super" => drop(from.pop()),
+                part => from.push(part.to_string()),
+            }
+        }
+        from
+    };
+    paths.into_iter().map(absolute).collect()
 }
 
 #[test]
@@ -125,8 +181,8 @@ fn dependencies_point_one_way() {
             continue;
         }
         let allowed = allowed.get(layer.as_str()).unwrap_or_else(|| panic!("{name}: folder {layer} has no layer"));
-        for used in named_layers(&text) {
-            if used != layer && !allowed.contains(&used.as_str()) {
+        for used in named_paths(&name, &without_comments(&text)).iter().map(|path| path[0].as_str()) {
+            if used != layer && LAYERS.iter().any(|(layer, _)| used == *layer) && !allowed.contains(&used) {
                 wrong.push(format!("{name} names {used}"));
             }
         }
@@ -134,10 +190,29 @@ fn dependencies_point_one_way() {
     assert!(wrong.is_empty(), "these point the wrong way:\n{}", wrong.join("\n"));
 }
 
+/// An order that forbids circles: a room may name only rooms above it in the table.
 #[test]
-fn the_layer_reader_sees_what_it_should() {
-    let text = "use crate::scene::camera::Camera;\n// crate::train in a comment\nuse crate::{optim, base::rng};\n";
-    assert_eq!(named_layers(text), ["scene", "optim", "base"]);
+fn rooms_of_train_have_an_order() {
+    let mut wrong = Vec::new();
+    for (at, (room, may)) in TRAIN_ROOMS.iter().enumerate() {
+        let above = |name: &&&str| !TRAIN_ROOMS[..at].iter().any(|(room, _)| *room == **name);
+        wrong.extend(may.iter().filter(above).map(|name| format!("the table has {room} name {name}, not above it")));
+    }
+    for (name, text) in rust_files(&["src"]) {
+        let code = code_of(&text);
+        let inside = name.strip_prefix("src/train/").map(|rest| rest.split(['/', '.']).next().unwrap());
+        let is_start_up = inside.is_some_and(|room| START_UP_ROOMS.contains(&room));
+        if !is_start_up && !name.starts_with("src/config/") && code.contains("TrainConfig") {
+            wrong.push(format!("{name} names TrainConfig"));
+        }
+        let Some(room) = inside.filter(|room| *room != "mod") else { continue };
+        let known = TRAIN_ROOMS.iter().find(|(known, _)| *known == room);
+        let (_, may) = known.unwrap_or_else(|| panic!("{name}: {room} is not in TRAIN_ROOMS"));
+        let paths = named_paths(&name, &code).into_iter().filter(|path| path[0] == "train" && path.len() > 1);
+        let others = paths.map(|path| path[1].clone()).filter(|other| other != room && !may.contains(&other.as_str()));
+        wrong.extend(others.map(|other| format!("{name} names train::{other}")));
+    }
+    assert!(wrong.is_empty(), "these name what they may not:\n{}", wrong.join("\n"));
 }
 
 /// Rooms, and folders of rooms.
@@ -149,24 +224,14 @@ fn rooms() -> Vec<String> {
     rooms
 }
 
-/// Files of a room (a folder in it counts as one) that a file of the room imports, tests left out.
+/// Files of a room (a folder in it counts as one) that a file of the room names, tests left out.
 fn imported_files(room: &str, name: &str, text: &str) -> Vec<String> {
-    let depth = Path::new(name).components().count() - if name.ends_with("/mod.rs") { 1 } else { 0 };
-    // From src/ROOM/file.rs the room is one step up, from src/ROOM/folder/file.rs two.
-    let above = 1 + Path::new(room).components().count();
-    let prefixes = ["super::".repeat(depth.saturating_sub(above)), format!("crate::{}::", room.replace('/', "::"))];
-    let code = text.split("#[cfg(test)]").next().unwrap_or("");
-    let mut found = Vec::new();
-    for statement in code.split("use ").skip(1).map(|rest| rest.split(';').next().unwrap_or("")) {
-        let Some(rest) = prefixes.iter().filter(|p| !p.is_empty()).find_map(|p| statement.strip_prefix(p.as_str()))
-        else {
-            continue;
-        };
-        let names = rest.strip_prefix('{').map_or(vec![rest], |list| list.trim_end_matches('}').split(',').collect());
-        let first = |path: &str| path.trim().split("::").next().unwrap_or("").to_string();
-        found.extend(names.into_iter().map(first).filter(|n| n != "super" && !n.is_empty()));
-    }
-    found
+    let room: Vec<&str> = room.split('/').collect();
+    let paths = named_paths(name, &code_of(text)).into_iter();
+    paths
+        .filter(|path| path.len() > room.len() && path[..room.len()] == room)
+        .map(|mut p| p.remove(room.len()))
+        .collect()
 }
 
 /// The files from `at` back to `at`, if there is such a way.
@@ -215,12 +280,97 @@ fn the_reader_of_imports_sees_what_it_should() {
         "use super::a::X;\nuse super::{b, c::Y};\nuse crate::train::d;\n#[cfg(test)]\nmod tests { use super::e::Z; }\n";
     assert_eq!(imported_files("train", "src/train/f.rs", text), ["a", "b", "c", "d"]);
     let text = "use super::super::a::X;\nuse super::b::Y;\n";
-    assert_eq!(imported_files("train", "src/train/stores/f.rs", text), ["a"]);
+    assert_eq!(imported_files("train", "src/train/stores/f.rs", text), ["a", "stores"]);
     let text = "use super::a::X;\nuse crate::page::map::b::Y;\nuse crate::page::c::Z;\n";
     assert_eq!(imported_files("page/map", "src/page/map/f.rs", text), ["a", "b"]);
+    let text =
+        "use crate::train::{a::b, c::{d, e::F}, g};\nfn f() -> crate::train::h::I {}\nuse crate::{train, base::rng};";
+    assert_eq!(imported_files("train", "src/train/f.rs", text), ["a", "c", "c", "g", "h"]);
+    let layers = named_paths("src/a.rs", &without_comments("// crate::train\nuse crate::{optim::x as y, base};"));
+    assert_eq!(layers.iter().map(|path| path.join("::")).collect::<Vec<_>>(), ["optim::x", "as", "y", "base"]);
     let edges = [("a", "b"), ("b", "c"), ("c", "b")].map(|(from, to)| (from.to_string(), vec![to.to_string()]));
     assert_eq!(circle_from("b", &edges.clone().into()).map(|way| way.len()), Some(3));
     assert_eq!(circle_from("a", &edges.into()), None);
+}
+
+/// Name of the type whose own methods an `impl` line holds. A trait's methods, and a macro's types, have none.
+fn type_of_impl(line: &str) -> Option<String> {
+    let header = line.strip_prefix("impl")?.replace("->", "");
+    let mut depth = 0;
+    let parameters = header.find(|c| {
+        depth += i32::from(c == '<') - i32::from(c == '>');
+        depth == 0
+    })?;
+    let path = header[parameters + 1..].trim_start().split([' ', '<']).next()?.rsplit("::").next()?;
+    (!header.contains(" for ") && path.starts_with(char::is_alphabetic)).then(|| path.to_string())
+}
+
+/// Name of the type or trait that a line declares. Associated types have no name of their own.
+fn declared_type(line: &str) -> Option<&str> {
+    let code = line.trim_start();
+    let code = match code.strip_prefix("pub") {
+        Some(rest) if rest.starts_with('(') => rest.split_once(") ")?.1,
+        Some(rest) => rest.trim_start(),
+        None => code,
+    };
+    let kinds = ["struct ", "enum ", "trait ", "type "];
+    let kinds = &kinds[..if line.starts_with(' ') { 3 } else { 4 }];
+    let name = kinds.iter().find_map(|kind| code.strip_prefix(kind))?;
+    name.split(|c: char| !c.is_alphanumeric() && c != '_').next().filter(|name| !name.is_empty())
+}
+
+/// For each top folder and name, the files that declare such a type; and the files with its own methods, `cfg` twins aside.
+type Homes = BTreeMap<(String, String), [Vec<String>; 2]>;
+
+fn homes_of_types() -> Homes {
+    let mut homes = Homes::new();
+    for (name, text) in rust_files(&["src"]) {
+        let top = name.split('/').nth(1).unwrap().to_string();
+        let mut before = String::new();
+        for line in code_of(&text).lines() {
+            let found = declared_type(line).map(|of| (of.to_string(), 0));
+            let of_impl = || type_of_impl(line).filter(|_| !before.starts_with("#[cfg(")).map(|of| (of, 1));
+            if let Some((of, which)) = found.or_else(of_impl) {
+                let files = &mut homes.entry((top.clone(), of)).or_default()[which];
+                if !files.contains(&name) {
+                    files.push(name.clone());
+                }
+            }
+            before = line.to_string();
+        }
+    }
+    homes
+}
+
+#[test]
+fn the_methods_of_a_type_stand_in_one_file() {
+    let mut spread = Vec::new();
+    for ((top, of), [declared, methods]) in homes_of_types() {
+        // Files that each declare a private type of the same name hold several types.
+        if methods.len() > 1 && methods.iter().any(|file| !declared.contains(file)) {
+            spread.push((format!("{top} {of}"), methods));
+        }
+    }
+    let unlisted: Vec<_> = spread.iter().filter(|(of, _)| !SPREAD_TYPES.contains(&of.as_str())).collect();
+    assert!(unlisted.is_empty(), "bring the methods of these types into one file each: {unlisted:#?}");
+    let stale: Vec<_> = SPREAD_TYPES.iter().filter(|of| !spread.iter().any(|(known, _)| known == **of)).collect();
+    assert!(stale.is_empty(), "take these out of SPREAD_TYPES, they stand in one file now: {stale:?}");
+    let lines = ["impl A {", "impl<'a, F: Fn(u8) -> B<'a>> crate::C<'a, F> {", "impl D for E {", "impl<'a> $F<'a> {"];
+    assert_eq!(lines.map(type_of_impl), [Some("A"), Some("C"), None, None].map(|of| of.map(str::to_string)));
+}
+
+#[test]
+fn few_types_share_a_name() {
+    let mut owners: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for ((_, of), [declared, _]) in homes_of_types() {
+        owners.entry(of).or_default().extend(declared);
+    }
+    owners.retain(|_, files| files.len() > 1);
+    let (count, most) = (owners.len(), SHARED_TYPE_NAMES_MAX);
+    assert!(count <= most, "{count} names have several types, of at most {most}; find a name of its own: {owners:#?}");
+    let lines =
+        ["pub(in crate::a) struct B<T> {", "type C = D;", "    type Err = E;", "    enum F {", "pub trait $View {"];
+    assert_eq!(lines.map(declared_type), [Some("B"), Some("C"), None, Some("F"), None]);
 }
 
 #[test]
