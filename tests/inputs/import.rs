@@ -1,6 +1,7 @@
 //! Point clouds larger than memory: reading, measuring and partitioning them within a budget gives the same pages and
 //! numbers as in memory.
 
+use super::readers::write::{Model, Pt};
 use glam::DVec3;
 use gsscale::base::error::InputError;
 use gsscale::base::rng::{Purpose, Stream};
@@ -27,17 +28,10 @@ fn points(count: u64) -> (Vec<[f64; 3]>, Vec<[u8; 3]>) {
 }
 
 fn write_colmap(path: &Path, positions: &[[f64; 3]], colors: &[[u8; 3]]) {
-    let mut bytes = (positions.len() as u64).to_le_bytes().to_vec();
-    for (i, (position, color)) in positions.iter().zip(colors).enumerate() {
-        bytes.extend((i as u64).to_le_bytes());
-        position.iter().for_each(|x| bytes.extend(x.to_le_bytes()));
-        bytes.extend(color);
-        bytes.extend(0.5f64.to_le_bytes());
-        let track = (i % 5) as u64;
-        bytes.extend(track.to_le_bytes());
-        bytes.extend(vec![7; 8 * track as usize]);
-    }
-    std::fs::write(path, bytes).unwrap();
+    let point = |(i, (&position, &color))| Pt { position, color, track: i % 5 };
+    let points = positions.iter().zip(colors).enumerate().map(point).collect();
+    let model = Model { cameras: Vec::new(), images: Vec::new(), points };
+    std::fs::write(path, model.points_bin()).unwrap();
 }
 
 fn write_ply(path: &Path, positions: &[[f64; 3]], colors: &[[u8; 3]]) {

@@ -1,5 +1,6 @@
-//! The culling of rows against exact boxes: every row that the projection would draw is kept, and few others are.
+//! The culling of rows against the projection kernel: every row that the projection would draw is kept, and few others are.
 
+use crate::support::{paths, random_rotation};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::config::file::TrainConfig;
@@ -26,47 +27,8 @@ use gsscale::train::step::pages::PagedScene;
 use gsscale::train::step::train_step::{StepView, train_step};
 use gsscale::train::step::working_set::WorkingSet;
 
-fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
-    let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let [w, x, y, z] = q.map(|c| c / n);
-    [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-}
-
-fn mul(a: [[f64; 3]; 3], b: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
-    std::array::from_fn(|i| std::array::from_fn(|j| (0..3).map(|k| a[i][k] * b[k][j]).sum()))
-}
-
-/// Whether the 3.33-sigma box of a row meets the image: gsplat's projection in f64.
-fn is_drawn(columns: &Columns, row: usize, camera: &Camera) -> bool {
-    let widen = |c: Column| columns.row(c, row).iter().map(|&x| f64::from(x)).collect::<Vec<_>>();
-    let (p, q, s) = (widen(Column::Means), widen(Column::Quats), widen(Column::Scales));
-    let m = camera.viewmat.map(|r| r.map(f64::from));
-    let t: [f64; 3] = std::array::from_fn(|i| m[i][0] * p[0] + m[i][1] * p[1] + m[i][2] * p[2] + m[i][3]);
-    let [x, y, z] = t;
-    if z <= f64::from(camera.near_plane) || z >= f64::from(camera.far_plane) {
-        return false;
-    }
-    let view = std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]);
-    let mut half = mul(view, rotation([q[0], q[1], q[2], q[3]]));
-    half.iter_mut().for_each(|r| (0..3).for_each(|j| r[j] *= s[j].exp()));
-    let axis = |size: u32, f: f32, c: f32, x: f64, row: usize| {
-        let (size, f, c) = (f64::from(size), f64::from(f), f64::from(c));
-        let margin = 0.3 * 0.5 * size / f;
-        let slope = (x / z).clamp(-(c / f + margin), (size - c) / f + margin);
-        let line: [f64; 3] = std::array::from_fn(|j| f / z * (half[row][j] - slope * half[2][j]));
-        let radius = (3.33 * (line.iter().map(|l| l * l).sum::<f64>() + 0.3).sqrt()).ceil();
-        let mean = f * x / z + c;
-        mean + radius > 0.0 && mean - radius < size
-    };
-    axis(camera.width, camera.fx, camera.cx, x, 0) && axis(camera.height, camera.fy, camera.cy, y, 1)
-}
-
 fn camera(draws: &mut Stream) -> Camera {
-    let r = rotation(std::array::from_fn(|_| draws.normal()));
+    let r = random_rotation(draws);
     let viewmat =
         std::array::from_fn(|i| [r[i][0] as f32, r[i][1] as f32, r[i][2] as f32, (draws.normal() * 4.0) as f32]);
     let (width, height) = (200 + draws.below(400) as u32, 100 + draws.below(400) as u32);
@@ -110,48 +72,27 @@ fn scene(rows: usize, adam: &DeferredAdam) -> SceneState {
 }
 
 #[test]
-fn no_row_that_would_be_drawn_is_left_out() {
-    // A large learning rate, so that rows move far between their last update and now.
-    let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), SimdPath::best());
-    let rows = 3000 + 7;
-    let state = scene(rows, &adam);
-    let mut draws = Stream::new(1, Purpose::Test, 1, 2);
-    let (mut drawn, mut listed, mut out) = (0, 0, Vec::new());
-    for now in 12..72 {
-        let camera = camera(&mut draws);
-        let values = evaluate_all(&[state.view()], 0, &adam, now);
-        visible_rows(&[state.view()], &adam, now, &camera, &mut out);
-        assert!(out.windows(2).all(|pair| pair[0] < pair[1]));
-        listed += out.len();
-        for row in 0..rows {
-            if is_drawn(&values, row, &camera) {
-                drawn += 1;
-                assert!(out.binary_search(&(row as u32)).is_ok(), "row {row} of view {now} is missing");
-            }
-        }
-    }
-    // Culling uses the largest sigma for every direction. That lists a third more rows here, with needles up to the
-    // size of the scene and principal points outside the picture.
-    assert!(drawn > 4000 && listed * 2 < drawn * 3, "{listed} listed for {drawn} drawn");
-}
-
-#[test]
 fn no_row_that_the_projection_kernel_draws_is_left_out() {
     let simd = SimdPath::best();
+    // A large learning rate, so that rows move far between their last update and now.
     let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd);
     let state = scene(20_000, &adam);
     let mut draws = Stream::new(3, Purpose::Test, 1, 2);
-    let (mut drawn, mut out, mut projected) = (0, Vec::new(), Projected::default());
+    let (mut drawn, mut listed, mut out, mut projected) = (0, 0, Vec::new(), Projected::default());
     for now in 12..212 {
         let camera = camera(&mut draws);
         visible_rows(&[state.view()], &adam, now, &camera, &mut out);
+        assert!(out.windows(2).all(|pair| pair[0] < pair[1]));
+        listed += out.len();
         project_fwd(&evaluate_all(&[state.view()], 0, &adam, now), &camera, EPS2D, simd, 0, &mut projected);
         for (row, radii) in projected.radii.iter().enumerate().filter(|(_, r)| **r != [0, 0]) {
             drawn += 1;
             assert!(out.binary_search(&(row as u32)).is_ok(), "row {row} with radii {radii:?} is missing");
         }
     }
-    assert!(drawn > 50_000, "{drawn}");
+    // Culling uses the largest sigma for every direction. That lists a third more rows here, with needles up to the
+    // size of the scene and principal points outside the picture.
+    assert!(drawn > 50_000 && listed * 2 < drawn * 3, "{listed} listed for {drawn} drawn");
 }
 
 /// From pages to picture: rows that were not selected would not have changed one bit of the picture.
@@ -227,7 +168,7 @@ fn lists_do_not_depend_on_threads_or_on_the_instruction_path() {
         })
     };
     let want = lists(SimdPath::Baseline, 1);
-    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+    for simd in paths() {
         assert!(lists(simd, 3) == want, "{}", simd.name());
     }
 }

@@ -2,6 +2,7 @@
 //! row changes no bit.
 
 use crate::support::dense_adam::DenseAdam;
+use crate::support::paths;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::ops::reset_opacity_rows;
@@ -288,7 +289,7 @@ fn the_same_bits_on_every_instruction_path_whatever_happens_to_rows() {
     for (degree, moments) in [(0, Moments::F32), (1, Moments::F32), (2, Moments::Bf16), (3, Moments::F32)] {
         let (plain, state, counts) = eventful_steps(SimdPath::Baseline, degree, moments);
         assert!(counts[0] > 10_000 && counts[1] > 1000, "{counts:?}");
-        for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+        for simd in paths() {
             let (adam, same, same_counts) = eventful_steps(simd, degree, moments);
             assert!(bits_of(&same) == bits_of(&state), "{} at degree {degree}", simd.name());
             assert_eq!(same_counts, counts);
@@ -330,7 +331,7 @@ fn nan_stays_nan_on_every_instruction_path() {
 
 #[test]
 fn every_way_of_reading_gives_the_same_bits() {
-    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+    for simd in paths() {
         let (adam, state, _) = eventful_steps(simd, 3, Moments::F32);
         for now in [60, 61, 77, 459, 460, 461, 5000] {
             let all = evaluate_all(&state, &adam, now);
@@ -377,7 +378,7 @@ fn settling_a_row_keeps_its_later_values() {
 
 #[test]
 fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
-    SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(bad_gradients_leave_their_row_alone);
+    paths().for_each(bad_gradients_leave_their_row_alone);
 }
 
 fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
@@ -410,7 +411,7 @@ fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
 /// A load of a row also reads a little of the next row, and the last row of a table takes a different code path.
 #[test]
 fn a_rows_result_does_not_depend_on_its_neighbours() {
-    SimdPath::ALL.into_iter().filter(|p| p.is_supported()).for_each(rows_beside_it_change_no_bit);
+    paths().for_each(rows_beside_it_change_no_bit);
 }
 
 fn rows_beside_it_change_no_bit(simd: SimdPath) {
@@ -461,7 +462,7 @@ fn rows_beside_it_change_no_bit(simd: SimdPath) {
 
 /// Every case on every SIMD path of this machine.
 fn each_path<T: Clone, const N: usize>(cases: [T; N]) -> impl Iterator<Item = (SimdPath, T)> {
-    let paths = SimdPath::ALL.into_iter().filter(|p| p.is_supported());
+    let paths = paths();
     paths.flat_map(move |simd| cases.clone().map(|case| (simd, case)))
 }
 
@@ -480,7 +481,7 @@ fn a_list_that_does_not_ascend_is_refused_before_any_row_is_changed() {
 /// Rows 3000 to 5200 of a table, processed in pieces.
 #[test]
 fn a_list_that_does_not_fit_the_view_is_refused_before_any_row_is_changed() {
-    for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
+    for simd in paths() {
         let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
         let all: Vec<u32> = (3000..5200).collect();
         let (grads, values) = (grads_at(&all, 3, 0), random_columns(all.len(), 3, 1.0, 5));

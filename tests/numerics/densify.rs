@@ -1,5 +1,4 @@
-//! Densification rounds and resets: decisions equal a plain second implementation, the cap holds, and events give the
-//! same rows when applied on time to the whole scene or late to its parts.
+//! Densification rounds and resets: decisions equal a plain second implementation, the cap holds. (Late events: `storage::pages`.)
 
 use crate::support::apply_event::apply_event;
 use gsscale::base::rng::{Purpose, Stream, hash64};
@@ -7,18 +6,18 @@ use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::stats::{GradHistogram, accumulate};
-use gsscale::densify::strategy::{RoundSteps, RowCount, Strategy};
+use gsscale::densify::strategy::{RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::events::{Event, EventKind, EventLog, RoundThresholds};
+use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
 use gsscale::train::step::catch_up;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::HashMap;
 
 const SEED: u64 = 11;
 
@@ -65,19 +64,6 @@ fn touch(
     }
     take_step(adam, state, &rows, &grads, step);
     accumulate(&mut state.view_mut(), &rows, &v_means2d, &radii, [20, 30], histogram);
-}
-
-/// Every row as (values, moments, stamp, statistics) by uid: these must agree bit for bit.
-fn by_uid(state: &SceneState) -> BTreeMap<u64, Vec<u32>> {
-    let mut rows = BTreeMap::new();
-    for row in 0..state.rows() {
-        let mut bits = vec![state.stamp[row], state.grad2d[row].to_bits(), state.count[row]];
-        for table in [&state.columns, &state.exp_avg, &state.exp_avg_sq] {
-            Column::ALL.iter().for_each(|&c| bits.extend(table.row(c, row).iter().map(|x| x.to_bits())));
-        }
-        assert!(rows.insert(state.uid[row], bits).is_none(), "uid {} twice", state.uid[row]);
-    }
-    rows
 }
 
 #[test]
@@ -136,74 +122,8 @@ fn a_round_does_what_a_plain_implementation_does() {
     assert!(state.grad2d.iter().all(|&g| g == 0.0) && state.count.iter().all(|&n| n == 0));
 }
 
-/// Whether a part of the scene is drawn at a step.
-fn part_is_drawn(part: usize, step: u32) -> bool {
-    hash64(&[part as u64, u64::from(step), 1]).is_multiple_of(23)
-}
-
 fn row_is_drawn(uid: u64, step: u32) -> bool {
     hash64(&[uid, u64::from(step), 2]).is_multiple_of(3)
-}
-
-#[test]
-fn events_applied_late_to_parts_give_the_rows_of_events_applied_on_time() {
-    let (adam, start, parts, steps) = (adam(), scene(1200, 1), 6, 260u32);
-    let config = DefaultStrategy {
-        rounds: RoundSteps { start: 20, stop: 240, every: 30 },
-        reset_every: 70,
-        grow_grad2d: 3e-4,
-        max_gaussians: 1330,
-        ..DefaultStrategy::default()
-    };
-    // On time, the whole scene in one table.
-    let (mut whole, mut log, mut histogram) = (start.clone(), EventLog::default(), GradHistogram::default());
-    let mut part_from_uid: HashMap<u64, usize> = start.uid.iter().map(|&u| (u, u as usize % parts)).collect();
-    for step in 0..steps {
-        touch(&mut whole, &adam, step, &mut histogram, |uid| {
-            part_is_drawn(part_from_uid[&uid], step) && row_is_drawn(uid, step)
-        });
-        let kinds: Vec<EventKind> =
-            config.events_after(step, 1.0, RowCount::unlimited(whole.rows() as u64), &histogram);
-        for kind in kinds {
-            let index = log.push(Event { step, kind });
-            for &uid in &whole.uid {
-                let part = part_from_uid[&uid];
-                for child in 0..2 {
-                    part_from_uid.insert(child_uid(uid, index as u64, child), part);
-                }
-            }
-            apply_event(&mut whole, &adam, SEED, index, &log.events()[index]);
-            if matches!(kind, EventKind::Densify(_)) {
-                histogram.clear();
-            }
-            assert!(whole.rows() <= 1330);
-        }
-    }
-    assert_eq!(log.len(), 10);
-    assert!(whole.uid.iter().filter(|&&uid| uid >= 1200).count() > 100, "hardly anything grew");
-    // Late: each part applies the missed events when it is next drawn, and at the end.
-    let mut late = BTreeMap::new();
-    for part in 0..parts {
-        let mut state = start.clone();
-        let others: Vec<u32> = (0..state.rows()).filter(|row| row % parts != part).map(|row| row as u32).collect();
-        state.remove(&others);
-        let mut applied = 0;
-        let mut catch_up = |state: &mut SceneState, until: u32| {
-            let pending = log.events().iter().enumerate().skip(applied);
-            for (index, event) in pending.filter(|(_, event)| event.now() <= until) {
-                apply_event(state, &adam, SEED, index, event);
-                applied = index + 1;
-            }
-        };
-        for step in (0..steps).filter(|&step| part_is_drawn(part, step)) {
-            catch_up(&mut state, step);
-            let mut own = histogram_of(&state);
-            touch(&mut state, &adam, step, &mut own, |uid| row_is_drawn(uid, step));
-        }
-        catch_up(&mut state, steps);
-        late.extend(by_uid(&state));
-    }
-    assert!(by_uid(&whole) == late);
 }
 
 /// Recounts the histogram of the rows of a table.

@@ -34,17 +34,8 @@ const ROW_MAX: f64 = 1e-3;
 
 pub(super) fn camera() -> Camera {
     // A product of two rotations by 3-4-5 angles: orthonormal up to the rounding of its entries.
-    Camera {
-        viewmat: [[0.8, 0.0, -0.6, 0.25], [0.36, 0.8, 0.48, -0.125], [0.48, -0.6, 0.64, 4.0]],
-        fx: 30.0,
-        fy: 28.0,
-        cx: 16.5,
-        cy: 11.0,
-        width: 32,
-        height: 24,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
+    let viewmat = [[0.8, 0.0, -0.6, 0.25], [0.36, 0.8, 0.48, -0.125], [0.48, -0.6, 0.64, 4.0]];
+    crate::support::camera(viewmat, [30.0, 28.0, 16.5, 11.0], [32, 24])
 }
 
 /// Parameters of a random scene.
@@ -269,17 +260,7 @@ fn fixture_rows(file: &Fixture) -> Rows64 {
 fn the_second_renderer_draws_the_fixtures() {
     for name in ["single", "small", "odd_bg", "white_bg", "stress"] {
         let Some(file) = Fixture::open(&format!("raster_{name}")) else { return };
-        let (m, k, wh) = (file.f32("viewmat"), file.f32("K"), file.f64("wh"));
-        let camera = Camera {
-            viewmat: std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j])),
-            fx: k[0],
-            fy: k[4],
-            cx: k[2],
-            cy: k[5],
-            width: wh[0] as u32,
-            height: wh[1] as u32,
-            ..camera()
-        };
+        let camera = file.camera();
         let settings = Settings {
             sh_degree: file.metadata["sh_degree"].parse().unwrap(),
             max_alpha: file.metadata["max_alpha"].parse().unwrap(),

@@ -129,7 +129,7 @@ const INPUTS: [(&str, &str, &[&str]); 27] = [
     (
         "resets and rounds while a row sleeps",
         "late equals on time",
-        &["events_applied_late_to_parts_give_the_rows_of_events_applied_on_time"],
+        &["events_that_pages_replay_late_give_the_rows_of_events_applied_at_once"],
     ),
     (
         "the same run again, with more threads",
@@ -197,8 +197,7 @@ fn renderers() -> Vec<Box<dyn Renderer>> {
 
 fn camera(width: u32, height: u32) -> Camera {
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-    let (cx, cy) = (0.5 * width as f32, 0.5 * height as f32);
-    Camera { viewmat, fx: 60.0, fy: 60.0, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 }
+    crate::support::camera(viewmat, [60.0, 60.0, 0.5 * width as f32, 0.5 * height as f32], [width, height])
 }
 
 /// Grey Gaussians of size e^-3 at these places, of this logit opacity.

@@ -1,5 +1,6 @@
 //! The visibility test of pages against the test of rows: every row that the row test would draw lies in a listed page.
 
+use crate::support::random_rotation;
 use gsscale::base::ids::{PageId, PageNo};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::scene::camera::Camera;
@@ -25,21 +26,10 @@ fn meta(page: usize, bounds: PageBounds) -> PageMeta {
     PageMeta { id: PageId::initial(page as u32), rows: 1, sh_degree: 0, events_applied: 0, bounds }
 }
 
-fn rotation(draws: &mut Stream) -> [[f64; 3]; 3] {
-    let q: [f64; 4] = std::array::from_fn(|_| draws.normal());
-    let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let [w, x, y, z] = q.map(|c| c / n);
-    [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-}
-
 /// A random camera: any direction, wide to narrow, principal points up to far outside the image, small and large
 /// worlds.
 fn camera(draws: &mut Stream) -> Camera {
-    let r = rotation(draws);
+    let r = random_rotation(draws);
     let far_out = libm::pow(10.0, draws.range(-1.0, 4.0));
     let viewmat =
         std::array::from_fn(|i| [r[i][0] as f32, r[i][1] as f32, r[i][2] as f32, (draws.normal() * far_out) as f32]);
@@ -152,32 +142,5 @@ fn pages_without_rows_are_never_needed_and_unusable_bounds_always() {
             let kinds: [usize; 4] = std::array::from_fn(|kind| list.iter().filter(|p| p.index() % 4 == kind).count());
             assert_eq!(kinds, [0, pages / 4, pages / 4, pages / 4]);
         }
-    }
-}
-
-/// Prints times: `GSSCALE_TIMES=1 cargo nextest run --test numerics --no-capture visibility::times`. Without the variable the
-/// test does nothing.
-#[test]
-fn times() {
-    if std::env::var_os("GSSCALE_TIMES").is_none() {
-        return;
-    }
-    let mut draws = Stream::new(4, Purpose::Test, 40, 0);
-    for pages in [28_000, 1_000_000] {
-        let page = |p: usize| {
-            let at: [f32; 3] = std::array::from_fn(|_| (100.0 * draws.normal()) as f32);
-            let bounds = PageBounds { lo: at, hi: at.map(|x| x + 1.0), sigma_max: 0.1 };
-            meta(p, bounds)
-        };
-        let index: Vec<PageMeta> = (0..pages).map(page).collect();
-        let mut view = camera(&mut draws);
-        let (mut list, mut best) = (Vec::new(), f64::INFINITY);
-        (0..3).for_each(|i| view.viewmat[i][3] = 0.0);
-        for _ in 0..20 {
-            let began = std::time::Instant::now();
-            visible_pages(&index, &view, &mut list);
-            best = best.min(began.elapsed().as_secs_f64());
-        }
-        println!("{pages} pages: {:.3} ms, {} needed", 1e3 * best, list.len());
     }
 }

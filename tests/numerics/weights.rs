@@ -1,6 +1,7 @@
 //! Blending weights of rows, alone and times the squared error of the picture, against the second renderer in f64.
 
 use crate::gradients::{FAINT, OPAQUE, Recipe, camera};
+use crate::support::paths;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::render::cpu::CpuRenderer;
@@ -56,7 +57,7 @@ fn check(recipe: &Recipe, target: &Target, simd: SimdPath) {
 
 #[test]
 fn weights_of_rows_are_those_of_a_plain_renderer() {
-    for simd in SimdPath::ALL.into_iter().filter(|path| path.is_supported()) {
+    for simd in paths() {
         for is_masked in [false, true] {
             let target = photo(is_masked);
             check(&FAINT, &target, simd);

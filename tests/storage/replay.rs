@@ -103,29 +103,6 @@ fn miss(run: &Replay) -> f64 {
     1.0 - run.figures(run.steady()).hit_rate
 }
 
-/// The table of the design, on two surveys. `GSSCALE_TABLES=1 cargo nextest run --test storage --no-capture replay::table`
-#[test]
-fn table() {
-    if std::env::var_os("GSSCALE_TABLES").is_none() {
-        return;
-    }
-    for (name, tilt) in [("vertical", 0.0), ("tilted", 0.7)] {
-        let survey = survey(1000, 64, 0.07, tilt);
-        let pages = ViewPages::new(&survey.index, &survey.cameras);
-        let share = pages.total() as f64 / (survey.cameras.len() * survey.index.len()) as f64;
-        println!("{name}: a view sees {share:.3} of the pages, at most {}", pages.most());
-        for order in ["shuffle", "groups:4", "groups:9", "groups:16", "groups:25", "groups:49", "groups:100", "tour"] {
-            let cells = [0.13, 0.25, 0.5].map(|cache| {
-                let [b, l] = [EvictPolicy::FarthestNextUse, EvictPolicy::LeastRecentlyUsed]
-                    .map(|p| run(&survey, &pages, order.parse().unwrap(), p, cache, 4));
-                assert!(b.is_exact);
-                format!("{:.3} / {:.3}", miss(&l), miss(&b))
-            });
-            println!("| {order} | {} |", cells.join(" | "));
-        }
-    }
-}
-
 #[test]
 fn orders_and_policies_read_in_the_order_of_the_design() {
     let survey = survey(400, 32, 0.07, 0.0);

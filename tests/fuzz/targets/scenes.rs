@@ -7,54 +7,26 @@ use gsscale::dataset::paths::{MAX_NAME_BYTES, read_name};
 use std::path::Path;
 use tempfile::TempDir;
 
+#[allow(dead_code)] // other tests use all of it
+#[path = "../../inputs/readers/write.rs"]
+mod write;
+
 const MEMORY: [u64; 2] = [2 << 20, 60];
 const FILES: [&str; 3] = ["cameras", "images", "points3D"];
 
-fn binary_files(name: &[u8]) -> [Vec<u8>; 3] {
-    let u64s = |n: u64| n.to_le_bytes().to_vec();
-    let mut cameras = u64s(2);
-    for (id, model, params) in
-        [(1u32, 1i32, vec![500.0f64, 510.0, 320.0, 240.0]), (7, 3, vec![300.0, 160.0, 100.0, 0.1, 0.0])]
-    {
-        cameras.extend(id.to_le_bytes());
-        cameras.extend(model.to_le_bytes());
-        cameras.extend([u64s(640), u64s(480)].concat());
-        cameras.extend(params.iter().flat_map(|p| p.to_le_bytes()));
+/// The three files of a model, whose first image has this name.
+fn model_files(name: &[u8], extension: &str) -> [Vec<u8>; 3] {
+    let mut model = write::model(20);
+    model.images.truncate(3);
+    if extension == "bin" {
+        model.images[0].name = name.to_vec();
+        return [model.cameras_bin(), model.images_bin(), model.points_bin()];
     }
-    let mut images = u64s(3);
-    for (i, name) in [name, b"a b.jpg", b"sub/c.png"].into_iter().enumerate() {
-        images.extend((i as u32 + 1).to_le_bytes());
-        images.extend([0.9, 0.1, -0.2, 0.3, 1.0, -0.5, 2.0f64].iter().flat_map(|x| x.to_le_bytes()));
-        images.extend([1u32, 7, 1][i].to_le_bytes());
-        images.extend_from_slice(name);
-        images.push(0);
-        images.extend(u64s(i as u64));
-        images.extend(vec![0; 24 * i]);
-    }
-    let mut points = u64s(20);
-    for i in 0..20u64 {
-        points.extend(u64s(i));
-        points.extend([i as f64, 0.5, -1.5].iter().flat_map(|x| x.to_le_bytes()));
-        points.extend([1, 2, 3]);
-        points.extend(0.7f64.to_le_bytes());
-        points.extend(u64s(i % 3));
-        points.extend(vec![0; 8 * (i % 3) as usize]);
-    }
-    [cameras, images, points]
-}
-
-fn text_files(name: &[u8]) -> [Vec<u8>; 3] {
-    let cameras = b"# Camera list\n# Number of cameras: 2\n1 PINHOLE 640 480 500 510 320 240\n7 RADIAL 640 480 300 160 100 0.1 0\n";
-    let mut images = b"# Number of images: 3, mean\n1 0.9 0.1 -0.2 0.3 1 -0.5 2 1 ".to_vec();
-    images.extend_from_slice(name);
-    images.extend_from_slice(
-        b"\n\n2 1 0 0 0 0 0 0 7 a b.jpg\n1.5 2.5 -1\n3 1 0 0 0 0 0 1e1 1 sub/c.png\n0.5 1.5 3 2 3 -1\n",
-    );
-    let mut points = b"# Number of points: 20\n".to_vec();
-    for i in 0..20 {
-        points.extend(format!("{i} {i}.25 0.5 -1.5 1 2 3 0.7 1 2\n").bytes());
-    }
-    [cameras.to_vec(), images, points]
+    model.images[0].name = b"NAME".to_vec();
+    let images = model.images_txt();
+    let (before, after) = images.split_once("NAME").unwrap();
+    let images = [before.as_bytes(), name, after.as_bytes()].concat();
+    [model.cameras_txt().into_bytes(), images, model.points_txt().into_bytes()]
 }
 
 /// A scene with these model files.
@@ -70,25 +42,25 @@ fn scene_of(files: &[Vec<u8>; 3], extension: &str) -> TempDir {
 }
 
 /// The first byte selects the model file that the rest replaces.
-fn run_model(input: &[u8], mut files: [Vec<u8>; 3], extension: &str) {
-    let (mode, rest) = split_mode(input);
+fn run_model(input: &[u8], extension: &str) {
+    let ((mode, rest), mut files) = (split_mode(input), model_files(b"b.jpg", extension));
     files[usize::from(mode % 3)] = rest.to_vec();
     read_and_check(scene_of(&files, extension).path());
 }
 
-fn model_seeds(files: &[Vec<u8>; 3]) -> Vec<Vec<u8>> {
-    files.iter().zip(0..).map(|(file, mode)| with_mode(mode, file)).collect()
+fn model_seeds(extension: &str) -> Vec<Vec<u8>> {
+    model_files(b"b.jpg", extension).iter().zip(0..).map(|(file, mode)| with_mode(mode, file)).collect()
 }
 
 pub fn colmap_binary() -> Target {
-    let run = |input: &[u8]| run_model(input, binary_files(b"b.jpg"), "bin");
-    let seeds = model_seeds(&binary_files(b"b.jpg"));
+    let run = |input: &[u8]| run_model(input, "bin");
+    let seeds = model_seeds("bin");
     Target { name: "colmap_binary", run, seeds, words: &["../", "\0"], cases: 3_000, memory: MEMORY }
 }
 
 pub fn colmap_text() -> Target {
-    let run = |input: &[u8]| run_model(input, text_files(b"b.jpg"), "txt");
-    let seeds = model_seeds(&text_files(b"b.jpg"));
+    let run = |input: &[u8]| run_model(input, "txt");
+    let seeds = model_seeds("txt");
     let words = &["OPENCV", "FOV", "FULL_OPENCV", "# Number of images: 9\n", "\n\n", "\u{feff}", "../", "\t", " "];
     Target { name: "colmap_text", run, seeds, words, cases: 3_000, memory: MEMORY }
 }
@@ -206,8 +178,9 @@ fn run_name(input: &[u8]) {
             assert_eq!(read_name("", tail).map(|n| (n.name, n.outside)), Ok((tail.to_string(), None)));
         }
     }
-    read_and_check(scene_of(&binary_files(input), "bin").path());
-    read_and_check(scene_of(&text_files(input), "txt").path());
+    for extension in ["bin", "txt"] {
+        read_and_check(scene_of(&model_files(input, extension), extension).path());
+    }
     let text = serde_json::json!({
         "w": 64, "h": 48, "fl_x": 60, "ply_file_path": name,
         "frames": [{"file_path": name, "mask_path": name,

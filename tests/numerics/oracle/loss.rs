@@ -2,6 +2,7 @@
 //! neither separable nor tiled) on odd sizes with masks. Finite differences of that SSIM give its gradient.
 
 use crate::support::fixture::Fixture;
+use crate::support::paths;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::image_loss::{ImageLoss, ImagePair, Reference, SsimVariant, mean_ssim};
@@ -11,17 +12,8 @@ use gsscale::scene::image::{Image, Target};
 
 const FILES: [&str; 5] = ["loss_edge", "loss_noise", "loss_smooth", "loss_tiny", "loss_u8gt"];
 
-fn supported_paths() -> impl Iterator<Item = SimdPath> {
-    SimdPath::ALL.into_iter().filter(|path| path.is_supported())
-}
-
 fn options(ssim_lambda: f32, padding: SsimPadding, simd: SimdPath) -> LossOptions {
     LossOptions { ssim_lambda, padding, simd }
-}
-
-/// `[H, W, 3]` to `[3, H, W]`.
-fn planar(interleaved: &[f32]) -> Vec<f32> {
-    (0..3).flat_map(|c| interleaved.iter().skip(c).step_by(3).copied()).collect()
 }
 
 /// Largest difference relative to the largest magnitude of `want`.
@@ -40,7 +32,7 @@ fn assert_value(fixture: &Fixture, name: &str, got: f64, context: &str) {
 
 /// 5e-4 of the largest entry is the README's limit (measured f32 error of a reference: 6e-5).
 fn assert_gradient(fixture: &Fixture, name: &str, got: &[f32], context: &str) {
-    let worst = worst(got, &planar(&fixture.f32(name)));
+    let worst = worst(got, &fixture.planar(name));
     assert!(worst < 5e-4, "{context} {name}: worst error {worst} of the largest entry");
 }
 
@@ -49,11 +41,11 @@ fn values_and_gradients_match_the_fixtures() {
     for file in FILES {
         let Some(fixture) = Fixture::open(file) else { return };
         let (height, width) = (fixture.shape("img")[0], fixture.shape("img")[1]);
-        let (rgb, gt) = (planar(&fixture.f32("img")), planar(&fixture.f32("gt")));
+        let (rgb, gt) = (fixture.planar("img"), fixture.planar("gt"));
         let pair = ImagePair { width, height, rgb: &rgb, reference: Reference::Planar(&gt), mask: None, clamp: false };
         let lambda = fixture.f64("lambda")[0] as f32;
         let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
-        for path in supported_paths() {
+        for path in paths() {
             let context = format!("{file} {}", path.name());
             let mut run = |lambda, padding| {
                 let value = loss.pair_value_and_gradient(&pair, &options(lambda, padding, path), &mut v);
@@ -79,6 +71,12 @@ fn values_and_gradients_match_the_fixtures() {
             let psnr = -10.0 * libm::log10(same.mse);
             assert!((psnr - fixture.f64("val_psnr")[0]).abs() < 1e-4, "{context} psnr {psnr}");
         }
+        // metrics::psnr takes 8-bit photos only; the definition is checked on the slices it is made from.
+        let [rgb, gt] = [&rgb, &gt].map(|values| values.iter().map(|v| v.clamp(0.0, 1.0)).collect::<Vec<f32>>());
+        let pair = ImagePair { rgb: &rgb, reference: Reference::Planar(&gt), ..pair };
+        let options = options(0.2, SsimPadding::Same, SimdPath::best());
+        let psnr = -10.0 * libm::log10(loss.pair_value_and_gradient(&pair, &options, &mut v).mse);
+        assert!((psnr - fixture.f64("val_psnr_clamped")[0]).abs() < 1e-4, "{file}: {psnr}");
     }
 }
 
@@ -91,7 +89,7 @@ fn metrics_match_the_fixture_with_an_8_bit_photo() {
         assert_eq!(f32::from(*byte) / 255.0, value, "the fixture's photo is 8-bit");
     }
     let target = Target { width, height, rgb: bytes, mask: None };
-    let image = Image { width, height, rgb: planar(&fixture.f32("img")) };
+    let image = Image { width, height, rgb: fixture.planar("img") };
     let psnr = metrics::psnr(&image, &target);
     assert!((psnr - fixture.f64("val_psnr_clamped")[0]).abs() < 1e-4, "psnr {psnr}");
     let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
@@ -105,27 +103,6 @@ fn metrics_match_the_fixture_with_an_8_bit_photo() {
     for variant in SsimVariant::ALL {
         let (got, want) = (metrics::ssim(&image, &target, variant, SimdPath::best()), by_hand.direct_ssim(variant));
         assert!((got - want).abs() < 1e-5, "{variant}: {got}, want {want}");
-    }
-}
-
-#[test]
-fn clamped_psnr_matches_every_fixture() {
-    for file in FILES {
-        let Some(fixture) = Fixture::open(file) else { return };
-        // metrics::psnr takes 8-bit photos only; the definition is checked on the slices it is made from.
-        let (rgb, gt) = (fixture.f32("img"), fixture.f32("gt"));
-        let clamped: Vec<f32> = planar(&rgb).iter().map(|v| v.clamp(0.0, 1.0)).collect();
-        let (height, width) = (fixture.shape("img")[0], fixture.shape("img")[1]);
-        let gt = planar(&gt).iter().map(|v| v.clamp(0.0, 1.0)).collect::<Vec<_>>();
-        let pair =
-            ImagePair { width, height, rgb: &clamped, reference: Reference::Planar(&gt), mask: None, clamp: false };
-        let value = ImageLoss::default().pair_value_and_gradient(
-            &pair,
-            &options(0.2, SsimPadding::Same, SimdPath::best()),
-            &mut Vec::new(),
-        );
-        let psnr = -10.0 * libm::log10(value.mse);
-        assert!((psnr - fixture.f64("val_psnr_clamped")[0]).abs() < 1e-4, "{file}: {psnr}");
     }
 }
 
@@ -302,7 +279,7 @@ fn bits(case: &Case, path: SimdPath) -> (Vec<u32>, [u64; 4], u64) {
 #[test]
 fn the_bits_do_not_depend_on_threads() {
     let case = Case::new(300, 201, true);
-    for path in supported_paths() {
+    for path in paths() {
         let run = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
             pool.install(|| bits(&case, path))

@@ -5,6 +5,7 @@
 
 use crate::support::fixture::Fixture;
 use crate::support::reference64::{Rows64, Settings, project};
+use crate::support::{camera, random_rotation};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::project_bwd::{GeometryGradient, geometry_vjp, project_bwd};
@@ -46,7 +47,7 @@ struct Scene {
 impl Scene {
     fn open(name: &str) -> Option<Scene> {
         let file = Fixture::open(&format!("projection_{name}"))?;
-        let camera = camera_of(&file);
+        let camera = file.camera();
         let rows = file.shape("means")[0];
         Some(Scene { file, camera, rows })
     }
@@ -93,21 +94,6 @@ impl Scene {
     }
 }
 
-pub(crate) fn camera_of(file: &Fixture) -> Camera {
-    let (m, k, wh) = (file.f32("viewmat"), file.f32("K"), file.f64("wh"));
-    Camera {
-        viewmat: std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j])),
-        fx: k[0],
-        fy: k[4],
-        cx: k[2],
-        cy: k[5],
-        width: wh[0] as u32,
-        height: wh[1] as u32,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
-}
-
 fn norm(x: &[f64]) -> f64 {
     x.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
@@ -140,13 +126,7 @@ fn visibility_and_boxes_agree() {
 
 /// A camera of some size that looks at the origin's surroundings from a random side.
 fn random_camera(draws: &mut Stream, width: u32, height: u32) -> Camera {
-    let q: [f64; 4] = std::array::from_fn(|_| draws.normal());
-    let [w, x, y, z] = q.map(|c| c / norm(&q));
-    let rotation = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ];
+    let rotation = random_rotation(draws);
     let mut viewmat = [[0.0f32; 4]; 3];
     for i in 0..3 {
         for j in 0..3 {
@@ -156,17 +136,8 @@ fn random_camera(draws: &mut Stream, width: u32, height: u32) -> Camera {
     }
     let focal = f64::from(width) * draws.range(0.7, 1.5);
     let off = |size: u32, draws: &mut Stream| (f64::from(size) * draws.range(0.4, 0.6)) as f32;
-    Camera {
-        viewmat,
-        fx: focal as f32,
-        fy: (focal * 1.02) as f32,
-        cx: off(width, draws),
-        cy: off(height, draws),
-        width,
-        height,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
+    let principal = [off(width, draws), off(height, draws)];
+    camera(viewmat, [focal as f32, (focal * 1.02) as f32, principal[0], principal[1]], [width, height])
 }
 
 /// Rows in front of a camera, of 0.1 to 400 pixels and all shapes down to 1:20, some beyond the picture's edges.

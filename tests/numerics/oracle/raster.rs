@@ -1,25 +1,13 @@
 //! The renderer, forward and backward, against the float64 reference, and a short training run.
 
-use super::projection::camera_of;
-use crate::support::fixture::Fixture;
+use crate::support::fixture::{Fixture, RASTER_FILES, split_sh};
+use crate::support::paths;
 use gsscale::base::simd::SimdPath;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, PictureGradient, RenderOptions, Renderer, SsimPadding};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
-
-const FILES: [&str; 9] = [
-    "raster_single",
-    "raster_small",
-    "raster_odd_bg",
-    "raster_white_bg",
-    "raster_stress",
-    "raster_large",
-    "raster_dense_a990",
-    "raster_dense_a999",
-    "garden",
-];
 
 /// The reference run in f32 is up to 6e-6 off; the README beside the files suggests this (and 2e-3 for the stress file,
 /// which a determinant from minors makes unnecessary).
@@ -40,39 +28,11 @@ struct Scene {
     options: RenderOptions,
 }
 
-/// Splits `[rows][K][3]` coefficients into the constant band and the others.
-fn split_sh(sh: &[f32], rows: usize) -> (Vec<f32>, Vec<f32>) {
-    let width = sh.len() / rows;
-    let sh0 = sh.chunks_exact(width).flat_map(|r| r[..3].to_vec()).collect();
-    let sh_n = sh.chunks_exact(width).flat_map(|r| r[3..].to_vec()).collect();
-    (sh0, sh_n)
-}
-
 impl Scene {
     fn open(name: &str) -> Option<Scene> {
         let file = Fixture::open(name)?;
-        let n = file.shape("means")[0];
-        let sh_degree: u8 = file.metadata["sh_degree"].parse().unwrap();
-        let (sh0, sh_n) = split_sh(&file.f32("sh"), n);
-        let rows = Columns {
-            sh_degree,
-            means: file.f32("means"),
-            quats: file.f32("quats"),
-            scales: file.f64("scales").iter().map(|&s| libm::log(s) as f32).collect(),
-            opacities: file.f64("opacities").iter().map(|&o| libm::log(o / (1.0 - o)) as f32).collect(),
-            sh0,
-            sh_n,
-        };
-        let background = file.f32("background").try_into().unwrap();
-        let max_alpha = file.metadata["max_alpha"].parse().unwrap();
-        let options = RenderOptions { sh_degree, max_alpha, background, ..RenderOptions::default() };
-        Some(Scene { camera: camera_of(&file), file, rows, options })
-    }
-
-    /// `[height][width][3]` to `[3][height][width]`.
-    fn planar(&self, name: &str) -> Vec<f32> {
-        let interleaved = self.file.f32(name);
-        (0..3).flat_map(|c| interleaved.iter().skip(c).step_by(3).copied().collect::<Vec<_>>()).collect()
+        let (rows, camera, options) = file.scene();
+        Some(Scene { file, rows, camera, options })
     }
 
     /// Own gradients from the file's upstream.
@@ -80,7 +40,7 @@ impl Scene {
         let mut renderer = CpuRenderer::new();
         renderer.draw(&self.rows, &self.camera, &self.options).unwrap();
         let mut grads = Gradients::default();
-        let (v_rgb, v_alpha) = (self.planar("v_rgb"), Some(self.file.f32("v_alpha").to_vec()));
+        let (v_rgb, v_alpha) = (self.file.planar("v_rgb"), Some(self.file.f32("v_alpha").to_vec()));
         *renderer.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
         renderer.backpropagate(&self.rows, &mut grads).unwrap();
         grads
@@ -119,11 +79,6 @@ fn own_gradients(grads: &Gradients, sh_width: usize) -> Vec<Vec<f32>> {
     ]
 }
 
-/// The instruction paths of this machine.
-fn paths() -> impl Iterator<Item = SimdPath> {
-    SimdPath::ALL.into_iter().filter(|path| path.is_supported())
-}
-
 /// Pictures and gradients as bits. A run may go on with another path of its class, so no bit may tell them apart.
 #[test]
 fn the_paths_of_a_class_give_the_same_bits() {
@@ -131,7 +86,7 @@ fn the_paths_of_a_class_give_the_same_bits() {
         println!("SKIPPED: this machine lacks AVX-512 or AVX2");
         return;
     }
-    for name in FILES {
+    for name in RASTER_FILES {
         let Some(mut scene) = Scene::open(name) else { return };
         let mut bits = |simd: SimdPath| -> Vec<u32> {
             scene.options.simd = simd;
@@ -148,7 +103,7 @@ fn the_paths_of_a_class_give_the_same_bits() {
 
 #[test]
 fn pictures_agree() {
-    for name in FILES {
+    for name in RASTER_FILES {
         let Some(mut scene) = Scene::open(name) else { return };
         for simd in paths() {
             scene.options.simd = simd;
@@ -166,7 +121,7 @@ fn worst_pixel(scene: &Scene) -> (f64, usize) {
     renderer.draw(&scene.rows, &scene.camera, &scene.options).unwrap();
     let image = renderer.image().unwrap().clone();
     let (ambiguous, terminated) = (scene.file.f64("ambiguous"), scene.file.f64("terminated"));
-    let (rgb, alpha) = (scene.planar("rgb"), scene.file.f64("alpha"));
+    let (rgb, alpha) = (scene.file.planar("rgb"), scene.file.f64("alpha"));
     let (width, pixels) = (scene.camera.width as usize, scene.camera.pixels());
     let (mut worst, mut compared) = (0.0f64, 0);
     for p in (0..pixels).filter(|&p| ambiguous[p] == 0.0) {
@@ -184,7 +139,7 @@ fn worst_pixel(scene: &Scene) -> (f64, usize) {
 
 #[test]
 fn gradients_agree_end_to_end() {
-    for name in FILES {
+    for name in RASTER_FILES {
         let Some(mut scene) = Scene::open(name) else { return };
         let want = scene.gradients();
         for simd in paths() {
@@ -287,7 +242,7 @@ fn a_short_training_run_follows_the_reference() {
         sh0,
         sh_n,
     };
-    let camera = camera_of(&file);
+    let camera = file.camera();
     // The file's target is quantised to k / 255.
     let rgb = file.f64("target").iter().map(|x| (x * 255.0).round() as u8).collect();
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };

@@ -1,5 +1,6 @@
 //! Spherical harmonics, forward and backward, against the float64 reference.
 
+use crate::support::camera;
 use crate::support::fixture::Fixture;
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::sh_bwd::sh_bwd;
@@ -12,17 +13,7 @@ const TOLERANCE: f64 = 2e-6;
 
 /// A camera at the origin, so that a row's mean is its viewing direction.
 fn camera_at_origin() -> Camera {
-    Camera {
-        viewmat: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
-        fx: 1.0,
-        fy: 1.0,
-        cx: 0.0,
-        cy: 0.0,
-        width: 1,
-        height: 1,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
+    camera([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], [1.0, 1.0, 0.0, 0.0], [1, 1])
 }
 
 /// Rows of the fixture stored with `stored` bands, the bands above the fixture's own filled with a value that must

@@ -4,7 +4,8 @@
 //! a pixel adds up to a few hundred of them. Rarely, a rounding flips a decision (one tile more, a stop one Gaussian
 //! later). Such a pixel may differ by the threshold of that decision, at most 1/255 of a colour.
 
-use crate::support::fixture::Fixture;
+use crate::support::camera;
+use crate::support::fixture::{Fixture, RASTER_FILES, split_sh};
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::gpu::{FaultKind, GpuError, GpuOptions, InjectedFault};
@@ -16,7 +17,6 @@ use gsscale::render::{
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::{Image, Target};
-use std::ops::Range;
 
 pub fn renderer(options: &GpuOptions) -> Option<GpuRenderer> {
     open(options).map(|gpu| GpuRenderer::new(gpu).unwrap())
@@ -32,18 +32,20 @@ pub fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
     c.opacities.fill_with(|| draws.range(-6.0, 7.0) as f32);
     c.sh0.iter_mut().chain(&mut c.sh_n).for_each(|x| *x = 0.5 * draws.normal() as f32);
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
-    let (fx, fy, cx, cy) = (60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
+    (c, camera(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }
 
-/// The rows `place` of a table.
-fn part_of(rows: &Columns, place: Range<usize>) -> Columns {
-    let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
-    for column in Column::ALL {
-        let width = column.width(rows.sh_degree);
-        *part.column_mut(column) = rows.column(column)[place.start * width..place.end * width].to_vec();
-    }
-    part
+/// The rows of a table in batches that end at `ends`, the first of which is where they begin.
+pub fn batches_of(rows: &Columns, ends: &[usize]) -> Vec<Columns> {
+    let batch = |ends: &[usize]| {
+        let mut batch = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
+        for column in Column::ALL {
+            let width = column.width(rows.sh_degree);
+            *batch.column_mut(column) = rows.column(column)[ends[0] * width..ends[1] * width].to_vec();
+        }
+        batch
+    };
+    ends.windows(2).map(batch).collect()
 }
 
 /// A smooth photo with a hole in its mask.
@@ -347,10 +349,9 @@ fn batches_of_rows_change_no_bit() {
     let (rows, camera) = scene(3000, 100, 70);
     let (target, options) = (photo(100, 70, true), RenderOptions::default());
     let loss = LossOptions::default();
-    let part = |place: Range<usize>| part_of(&rows, place);
     let bits = |values: &[f32]| values.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
     let mut run = |ends: &[usize], how: RowBatches| {
-        let batches: Vec<Columns> = ends.windows(2).map(|ends| part(ends[0]..ends[1])).collect();
+        let batches = batches_of(&rows, ends);
         gpu.begin_view(&camera, &options, how).unwrap();
         batches.iter().for_each(|batch| gpu.rows_in(batch).unwrap());
         gpu.picture().unwrap();
@@ -468,63 +469,14 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
     assert_eq!(gpu.frames_rerecorded(), 1);
 }
 
-/// The reference files: see `tests/numerics/oracle/raster.rs`, whose limits are those of the files' README.
-const FILES: [&str; 9] = [
-    "raster_single",
-    "raster_small",
-    "raster_odd_bg",
-    "raster_white_bg",
-    "raster_stress",
-    "raster_large",
-    "raster_dense_a990",
-    "raster_dense_a999",
-    "garden",
-];
-
-fn open_reference(name: &str) -> Option<(Fixture, Columns, Camera, RenderOptions)> {
-    let file = Fixture::open(name)?;
-    let sh_degree: u8 = file.metadata["sh_degree"].parse().unwrap();
-    let rows = file.shape("means")[0];
-    let (sh, width) = (file.f32("sh"), file.f64("sh").len() / rows);
-    let columns = Columns {
-        sh_degree,
-        means: file.f32("means"),
-        quats: file.f32("quats"),
-        scales: file.f64("scales").iter().map(|&s| libm::log(s) as f32).collect(),
-        opacities: file.f64("opacities").iter().map(|&o| libm::log(o / (1.0 - o)) as f32).collect(),
-        sh0: sh.chunks_exact(width).flat_map(|r| r[..3].to_vec()).collect(),
-        sh_n: sh.chunks_exact(width).flat_map(|r| r[3..].to_vec()).collect(),
-    };
-    let (m, k, wh) = (file.f32("viewmat"), file.f32("K"), file.f64("wh"));
-    let camera = Camera {
-        viewmat: std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j])),
-        fx: k[0],
-        fy: k[4],
-        cx: k[2],
-        cy: k[5],
-        width: wh[0] as u32,
-        height: wh[1] as u32,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    };
-    let background = file.f32("background").try_into().unwrap();
-    let max_alpha = file.metadata["max_alpha"].parse().unwrap();
-    let options = RenderOptions { sh_degree, max_alpha, background, ..RenderOptions::default() };
-    Some((file, columns, camera, options))
-}
-
-/// `[height][width][3]` to `[3][height][width]`.
-fn planar(values: &[f32]) -> Vec<f32> {
-    (0..3).flat_map(|c| values.iter().skip(c).step_by(3).copied().collect::<Vec<_>>()).collect()
-}
-
 #[test]
 fn views_are_those_of_the_reference() {
     let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
-    for name in FILES {
-        let Some((file, rows, camera, options)) = open_reference(name) else { return };
+    for name in RASTER_FILES {
+        let Some(file) = Fixture::open(name) else { return };
+        let (rows, camera, options) = file.scene();
         gpu.draw(&rows, &camera, &options).unwrap();
-        let (rgb, want) = (gpu.image().unwrap().rgb.clone(), planar(&file.f32("rgb")));
+        let (rgb, want) = (gpu.image().unwrap().rgb.clone(), file.planar("rgb"));
         let (alpha, want_alpha) = (gpu.alpha().unwrap(), file.f64("alpha"));
         let (ambiguous, pixels) = (file.f64("ambiguous"), camera.pixels());
         for p in (0..pixels).filter(|&p| ambiguous[p] == 0.0) {
@@ -535,7 +487,7 @@ fn views_are_those_of_the_reference() {
             assert!((f64::from(alpha[p]) - want_alpha[p]).abs() < 5e-5, "{name}: coverage of pixel {p}");
         }
         let mut grads = Gradients::default();
-        let (v_rgb, v_alpha) = (planar(&file.f32("v_rgb")), Some(file.f32("v_alpha").to_vec()));
+        let (v_rgb, v_alpha) = (file.planar("v_rgb"), Some(file.f32("v_alpha").to_vec()));
         *gpu.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
         gpu.backpropagate(&rows, &mut grads).unwrap();
         assert_gradients(name, &file, &grads);
@@ -547,10 +499,7 @@ fn assert_gradients(name: &str, file: &Fixture, grads: &Gradients) {
     let scales: Vec<f32> = file.f64("g_scales").iter().zip(file.f64("scales")).map(|(g, s)| (g * s) as f32).collect();
     let logits = file.f64("g_opacities").iter().zip(file.f64("opacities"));
     let opacities: Vec<f32> = logits.map(|(g, o)| (g * o * (1.0 - o)) as f32).collect();
-    let sh = file.f32("g_sh");
-    let width = sh.len() / c.rows();
-    let sh0: Vec<f32> = sh.chunks_exact(width).flat_map(|r| r[..3].to_vec()).collect();
-    let sh_n: Vec<f32> = sh.chunks_exact(width).flat_map(|r| r[3..].to_vec()).collect();
+    let (sh0, sh_n) = split_sh(&file.f32("g_sh"), c.rows());
     for (column, got, want) in [
         ("means2d", grads.means2d.as_flattened(), &file.f32("g_means2d")),
         ("means", &c.means[..], &file.f32("g_means")),
@@ -578,7 +527,7 @@ fn unusable_gradients_are_counted_on_both_devices() {
             RowBatches::One => vec![0, rows.rows()],
             RowBatches::Several => vec![0, half, rows.rows()],
         };
-        let parts: Vec<Columns> = cuts.windows(2).map(|cut| part_of(&rows, cut[0]..cut[1])).collect();
+        let parts = batches_of(&rows, &cuts);
         renderer.begin_view(&camera, &RenderOptions::default(), batches).unwrap();
         parts.iter().for_each(|part| renderer.rows_in(part).unwrap());
         renderer.picture().unwrap();

@@ -1,15 +1,16 @@
 //! gate, and the parts of gather that a step without waits needs: the device decides and lists as the twins do.
 
+use super::pages::read;
+use super::rows::camera;
 use crate::support::gpu::open;
 use crate::twins::{self, gather};
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::gpu::{Buffer, Gpu, GpuOptions, groups_1d};
+use gsscale::gpu::{Buffer, GpuOptions, groups_1d};
 use gsscale::kernels::gate::{self, GateUniforms, StepVerdict};
 use gsscale::kernels::uniforms::{DevicePage, GatherUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
-use gsscale::scene::camera::Camera;
 use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::PageLayout;
 
@@ -55,13 +56,6 @@ fn cases() -> Vec<(GateUniforms, u32, StepVerdict, u32)> {
     all
 }
 
-fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer) -> Vec<T> {
-    let mut recorder = gpu.begin("parity");
-    let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
-    gpu.submit(recorder).unwrap();
-    bytes.to_vec().unwrap()
-}
-
 #[test]
 fn a_gate_closes_for_every_reason_and_stays_closed() {
     let gpu = open(&GpuOptions::default());
@@ -84,8 +78,8 @@ fn a_gate_closes_for_every_reason_and_stays_closed() {
         let pipeline = gpu.pipeline("gate.wgsl", "decide", &[]).unwrap();
         recorder.dispatch("gate", &pipeline, &views, groups_1d(1, 1)).unwrap();
         gpu.submit(recorder).unwrap();
-        assert_eq!(read::<StepVerdict>(gpu, &verdict), [want], "case {i}");
-        assert_eq!(read::<u32>(gpu, &buffers[5]), [closed], "case {i}: the gate");
+        assert_eq!(read::<StepVerdict>(gpu, &verdict, 1), [want], "case {i}");
+        assert_eq!(read::<u32>(gpu, &buffers[5], 1), [closed], "case {i}: the gate");
     }
 }
 
@@ -94,17 +88,6 @@ fn a_gate_closes_for_every_reason_and_stays_closed() {
 fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let adam = DeferredAdam::new(Rates::new(1.0, 10), AdamConfig::default(), gsscale::base::simd::SimdPath::best());
-    let camera = Camera {
-        viewmat: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0]],
-        fx: 70.0,
-        fy: 60.0,
-        cx: 33.0,
-        cy: 22.0,
-        width: 65,
-        height: 47,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    };
     let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
     let layout = PageLayout { rows: 40, sh_degree: 0 };
     for (count, room) in [(1u32, 64u32), (700, 16_000), (700, 9000), (256, 1)] {
@@ -117,7 +100,7 @@ fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
         let [on_device, found_there] =
             [[&counts[..], &[0]].concat(), found.clone()].map(|words| recorder.buffer_with("words", &words).unwrap());
         let listed = recorder.buffer_with("listed", &vec![[7u32; 2]; room as usize]).unwrap();
-        let uniforms = GatherUniforms::new(&camera, &adam.numbers(10).unwrap(), 1, &splits, count);
+        let uniforms = GatherUniforms::new(&camera(), &adam.numbers(10).unwrap(), 1, &splits, count);
         let uniform = recorder.uniform(&GatherUniforms { row_count: room, ..uniforms }).unwrap();
         let [place, pad, list] = ["place", "pad", "list"].map(|entry| gpu.pipeline("gather.wgsl", entry, &[]).unwrap());
         let views = [uniform.clone(), on_device.view(), table.view()];
@@ -130,8 +113,8 @@ fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
         let mut want = vec![[gather::UNLISTED, 0]; room as usize];
         let total = gather::place(&mut pages, &counts);
         gather::list(&pages, &counts, &found, &mut want);
-        let got: Vec<[u32; 2]> = read(&gpu, &listed);
+        let got: Vec<[u32; 2]> = read(&gpu, &listed, room as usize);
         assert!(got == want, "{count} pages, {total} rows, room for {room}");
-        assert_eq!(read::<u32>(&gpu, &on_device)[count as usize], total);
+        assert_eq!(read::<u32>(&gpu, &on_device, count as usize + 1)[count as usize], total);
     }
 }

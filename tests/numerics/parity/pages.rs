@@ -3,6 +3,7 @@
 //! Source of the tolerances: a movement is some ten roundings of 6e-8, or devices' divisions of 2.5 units in the last
 //! place, so 3e-6 of the movement; a value has one rounding of its own.
 
+use super::rows::camera;
 use crate::support::begin_view;
 use crate::support::gpu::open;
 use crate::twins::gather::{self, GatherInput};
@@ -21,7 +22,6 @@ use gsscale::optim::rates::Rates;
 use gsscale::render::gpu_pages::{DevicePages, UpdateBuffers};
 use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, footprint_bytes};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
-use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
@@ -36,20 +36,6 @@ const SPLITS: SplitLimits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, r
 
 fn adam() -> DeferredAdam {
     DeferredAdam::new(Rates::new(1.0, STEPS), AdamConfig::default(), SimdPath::best())
-}
-
-fn camera() -> Camera {
-    Camera {
-        viewmat: [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]],
-        fx: 70.0,
-        fy: 60.0,
-        cx: 33.0,
-        cy: 22.0,
-        width: 65,
-        height: 47,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
 }
 
 /// A page after at most `now` steps; half of its rows have weights, if any have. Some second moments are so small that eps matters, some rows never had a gradient.
@@ -127,7 +113,7 @@ fn parts(sh_degree: u8) -> Vec<(Column, usize, usize)> {
     narrow.chain(bands).collect()
 }
 
-fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T> {
+pub fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T> {
     let mut recorder = gpu.begin("parity");
     let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
     gpu.submit(recorder).unwrap();

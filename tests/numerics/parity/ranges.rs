@@ -1,7 +1,7 @@
 //! Views that device memory cannot hold at once: rows in chunks, pictures in ranges of tiles. The results have the bits of the
 //! view that fits, for any budget and any binding, down to the least that is stated.
 
-use super::frame::{bits, photo, renderer, results_with, scene};
+use super::frame::{batches_of, bits, photo, renderer, results_with, scene};
 use gsscale::gpu::{GpuError, GpuOptions};
 use gsscale::render::device_needs::DeviceNeeds;
 use gsscale::render::gpu::GpuRenderer;
@@ -10,7 +10,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 
 /// A view whose Gaussians cross many tile columns.
-fn wide_scene(rows: usize) -> (Columns, Camera) {
+pub fn wide_scene(rows: usize) -> (Columns, Camera) {
     let (mut columns, camera) = scene(rows, 208, 144);
     columns.scales.iter_mut().for_each(|s| *s *= 0.3);
     columns.opacities.iter_mut().for_each(|o| *o -= 3.0);
@@ -18,7 +18,7 @@ fn wide_scene(rows: usize) -> (Columns, Camera) {
 }
 
 /// The least memory that the renderer states for a view.
-fn least(gpu: &GpuRenderer) -> u64 {
+pub fn least(gpu: &GpuRenderer) -> u64 {
     DeviceNeeds::new(gpu.device_sizes().unwrap(), RenderOptions::default().sh_degree).least()
 }
 
@@ -159,15 +159,7 @@ fn in_batches(
     target: &gsscale::scene::image::Target,
     loss: &LossOptions,
 ) -> Vec<u32> {
-    let part = |first: usize, end: usize| {
-        let mut part = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
-        for column in Column::ALL {
-            let width = column.width(rows.sh_degree);
-            *part.column_mut(column) = rows.column(column)[first * width..end * width].to_vec();
-        }
-        part
-    };
-    let batches: Vec<Columns> = ends.windows(2).map(|ends| part(ends[0], ends[1])).collect();
+    let batches = batches_of(rows, ends);
     gpu.begin_view(camera, options, RowBatches::Several).unwrap();
     batches.iter().for_each(|batch| gpu.rows_in(batch).unwrap());
     gpu.picture().unwrap();

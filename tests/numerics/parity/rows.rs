@@ -21,18 +21,9 @@ const EPS2D: f32 = 0.3;
 /// Numbers of rows: none, one, below, at and above the workgroup, several workgroups.
 const SIZES: [usize; 6] = [0, 1, 255, 256, 257, 5000];
 
-fn camera() -> Camera {
-    Camera {
-        viewmat: [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]],
-        fx: 70.0,
-        fy: 60.0,
-        cx: 33.0,
-        cy: 22.0,
-        width: 65,
-        height: 47,
-        near_plane: 0.01,
-        far_plane: 1e10,
-    }
+pub fn camera() -> Camera {
+    let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]];
+    crate::support::camera(viewmat, [70.0, 60.0, 33.0, 22.0], [65, 47])
 }
 
 fn random_rows(n: usize) -> Columns {

@@ -1,11 +1,10 @@
 //! Blending weights of rows on a device, alone and times the squared error of the picture, against those of the CPU.
 
-use super::frame::{bits, photo, renderer, results_with, scene};
+use super::frame::{batches_of, bits, photo, renderer, results_with, scene};
+use super::ranges::{least, wide_scene};
 use gsscale::gpu::GpuOptions;
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::device_needs::DeviceNeeds;
 use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, RowBatches};
-use gsscale::scene::columns::{Column, Columns};
 
 /// Relative L2 distance over the rows: sums of some hundred products of f32, as for the gradients (see `frame`), whose terms do
 /// not cancel; a flipped decision moves one pixel of one row.
@@ -55,9 +54,7 @@ fn weights_are_those_of_the_cpu_and_cost_nothing_when_off() {
 #[test]
 fn weights_have_the_same_bits_for_any_cut() {
     let rows = 3000;
-    let mut view = scene(rows, 208, 144);
-    view.0.scales.iter_mut().for_each(|s| *s *= 0.3);
-    view.0.opacities.iter_mut().for_each(|o| *o -= 3.0);
+    let view = wide_scene(rows);
     let (target, loss) = (photo(208, 144, true), LossOptions::default());
     let options = RenderOptions::default();
     let Some(mut whole) = renderer(&GpuOptions::default()) else { return };
@@ -66,15 +63,19 @@ fn weights_have_the_same_bits_for_any_cut() {
     whole.set_capacity(100);
     assert!(results_with(&mut whole, &view, &options, &target, &loss).unwrap().grads.weights == want);
     assert!(whole.frames_rerecorded() > 0);
-    assert!(
-        in_batches(&mut whole, &view.0, &[0, 1100, rows], |gpu, batches| {
-            gpu.begin_view(&view.1, &options, RowBatches::Several).unwrap();
-            batches.iter().for_each(|batch| gpu.rows_in(batch).unwrap());
-            gpu.picture().unwrap();
-            gpu.loss(&target, &loss).unwrap();
-        }) == want
-    );
-    let least = DeviceNeeds::new(whole.device_sizes().unwrap(), options.sh_degree).least();
+    let batches = batches_of(&view.0, &[0, 1100, rows]);
+    whole.begin_view(&view.1, &options, RowBatches::Several).unwrap();
+    batches.iter().for_each(|batch| whole.rows_in(batch).unwrap());
+    whole.picture().unwrap();
+    whole.loss(&target, &loss).unwrap();
+    whole.picture_back().unwrap();
+    let (mut weights, mut grads) = (vec![Vec::new(); batches.len()], Gradients::default());
+    for (number, batch) in batches.iter().enumerate().rev() {
+        whole.rows_out(number, batch, &mut grads).unwrap();
+        weights[number] = grads.weights.clone();
+    }
+    assert!(weights.concat() == want);
+    let least = least(&whole);
     let mut most = 0;
     for budget in [least, least + least / 4] {
         let Some(mut gpu) = renderer(&GpuOptions { budget: Some(budget), ..GpuOptions::default() }) else { return };
@@ -85,34 +86,6 @@ fn weights_have_the_same_bits_for_any_cut() {
         most = most.max(gpu.ranges());
     }
     assert!(most > 2, "{most} ranges at most");
-}
-
-/// The weights of a view whose rows come in batches that end at `ends`; `forward` takes the view up to its loss.
-fn in_batches(
-    gpu: &mut dyn Renderer,
-    rows: &Columns,
-    ends: &[usize],
-    forward: impl FnOnce(&mut dyn Renderer, &[Columns]),
-) -> Vec<[f32; 2]> {
-    let batches: Vec<Columns> = ends
-        .windows(2)
-        .map(|place| {
-            let mut batch = Columns { sh_degree: rows.sh_degree, ..Columns::default() };
-            for column in Column::ALL {
-                let width = column.width(rows.sh_degree);
-                *batch.column_mut(column) = rows.column(column)[place[0] * width..place[1] * width].to_vec();
-            }
-            batch
-        })
-        .collect();
-    forward(gpu, &batches);
-    gpu.picture_back().unwrap();
-    let (mut weights, mut grads) = (vec![Vec::new(); batches.len()], Gradients::default());
-    for (number, batch) in batches.iter().enumerate().rev() {
-        gpu.rows_out(number, batch, &mut grads).unwrap();
-        weights[number] = grads.weights.clone();
-    }
-    weights.concat()
 }
 
 /// The errors are those of a corrected picture; without a loss there are none.

@@ -1,6 +1,9 @@
 //! Reference fixtures of the oracle, and the printed skip where they are absent.
 
 use super::shared::shared_folder;
+use gsscale::render::RenderOptions;
+use gsscale::scene::camera::Camera;
+use gsscale::scene::columns::Columns;
 use safetensors::{Dtype, SafeTensors};
 use std::collections::HashMap;
 
@@ -37,6 +40,57 @@ impl Fixture {
     pub fn f32(&self, name: &str) -> Vec<f32> {
         self.f64(name).iter().map(|&x| x as f32).collect()
     }
+
+    /// A tensor of `[height][width][3]` as `[3][height][width]`.
+    pub fn planar(&self, name: &str) -> Vec<f32> {
+        let interleaved = self.f32(name);
+        (0..3).flat_map(|c| interleaved.iter().skip(c).step_by(3).copied()).collect()
+    }
+
+    /// The file's camera.
+    pub fn camera(&self) -> Camera {
+        let (m, k, wh) = (self.f32("viewmat"), self.f32("K"), self.f64("wh"));
+        let viewmat = std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j]));
+        super::camera(viewmat, [k[0], k[4], k[2], k[5]], [wh[0] as u32, wh[1] as u32])
+    }
+
+    /// Rows, as they are stored, camera and options of a raster file.
+    pub fn scene(&self) -> (Columns, Camera, RenderOptions) {
+        let sh_degree = self.metadata["sh_degree"].parse().unwrap();
+        let (sh0, sh_n) = split_sh(&self.f32("sh"), self.shape("means")[0]);
+        let rows = Columns {
+            sh_degree,
+            means: self.f32("means"),
+            quats: self.f32("quats"),
+            scales: self.f64("scales").iter().map(|&s| libm::log(s) as f32).collect(),
+            opacities: self.f64("opacities").iter().map(|&o| libm::log(o / (1.0 - o)) as f32).collect(),
+            sh0,
+            sh_n,
+        };
+        let background = self.f32("background").try_into().unwrap();
+        let max_alpha = self.metadata["max_alpha"].parse().unwrap();
+        (rows, self.camera(), RenderOptions { sh_degree, max_alpha, background, ..RenderOptions::default() })
+    }
+}
+
+/// The raster files that every renderer is compared with.
+pub const RASTER_FILES: [&str; 9] = [
+    "raster_single",
+    "raster_small",
+    "raster_odd_bg",
+    "raster_white_bg",
+    "raster_stress",
+    "raster_large",
+    "raster_dense_a990",
+    "raster_dense_a999",
+    "garden",
+];
+
+/// Splits `[rows][K][3]` coefficients into the constant band and the others.
+pub fn split_sh(sh: &[f32], rows: usize) -> (Vec<f32>, Vec<f32>) {
+    let width = sh.len() / rows;
+    let part = |from: usize, to: usize| sh.chunks_exact(width).flat_map(|row| row[from..to].to_vec()).collect();
+    (part(0, 3), part(3, width))
 }
 
 fn widen(dtype: Dtype, data: &[u8]) -> Vec<f64> {

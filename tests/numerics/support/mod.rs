@@ -1,4 +1,4 @@
-//! Reference fixtures, dense Adam, a second renderer, and a device.
+//! Reference fixtures, dense Adam, a second renderer, cameras, and a device.
 
 #[path = "../../support/apply_event.rs"]
 pub mod apply_event;
@@ -13,6 +13,8 @@ pub mod reference64;
 #[path = "../../support/shared.rs"]
 mod shared;
 
+use gsscale::base::rng::Stream;
+use gsscale::base::simd::SimdPath;
 use gsscale::gpu::Gpu;
 use gsscale::render::gpu_pages::{DevicePages, PagesView};
 use gsscale::scene::camera::Camera;
@@ -24,4 +26,26 @@ pub fn begin_view(gpu: &Gpu, pages: &DevicePages, camera: &Camera, step: &StepNu
     let view = pages.begin(&mut recorder, camera, step).unwrap();
     gpu.submit(recorder).unwrap();
     view
+}
+
+/// A camera that sees from 0.01 on, without end.
+pub fn camera(viewmat: [[f32; 4]; 3], [fx, fy, cx, cy]: [f32; 4], [width, height]: [u32; 2]) -> Camera {
+    Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 }
+}
+
+/// Any rotation, all equally likely.
+pub fn random_rotation(draws: &mut Stream) -> [[f64; 3]; 3] {
+    let q: [f64; 4] = std::array::from_fn(|_| draws.normal());
+    let n = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let [w, x, y, z] = q.map(|c| c / n);
+    [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+}
+
+/// The instruction paths of this machine.
+pub fn paths() -> impl Iterator<Item = SimdPath> {
+    SimdPath::ALL.into_iter().filter(|path| path.is_supported())
 }
