@@ -9,9 +9,12 @@ use gsscale::page::engine::open::{DEPTH, IoEngine, open_engine};
 use gsscale::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
 use gsscale::page::engine::segment_files::segment_file_name;
 use gsscale::page::engine::threaded::ThreadedEngine;
+#[cfg(target_os = "linux")]
+use gsscale::page::engine::uring::UringEngine;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use std::io::ErrorKind;
 use std::path::Path;
+use tempfile::TempDir;
 
 const SEGMENT: u64 = 8 << 20;
 
@@ -26,7 +29,6 @@ fn file_engines() -> Vec<(&'static str, Open)> {
     ];
     #[cfg(target_os = "linux")]
     {
-        use gsscale::page::engine::uring::UringEngine;
         match UringEngine::open(&std::env::temp_dir(), 1, true) {
             Ok(_) => {
                 // A ring of 4 entries is always full in this test.
@@ -60,6 +62,23 @@ fn move_one(store: &mut dyn PageEngine, transfer: Transfer) -> Completion {
     }
     assert_eq!((done.len(), store.in_flight()), (1, 0));
     done.remove(0)
+}
+
+/// Waits for all that is in flight.
+fn drain(store: &mut dyn PageEngine) -> Vec<Completion> {
+    let mut done = Vec::new();
+    while store.in_flight() > 0 {
+        store.complete(true, &mut done);
+    }
+    done
+}
+
+/// A new folder with an engine whose segment 0 exists.
+fn fresh(open: Open) -> (TempDir, Box<dyn PageEngine>) {
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = open(folder.path());
+    store.create_segment(0, SEGMENT).unwrap();
+    (folder, store)
 }
 
 fn random_buffer(draws: &mut Stream, bytes: usize) -> PageBuffer {
@@ -235,9 +254,7 @@ fn files_cut_short_or_removed_in_use_are_errors() {
 #[test]
 fn dropping_a_store_carries_out_what_was_submitted() {
     for (name, open) in file_engines() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut store = open(folder.path());
-        store.create_segment(0, SEGMENT).unwrap();
+        let (folder, mut store) = fresh(open);
         let mut draws = Stream::new(3, Purpose::Test, 0, 0);
         let expected: Vec<PageBuffer> = (0..8).map(|_| random_buffer(&mut draws, 1 << 20)).collect();
         let mut draws = Stream::new(3, Purpose::Test, 0, 0);
@@ -260,9 +277,7 @@ fn dropping_a_store_carries_out_what_was_submitted() {
 #[test]
 fn transfers_outlive_the_thread_that_submitted_them() {
     for (name, open) in all_engines() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut store = open(folder.path());
-        store.create_segment(0, SEGMENT).unwrap();
+        let (_folder, mut store) = fresh(open);
         for round in 0..20u8 {
             let submitting = std::thread::spawn(move || {
                 for token in 0..8 {
@@ -274,10 +289,7 @@ fn transfers_outlive_the_thread_that_submitted_them() {
                 store
             });
             store = submitting.join().unwrap();
-            let mut done = Vec::new();
-            while store.in_flight() > 0 {
-                store.complete(true, &mut done);
-            }
+            let done = drain(&mut *store);
             assert_eq!(done.len(), 8);
             for end in done {
                 end.result.unwrap_or_else(|e| panic!("{name}: {e}"));
@@ -302,7 +314,6 @@ fn more_segments_than_open_files() {
             store.create_segment(segment, 16384).unwrap();
         }
         for direction in [Direction::Write, Direction::Read] {
-            let mut done = Vec::new();
             for segment in 0..segments {
                 let mut buffer = PageBuffer::zeroed(8192);
                 if direction == Direction::Write {
@@ -310,9 +321,7 @@ fn more_segments_than_open_files() {
                 }
                 store.submit(transfer(u64::from(segment), direction, segment, 4096, buffer));
             }
-            while store.in_flight() > 0 {
-                store.complete(true, &mut done);
-            }
+            let done = drain(&mut *store);
             store.sync().unwrap_or_else(|e| panic!("{name}: {e}"));
             assert_eq!(done.len(), segments as usize);
             for end in done {
@@ -348,9 +357,7 @@ fn refused_writes_are_errors_with_their_buffers() {
     let stores: Vec<_> = engines
         .iter()
         .map(|(name, open)| {
-            let folder = tempfile::tempdir().unwrap();
-            let mut store = open(folder.path());
-            store.create_segment(0, SEGMENT).unwrap();
+            let (folder, store) = fresh(*open);
             (name, folder, store)
         })
         .collect();
@@ -370,23 +377,28 @@ fn refused_writes_are_errors_with_their_buffers() {
     }
 }
 
+/// A new folder with a ring whose segment 0 exists, if this system has rings.
+#[cfg(target_os = "linux")]
+fn ring(entries: usize, direct: bool) -> Option<(TempDir, UringEngine)> {
+    let folder = tempfile::tempdir().unwrap();
+    let opened = UringEngine::open(folder.path(), entries, direct);
+    let mut store = opened.inspect_err(|error| eprintln!("skipped: io_uring is refused here: {error}")).ok()?;
+    store.create_segment(0, SEGMENT).unwrap();
+    Some((folder, store))
+}
+
 /// A request of the ring that the system cuts short is resumed. The limit is lifted before the completion is taken.
 #[cfg(target_os = "linux")]
 #[test]
 fn a_short_answer_of_the_ring_is_resumed() {
-    use gsscale::page::engine::uring::{REQUEST_BYTES, UringEngine};
+    use gsscale::page::engine::uring::REQUEST_BYTES;
     const { assert!(REQUEST_BYTES <= 1 << 20, "larger requests may end with EAGAIN") };
     if !in_child(module_path!(), "a_short_answer_of_the_ring_is_resumed") {
         return;
     }
     outlive_the_signal_of_large_files();
     for direct in [true, false] {
-        let folder = tempfile::tempdir().unwrap();
-        let mut store = match UringEngine::open(folder.path(), 32, direct) {
-            Ok(store) => store,
-            Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
-        };
-        store.create_segment(0, SEGMENT).unwrap();
+        let Some((folder, mut store)) = ring(32, direct) else { return };
         let buffer = random_buffer(&mut Stream::new(3, Purpose::Test, 0, 0), 3 << 20);
         let bytes = buffer.as_slice().to_vec();
         let (cut, path) = (5 << 19, folder.path().join(segment_file_name(0)));
@@ -402,11 +414,7 @@ fn a_short_answer_of_the_ring_is_resumed() {
         let file = std::fs::read(&path).unwrap();
         assert!(file[cut..].iter().all(|&b| b == 0), "the request was not cut short");
         limit_files(None);
-        let mut done = Vec::new();
-        while store.in_flight() > 0 {
-            store.complete(true, &mut done);
-        }
-        done.remove(0).result.unwrap();
+        drain(&mut store).remove(0).result.unwrap();
         let file = std::fs::read(&path).unwrap();
         assert!(file[..bytes.len()] == bytes && file[bytes.len()..].iter().all(|&b| b == 0), "direct {direct}");
     }
@@ -466,10 +474,7 @@ fn three_times_the_usual_depth_completes_without_polling() {
         };
         store.create_segment(0, (transfers * bytes) as u64).unwrap();
         write_unasked(&mut *store, folder.path(), 0..transfers, bytes);
-        let mut done = Vec::new();
-        while store.in_flight() > 0 {
-            store.complete(true, &mut done);
-        }
+        let done = drain(&mut *store);
         assert!(done.len() == transfers && done.iter().all(|end| end.result.is_ok()));
     }
 }
@@ -478,21 +483,13 @@ fn three_times_the_usual_depth_completes_without_polling() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_ring_of_ended_requests_is_not_full() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut store = match gsscale::page::engine::uring::UringEngine::open(folder.path(), 4, true) {
-        Ok(store) => store,
-        Err(error) => return eprintln!("skipped: io_uring is refused here: {error}"),
-    };
-    store.create_segment(0, SEGMENT).unwrap();
+    let Some((folder, mut store)) = ring(4, true) else { return };
     for first in (0..16).step_by(4) {
         write_unasked(&mut store, folder.path(), first..first + 4, 64 << 10);
         // The completion follows soon after the bytes are in the file, but not at once.
         std::thread::sleep(std::time::Duration::from_millis(100));
     }
-    let mut done = Vec::new();
-    while store.in_flight() > 0 {
-        store.complete(true, &mut done);
-    }
+    let done = drain(&mut store);
     assert!(done.len() == 16 && done.iter().all(|end| end.result.is_ok()));
 }
 
@@ -516,8 +513,8 @@ fn expect_pinned(bytes: usize) {
 
 /// A ring with a table of registered buffers, if this system has one.
 #[cfg(target_os = "linux")]
-fn ring_with_table(folder: &Path) -> Option<gsscale::page::engine::uring::UringEngine> {
-    let store = gsscale::page::engine::uring::UringEngine::open(folder, 8, true);
+fn ring_with_table(folder: &Path) -> Option<UringEngine> {
+    let store = UringEngine::open(folder, 8, true);
     match &store {
         Ok(store) if store.supports_registration() => {}
         Ok(_) => eprintln!("skipped: this kernel has no table for buffers"),

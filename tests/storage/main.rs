@@ -4,7 +4,6 @@
 mod support;
 
 mod batches;
-mod belady;
 mod commits;
 mod crash;
 #[cfg(unix)]

@@ -1,10 +1,11 @@
-//! The schedule and the cache model against slow versions: next uses by scanning all steps, fewest reads by trying
-//! every choice.
+//! The schedule, the cache model and the incremental lower bound on page reads against slow versions: next uses by
+//! scanning all steps, fewest reads by trying every choice.
 
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::paging::frames::evict::{EvictPolicy, NEVER};
 use gsscale::paging::frames::table::FrameTable;
+use gsscale::paging::plan::bound::FewestReads;
 use gsscale::paging::plan::cache_model::{CacheModel, StepChange, TooFewFrames};
 use gsscale::paging::plan::steps::{Plan, USE_BYTES};
 
@@ -26,21 +27,26 @@ fn next_use(steps: &Steps, page: PageNo, from: usize) -> Option<u32> {
     (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32)
 }
 
-/// The fewest pages that any cache can read: a search over all sets that may be cached after each step.
-fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
-    let mut cost = vec![u32::MAX; 1 << pages];
+/// The set of these pages, as bits.
+fn set_of(pages: &[PageNo]) -> usize {
+    pages.iter().fold(0, |set, p| set | 1 << p.0)
+}
+
+/// The fewest of `pages` pages that any cache can read: a search over all sets that may be cached after each step, of which
+/// each has its number of frames and the pages that it needs.
+fn least_reads(steps: &[(u32, usize)], pages: u32) -> u64 {
+    let mut cost = vec![u64::MAX; 1 << pages];
     cost[0] = 0;
-    for needed in steps {
-        let needed = needed.iter().fold(0usize, |set, p| set | 1 << p.0);
-        let mut after = vec![u32::MAX; 1 << pages];
-        for (held, &reads) in cost.iter().enumerate().filter(|(_, c)| **c < u32::MAX) {
+    for &(frames, needed) in steps {
+        let mut after = vec![u64::MAX; 1 << pages];
+        for (held, &reads) in cost.iter().enumerate().filter(|(_, c)| **c < u64::MAX) {
             let kept_at_most = held & !needed;
             // All subsets of the held pages that the step does not need.
             let mut kept = kept_at_most;
             loop {
                 let now = kept | needed;
                 if now.count_ones() <= frames {
-                    after[now] = after[now].min(reads + (needed & !held).count_ones());
+                    after[now] = after[now].min(reads + u64::from((needed & !held).count_ones()));
                 }
                 if kept == 0 {
                     break;
@@ -54,7 +60,7 @@ fn least_reads(steps: &Steps, pages: u32, frames: u32) -> u32 {
 }
 
 /// Runs the model over all steps, checks the invariants of every change, and returns the reads.
-fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u32 {
+fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo, usize) -> Option<u32>) -> u64 {
     let mut cache = CacheModel::new(frames, policy);
     let mut held: Vec<PageNo> = Vec::new();
     let mut change = StepChange::default();
@@ -67,7 +73,7 @@ fn reads(steps: &Steps, frames: usize, policy: EvictPolicy, next: impl Fn(PageNo
         held.extend(&change.admit);
         assert!(held.len() <= frames && needed.iter().all(|p| held.contains(p) && cache.holds(*p)));
         assert!(change.evict.is_empty() || held.len() == frames, "no page leaves before its frame is needed");
-        reads += change.admit.len() as u32;
+        reads += change.admit.len() as u64;
     }
     reads
 }
@@ -79,7 +85,7 @@ fn farthest_next_use_reads_the_least_that_is_possible() {
     for _ in 0..150 {
         let frames = 3 + draws.below(4) as u32;
         let steps = steps(&mut draws, 14, 9, 1, u64::from(frames));
-        let least = least_reads(&steps, 9, frames);
+        let least = least_reads(&steps.iter().map(|pages| (frames, set_of(pages))).collect::<Vec<_>>(), 9);
         let known = |page, from| next_use(&steps, page, from);
         assert_eq!(reads(&steps, frames as usize, EvictPolicy::FarthestNextUse, known), least);
         lru_total += reads(&steps, frames as usize, EvictPolicy::LeastRecentlyUsed, known);
@@ -96,7 +102,7 @@ fn least_recent_use_is_what_a_queue_does() {
         let mut queue: Vec<PageNo> = Vec::new();
         let mut want = 0;
         for needed in &steps {
-            want += needed.iter().filter(|p| !queue.contains(p)).count() as u32;
+            want += needed.iter().filter(|p| !queue.contains(p)).count() as u64;
             queue.retain(|p| !needed.contains(p));
             let mut sorted = needed.clone();
             sorted.sort_unstable();
@@ -204,4 +210,70 @@ fn planned_changes_are_those_that_happen_and_print_exactly() {
     assert_eq!(plan.to_string().lines().nth(3), Some("step 12: 0 3"));
     let small = CacheModel::new(1, EvictPolicy::FarthestNextUse);
     assert_eq!(small.changes(&plan, 10..11), Err(TooFewFrames { step: 10, needed: 2, frames: 1 }));
+}
+
+/// From an empty cache, or with first pages of the cache's own choice.
+#[test]
+fn the_bound_counts_what_the_cache_that_knows_the_future_reads() {
+    let mut draws = Stream::new(5, Purpose::Test, 1, 1);
+    for round in 0..300 {
+        let pages = 4 + draws.below(20) as u32;
+        let frames = 2 + draws.below(u64::from(pages)) as usize;
+        let steps = steps(&mut draws, 40, pages, 1, frames.min(pages as usize) as u64);
+        for is_warm in [false, true] {
+            let mut bound = FewestReads::default();
+            let mut first: Vec<PageNo> = (0..if is_warm { pages } else { 0 }).map(PageNo).collect();
+            first.iter().for_each(|&page| bound.add(page));
+            steps.iter().for_each(|pages| bound.step(frames, pages.iter().map(|&p| (p, 10))));
+            first.sort_by_key(|&page| next_use(&steps, page, 0).unwrap_or(u32::MAX));
+            first.truncate(frames);
+            let made = first.len() as u64;
+            let all: Steps = std::iter::once(first).chain(steps.iter().cloned()).collect();
+            let known = |page, from| next_use(&all, page, from);
+            let want = reads(&all, frames, EvictPolicy::FarthestNextUse, known) - made;
+            assert_eq!((bound.pages(), bound.bytes()), (want, 10 * want), "round {round}, {frames} frames");
+        }
+    }
+}
+
+#[test]
+fn pages_made_in_memory_are_not_read() {
+    let mut bound = FewestReads::default();
+    bound.add(PageNo(0));
+    bound.step(2, [(PageNo(0), 1)].into_iter());
+    bound.add(PageNo(1));
+    bound.step(2, [(PageNo(0), 1), (PageNo(1), 1)].into_iter());
+    assert_eq!(bound.pages(), 0);
+    // The two frames hold other pages, so the page is read.
+    bound.step(2, [(PageNo(2), 7)].into_iter());
+    assert_eq!((bound.pages(), bound.bytes()), (1, 7));
+}
+
+#[test]
+fn frames_may_be_taken_away_and_given_back_between_steps() {
+    let mut draws = Stream::new(6, Purpose::Test, 1, 1);
+    let mut differs = 0;
+    for round in 0..200 {
+        let pages = 6;
+        let mut frames = 5;
+        let steps: Vec<(u32, usize)> = (0..14)
+            .map(|_| {
+                frames -= u32::from(frames > 2 && draws.below(3) == 0);
+                frames += u32::from(frames < 5 && draws.below(6) == 0);
+                let needed = (0..frames).fold(0, |needed, _| needed | 1 << draws.below(pages));
+                (frames, needed)
+            })
+            .collect();
+        let bound = |frames_at: &dyn Fn(u32) -> usize| {
+            let mut bound = FewestReads::default();
+            for &(frames, needed) in &steps {
+                let list = (0..pages as u32).filter(|page| needed >> page & 1 == 1).map(|page| (PageNo(page), 1));
+                bound.step(frames_at(frames), list);
+            }
+            bound.pages()
+        };
+        assert_eq!(bound(&|frames| frames as usize), least_reads(&steps, pages as u32), "round {round}: {steps:?}");
+        differs += u32::from(bound(&|frames| frames as usize) != bound(&|_| 5));
+    }
+    assert!(differs > 20, "in {differs} rounds the frames that were taken away made a difference");
 }

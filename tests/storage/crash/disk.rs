@@ -311,8 +311,8 @@ impl Disk {
         }
         state.durable_entries = entries.clone();
         state.entries = entries;
-        (state.crashed, state.crash_at, state.fault, state.failing_sync) = (false, u64::MAX, None, None);
-        state.short_write = None;
+        drop(state);
+        self.process_killed();
     }
 
     /// The process ends and the machine keeps running: nothing is lost.
@@ -331,29 +331,32 @@ impl Disk {
         state.entries.get(name).map_or(0, |&i| state.files[i].now.len)
     }
 
-    /// Flips a bit on the drive.
-    pub fn flip(&self, name: &str, bit: u64) {
+    /// Changes the bytes of a file on the drive.
+    fn spoil(&self, name: &str, change: impl FnOnce(&mut Image)) {
         let mut state = self.state();
         let index = state.entries[name];
         let file = &mut state.files[index];
-        let mut byte = [0];
-        file.now.read(bit / 8, &mut byte);
-        byte[0] ^= 1 << (bit % 8);
-        file.now.write(bit / 8, &byte);
+        change(&mut file.now);
         file.durable = file.now.clone();
         file.unsynced.clear();
     }
 
+    /// Flips a bit on the drive.
+    pub fn flip(&self, name: &str, bit: u64) {
+        self.spoil(name, |file| {
+            let mut byte = [0];
+            file.read(bit / 8, &mut byte);
+            file.write(bit / 8, &[byte[0] ^ 1 << (bit % 8)]);
+        });
+    }
+
     /// Copies bytes of a file to another place in it: a misdirected write.
     pub fn copy_within(&self, name: &str, from: u64, to: u64, bytes: usize) {
-        let mut state = self.state();
-        let index = state.entries[name];
-        let file = &mut state.files[index];
-        let mut moved = vec![0; bytes];
-        file.now.read(from, &mut moved);
-        file.now.write(to, &moved);
-        file.durable = file.now.clone();
-        file.unsynced.clear();
+        self.spoil(name, |file| {
+            let mut moved = vec![0; bytes];
+            file.read(from, &mut moved);
+            file.write(to, &moved);
+        });
     }
 
     /// The bytes of a file.
@@ -367,13 +370,10 @@ impl Disk {
 
     /// Replaces the bytes of a file.
     pub fn replace(&self, name: &str, bytes: &[u8]) {
-        let mut state = self.state();
-        let index = state.entries[name];
-        let file = &mut state.files[index];
-        file.now.set_len(bytes.len() as u64);
-        file.now.write(0, bytes);
-        file.durable = file.now.clone();
-        file.unsynced.clear();
+        self.spoil(name, |file| {
+            file.set_len(bytes.len() as u64);
+            file.write(0, bytes);
+        });
     }
 }
 

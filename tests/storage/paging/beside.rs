@@ -2,14 +2,14 @@
 //! with exactly these pages.
 
 use super::world::{Model, PAGE_ROWS, Run, SH_DEGREE, check, config};
-use super::{PAGES, STEPS, in_memory};
+use super::{PAGES, STEPS, run_in_memory};
 use crate::support::faulty_engine::{Fault, Faults, FaultyEngine, Operation};
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::CommitConfig;
+use gsscale::page::map::commit::{CommitConfig, Commits};
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::paged_store::PagedStore;
 use gsscale::page::versions::slots::SlotLayout;
@@ -25,6 +25,26 @@ pub fn paged_store(opened: &Opened, folder: &Path, codec: Codec, faults: &Faults
     let engine = open_engine(IoEngine::Pread, folder, 3).unwrap().store;
     let layout = SlotLayout::new(capacity_bytes(PAGE_ROWS, SH_DEGREE), 40);
     opened.paged_store(Box::new(FaultyEngine::new(engine, faults.clone())), layout, codec).unwrap()
+}
+
+/// A run over a new store in `folder`.
+fn started(
+    folder: &Path,
+    seed: u64,
+    frames: usize,
+    codec: Codec,
+    faults: &Faults,
+) -> Result<(Run, Commits), PagingError> {
+    let opened = Opened::create(Box::new(DriveFolder::new(folder)), COMMITS).unwrap();
+    let pager = Pager::new(config(frames), paged_store(&opened, folder, codec, faults));
+    Ok((Run::new(pager, seed, PAGES, STEPS)?, opened.commits))
+}
+
+/// Commits a cut of the run as it is.
+fn commit_cut(run: &mut Run, commits: &mut Commits) {
+    run.pager.freeze().unwrap();
+    run.pager.finish_frozen().unwrap();
+    run.pager.commit_frozen(commits, b"state", b"").unwrap().unwrap();
 }
 
 /// Asserts that the store holds exactly the pages of `model` that have rows.
@@ -54,10 +74,7 @@ struct Done {
 fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> Result<Done, PagingError> {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
-    let opened = Opened::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
-    let pager = Pager::new(config(frames), paged_store(&opened, at, codec, faults));
-    let mut commits = opened.commits;
-    let mut run = Run::new(pager, seed, PAGES, STEPS)?;
+    let (mut run, mut commits) = started(at, seed, frames, codec, faults)?;
     let mut draws = Stream::new(seed, Purpose::Test, 9, 9);
     let mut done = Done::default();
     let (mut cut, mut last): (Option<Model>, Option<Model>) = (None, None);
@@ -110,9 +127,7 @@ fn run_with_commits(seed: u64, frames: usize, codec: Codec, faults: &Faults) -> 
 fn a_cut_is_committed_as_it_was_whatever_the_steps_after_it_do() {
     let (mut committed, mut had_to_write) = (0, 0);
     for seed in 0..6 {
-        let mut memory = in_memory(seed);
-        (0..STEPS).for_each(|_| memory.step().unwrap());
-        let fewest = memory.pager.stats().pinned_max;
+        let (_, fewest) = run_in_memory(seed);
         for (frames, codec) in [(fewest, Codec::Raw), (fewest + 5, Codec::Zstd { level: 1 }), (usize::MAX, Codec::Raw)]
         {
             let faults = Faults::new();
@@ -133,9 +148,7 @@ fn a_cut_is_committed_as_it_was_whatever_the_steps_after_it_do() {
 fn a_failed_write_is_left_to_the_next_step_once_rows_have_changed() {
     let folder = tempfile::tempdir().unwrap();
     let faults = Faults::new();
-    let opened = Opened::create(Box::new(DriveFolder::new(folder.path())), COMMITS).unwrap();
-    let pager = Pager::new(config(usize::MAX), paged_store(&opened, folder.path(), Codec::Raw, &faults));
-    let mut run = Run::new(pager, 3, PAGES, STEPS).unwrap();
+    let (mut run, _commits) = started(folder.path(), 3, usize::MAX, Codec::Raw, &faults).unwrap();
     (0..20).for_each(|_| run.step().unwrap());
     run.pager.freeze().unwrap();
     faults.add(Operation::Write, faults.count(Operation::Write), true, Fault::Error(ErrorKind::StorageFull));
@@ -152,14 +165,9 @@ fn a_failed_write_gives_the_cut_up_and_nothing_else() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     let faults = Faults::new();
-    let opened = Opened::create(Box::new(DriveFolder::new(at)), COMMITS).unwrap();
-    let pager = Pager::new(config(usize::MAX), paged_store(&opened, at, Codec::Raw, &faults));
-    let mut commits = opened.commits;
-    let mut run = Run::new(pager, 3, PAGES, STEPS).unwrap();
+    let (mut run, mut commits) = started(at, 3, usize::MAX, Codec::Raw, &faults).unwrap();
     (0..20).for_each(|_| run.step().unwrap());
-    run.pager.freeze().unwrap();
-    run.pager.finish_frozen().unwrap();
-    run.pager.commit_frozen(&mut commits, b"state", b"").unwrap().unwrap();
+    commit_cut(&mut run, &mut commits);
     let first = run.model.clone();
     (0..10).for_each(|_| run.step().unwrap());
     faults.add(Operation::Write, faults.count(Operation::Write) + 2, false, Fault::Error(ErrorKind::StorageFull));
@@ -175,9 +183,7 @@ fn a_failed_write_gives_the_cut_up_and_nothing_else() {
             assert!(error.is_out_of_space(), "{error}");
         }
     }
-    run.pager.freeze().unwrap();
-    run.pager.finish_frozen().unwrap();
-    run.pager.commit_frozen(&mut commits, b"state", b"").unwrap().unwrap();
+    commit_cut(&mut run, &mut commits);
     run.check_all(4).unwrap();
     drop(commits);
     opens_with(at, &run.model);

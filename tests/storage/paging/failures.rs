@@ -2,7 +2,7 @@
 //! rows.
 
 use super::world::{Run, config, store};
-use super::{PAGES, STEPS, in_memory};
+use super::{PAGES, STEPS, run_in_memory};
 use crate::support::faulty_engine::{Fault, Faults, Operation};
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::error::PagingError;
@@ -14,9 +14,7 @@ fn run(seed: u64, frames: usize, faults: &Faults) -> Run {
 }
 
 fn frames_of(seed: u64) -> usize {
-    let mut memory = in_memory(seed);
-    (0..STEPS).for_each(|_| memory.step().unwrap());
-    memory.pager.stats().pinned_max + 3
+    run_in_memory(seed).1 + 3
 }
 
 /// Occasional failures of reads and of space are passed on with the page's name; the repeated step works.

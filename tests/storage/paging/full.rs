@@ -2,7 +2,7 @@
 //! full when the map is reopened. Neither case loses a page, and no deleted page comes back.
 
 use super::beside::{COMMITS, opens_with, paged_store};
-use super::in_memory;
+use super::run_in_memory;
 use super::world::{Model, Run, config, fill, meta};
 use super::{PAGES, STEPS};
 use crate::support::faulty_engine::Faults;
@@ -107,9 +107,7 @@ impl Folder for FolderOnDrive {
 
 /// A run over a store in `at`, with one commit after twenty steps, and the model at that commit.
 fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model) {
-    let mut memory = in_memory(seed);
-    (0..STEPS).for_each(|_| memory.step().unwrap());
-    let frames = memory.pager.stats().pinned_max + 5;
+    let frames = run_in_memory(seed).1 + 5;
     let folder = || Box::new(FolderOnDrive(DriveFolder::new(at), Arc::clone(shortage)));
     let opened = Opened::create(folder(), COMMITS).unwrap();
     let pager = Pager::new(config(frames), paged_store(&opened, at, Codec::Raw, &Faults::new()));

@@ -19,17 +19,20 @@ use world::{PAGE_ROWS, Run, SH_DEGREE, config, store};
 const STEPS: usize = 150;
 const PAGES: u32 = 60;
 
-fn in_memory(seed: u64) -> Run {
-    Run::new(Pager::in_memory(PagerConfig::in_memory(PAGE_ROWS, SH_DEGREE)), seed, PAGES, STEPS).unwrap()
+/// A whole run in memory, and the most pages that a view of it needs.
+fn run_in_memory(seed: u64) -> (Run, usize) {
+    let pager = Pager::in_memory(PagerConfig::in_memory(PAGE_ROWS, SH_DEGREE));
+    let mut memory = Run::new(pager, seed, PAGES, STEPS).unwrap();
+    (0..STEPS).for_each(|_| memory.step().unwrap());
+    let most = memory.pager.stats().pinned_max;
+    (memory, most)
 }
 
 #[test]
 fn pages_hold_what_was_put_into_them_whatever_the_frames() {
     for seed in 0..8 {
-        let mut memory = in_memory(seed);
-        (0..STEPS).for_each(|_| memory.step().unwrap());
+        let (mut memory, fewest) = run_in_memory(seed);
         memory.check_all(7).unwrap();
-        let fewest = memory.pager.stats().pinned_max;
         for (i, frames) in [fewest, fewest + 1, fewest + 5, fewest * 2, usize::MAX].into_iter().enumerate() {
             let ahead = EvictPolicy::ALL.map(|policy| (policy, 3, Codec::Raw));
             let planned = EvictPolicy::FarthestNextUse;
@@ -60,9 +63,7 @@ fn pages_hold_what_was_put_into_them_whatever_the_frames() {
 #[test]
 fn frames_that_are_taken_away_and_given_back_cost_no_page() {
     for seed in 0..8 {
-        let mut memory = in_memory(seed);
-        (0..STEPS).for_each(|_| memory.step().unwrap());
-        let fewest = memory.pager.stats().pinned_max;
+        let (memory, fewest) = run_in_memory(seed);
         for codec in [Codec::Raw, Codec::Zstd { level: 1 }] {
             let faults = Faults::new();
             faults.reorder(seed + 100);
@@ -93,9 +94,7 @@ fn frames_that_are_taken_away_and_given_back_cost_no_page() {
 #[test]
 fn one_frame_less_than_the_largest_view_is_refused_with_the_need() {
     for seed in 0..4 {
-        let mut memory = in_memory(seed);
-        (0..STEPS).for_each(|_| memory.step().unwrap());
-        let fewest = memory.pager.stats().pinned_max;
+        let (_, fewest) = run_in_memory(seed);
         let pager = Pager::new(config(fewest - 1), store(Codec::Raw, &Faults::new()));
         let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();
         let error = (0..STEPS).find_map(|_| run.step().err()).expect("the largest view does not fit");

@@ -7,12 +7,13 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::page::format::codec::Codec;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::plan::bound::FewestReads;
 use gsscale::paging::plan::cache_model::CacheModel;
 use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::stats::PagerStats;
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::visibility::visible_pages;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 const PAGES: u32 = 100;
 
@@ -41,28 +42,12 @@ fn drive(config: PagerConfig, cameras: &[Camera], touches: bool, calls: usize) -
     (PagerStats { pages_read: after.pages_read - before.pages_read, ..after }, start)
 }
 
-/// Page reads of the optimal cache of `frames` frames: a miss evicts the page with the farthest next use. `start` are
-/// in memory at first.
+/// Page reads of the optimal cache of `frames` frames (see `storage::schedule`). `start` are in memory at first.
 fn belady(views: &[Vec<u32>], frames: usize, start: &[u32]) -> u64 {
-    let mut uses: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
-    views.iter().enumerate().for_each(|(s, v)| v.iter().for_each(|&p| uses.entry(p).or_default().push(s)));
-    let next = |page: u32, step: usize| uses[&page].iter().copied().find(|&s| s >= step).unwrap_or(usize::MAX);
-    let mut held: BTreeSet<u32> = start.iter().copied().collect();
-    let mut read = 0;
-    for (step, view) in views.iter().enumerate() {
-        for &page in view {
-            if held.contains(&page) {
-                continue;
-            }
-            if held.len() == frames {
-                let victim = held.iter().copied().filter(|p| !view.contains(p)).max_by_key(|&p| next(p, step));
-                held.remove(&victim.expect("frames for the view"));
-            }
-            held.insert(page);
-            read += 1;
-        }
-    }
-    read
+    let mut bound = FewestReads::default();
+    start.iter().for_each(|&page| bound.add(PageNo(page)));
+    views.iter().for_each(|view| bound.step(frames, view.iter().map(|&page| (PageNo(page), 1))));
+    bound.pages()
 }
 
 fn pages_of(cameras: &[Camera]) -> Vec<Vec<u32>> {
