@@ -2,7 +2,7 @@
 //! `developer.playcanvas.com`): by a reader of the tests' own.
 
 use super::ply::scene;
-use super::support::ExportedRow as Row;
+use super::support::{ExportedRow as Row, files};
 use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::meta::{ExportFrame, SceneMeta};
 use gsscale::exchange::ply::{PlyContent, read_ply};
@@ -10,7 +10,6 @@ use gsscale::exchange::sink::Written;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rotation::Rotation;
 use serde_json::Value;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// A chunk, with what its values are rounded to.
@@ -181,23 +180,6 @@ fn check_row(ply: &Columns, row: usize, of: &Row, chunk: &Chunk) {
         let want = value(Column::ShN, i);
         near(given, want, half_gap(&chunk.harmonics, want) + 1e-5, "harmonic");
     }
-}
-
-/// Every file below a folder by its path there.
-fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    let mut open = vec![folder.to_path_buf()];
-    while let Some(path) = open.pop() {
-        for entry in std::fs::read_dir(path).unwrap().map(|entry| entry.unwrap().path()) {
-            match entry.is_dir() {
-                true => open.push(entry),
-                false => {
-                    found.insert(entry.strip_prefix(folder).unwrap().to_path_buf(), std::fs::read(&entry).unwrap());
-                }
-            }
-        }
-    }
-    found
 }
 
 pub(super) struct Leaf {

@@ -1,6 +1,7 @@
 //! SPZ files, read as its specification says (`github.com/nianticlabs/spz`): by a reader of the tests' own.
 
 use super::ply::scene;
+use super::sog::write;
 use super::support::ExportedRow as Row;
 use flate2::read::GzDecoder;
 use gsscale::exchange::format::ExportFormat;
@@ -72,14 +73,12 @@ fn smallest_three(bits: u32) -> [f64; 4] {
 /// Both files of the same rows and metadata.
 fn both(columns: &Columns, meta: &SceneMeta) -> (Columns, Vec<Row>, f64) {
     let folder = tempfile::tempdir().unwrap();
-    let write = |format: ExportFormat, name: &str| {
+    let [ply, spz] = [(ExportFormat::Ply, "a.ply"), (ExportFormat::Spz, "a.spz")].map(|(format, name)| {
         let path = folder.path().join(name);
-        let mut sink = format.create(&path, columns.sh_degree, columns.rows() as u64, meta).unwrap();
-        sink.write(columns).unwrap();
-        assert_eq!(sink.finish().unwrap().rows, columns.rows() as u64);
+        let written = write(format, &path, std::slice::from_ref(columns), meta);
+        assert_eq!(written.rows, columns.rows() as u64);
         path
-    };
-    let [ply, spz] = [(ExportFormat::Ply, "a.ply"), (ExportFormat::Spz, "a.spz")].map(|(f, name)| write(f, name));
+    });
     let names = std::fs::read_dir(folder.path()).unwrap().count();
     assert_eq!(names, 2, "a temporary file is left");
     let PlyContent::Gaussians { columns, .. } = read_ply(&ply).unwrap() else { panic!("no Gaussians") };

@@ -1,6 +1,7 @@
 //! The generated city is an ordinary COLMAP scene: counts and sizes as requested, the same bytes for any number of
 //! threads, photos that agree with their poses, and no half-written or silently replaced folders.
 
+use super::support::files;
 use gsscale::dataset::colmap::read_colmap;
 use gsscale::dataset::read::ReadOptions;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
@@ -15,24 +16,6 @@ fn small() -> CityOptions {
 
 fn write(folder: &Path, options: &CityOptions) -> CitySummary {
     write_city(folder, options, &|_, _| {}).unwrap()
-}
-
-/// All files below a folder with their bytes.
-fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
-    let mut found = BTreeMap::new();
-    let mut open = vec![folder.to_path_buf()];
-    while let Some(at) = open.pop() {
-        for entry in std::fs::read_dir(at).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                open.push(path);
-            } else {
-                let name = path.strip_prefix(folder).unwrap().to_string_lossy().into_owned();
-                found.insert(name, std::fs::read(&path).unwrap());
-            }
-        }
-    }
-    found
 }
 
 /// Reads little-endian numbers one after the other; written against COLMAP's format, not against the writer.

@@ -6,6 +6,25 @@ pub mod exif;
 #[path = "../../support/shared.rs"]
 pub mod shared;
 
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Every file below a folder by its path there.
+pub fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    let (mut found, mut open) = (BTreeMap::new(), vec![folder.to_path_buf()]);
+    while let Some(at) = open.pop() {
+        for path in std::fs::read_dir(at).unwrap().map(|entry| entry.unwrap().path()) {
+            if path.is_dir() {
+                open.push(path);
+            } else {
+                let name = path.strip_prefix(folder).unwrap().to_string_lossy().into_owned();
+                found.insert(name, std::fs::read(&path).unwrap());
+            }
+        }
+    }
+    found
+}
+
 /// A Gaussian as a reader of an exported file gives it, in the axes of a PLY.
 #[derive(Clone)]
 pub struct ExportedRow {

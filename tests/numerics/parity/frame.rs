@@ -429,10 +429,17 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
     let mut draws = Stream::new(5, Purpose::Test, 0, 0);
     let scale = 1.0 / camera.pixels() as f32;
     let term: Vec<f32> = (0..3 * camera.pixels()).map(|_| scale * draws.normal() as f32).collect();
-    let with_term = |renderer: &mut dyn Renderer, weight: Option<f32>| {
+    // A correction of the picture before the loss, through which its gradient is taken back; and a second term.
+    let run = |renderer: &mut dyn Renderer, exposure: Option<f32>, weight: Option<f32>| {
         let mut grads = Gradients::default();
         renderer.draw(&rows, &camera, &options).unwrap();
+        if let Some(exposure) = exposure {
+            renderer.picture_mut().unwrap().iter_mut().for_each(|x| *x *= exposure);
+        }
         renderer.loss(&target, &loss).unwrap();
+        if let Some(exposure) = exposure {
+            renderer.picture_gradient().unwrap().v_rgb.iter_mut().for_each(|v| *v *= exposure);
+        }
         if let Some(weight) = weight {
             let gradient = renderer.picture_gradient().unwrap();
             gradient.v_rgb.iter_mut().zip(&term).for_each(|(v, term)| *v += weight * term);
@@ -441,31 +448,20 @@ fn gradients_that_the_caller_adds_to_reach_the_rows() {
         let value = renderer.loss_value().unwrap();
         Results { image: renderer.image().unwrap().clone(), value, grads }
     };
-    let (plain, want) = (with_term(&mut gpu, None), with_term(&mut CpuRenderer::new(), Some(1.0)));
-    assert!(bits(&with_term(&mut gpu, Some(0.0))) == bits(&plain), "to the host and back no bit changes");
-    let got = with_term(&mut gpu, Some(1.0));
+    let (plain, want) = (run(&mut gpu, None, None), run(&mut CpuRenderer::new(), None, Some(1.0)));
+    assert!(bits(&run(&mut gpu, None, Some(0.0))) == bits(&plain), "to the host and back no bit changes");
+    let got = run(&mut gpu, None, Some(1.0));
     assert_same("a second term", &got, &want);
     assert!(l2(&got.grads.columns.sh0, &plain.grads.columns.sh0) > 0.1, "the term is not lost in the loss");
     assert_eq!(got.value, plain.value, "the value is that of the loss alone");
-    // With a correction of the picture before the loss, and its gradient taken back through the correction.
-    let with_exposure = |renderer: &mut dyn Renderer, exposure: f32| {
-        let mut grads = Gradients::default();
-        renderer.draw(&rows, &camera, &options).unwrap();
-        renderer.picture_mut().unwrap().iter_mut().for_each(|x| *x *= exposure);
-        renderer.loss(&target, &loss).unwrap();
-        renderer.picture_gradient().unwrap().v_rgb.iter_mut().for_each(|v| *v *= exposure);
-        renderer.backpropagate(&rows, &mut grads).unwrap();
-        let value = renderer.loss_value().unwrap();
-        Results { image: renderer.image().unwrap().clone(), value, grads }
-    };
-    assert!(bits(&with_exposure(&mut gpu, 1.0)) == bits(&plain));
-    let (corrected, want) = (with_exposure(&mut gpu, 1.25), with_exposure(&mut CpuRenderer::new(), 1.25));
+    assert!(bits(&run(&mut gpu, Some(1.0), None)) == bits(&plain));
+    let (corrected, want) = (run(&mut gpu, Some(1.25), None), run(&mut CpuRenderer::new(), Some(1.25), None));
     assert_same("an exposure", &corrected, &want);
     assert!((corrected.value.loss - plain.value.loss).abs() > 1e-3, "the loss compares the corrected picture");
     // A capacity that was too small is detected by the first reader of a result: here the caller that wants the
     // gradient.
     gpu.set_capacity(100);
-    assert!(bits(&with_term(&mut gpu, Some(1.0))) == bits(&got));
+    assert!(bits(&run(&mut gpu, None, Some(1.0))) == bits(&got));
     assert_eq!(gpu.frames_rerecorded(), 1);
 }
 
