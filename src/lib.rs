@@ -64,8 +64,9 @@
 //! 2. `train/run/begin.rs`, `begin`: asks the renderer before the output folder exists.
 //!
 //! **A densification strategy**
-//! 1. `densify/strategy.rs` states the steps: a file with the [`densify::strategy::Strategy`], its name, and an
-//!    event kind in `scene/events.rs` if a round needs other values than today's. `densify/mod.rs` names the file.
+//! 1. `densify/` gets a file with the [`densify::strategy::Strategy`], which `densify/mod.rs` names. `densify/strategy.rs`: its name in
+//!    [`densify::strategy::StrategyName`]. A round that needs other values than today's is an event kind in `scene/events.rs` with a
+//!    [`densify::strategy::Round`], which [`densify::strategy::effect_of`] names.
 //! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
 //!    strategy from the keys. `check` in `config/file.rs`: which keys it needs, and whether an optimizer on the device can do without it.
 //! 3. What acts on the rows of a view in every step: [`densify::strategy::Strategy::add_gradients`] and

@@ -30,7 +30,7 @@ mod sweep;
 mod sweep_page;
 
 use clap::Parser;
-use gsscale::base::error::InputError;
+use gsscale::base::error::{InputError, InputResult};
 use gsscale::config::choice::Choice;
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
@@ -122,4 +122,10 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
         let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads as usize).build_global();
     }
     Ok(config)
+}
+
+/// A file of a run.
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path, remedy: &str) -> InputResult<T> {
+    let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
+    serde_json::from_slice(&text).map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), remedy))
 }

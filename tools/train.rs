@@ -116,8 +116,8 @@ fn main() -> ExitCode {
         return ExitCode::SUCCESS;
     }
     let quiet = args.quiet;
-    let trace = args.trace.as_deref().filter(|_| !args.dry_run);
-    let outcome = begin_trace(trace).and_then(|()| start(args));
+    let begun = args.trace.as_deref().filter(|_| !args.dry_run).map_or(Ok(()), trace::start);
+    let outcome = begun.map_err(TrainError::from).and_then(|()| start(args));
     if let Err(error) = trace::finish() {
         gsscale::tell!("warning: {error}");
     }
@@ -128,10 +128,6 @@ fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
-}
-
-fn begin_trace(path: Option<&Path>) -> Result<(), TrainError> {
-    path.map_or(Ok(()), |path| Ok(trace::start(path)?))
 }
 
 /// Prints one line per adapter, and one for the CPU renderer, which always exists.
@@ -145,17 +141,11 @@ fn list_devices() {
     gsscale::say!("cpu: the CPU renderer");
 }
 
-/// Starts the page of the run and says where it is.
-fn begin_live(address: Option<SocketAddr>) -> InputResult<Option<Live>> {
-    let live = address.map(Live::begin).transpose()?;
+fn start(args: Args) -> Result<RunOutcome, TrainError> {
+    let live = args.serve.filter(|_| !args.dry_run).map(Live::begin).transpose()?;
     if let Some(live) = &live {
         gsscale::tell!("live page: http://{}/", live.address());
     }
-    Ok(live)
-}
-
-fn start(args: Args) -> Result<RunOutcome, TrainError> {
-    let live = begin_live(args.serve.filter(|_| !args.dry_run))?;
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
         let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet, live };

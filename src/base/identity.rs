@@ -25,12 +25,10 @@ impl RunId {
     /// No run's identity: for a store that was imported, or salvaged without its run's config.
     pub const UNKNOWN: RunId = RunId(0);
 
-    /// Draws the identity of a new run.
     pub fn draw() -> RunId {
         RunId(draw_identity().max(1))
     }
 
-    /// Whether this identifies a run.
     pub fn is_known(self) -> bool {
         self != RunId::UNKNOWN
     }

@@ -74,7 +74,6 @@ impl std::fmt::Display for PageId {
 pub struct PageNo(pub u32);
 
 impl PageNo {
-    /// As an index.
     pub fn index(self) -> usize {
         self.0 as usize
     }

@@ -54,7 +54,6 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// The stream of (seed, purpose, a, b).
     pub fn new(seed: u64, purpose: Purpose, a: u64, b: u64) -> Self {
         Stream { state: hash64(&[seed, purpose as u64, a, b]) }
     }

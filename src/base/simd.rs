@@ -53,7 +53,6 @@ impl SimdPath {
         }
     }
 
-    /// The path with this name.
     pub fn from_name(name: &str) -> Option<SimdPath> {
         SimdPath::ALL.into_iter().find(|p| p.name() == name)
     }
@@ -66,7 +65,6 @@ impl SimdPath {
         }
     }
 
-    /// Whether this machine supports the path.
     #[cfg(target_arch = "x86_64")]
     pub fn is_supported(self) -> bool {
         match self {
@@ -82,13 +80,11 @@ impl SimdPath {
         }
     }
 
-    /// Whether this machine supports the path.
     #[cfg(not(target_arch = "x86_64"))]
     pub fn is_supported(self) -> bool {
         self == SimdPath::Baseline
     }
 
-    /// The best path of this machine.
     pub fn best() -> SimdPath {
         static BEST: OnceLock<SimdPath> = OnceLock::new();
         *BEST.get_or_init(|| SimdPath::ALL.into_iter().find(|p| p.is_supported()).unwrap_or(SimdPath::Baseline))

@@ -58,7 +58,6 @@ pub struct TextReader<R> {
 }
 
 impl<R: Read> TextReader<R> {
-    /// Reads the text of `source`.
     pub fn new(source: R) -> TextReader<R> {
         let (raw, text) = (Vec::new(), String::new());
         TextReader { source, encoding: Encoding::Unknown, raw, text, passed: 0, ended: false }

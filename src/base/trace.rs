@@ -20,7 +20,6 @@ use std::time::Instant;
 
 /// Whether the process has a trace.
 static IS_ON: AtomicBool = AtomicBool::new(false);
-/// The trace.
 static SINK: Mutex<Option<Sink>> = Mutex::new(None);
 /// The 0-based step that the process is at.
 static STEP: AtomicU32 = AtomicU32::new(0);
@@ -100,7 +99,6 @@ pub fn span(name: &'static str) -> Span {
     Span { name, began, notes: String::new() }
 }
 
-/// A span under way.
 #[derive(Debug)]
 pub struct Span {
     name: &'static str,
@@ -127,7 +125,6 @@ impl Span {
         self
     }
 
-    /// Adds a number to the notes.
     pub fn note(&mut self, key: &'static str, value: u64) {
         if self.began.is_some() {
             let _ = write!(self.notes, ",\"{key}\":{value}");

@@ -67,9 +67,14 @@ impl Drop for PartFile {
 
 /// The temporary file `.NAME.part` of a target, which a process that is killed leaves; `None` if the target names no file.
 pub fn part_path(target: &Path) -> Option<PathBuf> {
+    hidden_beside(target, ".part")
+}
+
+/// `.NAME` and an ending, beside a target; `None` if the target has no name.
+pub(super) fn hidden_beside(target: &Path, ending: &str) -> Option<PathBuf> {
     let mut name = std::ffi::OsString::from(".");
     name.push(target.file_name()?);
-    name.push(".part");
+    name.push(ending);
     Some(target.with_file_name(name))
 }
 
@@ -92,7 +97,6 @@ pub fn write_whole_with(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Re
     part.finish(written.map_err(|e| InputError::io(path, "writing", &e))?)
 }
 
-/// The folder that a path lies in.
 pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }

@@ -7,7 +7,7 @@
 //! 3. files are durable before the folder gets its name; 4. dropping a folder that is being written removes it.
 
 use super::error::{InputError, InputResult};
-use super::whole_file::{folder_of, sync_folder};
+use super::whole_file::{folder_of, hidden_beside, sync_folder};
 use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -15,7 +15,6 @@ use std::path::{Path, PathBuf};
 /// Whether the writer of a folder makes a file of this path inside the folder. Such a file is called ours; every other one is foreign.
 pub type IsOurs = fn(&Path) -> bool;
 
-/// A folder that is being written.
 #[derive(Debug)]
 pub struct PartFolder {
     path: PathBuf,
@@ -32,14 +31,8 @@ impl PartFolder {
     /// The folder cannot be written, `target` names no folder, or the folder exists and holds foreign files.
     pub fn create(target: &Path, is_ours: IsOurs) -> InputResult<PartFolder> {
         let no_name = || InputError::new(target, "this path names no folder", "name a new folder");
-        let name = target.file_name().ok_or_else(no_name)?;
-        let beside = |ending: &str| {
-            let mut hidden = std::ffi::OsString::from(".");
-            hidden.push(name);
-            hidden.push(ending);
-            target.with_file_name(hidden)
-        };
-        let (path, old) = (beside(".part"), beside(".old"));
+        let beside = |ending: &str| hidden_beside(target, ending).ok_or_else(no_name);
+        let (path, old) = (beside(".part")?, beside(".old")?);
         let part = PartFolder { path, old, target: target.to_path_buf(), is_ours, bytes: 0 };
         check_ours(target, is_ours)?;
         // A process that was killed between the two renames left `.old`; one that was killed earlier left `.part`.

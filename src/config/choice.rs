@@ -39,7 +39,6 @@ pub trait Choice: Clone + Send + Sync + 'static {
     /// The value of a word; `None` for a word that a user may not write.
     fn from_word(word: &str) -> Option<Self>;
 
-    /// The word of a value.
     fn word(&self) -> Cow<'static, str>;
 }
 
@@ -60,7 +59,6 @@ fn unknown<T: Choice>(flag: &str, word: &str) -> String {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen<T>(pub Option<T>);
 
-/// Format of the metrics log.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LogFormat {
     /// metrics.jsonl alone.
@@ -268,7 +266,6 @@ impl<T: Choice> TypedValueParser for ChoiceParser<T> {
 /// The renderer: the value of `--device`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Device {
-    /// The CPU.
     Cpu,
     /// The chosen GPU; the CPU if [`DeviceChoice::Auto`] finds none.
     Gpu(DeviceChoice),

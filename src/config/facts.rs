@@ -13,21 +13,16 @@ use std::path::{Path, PathBuf};
 /// Facts of a run that follow from its config, scene and machine.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Resolved {
-    /// Version of the program.
     pub version: String,
     /// Identity of the run; its commits hold it too. Unknown if somebody removed the line.
     #[serde(default)]
     pub run: RunId,
     pub scene: PathBuf,
-    /// Instruction path in use.
     pub simd: String,
-    /// Worker threads in use.
     pub threads: usize,
     /// The renderer: "cpu", or the name of the GPU with its driver.
     pub device: String,
-    /// Training views.
     pub train_views: usize,
-    /// Held-out views.
     pub test_views: usize,
     /// Gaussians at the start.
     pub gaussians: u64,

@@ -1,17 +1,13 @@
 //! A key's heading in help, its meaning, its class (the effect of a change), and where help shows it.
 
-/// A key of the config.
 #[derive(Debug, Clone, Copy)]
 pub struct Key {
-    /// Its heading in help.
     pub heading: &'static str,
     /// Its field in [`super::file::TrainConfig`], also the id of the flag.
     pub field: &'static str,
     /// Its meaning, for help and for configs/default.toml.
     pub meaning: &'static str,
-    /// The effect of a change.
     pub class: Class,
-    /// Where help shows it.
     pub shown: Shown,
 }
 

@@ -27,9 +27,7 @@ use std::sync::Arc;
 /// Resolved options of the training loop.
 #[derive(Debug, Clone)]
 pub struct RunOptions {
-    /// Total steps.
     pub steps: u32,
-    /// Seed of every draw.
     pub seed: u64,
     /// Highest SH degree.
     pub sh_degree: u8,
@@ -37,7 +35,6 @@ pub struct RunOptions {
     pub sh_every: u32,
     /// SH degree at step 0: that of the config or of the Gaussians from which the run starts.
     pub sh_degree_start: u8,
-    /// Capacity of a page, rows.
     pub page_rows: usize,
     /// View order; a shuffle until `auto` has been decided.
     pub view_order: Order,
@@ -46,22 +43,16 @@ pub struct RunOptions {
     pub loss: LossOptions,
     pub rates: Rates,
     pub adam: AdamConfig,
-    /// Which rows the optimizer updates.
     pub optimizer: Method,
-    /// Where the optimizer runs.
     pub optimizer_on: OptimizerPlace,
-    /// Format of stored moments.
     pub moments: Moments,
-    /// Densification strategy.
     pub strategy: Arc<dyn Strategy>,
     /// Scene scale, local units.
     pub scene_scale: f32,
     pub ssim_variant: SsimVariant,
     /// Method of the colour-corrected PSNR; `None` for none.
     pub color_correct: Option<ColorCorrect>,
-    /// What is learnt of each photo.
     pub photos: PhotoOptions,
-    /// Coordinates of PLY files.
     pub export_frame: ExportFrame,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
     /// `--up auto` is unresolved.
@@ -131,7 +122,6 @@ impl RunOptions {
     }
 }
 
-/// The learning rates of a config.
 fn rates(config: &TrainConfig, scene_scale: f32) -> Rates {
     Rates {
         means: config.means_lr * f64::from(scene_scale),
@@ -146,7 +136,6 @@ fn rates(config: &TrainConfig, scene_scale: f32) -> Rates {
     }
 }
 
-/// The strategy of a config.
 fn strategy(config: &TrainConfig, scene_scale: f32) -> Arc<dyn Strategy> {
     let or_never = |n: u32| if n == 0 { u32::MAX } else { n };
     let rounds = RoundSteps { start: config.refine_start, stop: config.refine_stop, every: config.refine_every };
@@ -185,12 +174,10 @@ fn strategy(config: &TrainConfig, scene_scale: f32) -> Arc<dyn Strategy> {
     }
 }
 
-/// The loss of a config.
 fn loss_options(config: &TrainConfig) -> LossOptions {
     LossOptions { ssim_lambda: config.ssim_lambda as f32, padding: config.ssim_padding, simd: simd_path(config) }
 }
 
-/// The loss of the default config.
 impl Default for LossOptions {
     fn default() -> LossOptions {
         loss_options(&TrainConfig::default())
@@ -213,7 +200,6 @@ pub fn simd_path(config: &TrainConfig) -> SimdPath {
     config.simd.0.unwrap_or_else(SimdPath::best)
 }
 
-/// Options for reading the scene.
 pub fn read_options(config: &TrainConfig) -> ReadOptions {
     ReadOptions {
         images: (!config.images.is_empty()).then(|| config.images.clone()),
@@ -222,7 +208,6 @@ pub fn read_options(config: &TrainConfig) -> ReadOptions {
     }
 }
 
-/// Options for loading the dataset.
 pub fn load_options(config: &TrainConfig) -> LoadOptions {
     LoadOptions {
         data_factor: config.data_factor,

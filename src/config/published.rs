@@ -17,7 +17,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// The built-in runs, by name.
 pub const BUILT_IN: [(&str, &str); 8] = [
     ("rubble", include_str!("../../configs/rubble.toml")),
     ("building", include_str!("../../configs/building.toml")),
@@ -36,11 +35,9 @@ pub struct PublishedRun {
     /// Settings of the active tier.
     pub config: TrainConfig,
     pub facts: Published,
-    /// Densification tiers by name.
     pub tiers: BTreeMap<String, Tier>,
 }
 
-/// The table `[published]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct Published {
@@ -64,10 +61,8 @@ pub struct Published {
     pub size: Option<[u32; 2]>,
     #[serde(default)]
     pub notes: Vec<String>,
-    /// Published quality, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub expected: Option<Expected>,
-    /// Published memory saving, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub memory: Option<MemorySaving>,
 }
@@ -85,9 +80,7 @@ pub struct Expected {
     pub lpips_variant: String,
     /// PSNR of the original trainer, dB.
     pub original_psnr: f64,
-    /// SSIM of the original trainer.
     pub original_ssim: f64,
-    /// LPIPS of the original trainer.
     pub original_lpips: f64,
 }
 
@@ -104,7 +97,6 @@ pub struct MemorySaving {
     pub saving_mean: f64,
 }
 
-/// Densification settings of a tier.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct Tier {

@@ -12,7 +12,6 @@ use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, RoundThresholds, SPLIT_SIGMAS};
 use crate::scene::rows::{Rows, mean_grad2d};
 
-/// The strategy with its keys.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DefaultStrategy {
     /// A row grows if its mean gradient norm is above this value, NDC units.

@@ -5,20 +5,18 @@
 //! faintest carry detail, and the view loses decibels; where they abound, neighbours hide what a removed one leaves. The more
 //! decibels the held-out views lose, the more the next doubling brings.
 //!
-//! What counts as a loss that pays grows with the steps, since an untrained scene loses little whatever its count. The first
-//! check comes once the first Gaussians are trained somewhat, the last one soon after, because Gaussians that come later bring
-//! less. A stage of growth is mostly whole doublings: where only the rows of the largest scores were split, the faintest rows
-//! of a view would be the children of the most important ones, and the loss would say nothing about the count.
+//! What counts as a loss that pays grows with the steps, since an untrained scene loses little whatever its count. The last check
+//! comes soon after the first, because Gaussians that come later bring less. A stage of growth is mostly whole doublings: where only
+//! the rows of the largest scores were split, the faintest rows of a view would be the children of the most important ones.
 //! `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
 //!
-//! A loss below the price can mean two things. In a scene of few points, or of few steps a photo, every doubling pays. In other scenes
-//! growth only fits noise. The second kind shows training views much better than held-out ones. A scene without that gap doubles on
+//! A loss below the price can mean two things: in a scene of few points, or of few steps a photo, every doubling pays; in others
+//! growth only fits noise, and training views come out much better than held-out ones. A scene without that gap doubles on
 //! trial, unless `--quality draft` is set. Each further check doubles it again, if the gap is still small or the held-out views gained.
-//! Otherwise the check undoes the last doubling: the rows of least weight go ([`super::long_axis`]). The last check begins no trial,
+//! Otherwise it undoes the last doubling: the rows of least weight go ([`super::long_axis`]). The last check begins no trial,
 //! since no check would judge it.
 //!
-//! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`), which rows grow
-//! ([`super::long_axis`]).
+//! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::held_out`).
 //!
 //! Invariants: 1. a decision is a function of the step, the loss and the earlier decisions, which are part of commits; 2.
 //! the allowed number falls only by a doubling that was on trial, and never below the first number.
@@ -31,7 +29,6 @@ use std::fmt;
 pub enum Quality {
     /// Few Gaussians.
     Draft,
-    /// The default.
     Normal,
     /// Many Gaussians.
     Archive,
@@ -82,7 +79,6 @@ pub struct GrowthRule {
     unit: u32,
 }
 
-/// A check and its decision.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GrowthCheck {
     /// Steps done.
@@ -95,11 +91,9 @@ pub struct GrowthCheck {
     pub trained_psnr: f64,
     /// Decibels that a held-out view loses without its faintest quarter: the mean over the views.
     pub lost: f64,
-    /// Decibels from which growth pays.
     pub pays_from: f64,
     /// Whether the scene doubles on trial, although the loss does not pay.
     pub is_trial: bool,
-    /// Gaussians that are allowed from here on.
     pub allowed: u64,
 }
 
@@ -108,7 +102,6 @@ pub struct GrowthCheck {
 pub struct GrowthValues {
     /// PSNR of the held-out views.
     pub psnr: f64,
-    /// PSNR of as many views that are trained on.
     pub trained_psnr: f64,
     /// Loss of the held-out views without their faintest quarter.
     pub lost: f64,
@@ -124,7 +117,6 @@ pub struct GrowthState {
 }
 
 impl GrowthState {
-    /// Gaussians that are allowed now.
     pub fn allowed(&self) -> u64 {
         self.checks.last().map_or(self.first, |last| last.allowed)
     }
@@ -153,7 +145,6 @@ impl GrowthState {
 }
 
 impl GrowthCheck {
-    /// Whether the scene grows.
     pub fn grows(&self) -> bool {
         self.is_trial || self.lost > self.pays_from
     }
@@ -192,7 +183,6 @@ impl GrowthRule {
         })
     }
 
-    /// The steps of the first and of the last check.
     pub fn check_steps(&self) -> [u32; 2] {
         [CHECKS[0], CHECKS[CHECKS.len() - 1]].map(|[share, _]| (share * f64::from(self.unit)) as u32)
     }
@@ -364,23 +354,9 @@ mod tests {
         assert!(!first.1 && first == last && first.0 > 64_000, "{first:?}, {last:?}");
         let pays_later = decisions(1000, [[20.0, 20.0, 0.1], [19.0, 19.0, 1.0], [19.0, 19.0, 0.0], [19.0, 19.0, 0.0]]);
         assert_eq!(pays_later[0], (2000, true));
-        assert!(!pays_later[1].1 && pays_later[1].0 > 2000 && pays_later[3] == pays_later[1], "{pays_later:?}");
-    }
-
-    #[test]
-    fn only_the_first_check_begins_trials() {
-        let rule = GrowthRule::new(Quality::Normal, 3000);
-        let state = GrowthState { first: 1000, checks: Vec::new() };
-        let of = |trained_psnr: f64| {
-            rule.check((0, 1000), 1000, GrowthValues { psnr: 20.0, trained_psnr, lost: 0.001 }, &state)
-        };
-        let [near, far] = [19.5, 20.0 + TRIAL_GAP + 0.1].map(of);
-        assert_eq!([(near.allowed, near.is_trial), (far.allowed, far.is_trial)], [(2000, true), (1000, false)]);
         let draft = GrowthRule::new(Quality::Draft, 3000);
-        let values = GrowthValues { psnr: 20.0, trained_psnr: 19.5, lost: 0.001 };
-        assert!(!draft.check((0, 1000), 1000, values, &state).is_trial);
-        let state = GrowthState { checks: vec![far], ..state };
-        let later = rule.check((1, 1200), 1000, GrowthValues { psnr: 20.0, trained_psnr: 19.0, lost: 0.001 }, &state);
-        assert_eq!((later.allowed, later.is_trial), (1000, false));
+        let near = GrowthValues { psnr: 20.0, trained_psnr: 19.5, lost: 0.001 };
+        assert!(!draft.check((0, 1000), 1000, near, &GrowthState { first: 1000, checks: Vec::new() }).is_trial);
+        assert!(!pays_later[1].1 && pays_later[1].0 > 2000 && pays_later[3] == pays_later[1], "{pays_later:?}");
     }
 }

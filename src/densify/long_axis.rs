@@ -1,25 +1,22 @@
 //! The strategy `long-axis`: rows with the highest growth scores are split along their longest axis as far as the cap
 //! allows, and once the cap is reached, rows of little weight are removed so that better rows can take their places. The cap
-//! is `--max-gaussians`, or what the run allows at this step ([`super::growth`]).
+//! is `--max-gaussians`, or what the run allows at this step ([`super::growth`]). There are no opacity resets.
 //!
-//! A round comes every `refine_every` steps. Its growth takes whole bins of the score histogram from the top, as many as
-//! fit under the cap. Its recycling takes whole bins of the histogram of mean blending weights from the bottom, at most
-//! a share of the rows that enough views weighed since the last round: where views come in spatial groups, every region
-//! then loses its share when the views come to it. The capacity that removed rows free is used only by later rounds,
-//! when the removals have been applied, so the cap holds at every step. There are no opacity resets. Where the run allows fewer rows
-//! than there are, a round takes the surplus from the weighed rows in the same way.
+//! A round takes growth as whole bins of the score histogram from the top, as many as fit under the cap, and recycles whole bins of the
+//! histogram of mean blending weights from the bottom, at most a share of the rows that enough views weighed since the last round: where
+//! views come in spatial groups, every region then loses its share when the views come to it. Only later rounds use what removed rows
+//! free, so the cap holds at every step. Where the run allows fewer rows than there are, the surplus goes in the same way.
 //!
-//! Views may come region by region, in epochs longer than `refine_every`. A round within such an epoch would have the statistics of
-//! a few regions. So rounds come at the ends of epochs ([`Strategy::for_regions`]): the thresholds of a round then hold for all
-//! regions, as in a shuffle, and a round recycles as much as all rounds of a shuffled epoch. A run in which two such rounds do not
-//! fit keeps its rounds, and these rounds share the room.
+//! Where views come region by region, in epochs longer than `refine_every`, a round within an epoch would have the statistics of
+//! a few regions. So rounds come at the ends of epochs ([`Strategy::for_regions`]), and a round recycles as much as all rounds of a
+//! shuffled epoch. A run in which two such rounds do not fit keeps its rounds, which share the room.
 //!
 //! Growth scores, per row and view: the norm of the gradient of the projected mean (NDC units), the squared error of
 //! the picture under the row (sum over pixels of blending weight times squared error, mean over channels), or the
 //! geometric mean of both.
 //!
-//! Invariants: 1. a round never leaves more rows than the cap, unless there were more before; 2. a decision is a function of the step and of
-//! statistics; 3. nothing is drawn at random.
+//! Invariants: 1. a round never leaves more rows than the cap, unless there were more before; 2. a decision is a function of the step
+//! and of statistics; 3. nothing is drawn at random.
 
 use super::growth::GrowthRule;
 use super::stats::{
@@ -42,7 +39,6 @@ const RECYCLED_MOST: f64 = 0.25;
 /// The value of `--growth-score`: which rows grow first.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GrowthScore {
-    /// Gradient of the projected mean.
     Gradient,
     /// Squared error under the row.
     Error,
@@ -50,10 +46,8 @@ pub enum GrowthScore {
     Mixed,
 }
 
-/// The strategy with its keys.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LongAxisStrategy {
-    /// Which rows grow first.
     pub score: GrowthScore,
     /// Share of the weighed rows that a round removes at the cap; 0: none.
     pub recycle: f64,
@@ -326,16 +320,6 @@ mod tests {
         }
         let round = strategy.round(700, RowCount { allowed: 1000, ..RowCount::unlimited(1000) }, &histogram);
         assert_eq!(round.remove_below_bin, 0);
-    }
-
-    #[test]
-    fn faint_rows_go_and_bounds_of_pages_know_it() {
-        let strategy = strategy(GrowthScore::Mixed, 1000);
-        let round = strategy.round(700, RowCount::unlimited(10), &GradHistogram::default());
-        let of = |opacity: f32| round.fate(&RowFacts { grad2d: 0.0, count: 0, log_scale: 0.0, opacity });
-        assert_eq!((of(logit(0.004)), of(logit(0.006))), (Fate::Prune, Fate::Keep));
-        let keeps = |lowest_opacity: f32| round.keeps_all(&Extremes { lowest_opacity, sigma_max: 1e9 });
-        assert!(keeps(logit(0.006)) && !keeps(logit(0.004)));
     }
 
     /// The steps of the rounds.

@@ -5,17 +5,15 @@
 //! adds noise to the means of the rows that it rewrote. Each view adds the gradients of two regularisers to the rows that it drew.
 //!
 //! Where it differs from gsplat, which reads all rows in every step:
-//! - The draw is one without replacement. A row gets the key opacity / E, with E from the exponential distribution: the rows
-//!   with the greatest keys are such a draw (Efraimidis and Spirakis 2006). The histogram of keys gives the least key that
-//!   still fits, in whole bins. gsplat draws with replacement, so a row may get several copies in a round; here it gets one.
-//! - The opacity of the draw is the mean over the views that drew the row since the last round. Other rows get no copy.
+//! - The draw is one without replacement, so a row gets one copy in a round. Its key is opacity / E, with E from the exponential
+//!   distribution: the rows with the greatest keys are such a draw (Efraimidis and Spirakis 2006). The histogram of keys gives the least
+//!   key that still fits, in whole bins. The opacity is the mean over the views that drew the row since the last round; other rows get
+//!   no copy.
 //! - A round gives away places for 5 % of the rows drawn since the last round, as far as the cap has room. The place of
-//!   a dead row becomes room when its page has applied the removal, so another round gives it away.
+//!   a dead row becomes room when its page has applied the removal.
 //! - Noise and regularisers act on rows that the view drew only. The means of the regularisers are over the rows of the view.
 //! - Lengths are in units of the scene scale, which gsplat has by making it about 1 on loading.
 //! - Both rows of a place start with zero moments and new uids.
-//!
-//! Not here: the values of the two rows of a place ([`super::ops`]).
 //!
 //! Invariants: 1. a round never leaves more rows than the cap, unless there were more before; 2. keys and noise are functions
 //! of (seed, round or step, uid) and the row; 3. an update ends with the noise, so bounds of pages, which are taken
@@ -47,7 +45,6 @@ const SCALE_WEIGHT: f64 = 0.01;
 /// Least value of an exponential draw, so that no key is infinite.
 const DRAW_LEAST: f64 = 1e-20;
 
-/// The strategy with its keys.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct McmcStrategy {
     /// Rows of this opacity or less are dead.

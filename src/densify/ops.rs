@@ -26,11 +26,10 @@ const SHORT_AXES_SHRINK: f64 = 0.85;
 /// Opacity of the children of a long-axis split over that of their parent, after activation.
 const CHILD_OPACITY: f64 = 0.6;
 /// Children of a split in place ([`Fate::SplitInPlace`]).
-const IN_PLACE_CHILDREN: u64 = 2;
+const IN_PLACE_CHILDREN: usize = 2;
 /// Least opacity of such a child.
 const IN_PLACE_OPACITY_LEAST: f32 = 0.005;
 
-/// The effect of a round in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct RoundCounts {
     pub duplicated: usize,
@@ -40,7 +39,6 @@ pub struct RoundCounts {
     pub pruned: usize,
 }
 
-/// The edits of a round to the rows of a view.
 #[derive(Debug, Clone)]
 pub struct RoundEdits {
     /// Rows to remove, numbered in the view, ascending.
@@ -73,47 +71,39 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
             values.evaluate_row(rows, row, &mut block);
             values.log_scales().clamp_all(scales_of(&mut block));
         }
-        match fate {
-            Fate::Keep => {}
+        let uid = |child: u64| child_uid(rows.uid[row], event, child);
+        let children = match fate {
+            Fate::Keep => continue,
             Fate::Prune => {
-                removed.push(row as u32);
                 counts.pruned += 1;
+                None
             }
             Fate::Duplicate { pruned: false } => {
                 counts.duplicated += 1;
-                new_rows.push(child_uid(rows.uid[row], event, 0), &block);
+                new_rows.push(uid(0), &block);
+                continue;
             }
             Fate::Duplicate { pruned: true } => {
                 // Row and copy are both pruned.
                 counts.duplicated += 1;
                 counts.pruned += 2;
-                removed.push(row as u32);
+                None
             }
-            Fate::Split { children_pruned } => {
+            Fate::Split { children_pruned: true } => {
                 counts.split += 1;
-                removed.push(row as u32);
-                if children_pruned {
-                    counts.pruned += 2;
-                    continue;
-                }
-                for child in 0..2 {
-                    let uid = child_uid(rows.uid[row], event, child);
-                    new_rows.push(uid, &split_child(&block, seed, uid, event));
-                }
+                counts.pruned += 2;
+                None
             }
-            Fate::SplitLongAxis => {
-                counts.split += 1;
-                removed.push(row as u32);
-                for (child, block) in (0..).zip(long_axis_children(&block)) {
-                    new_rows.push(child_uid(rows.uid[row], event, child), &block);
-                }
+            Fate::Split { children_pruned: false } => {
+                Some([0, 1].map(|child| split_child(&block, seed, uid(child), event)))
             }
-            Fate::SplitInPlace => {
-                counts.split += 1;
-                removed.push(row as u32);
-                let shared = in_place_child(&block);
-                (0..IN_PLACE_CHILDREN).for_each(|child| new_rows.push(child_uid(rows.uid[row], event, child), &shared));
-            }
+            Fate::SplitLongAxis => Some(long_axis_children(&block)),
+            Fate::SplitInPlace => Some([in_place_child(&block); IN_PLACE_CHILDREN]),
+        };
+        removed.push(row as u32);
+        counts.split += usize::from(children.is_some());
+        for (child, block) in (0..).zip(children.iter().flatten()) {
+            new_rows.push(uid(child), block);
         }
     }
     RoundEdits { removed, added: new_rows.into_state(values.now()), counts }
@@ -148,7 +138,6 @@ pub fn reset_opacity_rows<V: RowsNow>(values: &V, rows: &mut RowsMut<'_>, max_op
     rewritten
 }
 
-/// The uid of a new row.
 pub fn child_uid(parent: u64, event: u64, child: u64) -> u64 {
     hash64(&[parent, event, child])
 }
@@ -247,7 +236,6 @@ pub(super) fn rotation(q: [f64; 4]) -> [[f64; 3]; 3] {
     Rotation::from_quaternion(q.map(|c| c / length)).unwrap_or(Rotation::IDENTITY).matrix()
 }
 
-/// New rows of a round.
 struct NewRows {
     columns: Columns,
     uid: Vec<u64>,

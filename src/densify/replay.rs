@@ -23,10 +23,8 @@ use crate::scene::sightings::{VIEWS_MOST, of_mean_weight};
 use crate::scene::state::SceneState;
 use std::sync::OnceLock;
 
-/// The effect of one round on a page.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageRound {
-    /// Index of the event.
     pub event: usize,
     /// Rows after the round minus rows before.
     pub rows_change: i64,
@@ -36,24 +34,20 @@ pub struct PageRound {
     pub counts: RoundCounts,
 }
 
-/// The effect of a replay on a page.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PageEdit {
     /// No byte changed; the page stays clean.
     Unchanged,
     /// Statistics were cleared in place, and nothing else changed.
     Cleared,
-    /// The rows were edited in place.
     InPlace,
     /// These pages replace the page, ordered by name: the page itself, possibly without rows, or its parts. The rows in
     /// the frame are obsolete.
     Replaced(Vec<(PageId, SceneState)>),
 }
 
-/// Outcome of a replay.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Replay {
-    /// The effect on the page.
     pub edit: PageEdit,
     /// The rounds among the events, in order.
     pub rounds: Vec<PageRound>,
@@ -215,7 +209,6 @@ impl Default for Replay {
     }
 }
 
-/// The rows of a replay.
 struct EditedRows<'a, 'r> {
     /// The rows of a page, edited in place until `table` exists.
     page: &'a mut RowsMut<'r>,

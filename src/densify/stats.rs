@@ -56,7 +56,6 @@ impl GradHistogram {
         rows.grad2d.iter().zip(rows.count).for_each(|(&grad2d, &count)| self.add_row(grad2d, count));
     }
 
-    /// Counts a row with these statistics.
     fn add_row(&mut self, grad2d: f32, count: u32) {
         if count > 0 {
             self.add(mean_grad2d(grad2d, count));
@@ -66,7 +65,6 @@ impl GradHistogram {
         }
     }
 
-    /// Removes a row with these statistics.
     fn remove_row(&mut self, grad2d: f32, count: u32) {
         if count > 0 {
             self.take_from(bin(mean_grad2d(grad2d, count)));
@@ -103,7 +101,6 @@ impl GradHistogram {
         self.bins.fill(0);
     }
 
-    /// Number of rows with statistics.
     pub fn rows(&self) -> u64 {
         self.bins[..BINS].iter().map(|&n| u64::from(n)).sum()
     }

@@ -4,14 +4,6 @@
 //! A round does not depend on the strategy of the run: a page may apply a round late, when the config has changed, and
 //! must get the result of applying the round on time. The event therefore holds every value that the decision needs.
 //!
-//! To add a strategy:
-//! 1. add a file beside [`super::default`] with a struct that holds the keys and implements [`Strategy`];
-//! 2. add a name to [`StrategyName`];
-//! 3. add the keys to `config/file.rs` and pass them to the struct in `config/limits.rs`;
-//! 4. if a round needs values beyond those of the events in `scene/events.rs`, add an event kind there, implement
-//!    [`Round`] for it and name it in [`effect_of`];
-//! 5. if a row needs another [`Fate`], add it here and its values in [`super::ops`].
-//!
 //! Invariants: 1. strategies and rounds are functions of their arguments, without side effects; 2. an event gives a row
 //! the same fate whenever it is applied.
 
@@ -24,16 +16,11 @@ use crate::scene::rows::{Rows, RowsMut};
 use std::fmt;
 use std::sync::Arc;
 
-/// The value of `--strategy`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum StrategyName {
-    /// [`super::default::DefaultStrategy`].
     Default,
-    /// [`super::long_axis::LongAxisStrategy`].
     LongAxis,
-    /// [`super::mcmc::McmcStrategy`].
     Mcmc,
-    /// [`NoStrategy`].
     None,
 }
 
@@ -56,7 +43,6 @@ pub struct RoundSteps {
 }
 
 impl RoundSteps {
-    /// Whether a round follows this step.
     pub fn is_round(&self, step: u32) -> bool {
         step > self.start && step < self.stop && step.is_multiple_of(self.every)
     }
@@ -103,7 +89,6 @@ pub struct RowCount {
 }
 
 impl RowCount {
-    /// Rows without a limit.
     pub fn unlimited(rows: u64) -> RowCount {
         RowCount { rows, allowed: u64::MAX }
     }
@@ -125,7 +110,6 @@ pub trait Strategy: fmt::Debug + Send + Sync {
         self.rounds().is_some()
     }
 
-    /// Whether this step collects statistics.
     fn collects(&self, step: u32) -> bool {
         self.rounds().is_some_and(|rounds| step < rounds.stop)
     }
@@ -190,7 +174,6 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     fn split_limits(&self, scene_scale: f32) -> SplitLimits;
 }
 
-/// The strategy that never densifies.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NoStrategy;
 
@@ -237,7 +220,6 @@ pub enum Fate {
     Keep,
     /// The row is removed.
     Prune,
-    /// The row is duplicated.
     Duplicate {
         /// Whether the same round prunes both copies.
         pruned: bool,
@@ -253,9 +235,7 @@ pub enum Fate {
     SplitInPlace,
 }
 
-/// A logged round.
 pub trait Round: Sync {
-    /// The fate of a row.
     fn fate(&self, row: &RowFacts) -> Fate;
 
     /// Whether statistics decide the fate of a row here. Where they do not, the fate of every row must be the one that it would have
@@ -275,18 +255,17 @@ pub trait Round: Sync {
     fn promised_rows(&self, rows: &Rows<'_>) -> u64;
 }
 
-/// The effect of an event on rows.
 #[derive(Clone, Copy)]
 pub enum Effect<'a> {
-    /// A round of a strategy.
     Round(&'a dyn Round),
-    /// Opacities are capped.
     ResetOpacity {
         /// The cap, after activation.
         max_opacity: f32,
     },
     /// Rows that are stored with a lower SH degree get zeros for the missing bands.
-    RaiseShDegree { degree: u8 },
+    RaiseShDegree {
+        degree: u8,
+    },
 }
 
 /// The effect of an event kind on rows. The only place that names the rounds of all strategies.

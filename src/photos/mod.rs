@@ -34,9 +34,7 @@ pub struct PhotoOptions {
     pub robust_views: bool,
     /// Whether blocks of photos that contradict the scene are masked.
     pub robust_pixels: bool,
-    /// Whether the poses of training photos are refined.
     pub refine_poses: bool,
-    /// Steps of the run.
     pub steps: u32,
     /// Scene scale, local units.
     pub scene_scale: f32,
@@ -46,7 +44,6 @@ pub struct PhotoOptions {
 /// this order too.
 pub const KINDS: [Kind; 4] = [exposure::KIND, pose::KIND, outlier::views::KIND, outlier::blocks::KIND];
 
-/// The parameters of a run.
 pub type PhotoParameters = Vec<Box<dyn PhotoParameter>>;
 
 /// The parameters of a run of these options that has seen nothing.

@@ -23,7 +23,6 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
-/// A kind of parameters.
 pub struct Kind {
     /// Its name in commits; see [`PhotoParameter::name`].
     pub name: &'static str,
@@ -47,11 +46,9 @@ pub struct Finding {
     pub curve: Option<Curve>,
 }
 
-/// A curve over the photos.
 #[derive(Debug)]
 pub struct Curve {
     pub title: &'static str,
-    /// Unit of the values.
     pub unit: &'static str,
     /// A value for each photo, in the order of names.
     pub values: Vec<f64>,
@@ -71,9 +68,7 @@ pub struct PhotoStep<'a> {
     pub view: usize,
     /// Steps done.
     pub step: u32,
-    /// The camera of the step.
     pub camera: &'a Camera,
-    /// The events so far.
     pub events: &'a EventLog,
     /// Only the loss is measured: the view is not trained on.
     pub is_left_out: bool,
@@ -91,7 +86,6 @@ impl PhotoStep<'_> {
     }
 }
 
-/// A step that was done.
 #[derive(Debug, Clone, Copy)]
 pub struct PhotoOutcome<'a> {
     pub view: usize,
@@ -162,7 +156,6 @@ pub trait PhotoParameter {
         false
     }
 
-    /// Whether pictures are corrected.
     fn corrects(&self) -> bool {
         false
     }
@@ -221,7 +214,6 @@ pub trait PhotoParameter {
         0
     }
 
-    /// Frees the buffers for a step.
     fn free_buffers(&mut self) {}
 
     /// For the forecast: most bytes of the values during a run, with the copies that a commit makes.
@@ -269,7 +261,6 @@ pub struct Encoded(Vec<u8>);
 /// Why bytes are not values of a kind.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ValuesError {
-    /// The encoding is invalid.
     #[error(transparent)]
     Encoding(#[from] EncodingError),
     /// No run can have written them.

@@ -43,7 +43,6 @@ pub struct Motion {
 }
 
 impl Motion {
-    /// The camera after the motion.
     pub fn applied_to(&self, camera: &Camera) -> Camera {
         if *self == Motion::default() {
             return *camera;
@@ -67,7 +66,6 @@ impl Motion {
 const SUM_PER_UNIT: f64 = (1u64 << 60) as f64;
 /// Largest magnitude of what one row adds.
 const ROW_MOST: f64 = (1u64 << 30) as f64;
-/// Rows of a task.
 const ROWS_PER_TASK: usize = 4096;
 
 /// Sums over the rows of a view, fixed-point.
@@ -84,10 +82,6 @@ pub struct MotionGradient {
     pub shift: [f64; 3],
     /// Per radian.
     pub turn: [f64; 3],
-}
-
-fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
-    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 impl MotionSum {
@@ -127,7 +121,7 @@ impl MotionSum {
             -y * vw + z * vx + w * vy - x * vz,
             -z * vw - y * vx + x * vy + w * vz,
         ];
-        let of_place = cross(p, v_place);
+        let of_place = DVec3::from(p).cross(v_place.into());
         let turn: [f64; 3] = std::array::from_fn(|i| -of_place[i] - of_quat[i] / 2.0);
         let all = [-v_mean[0], -v_mean[1], -v_mean[2], turn[0], turn[1], turn[2]];
         if all.iter().all(|x| x.is_finite()) {
@@ -137,7 +131,6 @@ impl MotionSum {
         }
     }
 
-    /// The derivative.
     pub fn gradient(&self) -> MotionGradient {
         let of = |k: usize| self.sums[k] as f64 / SUM_PER_UNIT;
         MotionGradient { shift: [of(0), of(1), of(2)], turn: [of(3), of(4), of(5)] }
@@ -162,7 +155,6 @@ const BETAS: [f64; 2] = [0.8, 0.95];
 const BEGIN_SHARE: u32 = 10;
 const BEGIN_PASSES: u32 = 2;
 
-/// The motion of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct ViewPose {
     /// Shift and turn, fixed-point, with the mean in them.
@@ -178,7 +170,6 @@ pub struct ViewPose {
 /// All motions; empty for a run that refines no poses.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct PoseState {
-    /// By view of the dataset.
     views: Vec<ViewPose>,
     /// Sums of the motions of the photos seen.
     sums: [i64; 6],
@@ -215,11 +206,6 @@ impl PoseState {
         PoseState { views: vec![ViewPose::default(); views], ..PoseState::default() }
     }
 
-    /// Whether the motions are of as many photos as `other`.
-    pub fn has_same_counts(&self, other: &PoseState) -> bool {
-        self.views.len() == other.views.len()
-    }
-
     fn acting(&self, view: usize) -> [f64; 6] {
         let Some(pose) = self.views.get(view).filter(|pose| pose.sightings > 0) else { return [0.0; 6] };
         let of = |k: usize| (pose.values[k] as f64 - self.sums[k] as f64 / f64::from(self.seen.max(1))) / PER_UNIT;
@@ -230,11 +216,6 @@ impl PoseState {
     pub fn motion(&self, view: usize, scene_scale: f32) -> Motion {
         let [x, y, z, a, b, c] = self.acting(view);
         Motion { shift: [x, y, z].map(|share| share * f64::from(scene_scale)), turn: [a, b, c] }
-    }
-
-    /// Steps that have refined the pose of a view.
-    pub fn sightings(&self, view: usize) -> u32 {
-        self.views.get(view).map_or(0, |pose| pose.sightings)
     }
 
     /// Moves a pose against its gradient, by about `rate` ([`rate_at`]).
@@ -333,7 +314,7 @@ impl PhotoParameter for Poses {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, PoseState::check, PoseState::has_same_counts)
+        saved.restore(&mut self.state, PoseState::check, |a, b| a.views.len() == b.views.len())
     }
 
     fn camera(&self, view: usize, camera: Camera) -> Camera {
@@ -385,7 +366,7 @@ impl Poses {
             rotation: camera.viewmat.map(|[x, y, z, _]| [x, y, z].map(f64::from)),
             shift: length(motion.shift) * dataset.frame.scale,
             turn_degrees: length(motion.turn).to_degrees(),
-            sightings: self.state.sightings(view),
+            sightings: self.state.views[view].sightings,
         }
     }
 }

@@ -16,11 +16,10 @@ const WIDE: (u32, u32) = (1040, 480);
 const LEGEND_WIDTH: u32 = 190;
 /// Middle of the first row of the legend.
 const LEGEND_TOP: u32 = 40;
-/// Distance of the rows of the legend.
 const LEGEND_ROW: u32 = 20;
 /// Longest name in the legend, characters.
 const NAME_MAX: usize = 24;
-/// Colours of series, as many as a sweep needs for the reference, eleven groups and the front.
+/// Colours of series. [`color`] finds more where these do not suffice.
 const COLORS: [RGBColor; 13] = [
     RGBColor(36, 99, 180),
     RGBColor(205, 92, 32),
@@ -40,32 +39,29 @@ const COLORS: [RGBColor; 13] = [
 const TITLE_SIZE: u32 = 20;
 const TEXT_SIZE: u32 = 16;
 const LABEL_SIZE: u32 = 13;
+/// Width of a character of a label, at most, and height of a label, SVG units.
+const LABEL_CHAR: f64 = 7.5;
+const LABEL_HEIGHT: i32 = 14;
+/// Distances of labels from their points. A label that is not at the first one has a line to its point.
+const LABEL_REACH: [i32; 4] = [7, 20, 36, 56];
 /// Lines of the grid; the style of the page names this colour, as that of [`AXIS`] and white, for dark screens.
 const GRID: RGBColor = RGBColor(224, 224, 224);
 /// Points of a curve that [`smoothed`] averages over: this share of them.
 const SMOOTH_SHARE: usize = 20;
 
-/// Brightness of the colours in each round through [`COLORS`]: darker below 1, lighter above 1.
-const SHADES: [f64; 4] = [1.0, 0.6, 1.5, 0.3];
-
 /// Colour of axes and frames.
 const AXIS: RGBColor = RGBColor(97, 97, 97);
 
-/// The mark of a series.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mark {
-    /// A line through the points.
     Line,
     /// A pale thin line, behind a line of the same values smoothed.
     Faint,
-    /// A dot at every point.
     Dots,
-    /// A line with dots.
     LineAndDots,
 }
 
 impl Mark {
-    /// A line without dots.
     fn is_line(self) -> bool {
         matches!(self, Mark::Line | Mark::Faint)
     }
@@ -79,7 +75,7 @@ pub struct Series {
     /// (x, y).
     pub points: Vec<(f64, f64)>,
     pub mark: Mark,
-    /// Number of the colour; numbers beyond the palette repeat it in other shades.
+    /// Number of the colour.
     pub color: usize,
 }
 
@@ -90,9 +86,8 @@ pub struct Chart {
     pub x: String,
     /// Name and unit of the y axis.
     pub y: String,
-    /// The series, in drawing order.
     pub series: Vec<Series>,
-    /// Labels of points: (x, y, text). A label that would cover a point or another label is dropped.
+    /// Labels of points: (x, y, text). A label without a place where it covers no point and no other label is dropped.
     pub labels: Vec<(f64, f64, String)>,
     /// Vertical ranges: (x, lowest y, highest y).
     pub ranges: Vec<(f64, f64, f64)>,
@@ -103,7 +98,6 @@ pub struct Chart {
 }
 
 impl Chart {
-    /// A chart without series.
     pub fn new(title: &str, x: &str, y: &str) -> Chart {
         let [title, x, y] = [title, x, y].map(str::to_string);
         Chart { title, x, y, ..Chart::default() }
@@ -123,26 +117,22 @@ impl Chart {
         self
     }
 
-    /// Starts the y axis at zero.
     #[must_use]
     pub fn zero_based(mut self) -> Chart {
         self.from_zero = true;
         self
     }
 
-    /// Makes the chart as wide as the page.
     #[must_use]
     pub fn wide(mut self) -> Chart {
         self.is_wide = true;
         self
     }
 
-    /// Whether the chart has no points.
     pub fn is_empty(&self) -> bool {
         self.series.iter().all(|s| s.points.is_empty())
     }
 
-    /// The chart as SVG.
     pub fn svg(&self) -> String {
         draw_svg(self.size(), |root| self.draw(root))
     }
@@ -152,12 +142,10 @@ impl Chart {
         if self.is_wide { (WIDE.0, WIDE.1.max(legend)) } else { SIZE }
     }
 
-    /// The series in the legend.
     fn named(&self) -> impl Iterator<Item = &Series> {
         self.series.iter().filter(|s| !s.name.is_empty())
     }
 
-    /// Draws the legend of a wide chart.
     fn draw_legend(&self, root: &Canvas<'_>) -> Result<(), String> {
         let style = TextStyle::from(("sans-serif", TEXT_SIZE)).pos(Pos::new(HPos::Left, VPos::Center));
         for (row, series) in self.named().enumerate() {
@@ -217,35 +205,28 @@ impl Chart {
         Ok(())
     }
 
-    /// Draws each label beside its point, at the first of six places where it covers no point and no other label.
+    /// Draws each label beside its point, where it covers nothing.
     fn draw_labels(&self, root: &Canvas<'_>, chart: &Plot<'_, '_>) -> Result<(), String> {
-        let pixel = |x: f64, y: f64| chart.backend_coord(&(x, y));
+        let pixel = |&(x, y): &(f64, f64)| chart.backend_coord(&(x, y));
         let ([x0, x1], [y0, y1]) = self.ranges();
-        let ((left, bottom), (right, top)) = (pixel(x0, y0), pixel(x1, y1));
+        let ((left, bottom), (right, top)) = (pixel(&(x0, y0)), pixel(&(x1, y1)));
         let dots = self.series.iter().filter(|s| !s.mark.is_line()).flat_map(|s| &s.points);
-        let mut taken: Vec<[i32; 4]> = dots
-            .map(|&(x, y)| {
-                let (x, y) = pixel(x, y);
-                [x - 4, y - 4, x + 4, y + 4]
-            })
-            .collect();
+        let lines = self.series.iter().filter(|s| s.mark != Mark::Dots && s.mark != Mark::Faint);
+        let lines = lines.flat_map(|s| s.points.windows(2)).map(|ends| [pixel(&ends[0]), pixel(&ends[1])]);
+        let lines: Vec<[Pixel; 2]> = lines.chain(self.bars().map(|ends| ends.map(|end| pixel(&end)))).collect();
+        let labels: Vec<(Pixel, i32)> =
+            self.labels.iter().map(|(x, y, text)| (pixel(&(*x, *y)), width_of(text))).collect();
+        let places = label_places(&labels, &dots.map(pixel).collect::<Vec<_>>(), &lines, [left, top, right, bottom]);
         let (base_x, base_y) = root.get_base_pixel();
-        for (x, y, label) in &self.labels {
-            let ((x, y), width) = (pixel(*x, *y), 6 * label.chars().count() as i32);
-            let places = [(7, -6), (-width - 7, -6), (-width / 2, -18), (-width / 2, 7), (6, -17), (6, 6)];
-            let boxes = places.map(|(dx, dy)| [x + dx, y + dy, x + dx + width, y + dy + 11]);
-            let is_free = |b: &&[i32; 4]| {
-                b[0] >= left
-                    && b[2] <= right
-                    && b[1] >= top
-                    && b[3] <= bottom
-                    && taken.iter().all(|t| b[0] >= t[2] || t[0] >= b[2] || b[1] >= t[3] || t[1] >= b[3])
-            };
-            if let Some(&place) = boxes.iter().find(is_free) {
-                let at = (place[0] - base_x, place[1] - base_y);
-                root.draw(&Text::new(label.clone(), at, ("sans-serif", LABEL_SIZE))).map_err(text)?;
-                taken.push(place);
+        let here = |(x, y): Pixel| (x - base_x, y - base_y);
+        for (((point, _), place), (_, _, label)) in labels.iter().zip(places).zip(&self.labels) {
+            let Some((place, is_far)) = place else { continue };
+            if is_far {
+                let end = (point.0.clamp(place[0], place[2]), point.1.clamp(place[1], place[3]));
+                root.draw(&PathElement::new([here(*point), here(end)], AXIS.mix(0.5))).map_err(text)?;
             }
+            root.draw(&Text::new(label.clone(), here((place[0], place[1])), ("sans-serif", LABEL_SIZE)))
+                .map_err(text)?;
         }
         Ok(())
     }
@@ -298,16 +279,88 @@ fn text<E: std::fmt::Display>(e: E) -> String {
     e.to_string()
 }
 
-/// The colour with this number.
-fn color(index: usize) -> RGBColor {
-    let RGBColor(r, g, b) = COLORS[index % COLORS.len()];
-    let shade = SHADES[index / COLORS.len() % SHADES.len()];
-    let of = |c: u8| {
-        let c = f64::from(c);
-        let shaded = if shade <= 1.0 { c * shade } else { c + (255.0 - c) * (shade - 1.0) };
-        shaded.round() as u8
+type Pixel = (i32, i32);
+
+/// Most pixels that a label takes from left to right.
+fn width_of(label: &str) -> i32 {
+    (LABEL_CHAR * label.chars().count() as f64).ceil() as i32
+}
+
+/// A place for each label, a point and a width: its left, top, right and lower edge, and whether it is far from its point. It is the
+/// first one within `plot` that covers no dot, no earlier label and no line; where there is none, the first that covers no dot and no
+/// label; `None` without such a place.
+fn label_places(
+    labels: &[(Pixel, i32)],
+    dots: &[Pixel],
+    lines: &[[Pixel; 2]],
+    plot: [i32; 4],
+) -> Vec<Option<([i32; 4], bool)>> {
+    let mut taken: Vec<[i32; 4]> = dots.iter().map(|&(x, y)| [x - 4, y - 4, x + 4, y + 4]).collect();
+    let place = |&((x, y), width): &(Pixel, i32)| {
+        let places = LABEL_REACH.into_iter().flat_map(|reach| {
+            let (right, left, middle) = (x + reach, x - reach - width, x - width / 2);
+            let (above, level, below) = (y - reach - LABEL_HEIGHT, y - LABEL_HEIGHT / 2, y + reach);
+            let all = [
+                (right, level),
+                (left, level),
+                (middle, above),
+                (middle, below),
+                (right, above),
+                (right, below),
+                (left, above),
+                (left, below),
+            ];
+            all.map(|(x, y)| ([x, y, x + width, y + LABEL_HEIGHT], reach > LABEL_REACH[0]))
+        });
+        let is_free = |(b, _): &([i32; 4], bool)| {
+            let is_inside = b[0] >= plot[0] && b[1] >= plot[1] && b[2] <= plot[2] && b[3] <= plot[3];
+            is_inside && taken.iter().all(|t| b[0] >= t[2] || t[0] >= b[2] || b[1] >= t[3] || t[1] >= b[3])
+        };
+        let free: Vec<([i32; 4], bool)> = places.filter(is_free).collect();
+        let found = free.iter().find(|(b, _)| !lines.iter().any(|line| crosses(line, b))).or(free.first()).copied();
+        taken.extend(found.map(|(b, _)| b));
+        found
     };
-    RGBColor(of(r), of(g), of(b))
+    labels.iter().map(place).collect()
+}
+
+/// Whether a line meets a box of left, top, right and lower edge.
+fn crosses([a, b]: &[Pixel; 2], edges: &[i32; 4]) -> bool {
+    let (mut from, mut to) = (0.0f64, 1.0f64);
+    for (start, end, low, high) in [(a.0, b.0, edges[0], edges[2]), (a.1, b.1, edges[1], edges[3])] {
+        let [start, end, low, high] = [start, end, low, high].map(f64::from);
+        if start == end {
+            if start < low || start > high {
+                return false;
+            }
+            continue;
+        }
+        let [one, other] = [low, high].map(|edge| (edge - start) / (end - start));
+        (from, to) = (from.max(one.min(other)), to.min(one.max(other)));
+    }
+    from <= to
+}
+
+/// The colour with this number. Behind [`COLORS`] comes the one of a fixed set that differs most from all before it. Some 150 numbers
+/// have colours of their own.
+fn color(index: usize) -> RGBColor {
+    let hues = |lightness: f64| (0..30).map(move |hue| HSLColor(f64::from(hue) / 30.0, 0.7, lightness));
+    let fixed = [0.25, 0.36, 0.47, 0.58, 0.69].into_iter().flat_map(hues).map(|color| color.rgb());
+    let mut left: Vec<RGBColor> = fixed.map(|(r, g, b)| RGBColor(r, g, b)).collect();
+    let mut palette = COLORS.to_vec();
+    while palette.len() <= index && !left.is_empty() {
+        let nearest = |color: &RGBColor| palette.iter().map(|other| difference(*color, *other)).min();
+        let farthest = (0..left.len()).max_by_key(|&i| (nearest(&left[i]), left.len() - i)).unwrap_or(0);
+        palette.push(left.swap_remove(farthest));
+    }
+    palette[index % palette.len()]
+}
+
+/// How much two colours differ to the eye: the squared distance with the weights of "redmean".
+fn difference(RGBColor(r, g, b): RGBColor, RGBColor(r2, g2, b2): RGBColor) -> i64 {
+    let [red, green, blue] = [(r, r2), (g, g2), (b, b2)].map(|(one, other)| i64::from(one) - i64::from(other));
+    let mean = (i64::from(r) + i64::from(r2)) / 2;
+    (512 + mean) * red * red + 1024 * green * green + (767 - mean) * blue * blue
 }
 
 /// A name that fits the legend. A longer name loses its middle, because names of runs differ at both ends.
@@ -368,7 +421,6 @@ const VALUES: i32 = 250;
 /// Named values, one horizontal bar each; an empty bar for a value that is missing or not finite.
 #[derive(Debug, Clone)]
 pub struct Bars {
-    /// Title with the unit.
     pub title: String,
     /// Name, value, and text of the value.
     pub bars: Vec<(String, Option<f64>, String)>,
@@ -455,18 +507,6 @@ mod tests {
     }
 
     #[test]
-    fn colours_differ_also_when_they_begin_again() {
-        // A sweep needs colours for the reference, eleven groups and the front.
-        assert!(COLORS.len() > 12);
-        let all: Vec<RGBColor> = (0..COLORS.len() * SHADES.len()).map(color).collect();
-        assert_eq!(all[..COLORS.len()], COLORS);
-        for (i, one) in all.iter().enumerate() {
-            assert!(all[..i].iter().all(|other| other != one), "{i}: {one:?}");
-        }
-        assert_eq!(color(all.len()), COLORS[0]);
-    }
-
-    #[test]
     fn a_long_legend_stays_inside_the_chart() {
         let mut chart = Chart::new("a", "b", "c").wide();
         let name = |i: usize| format!("resolution-1-2-seed{i}-0123&{i:04}");
@@ -496,15 +536,42 @@ mod tests {
     }
 
     #[test]
-    fn labels_lie_over_nothing_and_wide_charts_have_their_legend_beside_them() {
-        let dots = vec![(0.0, 0.0), (1.0, 1.0), (1.001, 1.0), (1.002, 1.0)];
-        let mut chart = Chart::new("a", "b", "c").with("knob", dots.clone(), Mark::Dots).wide();
-        chart.labels = (0..20).map(|i| (1.001, 1.0, format!("label{i}"))).collect();
-        chart.ranges = vec![(0.0, -5.0, 5.0)];
+    fn no_two_categories_share_a_colour() {
+        let all: Vec<RGBColor> = (0..150).map(color).collect();
+        for (i, one) in all.iter().enumerate() {
+            let nearest = all[..i].iter().map(|other| difference(*one, *other)).min();
+            // Of 20 grey levels at least while a legend is still read, and of some at least.
+            assert!(
+                nearest.is_none_or(|nearest| nearest > if i < 40 { 20 * 20 * 2303 } else { 0 }),
+                "{i}: {one:?}, {nearest:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn labels_cover_no_dot_no_line_and_no_other_label() {
+        let plot = [0, 0, 600, 400];
+        let dots: Vec<Pixel> = (0..40).map(|i| (50 + 12 * i, 200 + 37 * i % 90)).collect();
+        let labels: Vec<(Pixel, i32)> = dots.iter().map(|&dot| (dot, 60)).collect();
+        let line = [[(0, 180), (600, 180)]];
+        let places: Vec<[i32; 4]> =
+            label_places(&labels, &dots, &line, plot).into_iter().flatten().map(|p| p.0).collect();
+        assert!(places.len() > 30, "{}", places.len());
+        let covers = |a: &[i32; 4], b: &[i32; 4]| a[0] < b[2] && b[0] < a[2] && a[1] < b[3] && b[1] < a[3];
+        for (i, place) in places.iter().enumerate() {
+            assert!(place[0] >= 0 && place[1] >= 0 && place[2] <= 600 && place[3] <= 400);
+            assert!(places[..i].iter().all(|other| !covers(place, other)));
+            assert!(dots.iter().all(|&(x, y)| !covers(place, &[x - 4, y - 4, x + 4, y + 4])));
+        }
+        let crossed = places.iter().filter(|place| crosses(&line[0], place)).count();
+        assert!(crossed <= 2, "{crossed}");
+        // Where there is no room, labels are dropped.
+        let heap = vec![((300, 200), 60); 90];
+        assert!(label_places(&heap, &[(300, 200)], &[], plot).contains(&None));
+        let mut chart = Chart::new("a", "b", "c").with("knob", vec![(0.0, 0.0), (1.0, 1.0)], Mark::Dots).wide();
+        chart.labels = vec![(1.0, 1.0, "a label".into())];
         let svg = chart.svg();
-        assert!(svg.contains("label0") && !svg.contains("label19"), "there is no room for twenty");
-        assert!(svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
-        assert!(chart.ranges().1[0] <= -5.0);
+        assert!(svg.contains(">\na label\n") && svg.contains(">\nknob") && svg.contains("width=\"1040\""), "{svg}");
     }
 
     #[test]

@@ -58,23 +58,19 @@ if(e.key==='ArrowLeft')to(f-.05);if(e.key==='ArrowRight')to(f+.05);});
 window.addEventListener('resize',fit);fit();to(.5);});
 ";
 
-/// A page under construction.
 pub struct Page {
     title: String,
     body: String,
 }
 
-/// A cell of a table.
 #[derive(Debug, Clone)]
 pub enum Cell {
-    /// Left-aligned text.
     Text(String),
     /// Right-aligned number, already formatted.
     Number(String),
 }
 
 impl Cell {
-    /// Left-aligned text.
     pub fn text(text: impl Into<String>) -> Cell {
         Cell::Text(text.into())
     }
@@ -137,7 +133,6 @@ impl Page {
         self.body += &format!("<figure class=\"{class}\">{svg}<figcaption>{caption}</figcaption></figure>\n");
     }
 
-    /// A table of these headings and rows.
     pub fn table<'a>(&mut self, head: impl IntoIterator<Item = &'a str>, rows: impl IntoIterator<Item = Vec<Cell>>) {
         let head: String = head.into_iter().map(|heading| format!("<th>{}</th>", escape(heading))).collect();
         self.body += &format!("<div class=\"table\"><table><thead><tr>{head}</tr></thead><tbody>\n");
@@ -156,13 +151,11 @@ impl Page {
         self.body += &format!("<div class=\"views\">\n{}</div>\n", sliders.concat());
     }
 
-    /// Preformatted text behind a fold.
     pub fn folded(&mut self, summary: &str, text: &str) {
         let (summary, text) = (escape(summary), escape(text));
         self.body += &format!("<details><summary>{summary}</summary><pre>{text}</pre></details>\n");
     }
 
-    /// The whole file.
     pub fn finish(self) -> String {
         format!(
             "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
@@ -189,7 +182,6 @@ pub fn slider(name: &str, figures: &str, [left, right]: [(&str, &str); 2], folde
     )
 }
 
-/// Escapes text for HTML and SVG.
 pub fn escape(text: &str) -> String {
     let text = text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;");
     text.replace('"', "&quot;").replace('\'', "&#39;")

@@ -59,7 +59,6 @@ pub struct PageTile {
     pub lo: [f32; 2],
     /// Upper corner of the page's box.
     pub hi: [f32; 2],
-    /// Gaussians of the page.
     pub rows: u32,
     /// Training views that need the page.
     pub views: u32,

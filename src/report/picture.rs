@@ -24,7 +24,6 @@ const SIDES_MAX: [u32; 2] = [1 << 17, 1 << 16];
 /// Differences of this many levels (of 255) and more are white.
 const FULL_DIFFERENCE: f32 = 64.0;
 
-/// The pictures of a view as data URIs.
 pub struct ViewPictures {
     pub render: String,
     pub photo: String,

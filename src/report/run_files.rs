@@ -17,7 +17,6 @@ pub const SUMMARY_FILE: &str = "summary.json";
 pub const PLY_FILE: &str = "point_cloud.ply";
 /// The way from the coordinates of the Gaussians to those of the dataset, and back.
 pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
-/// The page for people.
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
 pub const PAGES_FILE: &str = "pages.json";
@@ -33,7 +32,6 @@ pub const EVALUATED_AS_FILE: &str = "evaluated-as.toml";
 /// What stands under a name in the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum RunFile {
-    /// A file of this name.
     File(&'static str),
     /// The files of `--save-every`, as [`saved_ply_name`] names them.
     SavedPlys,
@@ -51,7 +49,6 @@ pub enum RunFile {
 /// The part of a run that a file describes. It decides when a later run in the folder removes the file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tells {
-    /// How the run began.
     Start,
     Steps,
     Result,

@@ -18,7 +18,6 @@ use std::path::{Path, PathBuf};
 
 /// Most views: a file with more opens slowly.
 const VIEWS_MAX: usize = 12;
-/// Most points of a curve.
 const POINTS_MAX: usize = 600;
 /// Size limit of a text file, bytes.
 const TEXT_BYTES_MAX: u64 = 256 << 20;
@@ -82,7 +81,6 @@ fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
 }
 
-/// What the run has learnt of its photos.
 fn add_finding(page: &mut Page, Finding { title, text, table, curve }: Finding) {
     page.heading(title);
     if !text.is_empty() {

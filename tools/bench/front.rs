@@ -22,7 +22,6 @@ impl Spread {
         (!values.is_empty()).then(|| Spread { mean: values.iter().sum::<f64>() / values.len() as f64, low, high })
     }
 
-    /// Highest value minus lowest value.
     pub fn width(&self) -> f64 {
         self.high - self.low
     }
@@ -31,7 +30,6 @@ impl Spread {
 /// Accuracy of a setting against the reference.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Verdict {
-    /// The setting is the reference.
     Reference,
     /// The same bits and the same traffic as the reference for every common seed: the setting changed nothing here.
     NoEffect,
@@ -59,12 +57,10 @@ impl Verdict {
     }
 }
 
-/// A setting with the runs of all its seeds.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Setting {
     /// Group and name, `group/name`.
     pub name: String,
-    /// The successful runs.
     pub runs: Vec<RunRecord>,
     /// Why a run of it failed.
     pub problem: Option<String>,

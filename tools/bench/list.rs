@@ -33,7 +33,6 @@ pub const BUILT_IN: [(&str, &str); 4] = [
 /// First letters of the environment variables that a list may set.
 const OWN_VARIABLES: &str = "GSSCALE_";
 
-/// A list.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct List {
@@ -43,12 +42,10 @@ pub struct List {
     /// Frames in percent of the pages; 0 = all pages in memory.
     #[serde(default)]
     pub share: f64,
-    /// Seeds of the reference.
     pub seeds: Vec<u64>,
     /// How many of these seeds the other runs have; all without.
     #[serde(default)]
     pub other_seeds: Option<usize>,
-    /// What is shown.
     pub view: View,
     /// Runs that every group has.
     #[serde(default)]
@@ -68,7 +65,6 @@ struct Group {
     runs: Vec<Entry>,
 }
 
-/// A run.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 struct Entry {
@@ -79,9 +75,7 @@ struct Entry {
     /// Factors of keys of the base.
     #[serde(default)]
     times: BTreeMap<String, f64>,
-    /// As that of the list.
     share: Option<f64>,
-    /// Environment variables.
     #[serde(default)]
     environment: BTreeMap<String, String>,
     /// Runs of one class and seed must end with the same bits.
@@ -91,7 +85,6 @@ struct Entry {
 
 /// The runs of a scene.
 pub struct Plan {
-    /// The config of the reference.
     pub reference: TrainConfig,
     /// The runs: those of the reference with all seeds, then all others seed by seed.
     pub runs: Vec<Planned>,

@@ -4,6 +4,7 @@
 //! figures (`published_table`). Writes only the output folder and the pages in `--spill-dir`.
 
 use super::published_table::{Comparison, Ours};
+use super::read_json;
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
@@ -277,11 +278,7 @@ fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, Exit
 }
 
 fn read_summary(out: &Path) -> InputResult<Summary> {
-    let path = out.join(SUMMARY_FILE);
-    let text = std::fs::read_to_string(&path).map_err(|e| InputError::io(&path, "reading the run's summary", &e))?;
-    serde_json::from_str(&text).map_err(|e| {
-        InputError::new(&path, format!("is not the summary of a run: {e}"), "use the output folder of a run")
-    })
+    read_json(&out.join(SUMMARY_FILE), "use the output folder of a run")
 }
 
 /// Our figures, from the run's summary or, for LPIPS and --no-train, from an evaluation of the PLY.

@@ -13,7 +13,6 @@ use gsscale::train::log::report::{Summary, TestMetrics};
 use serde_json::{Value, json};
 use std::path::Path;
 
-/// Figures of our run.
 pub struct Ours {
     /// Means over the held-out views.
     pub test: Option<TestMetrics>,
@@ -68,7 +67,6 @@ impl Ours {
     }
 }
 
-/// A row of the table.
 struct Row {
     measure: String,
     ours: Option<f64>,
@@ -97,12 +95,10 @@ impl Row {
     }
 }
 
-/// The input of the report.
 pub struct Comparison<'a> {
     pub run: &'a PublishedRun,
     /// Densification tier, if the settings are those of a tier.
     pub tier: Option<&'a str>,
-    /// Layout of the dataset.
     pub layout: &'a str,
     /// Folder of the dataset.
     pub data: &'a Path,
@@ -170,7 +166,6 @@ impl Comparison<'_> {
         facts
     }
 
-    /// The comparison as JSON.
     pub fn json(&self) -> Value {
         let rows = self.rows();
         let difference = |i: usize| rows[i].difference();

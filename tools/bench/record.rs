@@ -1,13 +1,11 @@
 //! The result of one run as a line of JSON (settings, quality and costs), its figures by name, and its times at one pace of the machine.
 //!
-//! The speed of a machine changes between runs. So a sweep trains the base for a few steps before and after each run, always the same
-//! steps. The time of this short training is the pace of the machine at that run.
-//!
-//! Not here: means over seeds ([`super::front`]), tables and charts ([`super::sweep_page`]).
+//! The speed of a machine changes between runs. So a sweep trains the base for a few steps before and after each run; the time of this
+//! short training is the pace of the machine at that run.
 //!
 //! Invariants: 1. the run's own process measured every figure except `wall_seconds`, the lifetime of that process, and
-//! `pace`, which two other runs measured; 2. only paces of one training are compared; 3. times of computing change in proportion to the
-//! pace. Time that a run waited for the drive, bytes, counts and quality stay as measured.
+//! `pace`; 2. only paces of one training are compared; 3. times of computing change in proportion to the pace; what a run waited for the
+//! drive, bytes, counts and quality stay as measured.
 
 use gsscale::base::units::format_bytes;
 use serde::de::Error;
@@ -25,7 +23,6 @@ pub struct Pace {
     pub cpu_seconds: Option<f64>,
 }
 
-/// A run of a sweep.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct RunRecord {
@@ -72,11 +69,8 @@ pub struct RunRecord {
     pub bytes_read: u64,
     /// Bytes that the steps wrote to the drive.
     pub bytes_written: u64,
-    /// Gaussians at the end.
     pub gaussians: u64,
-    /// Frames in use at the end.
     pub frames: u64,
-    /// Pages of the scene at the end.
     pub pages: u64,
     /// Largest resident size of the process, bytes.
     pub host_bytes_peak: u64,
@@ -88,7 +82,6 @@ pub struct RunRecord {
     pub ply: String,
     /// The order of views that the run used, after `auto` was resolved.
     pub view_order: String,
-    /// Version of the program.
     pub version: String,
     pub threads: u64,
     pub cpu: String,
@@ -135,16 +128,13 @@ fn median(records: &[RunRecord], of: impl Fn(&Pace) -> Option<f64>) -> Option<f6
     values.get(values.len() / 2).copied()
 }
 
-/// A figure of a run.
 #[derive(Debug, Clone, Copy)]
 pub struct Figure {
-    /// Its name in a list.
     pub name: &'static str,
     /// Its name for people, with the unit.
     pub title: &'static str,
     /// Decimals in a table; `None` for bytes.
     digits: Option<usize>,
-    /// Its value; `None` if the run has none.
     pub of: fn(&RunRecord) -> Option<f64>,
 }
 

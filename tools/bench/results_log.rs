@@ -47,7 +47,6 @@ impl ResultsLog {
         }
     }
 
-    /// The runs so far, in order.
     pub fn records(&self) -> &[RunRecord] {
         &self.records
     }

@@ -5,6 +5,7 @@
 //! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
 //! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
+use super::read_json;
 use super::record::{Pace, RunRecord, convert_to_one_pace};
 use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
@@ -32,15 +33,14 @@ const SPILL_PLACEHOLDER: &str = "spill";
 const PROBLEM_MAX: usize = 600;
 /// File in the output folder that the sweep and its current run lock.
 const LOCK: &str = "sweep.lock";
+const AGAIN: &str = "start the sweep again";
 /// File of results in the output folder.
 pub const RESULTS: &str = "results.jsonl";
 
 /// Where a sweep of one scene reads and writes.
 #[derive(Debug, Clone)]
 pub struct Place {
-    /// The scene.
     pub scene: PathBuf,
-    /// Folder of the results.
     pub out: PathBuf,
     /// Folder of the pages; `spill` in `out` without.
     pub spill: Option<PathBuf>,
@@ -70,7 +70,6 @@ impl Surroundings {
     }
 }
 
-/// A planned run.
 #[derive(Debug, Clone)]
 pub struct Planned {
     /// Group and name of the run, `group/name`.
@@ -85,14 +84,12 @@ pub struct Planned {
     pub bits: String,
 }
 
-/// A scene made from that of the sweep.
 #[derive(Debug, Clone)]
 pub struct MadeScene {
     /// Its folder, which exists while the run lives.
     pub folder: PathBuf,
     /// A complete description of the scene, which stands for the folder in the run's key.
     pub how: String,
-    /// What is wrong with it.
     pub disturbance: Disturbance,
     /// Training photos that are wrong in it, by name.
     pub wrong: Vec<String>,
@@ -276,12 +273,12 @@ impl Sweep {
 
     /// Reads the figures from the run's folder and removes the PLY, which is large.
     fn read_figures(&self, record: &mut RunRecord, config: &TrainConfig, folder: &Path) -> InputResult<()> {
-        let summary: Summary = read_json(&folder.join(SUMMARY_FILE))?;
+        let summary: Summary = read_json(&folder.join(SUMMARY_FILE), AGAIN)?;
         let ply = folder.join(PLY_FILE);
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
-        record.outlier_views = views::names_in(&read_json(&folder.join(SUMMARY_FILE))?);
+        record.outlier_views = views::names_in(&read_json(&folder.join(SUMMARY_FILE), AGAIN)?);
         record.seconds = summary.train_seconds;
         record.cpu_seconds = summary.costs.train_cpu_seconds;
         record.stall_seconds = summary.costs.train_stall_seconds;
@@ -305,7 +302,7 @@ impl Sweep {
                 record.problem = Some(problem(&output)?);
                 return Ok(());
             }
-            let report: Value = read_json(&json)?;
+            let report: Value = read_json(&json, AGAIN)?;
             (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
         }
         remove(&ply)
@@ -345,12 +342,6 @@ fn write_config(path: &Path, config: &TrainConfig) -> InputResult<()> {
     write_whole(path, text.as_bytes())
 }
 
-fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> InputResult<T> {
-    let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
-    serde_json::from_slice(&text)
-        .map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), "start the sweep again"))
-}
-
 /// The absolute path with links resolved, as far as the path exists: creating the folder does not change the result.
 fn resolved(path: &Path) -> PathBuf {
     let path = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
@@ -368,7 +359,6 @@ fn beside(program: &str) -> InputResult<PathBuf> {
     }
 }
 
-/// Takes the lock of an output folder.
 fn lock(out: &Path) -> InputResult<File> {
     let path = out.join(LOCK);
     let io = |e: std::io::Error| InputError::io(&path, "opening the lock", &e);

@@ -15,13 +15,10 @@ const FRONT_COLOR: usize = 4;
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct View {
-    /// What the sweep measures.
     pub title: String,
     /// Group and name of the run that all others are compared with, `group/name`.
     pub reference: String,
-    /// Columns of the table.
     pub figures: Vec<Figure>,
-    /// Charts, from the top.
     pub charts: Vec<ChartOf>,
 }
 
@@ -29,7 +26,6 @@ pub struct View {
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
 pub struct ChartOf {
-    /// The figure.
     pub figure: Figure,
     /// The other figure: a cost.
     pub against: Option<Figure>,
@@ -38,7 +34,6 @@ pub struct ChartOf {
     pub lost: bool,
 }
 
-/// The page for the runs of a sweep.
 pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) -> String {
     let settings = settings(records, &view.reference);
     let mut page = Page::new(&format!("gsscale: {}, {scene}", view.title), facts);

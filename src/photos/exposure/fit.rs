@@ -40,7 +40,6 @@ pub fn bounded(values: [f64; IMAGE_VALUES]) -> Option<[f64; IMAGE_VALUES]> {
     is_finite.then(|| std::array::from_fn(|k| values[k].clamp(-most(k), most(k))))
 }
 
-/// As [`bounded`], for a channel of a camera.
 pub fn bounded_channel(values: [f64; CHANNEL_VALUES]) -> Option<[f64; CHANNEL_VALUES]> {
     values.iter().all(|x| x.is_finite()).then(|| values.map(|x| x.clamp(-FALLOFF_MOST, FALLOFF_MOST)))
 }
@@ -50,11 +49,9 @@ pub fn bounded_channel(values: [f64; CHANNEL_VALUES]) -> Option<[f64; CHANNEL_VA
 pub struct Pair<'a> {
     /// `[3][height][width]`.
     pub drawn: &'a [f32],
-    /// The photo, of the same size.
     pub photo: &'a Target,
 }
 
-/// Normal equations of `N` values.
 #[derive(Debug, Clone, Copy)]
 struct Normal<const N: usize> {
     /// Values in the sums.
@@ -156,9 +153,8 @@ impl Pair<'_> {
             || Normal::ZERO,
             |sum, at, color, photo| {
                 let corrected = model.of(at, color);
-                let gains = model.gains(at);
-                let lit = std::array::from_fn(|c| gains[c] * color[c]);
-                let of_chroma = if used > 1 { homography_columns(&chroma, lit) } else { [[0.0; 3]; 8] };
+                let of_chroma =
+                    if used > 1 { homography_columns(&chroma, model.lit(at, color)) } else { [[0.0; 3]; 8] };
                 for (c, (difference, weight)) in differences(photo, corrected).into_iter().enumerate() {
                     let column = std::array::from_fn(|k| match k {
                         0 => std::f64::consts::LN_2 * corrected[c],
@@ -203,8 +199,7 @@ impl Pair<'_> {
             || [Normal::ZERO; 3],
             |sums, at, color, photo| {
                 let weighted = differences(photo, model.of(at, color));
-                let gains = model.gains(at);
-                let lit = std::array::from_fn(|c| gains[c] * color[c]);
+                let lit = model.lit(at, color);
                 let v = weighted.map(|(difference, weight)| weight * difference);
                 let v = model.chroma.as_ref().map_or(v, |h| homography_back(h, lit, v));
                 for (c, sum) in sums.iter_mut().enumerate() {
@@ -278,17 +273,12 @@ mod tests {
             Pair { drawn, photo }.image_values(&Look::default(), IMAGE_VALUES, 0..WIDTH as usize, 2)
         };
         let want = of(&drawn, &photo);
-        photo.mask = Some((0..WIDTH * HEIGHT).map(|i| if i % WIDTH < 9 { 0 } else { 255 }).collect());
+        let left = |i: usize| i % (WIDTH as usize) < 9;
+        photo.mask = Some((0..(WIDTH * HEIGHT) as usize).map(|i| if left(i) { 0 } else { 255 }).collect());
         let masked = of(&drawn, &photo);
         assert!(want.is_some() && masked != want, "the mask has taken pixels away");
-        for i in (0..drawn.len()).filter(|i| i % (WIDTH as usize) < 9) {
-            drawn[i] = f32::NAN;
-            photo.rgb[i] = 3;
-        }
-        let changed = (0..photo.rgb.len()).filter(|i| (i / 3) % (WIDTH as usize) < 9).collect::<Vec<_>>();
-        assert!(!changed.is_empty());
-        let mut photo = Target { rgb: photo_of(&self::drawn(), &look).rgb, ..photo };
-        changed.into_iter().for_each(|i| photo.rgb[i] = 200);
+        (0..drawn.len()).filter(|&i| left(i)).for_each(|i| drawn[i] = f32::NAN);
+        (0..photo.rgb.len()).filter(|&i| left(i / 3)).for_each(|i| photo.rgb[i] = 200);
         assert_eq!(of(&drawn, &photo), masked);
         photo.mask = None;
         assert_eq!(of(&drawn, &photo), None);

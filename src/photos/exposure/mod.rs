@@ -1,15 +1,13 @@
 //! Appearance (`--appearance`): what differs between the photos of one scene besides the pose. An exposure and a colour homography per
-//! photo, and vignetting per camera, act on the rendered picture before the loss.
+//! photo, and vignetting per camera, act on the rendered picture before the loss ([`model`]: that of PPISP, arXiv 2601.18336, without
+//! its response curve).
 //!
-//! The model is that of PPISP (arXiv 2601.18336) without its response curve: the picture is multiplied by 2^dt and by the
-//! falloff of the lens, then a homography changes chromaticities ([`model`]). Scene and correction share a freedom: a
-//! brighter scene under darker exposures gives the same pictures. So what acts on a photo is its value less the mean over
+//! A brighter scene under darker exposures gives the same pictures. So what acts on a photo is its value less the mean over
 //! the photos seen ([`state`]), and small weights pull it towards no change.
 //!
-//! Values follow one damped Gauss-Newton step per sighting ([`fit`]) instead of Adam. A run of 1,500 steps sees each of
-//! 150 photos ten times; Adam at a rate of .002 would move an exposure by .02 stops in that time. The nine values of a
-//! photo are well determined by one sighting, so their optimum is computed. Later sightings count less, so that the values
-//! settle.
+//! Values follow one damped Gauss-Newton step per sighting ([`fit`]) instead of Adam: a run of 1,500 steps sees each of
+//! 150 photos ten times, in which Adam at a rate of .002 would move an exposure by .02 stops. The nine values of a
+//! photo are well determined by one sighting. Later sightings count less, so that the values settle.
 //!
 //! Invariants: 1. sums over pixels are f64 in row order, so the bits are the same for any number of threads; 2. no value
 //! that is not finite, or out of bounds, is stored; 3. masked pixels count nowhere.
@@ -41,10 +39,8 @@ use std::path::Path;
 /// Which corrections are trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum AppearanceMode {
-    /// None.
     #[default]
     Off,
-    /// An exposure per photo.
     Exposure,
     /// Exposure and colour homography per photo, vignetting per camera.
     Full,
@@ -90,7 +86,6 @@ struct Appearance {
     state: AppearanceState,
     /// Photos whose exposure started from EXIF data.
     first_exposures: u32,
-    /// The correction of the step.
     look: Look,
     /// The picture of the step as it was drawn, `[3][height][width]`.
     drawn: Vec<f32>,
@@ -153,7 +148,7 @@ impl PhotoParameter for Appearance {
 
     /// Starts the exposures from EXIF data if more than half of the training photos state one. A function of the files alone.
     fn start(&mut self, dataset: &Dataset) -> Vec<String> {
-        if !self.state.is_new() {
+        if self.state.images.iter().any(|image| image.sightings > 0) {
             return Vec::new();
         }
         let views = dataset.train_views();
@@ -210,7 +205,7 @@ impl PhotoParameter for Appearance {
         let found = self.found.take().filter(|_| !outcome.is_skipped);
         if let (Some(found), Some(&group)) = (found, self.camera_groups.get(outcome.view)) {
             match outcome.is_left_out {
-                true => self.state.replace(self.mode, outcome.view, &found),
+                true => self.state.move_image(self.mode, outcome.view, &found, 1.0),
                 false => self.state.learn(self.mode, (outcome.view, group), &found),
             }
         }
@@ -250,7 +245,6 @@ impl PhotoParameter for Appearance {
     }
 }
 
-/// The file.
 #[derive(Debug, Serialize)]
 struct AppearanceFile {
     /// `exposure` or `full`.

@@ -33,7 +33,6 @@ pub trait Real:
     + Div<Output = Self>
     + Neg<Output = Self>
 {
-    /// The nearest number.
     fn of(x: f64) -> Self;
 }
 
@@ -51,7 +50,6 @@ impl Real for f64 {
     }
 }
 
-/// A correction, ready for pixels.
 #[derive(Debug, Clone, Copy)]
 pub struct PixelModel<T> {
     /// 2^dt.
@@ -82,12 +80,17 @@ impl<T: Real> PixelModel<T> {
         }
     }
 
-    /// The corrected colour.
     #[inline(always)]
     pub fn of(&self, at: [T; 2], color: [T; 3]) -> [T; 3] {
+        let lit = self.lit(at, color);
+        self.chroma.as_ref().map_or(lit, |h| homography(h, lit))
+    }
+
+    /// The colour after gain and falloff.
+    #[inline(always)]
+    pub fn lit(&self, at: [T; 2], color: [T; 3]) -> [T; 3] {
         let gains = self.gains(at);
-        let color = [gains[0] * color[0], gains[1] * color[1], gains[2] * color[2]];
-        self.chroma.as_ref().map_or(color, |h| homography(h, color))
+        [gains[0] * color[0], gains[1] * color[1], gains[2] * color[2]]
     }
 
     /// The gradient with respect to the colour, from the gradient `v` with respect to the corrected colour.
@@ -100,7 +103,6 @@ impl<T: Real> PixelModel<T> {
     }
 }
 
-/// The falloff of a channel at a position.
 #[inline(always)]
 pub fn falloff<T: Real>(values: &[T; CHANNEL_VALUES], at: [T; 2]) -> T {
     let [a1, a2, a3, mx, my] = *values;
@@ -133,7 +135,6 @@ fn projected<T: Real>(h: &[T; 8], [r, g, b]: [T; 3]) -> (T, [T; 2], [T; 3]) {
     (sum, [u, v], [q0, q1, h[6] * u + h[7] * v + sum])
 }
 
-/// The colour after the homography.
 #[inline(always)]
 pub fn homography<T: Real>(h: &[T; 8], color: [T; 3]) -> [T; 3] {
     let (sum, _, [q0, q1, q2]) = projected(h, color);
@@ -235,8 +236,7 @@ mod tests {
             let by = |k: usize| slope(|by| of(&std::array::from_fn(|i| IMAGE[i] + if i == k { by } else { 0.0 })));
             assert_near(of(&IMAGE).map(|c| std::f64::consts::LN_2 * c), by(0));
             let model = PixelModel::<f64>::new(&IMAGE, &LENS);
-            let gains = model.gains(at);
-            let lit = std::array::from_fn(|c| gains[c] * color[c]);
+            let lit = model.lit(at, color);
             let chroma = std::array::from_fn(|k| IMAGE[1 + k]);
             homography_columns(&chroma, lit).into_iter().enumerate().for_each(|(k, got)| assert_near(got, by(1 + k)));
             for channel in LENS {

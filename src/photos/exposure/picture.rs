@@ -21,7 +21,6 @@ pub struct Lens {
 }
 
 impl Lens {
-    /// The lens of a camera.
     pub fn of(camera: &Camera) -> Lens {
         let (width, height) = (camera.width as f32, camera.height as f32);
         let diagonal = (width * width + height * height).sqrt().max(1.0);

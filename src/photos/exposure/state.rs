@@ -1,11 +1,10 @@
 //! The values of all photos and cameras of a run: what a commit holds of appearance.
 //!
-//! The values of a photo are fixed-point numbers, and their sums over the photos seen are kept beside them. So the mean is
-//! known at every step without a sweep, and has the same bits whatever the order. What acts on a photo is its value less
-//! that mean; a photo without a value is not corrected. A photo has a value once a step has seen it, or from the start of the
-//! run if its file states an exposure ([`first_exposures`]): below, such a photo counts as seen. Otherwise each step of the first pass
-//! over the photos would pull the scene towards the exposure of its own photo. A first exposure counts as one fit, because camera
-//! settings can mislead: where the light changes and the camera follows, photos of equal brightness have different settings.
+//! Values are fixed-point numbers, and their sums over the photos seen are kept beside them, so the mean is known without a sweep and has
+//! the same bits whatever the order. A photo has a value, and counts as seen, once a step has seen it, or from the start of the
+//! run if its file states an exposure ([`first_exposures`]). Otherwise each step of the first pass would pull the scene towards the
+//! exposure of its own photo. A first exposure counts as one fit, because camera settings can mislead: where the light changes and the
+//! camera follows, photos of equal brightness have different settings.
 //!
 //! Invariants: 1. the sums are exactly those of the values of the photos seen; 2. what acts is within the bounds of
 //! [`super::fit::bounded`]; 3. a fit that found nothing changes nothing.
@@ -42,7 +41,6 @@ pub struct ImageState {
     pub sightings: u32,
 }
 
-/// The values of a camera.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct CameraState {
     /// Vignetting by channel.
@@ -51,7 +49,6 @@ pub struct CameraState {
     pub sightings: u32,
 }
 
-/// What a step has found for its photo.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Found {
     image: [f64; IMAGE_VALUES],
@@ -65,7 +62,6 @@ pub struct AppearanceState {
     pub images: Vec<ImageState>,
     /// By group of views with the same intrinsics.
     pub cameras: Vec<CameraState>,
-    /// Sums of the values of the photos seen.
     sums: [i64; IMAGE_VALUES],
     /// Photos seen.
     seen: u32,
@@ -110,11 +106,6 @@ impl AppearanceState {
         (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
     }
 
-    /// Whether no photo has a value.
-    pub fn is_new(&self) -> bool {
-        self.seen == 0
-    }
-
     /// Gives first exposures to photos that no step has seen: each a view and its exposure, stops within the bounds of
     /// [`bounded`]. They act from now on. The fit of the first step that sees the photo counts twice as much.
     pub fn begin_with(&mut self, exposures: impl IntoIterator<Item = (usize, f64)>) {
@@ -139,7 +130,6 @@ impl AppearanceState {
         bounded(std::array::from_fn(of)).unwrap_or_default()
     }
 
-    /// The correction of a view of camera group `group`.
     pub fn look(&self, mode: AppearanceMode, (view, group): (usize, usize), camera: &Camera) -> Look {
         let falloff = match mode {
             AppearanceMode::Full => self.cameras.get(group).map(|camera| camera.falloff).unwrap_or_default(),
@@ -162,14 +152,10 @@ impl AppearanceState {
         }
     }
 
-    /// Gives a photo the values that a step has found, in place of those it had. For photos that are left out: the next look must
-    /// not judge them by values from a rougher scene. The camera learns nothing.
-    pub fn replace(&mut self, mode: AppearanceMode, view: usize, found: &Found) {
-        self.move_image(mode, view, found, 1.0);
-    }
-
     /// Moves the values of a photo by this share of the way to what was found.
-    fn move_image(&mut self, mode: AppearanceMode, view: usize, found: &Found, weight: f64) {
+    ///
+    /// A photo that is left out gets the whole of it: the next look must not judge it by values from a rougher scene.
+    pub fn move_image(&mut self, mode: AppearanceMode, view: usize, found: &Found, weight: f64) {
         let (acting, mean) = (self.acting(view, mode.image_values()), self.mean());
         let Some(image) = self.images.get_mut(view) else { return };
         let is_new = image.sightings == 0;
@@ -263,7 +249,7 @@ mod tests {
         state.begin_with([(0, 1.0), (1, 0.0)]);
         let exposures = |state: &AppearanceState| [0, 1, 2].map(|view| state.acting(view, 1)[0]);
         assert_eq!(exposures(&state), [0.5, -0.5, 0.0]);
-        assert_eq!((state.check(), state.is_new()), (Ok(()), false));
+        assert_eq!((state.check(), state.seen), (Ok(()), 2));
         state.learn(mode, (0, 0), &found(0.8));
         let far = state.acting(0, 1)[0] - state.acting(1, 1)[0];
         assert!((far - (1.0 + 0.3 * 2.0 / 3.0)).abs() < 1e-6, "{far}");
@@ -279,7 +265,7 @@ mod tests {
         let mut state = AppearanceState::new(&[0, 0]);
         state.learn(mode, (0, 0), &found(0.0));
         for exposure in [-2.0, -2.0, 0.5] {
-            state.replace(mode, 1, &Found { falloff: Some([[0.1; CHANNEL_VALUES]; 3]), ..found(exposure) });
+            state.move_image(mode, 1, &Found { falloff: Some([[0.1; CHANNEL_VALUES]; 3]), ..found(exposure) }, 1.0);
         }
         // What is found counts from the mean before: -2, then -1 - 2, then -1.5 + .5. An average of the three would lie at -1.9.
         let far = state.acting(1, 1)[0] - state.acting(0, 1)[0];

@@ -36,7 +36,6 @@ pub struct BlockGrid {
 }
 
 impl BlockGrid {
-    /// The most blocks of a photo.
     pub const BLOCKS_MOST: usize = BLOCKS_ALONG * BLOCKS_ALONG;
 
     /// The blocks of a photo of this size, pixels.
@@ -71,7 +70,6 @@ impl BlockGrid {
         line * self.columns()..((line + 1) * self.columns()).min(self.blocks())
     }
 
-    /// The blocks around a block, and the block.
     pub fn around(&self, block: usize) -> impl Iterator<Item = usize> {
         let (columns, lines) = (self.columns(), self.height.div_ceil(self.side));
         let (x, y) = (block % columns, block / columns);

@@ -1,17 +1,15 @@
 //! Wrong views: which photos contradict the scene that all others agree on. Every run names them; `--robust-views` leaves them out.
 //!
-//! A photo with a wrong pose differs from its picture about as much as two unrelated photos differ. So a view is judged by
-//! the share of its photo's variance that its picture leaves unexplained, which photos of much and of little contrast have in
-//! common. The measure is the logarithm of mean squared error over variance.
+//! A photo with a wrong pose differs from its picture about as much as two unrelated photos differ. So the measure of a view is the
+//! logarithm of the share of its photo's variance that its picture leaves unexplained, which does not depend on the contrast.
 //!
-//! At the end of each epoch the views that were measured in it are judged together. A view whose measure lies far above their median, by
-//! the median absolute deviation, gets a strike; any other of them loses one. A view is an outlier from its second strike on, until it
-//! has lost all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
+//! At the end of each epoch, a view whose measure lies far above the median of those measured in it, by the median absolute deviation,
+//! gets a strike; any other of them loses one. A view is an outlier from its second strike on, until it has lost all strikes, so that one
+//! bad epoch does not count. Views that are left out are still measured, so they can return.
 //!
-//! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step does not
-//! train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures fall
-//! fast at first. Where views come in large groups, these are steps of the same group: a region that has just been trained says nothing
-//! about one that has not.
+//! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step
+//! does not train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures
+//! fall fast at first; where views come in large groups, with those of the same group.
 //!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
 //! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
@@ -51,7 +49,6 @@ const RECENT_MOST: usize = 16;
 /// A contradiction is clear if the same three conditions hold with these limits.
 const CLEAR: Limits = Limits { deviations: 4.0, ratio: 2.0, unexplained: 0.8 };
 
-/// The state of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ViewState {
     /// The last measure, fixed-point.
@@ -64,7 +61,6 @@ pub struct ViewState {
     is_named: bool,
 }
 
-/// All views of a dataset.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ViewOutliers {
     views: Vec<ViewState>,
@@ -115,11 +111,6 @@ fn measure(mse: f64, variance: f64) -> f64 {
     (libm::log(mse.max(1e-12) / variance) * PER_UNIT).clamp(-STORED_MOST, STORED_MOST)
 }
 
-/// Measures of the last steps as [`Limits::most`] takes them.
-fn recent(measures: &[i32]) -> Vec<f64> {
-    measures.iter().map(|&measure| f64::from(measure)).collect()
-}
-
 /// How far a measure may lie above the others, and how large it must be at least, to be an outlier.
 struct Limits {
     deviations: f64,
@@ -129,7 +120,8 @@ struct Limits {
 
 impl Limits {
     /// The largest measure that is no outlier among `measures`; `None` if they are too few.
-    fn most(&self, mut measures: Vec<f64>) -> Option<f64> {
+    fn most<'a>(&self, measures: impl Iterator<Item = &'a i32>) -> Option<f64> {
+        let mut measures: Vec<f64> = measures.map(|&measure| f64::from(measure)).collect();
         if measures.len() < VIEWS_LEAST {
             return None;
         }
@@ -142,20 +134,9 @@ impl Limits {
 impl ViewOutliers {
     /// The state of `views` views before the first measure.
     pub fn new(views: usize) -> ViewOutliers {
-        ViewOutliers::of_views(vec![ViewState::default(); views])
+        ViewOutliers { views: vec![ViewState::default(); views], recent: Vec::new() }
     }
 
-    /// The state of views whose last steps are unknown.
-    pub fn of_views(views: Vec<ViewState>) -> ViewOutliers {
-        ViewOutliers { views, recent: Vec::new() }
-    }
-
-    /// Whether both have the same number of views.
-    pub fn has_same_counts(&self, other: &ViewOutliers) -> bool {
-        self.views.len() == other.views.len()
-    }
-
-    /// Whether a view is an outlier.
     pub fn is_named(&self, view: usize) -> bool {
         self.views.get(view).is_some_and(|view| view.is_named)
     }
@@ -180,7 +161,7 @@ impl ViewOutliers {
         state.measure = measure(mse, variance).round() as i32;
         state.is_measured = true;
         if !state.is_named {
-            if CLEAR.most(recent(&self.recent)).is_some_and(|most| f64::from(state.measure) > most) {
+            if CLEAR.most(self.recent.iter()).is_some_and(|most| f64::from(state.measure) > most) {
                 state.strikes = state.strikes.max(1);
             }
             self.recent.drain(..(self.recent.len() + 1).saturating_sub(RECENT_MOST));
@@ -194,24 +175,22 @@ impl ViewOutliers {
     /// # Panics
     /// Picture and photo differ in size.
     pub fn contradicts(&self, picture: &[f32], photo: &Target) -> bool {
-        let (Some(most), Some(variance)) = (CLEAR.most(recent(&self.recent)), variance(photo)) else { return false };
+        let (Some(most), Some(variance)) = (CLEAR.most(self.recent.iter()), variance(photo)) else { return false };
         squared_error(picture, photo).is_some_and(|mse| measure(mse, variance) > most)
-    }
-
-    /// Forgets the measures of the last steps: the coming ones show another region.
-    pub fn forget_recent(&mut self) {
-        self.recent.clear();
     }
 
     /// Judges the views measured since the last call, at the end of the epoch with this number, from 0. Returns those that
     /// have become outliers, ascending.
     pub fn end_epoch(&mut self, epoch: u32) -> Vec<usize> {
-        let measured = self.views.iter().filter(|v| v.is_measured);
-        let measured = measured.map(|v| f64::from(v.measure)).collect();
+        let measured = self.views.iter().filter(|view| view.is_measured).map(|view| &view.measure);
         let mut found = Vec::new();
         if let (true, Some(most)) = (epoch > 0, USUAL.most(measured)) {
             for (number, view) in self.views.iter_mut().enumerate().filter(|(_, view)| view.is_measured) {
-                if view.count_epoch(f64::from(view.measure) > most) {
+                let (was_named, is_outlier) = (view.is_named, f64::from(view.measure) > most);
+                view.strikes =
+                    if is_outlier { (view.strikes + 1).min(STRIKES_MOST) } else { view.strikes.saturating_sub(1) };
+                view.is_named = if was_named { view.strikes > 0 } else { view.strikes >= STRIKES_NAMED };
+                if view.is_named && !was_named {
                     found.push(number);
                 }
             }
@@ -238,23 +217,12 @@ impl ViewOutliers {
     }
 }
 
-impl ViewState {
-    /// Counts an epoch; whether the view has become an outlier.
-    fn count_epoch(&mut self, is_outlier: bool) -> bool {
-        let was_named = self.is_named;
-        self.strikes = if is_outlier { (self.strikes + 1).min(STRIKES_MOST) } else { self.strikes.saturating_sub(1) };
-        self.is_named = if was_named { self.strikes > 0 } else { self.strikes >= STRIKES_NAMED };
-        self.is_named && !was_named
-    }
-}
-
 /// In summary.json, the views whose photo contradicts the scene: `name`, `unexplained` (share of the photo's variance that its
 /// picture leaves unexplained; above 1 where a grey picture would be closer) and `is_left_out` (whether the run has left it out).
 const FIGURE: &str = "outlier_views";
 
 pub(in crate::photos) const KIND: Kind = Kind { name: "outliers", file: None, first, check, finding };
 
-/// Names that a warning lists.
 const NAMES_LISTED: usize = 20;
 /// In a group of at least so many views, a view is compared with earlier views of the group only. In a smaller group hardly a view would
 /// come after the first eight, which are compared with nothing.
@@ -269,13 +237,10 @@ struct OutlierViews {
     state: ViewOutliers,
     are_left_out: bool,
     train_views: u32,
-    /// The step looks at its picture.
     looks: bool,
     /// The step is a rehearsal, whose look judges nothing.
     is_rehearsal: bool,
-    /// The picture contradicts its photo.
     is_contradicted: bool,
-    /// Steps of the run.
     steps: u32,
     /// Views that this process has named, ascending.
     told: Vec<usize>,
@@ -298,7 +263,8 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
 fn decoded(saved: &Encoded) -> Result<ViewOutliers, ValuesError> {
     match saved.decoded(ViewOutliers::check) {
         Err(ValuesError::Encoding(_)) => {
-            let outliers = ViewOutliers::of_views(saved.decoded(|_: &Vec<ViewState>| Ok(()))?);
+            let views = saved.decoded(|_: &Vec<ViewState>| Ok(()))?;
+            let outliers = ViewOutliers { views, recent: Vec::new() };
             outliers.check().map_err(ValuesError::Impossible)?;
             Ok(outliers)
         }
@@ -321,7 +287,7 @@ impl PhotoParameter for OutlierViews {
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
         let saved = decoded(saved)?;
-        if saved.has_same_counts(&self.state) {
+        if saved.views.len() == self.state.views.len() {
             self.state = saved;
         }
         Ok(())
@@ -364,11 +330,15 @@ impl PhotoParameter for OutlierViews {
 
     /// Notes the error of the view, also of a step that was skipped, and after an epoch names the views that have become outliers.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        if !self.is_dark(outcome.after_reset) {
+        // The picture is dark then, whatever its photo shows. Each view misses one turn; in epochs of more than [`STEPS_AFTER_RESET`]
+        // steps only some do.
+        let is_dark = outcome.after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views));
+        if !is_dark {
             self.state.measure(outcome.view, outcome.mse, outcome.photo);
         }
         if outcome.ended_group.is_some_and(|views| views >= COMPARED_WITHIN) {
-            self.state.forget_recent();
+            // The coming steps show another region.
+            self.state.recent.clear();
         }
         let (done, views) = (outcome.step + 1, self.train_views);
         if !done.is_multiple_of(views) {
@@ -376,7 +346,8 @@ impl PhotoParameter for OutlierViews {
         }
         let mut found = self.state.end_epoch(done / views - 1);
         if !self.are_left_out {
-            if !self.is_late(done) {
+            // Early pictures are rough, and those of sound photos at the rim of the scene stay rough the longest.
+            if done < WARNED_FROM_EPOCH * self.train_views || done < self.steps / 2 {
                 return Vec::new();
             }
             found = self.state.named().filter(|view| self.told.binary_search(view).is_err()).collect();
@@ -397,19 +368,6 @@ impl PhotoParameter for OutlierViews {
 }
 
 impl OutlierViews {
-    /// Whether a picture `after_reset` steps after an opacity reset is dark, whatever its photo shows. Such a picture is not measured: each
-    /// view misses one turn, and in epochs of more than [`STEPS_AFTER_RESET`] steps only some do.
-    fn is_dark(&self, after_reset: Option<u32>) -> bool {
-        after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views))
-    }
-
-    /// Whether the pictures after `done` steps say something about photos that only get a warning: early pictures are rough, and
-    /// those of sound photos at the rim of the scene stay rough the longest.
-    fn is_late(&self, done: u32) -> bool {
-        done >= WARNED_FROM_EPOCH * self.train_views && done >= self.steps / 2
-    }
-
-    /// Names views that have become outliers.
     fn warning(&self, found: &[usize], step: u32, dataset: &Dataset) -> Option<String> {
         if found.is_empty() {
             return None;
@@ -429,7 +387,6 @@ impl OutlierViews {
     }
 }
 
-/// The names of the views that a summary lists.
 pub fn names_in(summary: &Value) -> Vec<String> {
     let views = summary[FIGURE].as_array().map_or(&[][..], Vec::as_slice);
     views.iter().filter_map(|view| Some(view["name"].as_str()?.to_string())).collect()
@@ -557,7 +514,7 @@ mod tests {
         assert!(outliers.contradicts(&swapped, &photo), "outliers are no measure of others");
         let masked = Target { mask: Some(vec![0; 32]), ..photo.clone() };
         assert!(!outliers.contradicts(&swapped, &masked));
-        outliers.forget_recent();
+        outliers.recent.clear();
         assert!(!outliers.contradicts(&swapped, &photo), "nothing of this region was seen yet");
     }
 
@@ -601,13 +558,6 @@ mod tests {
             steps: 400,
             told: Vec::new(),
         }
-    }
-
-    #[test]
-    fn a_warning_comes_after_ten_epochs_and_half_of_the_steps() {
-        let of_steps = |steps: u32| OutlierViews { steps, ..outliers(&[3]) };
-        assert!(!of_steps(400).is_late(199) && of_steps(400).is_late(200));
-        assert!(!of_steps(90).is_late(90) && of_steps(0).is_late(100));
     }
 
     #[test]

@@ -56,14 +56,11 @@ impl Orbit {
     }
 }
 
-/// Progress of the run.
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Status {
     /// Steps done.
     pub step: u32,
-    /// Steps of the run.
     pub steps: u32,
-    /// Gaussians in the pages.
     pub gaussians: u64,
     /// PSNR of the last step's view, dB.
     pub psnr: f64,
@@ -130,7 +127,6 @@ impl Live {
         Err(InputError::new("--serve", problem, "build it with the default features, or leave --serve out"))
     }
 
-    /// Address of the page.
     pub fn address(&self) -> SocketAddr {
         self.0.address
     }
@@ -139,12 +135,10 @@ impl Live {
         self.0.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Sets the path of the run's metrics.
     pub fn set_metrics(&self, metrics: PathBuf) {
         self.state().metrics = Some(metrics);
     }
 
-    /// Sets the progress of the run.
     pub fn set_status(&self, status: Status) {
         self.state().status = status;
     }
@@ -165,7 +159,6 @@ impl Live {
         state.answers.extend(answered.into_iter().map(|(ticket, _)| (ticket, Arc::clone(&picture))));
     }
 
-    /// Requests a picture.
     pub fn ask(&self, orbit: Orbit) -> Request {
         let mut state = self.state();
         state.last = Ticket(state.last.0 + 1);
