@@ -32,10 +32,7 @@ pub struct PixelChunks<R> {
 }
 
 impl<R: BufRead> PixelChunks<R> {
-    /// Starts at the first byte of a PNG file.
-    ///
-    /// # Errors
-    /// The file cannot be read.
+    /// Starts at the first byte of a PNG file. Errors: the file cannot be read.
     pub fn new(mut inner: R) -> Result<PixelChunks<R>> {
         let mut head = [0; 8];
         let filled = read_up_to(&mut inner, &mut head)?;

@@ -6,10 +6,7 @@ use png::{BitDepth, ColorType, Compression, Encoder, EncodingError};
 use std::io::{Error, Result, Write};
 
 /// Writes an RGB picture of 8 bits a channel. `fill` is called for each row from the top with its number and its
-/// `3 * width` bytes.
-///
-/// # Errors
-/// `to` cannot be written, or a side is 0.
+/// `3 * width` bytes. Errors: `to` cannot be written, or a side is 0.
 pub fn write_rgb_rows(to: impl Write, [width, height]: [u32; 2], mut fill: impl FnMut(usize, &mut [u8])) -> Result<()> {
     let other = |error: EncodingError| match error {
         EncodingError::IoError(error) => error,

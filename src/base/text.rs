@@ -139,9 +139,7 @@ impl<R: Read> Read for TextReader<R> {
 }
 
 /// The text of a file of at most `most` bytes.
-///
-/// # Errors
-/// The file cannot be read, or is longer; `remedy` says what to do then.
+/// Errors: the file cannot be read, or is longer; `remedy` says what to do then.
 pub fn read_text(file: &Path, most: u64, remedy: &str) -> InputResult<String> {
     let opened = File::open(file).map_err(|e| InputError::io(file, "opening", &e))?;
     let mut limited = opened.take(most + 1);

@@ -56,9 +56,7 @@ fn sink() -> std::sync::MutexGuard<'static, Option<Sink>> {
 }
 
 /// Begins the trace of the process in a new file. A trace that was begun before ends.
-///
-/// # Errors
-/// The file exists already, or cannot be created.
+/// Errors: the file exists already, or cannot be created.
 pub fn start(path: &Path) -> InputResult<()> {
     let file = File::create_new(path).map_err(|error| match error.kind() {
         ErrorKind::AlreadyExists => InputError::new(path, "exists already", "name another file, or remove this one"),
@@ -72,10 +70,7 @@ pub fn start(path: &Path) -> InputResult<()> {
 }
 
 /// Ends the trace; does nothing if none was begun. Removes the file of a trace without a span: the run was refused, and its next
-/// attempt may use the name.
-///
-/// # Errors
-/// A part of the trace could not be written.
+/// attempt may use the name. Errors: a part of the trace could not be written.
 pub fn finish() -> InputResult<()> {
     IS_ON.store(false, Ordering::Release);
     let Some(mut trace) = sink().take() else { return Ok(()) };

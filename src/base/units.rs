@@ -62,9 +62,7 @@ fn format_scaled(bytes: u64, round: impl Fn(f64) -> f64) -> String {
 }
 
 /// Parses a count: digits, which may be grouped (`30_000`, `30,000`), or a number with `k` or `M` (`30k`, `1.5M`).
-///
-/// # Errors
-/// The text is no whole number from 0 on.
+/// Errors: the text is no whole number from 0 on.
 pub fn parse_count(text: &str) -> Result<u64, String> {
     let wrong = || format!("'{text}' is not a count; write for example 30000 or 30k");
     let plain: String = text.trim().chars().filter(|c| !matches!(c, '_' | ',')).collect();
@@ -79,10 +77,7 @@ pub fn parse_count(text: &str) -> Result<u64, String> {
     if value < 9e15 && value == value.trunc() { Ok(value as u64) } else { Err(wrong()) }
 }
 
-/// As [`parse_count`], for keys of 32 bits.
-///
-/// # Errors
-/// As [`parse_count`], or the count is 2^32 or more.
+/// As [`parse_count`], for keys of 32 bits. Errors: as [`parse_count`], or the count is 2^32 or more.
 pub fn parse_count32(text: &str) -> Result<u32, String> {
     let too_large = |_| format!("'{text}' is too large; the most is 4,294,967,295");
     u32::try_from(parse_count(text)?).map_err(too_large)

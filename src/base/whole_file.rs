@@ -23,9 +23,7 @@ pub struct PartFile {
 
 impl PartFile {
     /// Begins to write the file `target`: creates `.NAME.part` beside it, to be given back to [`PartFile::finish`].
-    ///
-    /// # Errors
-    /// The folder cannot be written, or `target` names no file.
+    /// Errors: the folder cannot be written, or `target` names no file.
     pub fn create(target: &Path) -> InputResult<(PartFile, File)> {
         let no_name = || InputError::new(target, "this path has no file name", "give a file name");
         let part = PartFile { path: part_path(target).ok_or_else(no_name)?, target: target.to_path_buf() };
@@ -34,18 +32,14 @@ impl PartFile {
     }
 
     /// The temporary file again, to be written and read: for bytes that are never to get the name.
-    ///
-    /// # Errors
-    /// The file cannot be opened.
+    /// Errors: the file cannot be opened.
     pub fn reopen(&self) -> InputResult<File> {
         let opened = File::options().read(true).write(true).open(&self.path);
         opened.map_err(|e| InputError::io(&self.target, "opening the temporary file", &e))
     }
 
     /// Makes the bytes durable, and gives the file its name.
-    ///
-    /// # Errors
-    /// The drive fails. The target is unchanged, unless only its name could not be made durable.
+    /// Errors: the drive fails. The target is unchanged, unless only its name could not be made durable.
     pub fn finish(self, file: File) -> InputResult<()> {
         let target = &self.target;
         file.sync_all().map_err(|e| InputError::io(target, "flushing to the disk", &e))?;
@@ -78,18 +72,12 @@ pub(super) fn hidden_beside(target: &Path, ending: &str) -> Option<PathBuf> {
     Some(target.with_file_name(name))
 }
 
-/// Writes a file of these bytes.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Writes a file of these bytes. Errors: the folder cannot be written.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> InputResult<()> {
     write_whole_with(path, |out| out.write_all(bytes))
 }
 
-/// Writes a file of the bytes that `fill` writes.
-///
-/// # Errors
-/// The folder cannot be written, or `fill` failed.
+/// Writes a file of the bytes that `fill` writes. Errors: the folder cannot be written, or `fill` failed.
 pub fn write_whole_with(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Result<()>) -> InputResult<()> {
     let (part, file) = PartFile::create(path)?;
     let mut out = BufWriter::with_capacity(BUFFER_BYTES, file);
@@ -101,10 +89,7 @@ pub fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
-/// Makes the entries of a folder durable.
-///
-/// # Errors
-/// The drive reported an error, or its file system cannot do this.
+/// Makes the entries of a folder durable. Errors: the drive reported an error, or its file system cannot do this.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder)?.sync_all() } else { Ok(()) }
 }

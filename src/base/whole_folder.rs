@@ -26,9 +26,7 @@ pub struct PartFolder {
 
 impl PartFolder {
     /// Begins to write the folder `target`: creates `.NAME.part` beside it.
-    ///
-    /// # Errors
-    /// The folder cannot be written, `target` names no folder, or the folder exists and holds foreign files.
+    /// Errors: the folder cannot be written, `target` names no folder, or the folder exists and holds foreign files.
     pub fn create(target: &Path, is_ours: IsOurs) -> InputResult<PartFolder> {
         let no_name = || InputError::new(target, "this path names no folder", "name a new folder");
         let beside = |ending: &str| hidden_beside(target, ending).ok_or_else(no_name);
@@ -44,10 +42,7 @@ impl PartFolder {
         Ok(part)
     }
 
-    /// Writes a file at this path inside the folder, durably.
-    ///
-    /// # Errors
-    /// The disk fails.
+    /// Writes a file at this path inside the folder, durably. Errors: the disk fails.
     pub fn write(&mut self, inside: &Path, bytes: &[u8]) -> InputResult<()> {
         debug_assert!((self.is_ours)(inside), "{}", inside.display());
         let path = self.path.join(inside);
@@ -68,9 +63,7 @@ impl PartFolder {
     }
 
     /// Gives the folder its name, in place of an older one.
-    ///
-    /// # Errors
-    /// The drive fails, or the target now holds foreign files.
+    /// Errors: the drive fails, or the target now holds foreign files.
     pub fn finish(self) -> InputResult<()> {
         let io = |doing: &str, e: &std::io::Error| InputError::io(&self.target, doing, e);
         check_ours(&self.target, self.is_ours)?;
@@ -99,9 +92,7 @@ impl Drop for PartFolder {
 }
 
 /// Removes a folder without foreign files, if it exists.
-///
-/// # Errors
-/// The folder holds foreign files (then every file stays), or the drive fails.
+/// Errors: the folder holds foreign files (then every file stays), or the drive fails.
 pub fn remove_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     if !folder.is_dir() {
         return Ok(());
@@ -111,9 +102,7 @@ pub fn remove_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
 }
 
 /// Checks that a folder holds no foreign file, if it exists.
-///
-/// # Errors
-/// The folder holds a foreign file, or cannot be listed.
+/// Errors: the folder holds a foreign file, or cannot be listed.
 pub fn check_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     match first_other(folder, Path::new(""), is_ours) {
         Ok(None) => Ok(()),

@@ -42,10 +42,7 @@ pub trait Choice: Clone + Send + Sync + 'static {
     fn word(&self) -> Cow<'static, str>;
 }
 
-/// The value of a word.
-///
-/// # Errors
-/// The word is unknown; the error names the key and its words.
+/// The value of a word. Errors: the word is unknown; the error names the key and its words.
 pub fn parse_choice<T: Choice>(word: &str) -> Result<T, String> {
     T::from_word(word).ok_or_else(|| unknown::<T>(T::KEY, word))
 }

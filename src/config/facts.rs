@@ -37,10 +37,7 @@ pub struct Resolved {
     pub made_spill_dir: bool,
 }
 
-/// Writes config.toml: every key, then the facts.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Writes config.toml: every key, then the facts. Errors: the folder cannot be written.
 pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> InputResult<()> {
     let fail = |e: toml::ser::Error| InputError::new(path, format!("writing failed: {e}"), "report this as a bug");
     let mut text = toml::to_string(config).map_err(fail)?;
@@ -49,10 +46,7 @@ pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> I
     write_whole(path, text.as_bytes())
 }
 
-/// Reads the facts back from a run's config.toml.
-///
-/// # Errors
-/// The file has no `[resolved]` table of a run.
+/// Reads the facts back from a run's config.toml. Errors: the file has no `[resolved]` table of a run.
 pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
     let text = read_text(path, FILE_BYTES_MAX, "name the output folder of a run")?;
     let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");

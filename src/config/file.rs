@@ -330,17 +330,12 @@ config_keys! {
 
 impl TrainConfig {
     /// Reads a config file over the defaults.
-    ///
-    /// # Errors
-    /// The file cannot be read, is no config, or has an unknown key or word.
+    /// Errors: the file cannot be read, is no config, or has an unknown key or word.
     pub fn read(path: &Path) -> InputResult<TrainConfig> {
         Ok(TrainConfig::read_with_keys(path)?.0)
     }
 
-    /// As [`TrainConfig::read`], with the fields of the keys that the file gives.
-    ///
-    /// # Errors
-    /// As [`TrainConfig::read`].
+    /// As [`TrainConfig::read`], with the fields of the keys that the file gives. Errors: as [`TrainConfig::read`].
     pub fn read_with_keys(path: &Path) -> InputResult<(TrainConfig, BTreeSet<String>)> {
         let text = read_text(path, FILE_BYTES_MAX, "give a TOML file of keys")?;
         let of_code_page = |(_, line): &(usize, &str)| has_raw_bytes(line.split('#').next().unwrap_or(""));
@@ -352,18 +347,12 @@ impl TrainConfig {
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
     }
 
-    /// Parses a config text over the defaults.
-    ///
-    /// # Errors
-    /// The text is no TOML, or has an unknown key or word.
+    /// Parses a config text over the defaults. Errors: the text is no TOML, or has an unknown key or word.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
         Ok(TrainConfig::parse_with_keys(text)?.0)
     }
 
-    /// As [`TrainConfig::parse`], with the fields of the keys that the text gives.
-    ///
-    /// # Errors
-    /// As [`TrainConfig::parse`].
+    /// As [`TrainConfig::parse`], with the fields of the keys that the text gives. Errors: as [`TrainConfig::parse`].
     pub fn parse_with_keys(text: &str) -> Result<(TrainConfig, BTreeSet<String>), String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
         for name in TABLES.into_iter().chain([WITHOUT_EFFECT]) {
@@ -374,9 +363,7 @@ impl TrainConfig {
     }
 
     /// Checks ranges and relations between keys. Not here: whether files exist and whether a run fits.
-    ///
-    /// # Errors
-    /// Names the first key that is out of range, with what is allowed.
+    /// Errors: names the first key that is out of range, with what is allowed.
     pub fn check(&self) -> InputResult<()> {
         let positive = |x: f64| x.is_finite() && x > 0.0;
         // Compared in f32, as the run computes: 0.99999998 is 1 there.

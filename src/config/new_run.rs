@@ -71,20 +71,14 @@ const POOR_INIT_SCALE: f64 = 2.0;
 /// With `poor-points`: the share of Gaussians that a round at the cap moves to a better place.
 const POOR_RECYCLE: f64 = 0.05;
 
-/// The config of a new run, not checked yet.
-///
-/// # Errors
-/// The file cannot be read.
+/// The config of a new run, not checked yet. Errors: the file cannot be read.
 pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<TrainConfig> {
     let (mut config, given) = with_given(file, keys)?;
     set_open_keys(&mut config, &given);
     Ok(config)
 }
 
-/// As [`of_new_run`], of the given keys.
-///
-/// # Errors
-/// A key or a word is unknown.
+/// As [`of_new_run`], of the given keys. Errors: a key or a word is unknown.
 pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
     let given = keys.keys().map(|key| key.replace('-', "_")).collect();
     let mut config: TrainConfig = keys.try_into().map_err(|e: toml::de::Error| e.to_string())?;
@@ -92,10 +86,7 @@ pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
     Ok(config)
 }
 
-/// The keys that a config file and flags give.
-///
-/// # Errors
-/// The file cannot be read.
+/// The keys that a config file and flags give. Errors: the file cannot be read.
 pub fn given_keys(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<toml::Table> {
     let (config, given) = with_given(file, keys)?;
     let all = toml::Table::try_from(&config).unwrap_or_default();

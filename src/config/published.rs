@@ -118,9 +118,7 @@ struct Tables {
 
 impl PublishedRun {
     /// Finds a run by its name or its file.
-    ///
-    /// # Errors
-    /// The name or file does not exist, the file has no `[published]`, or its settings are invalid.
+    /// Errors: the name or file does not exist, the file has no `[published]`, or its settings are invalid.
     pub fn find(name_or_file: &Path) -> InputResult<PublishedRun> {
         let built_in = BUILT_IN.iter().find(|(name, _)| Path::new(name) == name_or_file);
         if let Some((name, text)) = built_in {
@@ -150,10 +148,7 @@ impl PublishedRun {
         Ok(PublishedRun { name: name.to_string(), config, facts: published, tiers: tier })
     }
 
-    /// Applies the settings of a tier to the config.
-    ///
-    /// # Errors
-    /// The tier does not exist.
+    /// Applies the settings of a tier to the config. Errors: the tier does not exist.
     pub fn use_tier(&mut self, name: &str) -> InputResult<()> {
         let Some(tier) = self.tiers.get(name) else {
             let names: Vec<&str> = self.tiers.keys().map(String::as_str).collect();

@@ -122,9 +122,7 @@ impl GrowthState {
     }
 
     /// What a commit cannot hold.
-    ///
-    /// # Errors
-    /// The checks are out of order, lie beyond `steps_done`, or hold a value that is not finite.
+    /// Errors: the checks are out of order, lie beyond `steps_done`, or hold a value that is not finite.
     pub fn check(&self, steps_done: u32) -> Result<(), &'static str> {
         let are_finite = |c: &GrowthCheck| [c.psnr, c.trained_psnr, c.lost, c.pays_from].iter().all(|x| x.is_finite());
         let is_sound = |c: &GrowthCheck| are_finite(c) && c.step <= steps_done;

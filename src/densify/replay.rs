@@ -90,9 +90,7 @@ impl<'a> PendingEvents<'a> {
     }
 
     /// Applies the pending events of page `id` to its rows, which have applied the first `applied` events.
-    ///
-    /// # Errors
-    /// The page outgrew its capacity and cannot be split.
+    /// Errors: the page outgrew its capacity and cannot be split.
     pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<Replay, SplitTooDeep> {
         let mut replay = Replay::default();
         let mut edited = EditedRows { page: rows, table: None };

@@ -56,27 +56,19 @@ pub fn camera(parameters: &PhotoParameters, dataset: &Dataset, view: usize) -> C
     parameters.iter().fold(dataset.views[view].camera, |camera, parameter| parameter.camera(view, camera))
 }
 
-/// The values as a commit holds them.
-///
-/// # Errors
-/// A value cannot be encoded; none of a valid kind.
+/// The values as a commit holds them. Errors: a value cannot be encoded; none of a valid kind.
 pub fn save(parameters: &PhotoParameters) -> Result<SavedValues, EncodingError> {
     parameters.iter().map(|parameter| Ok((parameter.name().to_string(), parameter.save()?))).collect()
 }
 
-/// Restores saved values. Values that are missing, or of other photos, stay as at a start.
-///
-/// # Errors
-/// As [`check`].
+/// Restores saved values. Values that are missing, or of other photos, stay as at a start. Errors: as [`check`].
 pub fn restore(parameters: &mut PhotoParameters, saved: &SavedValues) -> Result<(), ValuesError> {
     let saved_of = |name: &str| saved.get(name);
     parameters.iter_mut().try_for_each(|p| saved_of(p.name()).map_or(Ok(()), |bytes| p.restore(bytes)))
 }
 
 /// Checks values from a file.
-///
-/// # Errors
-/// They are of a kind that this program does not know, or values that no run can have written.
+/// Errors: they are of a kind that this program does not know, or values that no run can have written.
 pub fn check(saved: &SavedValues) -> Result<(), ValuesError> {
     saved.iter().try_for_each(|(name, bytes)| match KINDS.iter().find(|kind| kind.name == name) {
         Some(kind) => (kind.check)(bytes),

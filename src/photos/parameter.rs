@@ -119,16 +119,10 @@ pub trait PhotoParameter {
     /// told apart and read too.
     fn name(&self) -> &'static str;
 
-    /// The values as a commit holds them.
-    ///
-    /// # Errors
-    /// The values cannot be encoded.
+    /// The values as a commit holds them. Errors: the values cannot be encoded.
     fn save(&self) -> Result<Encoded, EncodingError>;
 
-    /// Restores saved values, unless they are of another number of photos.
-    ///
-    /// # Errors
-    /// No run can have written the values.
+    /// Restores saved values, unless they are of another number of photos. Errors: no run can have written the values.
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError>;
 
     /// Sets start values from the dataset, unless values were restored. Returns warnings for the user.
@@ -227,18 +221,13 @@ pub trait PhotoParameter {
     }
 
     /// Writes the values as people and other programs read them into the folder of the run.
-    ///
-    /// # Errors
-    /// The folder cannot be written.
+    /// Errors: the folder cannot be written.
     fn write_file(&self, _folder: &Path, _: &Dataset) -> InputResult<()> {
         Ok(())
     }
 }
 
-/// Writes a file of values.
-///
-/// # Errors
-/// The folder cannot be written.
+/// Writes a file of values. Errors: the folder cannot be written.
 pub fn write_values(path: &Path, values: &impl Serialize) -> InputResult<()> {
     let text = serde_json::to_string_pretty(values).map_err(|e| InputError::io(path, "writing", &e.into()))?;
     write_whole(path, (text + "\n").as_bytes())
@@ -269,18 +258,12 @@ pub enum ValuesError {
 }
 
 impl Encoded {
-    /// Encodes values.
-    ///
-    /// # Errors
-    /// The type contains something that cannot be encoded.
+    /// Encodes values. Errors: the type contains something that cannot be encoded.
     pub fn of<T: Serialize>(values: &T) -> Result<Encoded, EncodingError> {
         encoding::to_bytes(values).map(Encoded)
     }
 
-    /// Decodes values, and checks them.
-    ///
-    /// # Errors
-    /// The bytes are no such values, or `check` refuses them.
+    /// Decodes values, and checks them. Errors: the bytes are no such values, or `check` refuses them.
     pub fn decoded<T: DeserializeOwned>(
         &self,
         check: impl Fn(&T) -> Result<(), &'static str>,
@@ -291,9 +274,7 @@ impl Encoded {
     }
 
     /// As [`Encoded::decoded`], in place of `values`, unless they are of another number of photos.
-    ///
-    /// # Errors
-    /// As [`Encoded::decoded`].
+    /// Errors: as [`Encoded::decoded`].
     pub fn restore<T: DeserializeOwned>(
         &self,
         values: &mut T,

@@ -252,10 +252,7 @@ impl PoseState {
         self.seen += u32::from(is_new);
     }
 
-    /// Checks values from a file.
-    ///
-    /// # Errors
-    /// Names what no run can have written.
+    /// Checks values from a file. Errors: names what no run can have written.
     pub fn check(&self) -> Result<(), &'static str> {
         let is_stored = |pose: &ViewPose| pose.values.iter().all(|x| x.unsigned_abs() as f64 <= STORED_MOST * PER_UNIT);
         if !self.views.iter().all(is_stored) {

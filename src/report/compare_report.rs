@@ -101,10 +101,7 @@ fn photos(config: &Path) -> [Option<f64>; 2] {
     PHOTO_KEYS.map(|key| table.as_ref().and_then(|table| table.get(key)).and_then(number))
 }
 
-/// The page that compares the runs in `folders`.
-///
-/// # Errors
-/// A folder holds no metrics, or a picture cannot be decoded.
+/// The page that compares the runs in `folders`. Errors: a folder holds no metrics, or a picture cannot be decoded.
 pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let mut runs = Vec::new();
     for (folder, name) in folders.iter().zip(names(folders)) {

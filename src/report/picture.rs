@@ -32,9 +32,7 @@ pub struct ViewPictures {
 }
 
 /// Reads a PNG whose left half is the render and whose right half is the photo.
-///
-/// # Errors
-/// The file cannot be read or decoded, or exceeds the size limit.
+/// Errors: the file cannot be read or decoded, or exceeds the size limit.
 pub fn view_pictures(path: &Path) -> InputResult<ViewPictures> {
     let refused = |problem: String| InputError::new(path, problem, "evaluate the run again");
     let bad = |e: DecodingError| refused(format!("is not a picture: {e}"));

@@ -24,9 +24,7 @@ const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
 /// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its pictures.
-///
-/// # Errors
-/// The folder holds no metrics, or a picture cannot be decoded.
+/// Errors: the folder holds no metrics, or a picture cannot be decoded.
 pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
@@ -99,9 +97,7 @@ fn add_finding(page: &mut Page, Finding { title, text, table, curve }: Finding) 
 }
 
 /// Writes the report of the run in `folder` into the folder; returns its path. `progress` as for [`run_report`].
-///
-/// # Errors
-/// As [`run_report`], or the folder cannot be written.
+/// Errors: as [`run_report`], or the folder cannot be written.
 pub fn write_run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<PathBuf> {
     let html = run_report(folder, progress)?;
     let path = folder.join(REPORT_FILE);

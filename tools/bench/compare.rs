@@ -26,10 +26,7 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// Writes the page.
-///
-/// # Errors
-/// A folder holds no run, or the page cannot be written.
+/// Writes the page. Errors: a folder holds no run, or the page cannot be written.
 pub fn start(args: &Args) -> Result<(), TrainError> {
     write_whole(&args.out, compare_report(&args.runs)?.as_bytes())?;
     gsscale::tell!("{}", args.out.display());

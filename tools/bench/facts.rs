@@ -29,10 +29,7 @@ pub struct Facts {
 }
 
 impl Facts {
-    /// Reads the scene and partitions its initial Gaussians into pages, in memory.
-    ///
-    /// # Errors
-    /// The errors of a run.
+    /// Reads the scene and partitions its initial Gaussians into pages, in memory. Errors: the errors of a run.
     pub fn of(scene: &Path, config: &TrainConfig) -> Result<Facts, TrainError> {
         let prepared = prepare(scene, config)?;
         let (dataset, columns) = (&prepared.dataset, &prepared.columns);
@@ -52,9 +49,7 @@ impl Facts {
     }
 
     /// Frames for a share of the pages, in percent, raised to the need of the largest view.
-    ///
-    /// # Errors
-    /// A message: these are all pages, so nothing would leave memory.
+    /// Errors: a message: these are all pages, so nothing would leave memory.
     pub fn frames(&self, percent: f64) -> Result<u32, String> {
         let pages_at_end = (self.pages as f64 * self.growth).ceil();
         let fewest = (self.largest_view as f64 * self.growth * SPARE).ceil() + 2.0;

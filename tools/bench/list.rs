@@ -93,10 +93,7 @@ pub struct Plan {
 }
 
 impl List {
-    /// Reads a list: the name of one of [`BUILT_IN`], or a file.
-    ///
-    /// # Errors
-    /// The file cannot be read, or is no list.
+    /// Reads a list: the name of one of [`BUILT_IN`], or a file. Errors: the file cannot be read, or is no list.
     pub fn read(path: &Path) -> InputResult<List> {
         let text = match BUILT_IN.iter().find(|(name, _)| path.as_os_str() == *name) {
             Some((_, text)) => (*text).to_string(),
@@ -125,9 +122,7 @@ impl List {
     }
 
     /// Keeps the reference and the runs that `only` names by group, by name, or by both (`group/name`).
-    ///
-    /// # Errors
-    /// No run has one of these names.
+    /// Errors: no run has one of these names.
     pub fn keep(&mut self, only: &[String]) -> InputResult<()> {
         let is_named = |group: &Group, entry: &Entry, name: &str| {
             [&group.name, &entry.name, &name_of(group, entry)].into_iter().any(|own| own == name)
@@ -148,9 +143,7 @@ impl List {
     }
 
     /// The runs for a scene. `given` are the keys of a config file and flags.
-    ///
-    /// # Errors
-    /// The scene cannot be read, or a run has an invalid config.
+    /// Errors: the scene cannot be read, or a run has an invalid config.
     pub fn plan(&self, place: &Place, given: &Table) -> Result<Plan, TrainError> {
         let base = config_of("the base", over(&self.base, given))?;
         let dataset = match self.groups.iter().any(|group| group.disturb.is_some()) {

@@ -104,10 +104,7 @@ struct Setting {
     caveats: Vec<String>,
 }
 
-/// Runs the command.
-///
-/// # Errors
-/// The folder is incomplete, or the run fails.
+/// Runs the command. Errors: the folder is incomplete, or the run fails.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
     let mut run = PublishedRun::find(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));

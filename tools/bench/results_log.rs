@@ -23,9 +23,7 @@ pub struct ResultsLog {
 
 impl ResultsLog {
     /// Opens or creates the log and removes an incomplete last line.
-    ///
-    /// # Errors
-    /// The log cannot be read or written, or a complete line does not hold a result.
+    /// Errors: the log cannot be read or written, or a complete line does not hold a result.
     pub fn open(path: &Path) -> InputResult<ResultsLog> {
         let io = |e: std::io::Error| InputError::io(path, "opening the results", &e);
         let mut file = OpenOptions::new().read(true).append(true).create(true).open(path).map_err(io)?;
@@ -36,9 +34,7 @@ impl ResultsLog {
     }
 
     /// Reads the records of a log without changing it; none if the file does not exist.
-    ///
-    /// # Errors
-    /// As [`ResultsLog::open`].
+    /// Errors: as [`ResultsLog::open`].
     pub fn peek(path: &Path) -> InputResult<Vec<RunRecord>> {
         match File::open(path) {
             Ok(mut file) => Ok(read(path, &mut file)?.0),
@@ -51,10 +47,7 @@ impl ResultsLog {
         &self.records
     }
 
-    /// Appends a run.
-    ///
-    /// # Errors
-    /// The log cannot be written.
+    /// Appends a run. Errors: the log cannot be written.
     pub fn append(&mut self, record: RunRecord) -> InputResult<()> {
         let io = |e: std::io::Error| InputError::io(&self.path, "writing the results", &e);
         let text = serde_json::to_string(&record).map_err(|e| io(e.into()))? + "\n";

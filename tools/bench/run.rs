@@ -61,10 +61,7 @@ fn check_flags(config: &TrainConfig) -> InputResult<()> {
     }
 }
 
-/// Runs the measurement.
-///
-/// # Errors
-/// The errors of a run.
+/// Runs the measurement. Errors: the errors of a run.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let config = super::settle(args.config.as_deref(), &args.keys)?;
     check_flags(&config)?;

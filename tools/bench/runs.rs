@@ -55,10 +55,7 @@ pub struct Surroundings {
 }
 
 impl Surroundings {
-    /// Reads scene, drive, program and machine.
-    ///
-    /// # Errors
-    /// `gsscale-train` is missing.
+    /// Reads scene, drive, program and machine. Errors: `gsscale-train` is missing.
     pub fn of(place: &Place) -> InputResult<Surroundings> {
         let program = digest(&beside("gsscale-train")?)?;
         // The default folder in --out is not part of the key: an output folder may move with its results.
@@ -140,9 +137,7 @@ impl Planned {
 
 impl Sweep {
     /// Opens or creates the output folder, with its results; removes the leftovers of interrupted runs.
-    ///
-    /// # Errors
-    /// The folder cannot be written, another sweep uses it, or the results cannot be read.
+    /// Errors: the folder cannot be written, another sweep uses it, or the results cannot be read.
     pub fn open(place: &Place, base: &TrainConfig, pace_steps: u32, json: bool) -> InputResult<Sweep> {
         let (Place { scene, out, spill }, base) = (place.clone(), base.clone());
         make_folder(&out.join("runs"))?;
@@ -177,9 +172,7 @@ impl Sweep {
     }
 
     /// Trains a run and logs its result. Prints the result as JSON if that was asked for; warns if the run failed.
-    ///
-    /// # Errors
-    /// The program is missing or was interrupted, or results cannot be written. A failed run is a result.
+    /// Errors: the program is missing or was interrupted, or results cannot be written. A failed run is a result.
     pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<()> {
         let key = planned.key(&self.surroundings);
         if self.pace_after_last_run.is_none() {
@@ -374,9 +367,7 @@ fn lock(out: &Path) -> InputResult<File> {
 }
 
 /// The last error message of a failed program, or its exit status.
-///
-/// # Errors
-/// The program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
+/// Errors: the program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
 fn problem(output: &Output) -> InputResult<String> {
     if let Some(130 | 143) = output.status.code() {
         return Err(InputError::new("the sweep", "was interrupted", "start it again to continue"));
@@ -403,10 +394,7 @@ fn make_folder(path: &Path) -> InputResult<()> {
     std::fs::create_dir_all(path).map_err(|e| InputError::io(path, "making the folder", &e))
 }
 
-/// Removes a file or folder, if it exists.
-///
-/// # Errors
-/// It cannot be removed.
+/// Removes a file or folder, if it exists. Errors: it cannot be removed.
 pub fn remove(path: &Path) -> InputResult<()> {
     let removed = if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) };
     match removed {

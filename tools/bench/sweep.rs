@@ -81,10 +81,7 @@ pub struct Args {
     keys: TrainOverrides,
 }
 
-/// Runs the sweep.
-///
-/// # Errors
-/// The input is invalid, or the results cannot be written.
+/// Runs the sweep. Errors: the input is invalid, or the results cannot be written.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let mut list = List::read(&args.list)?;
     if !args.only.is_empty() {

@@ -169,10 +169,7 @@ impl AppearanceState {
         self.seen += u32::from(is_new);
     }
 
-    /// Checks values from a file.
-    ///
-    /// # Errors
-    /// Names what no run can have written.
+    /// Checks values from a file. Errors: names what no run can have written.
     pub fn check(&self) -> Result<(), &'static str> {
         let seen = || self.images.iter().filter(|image| image.sightings > 0);
         let sums: [i64; IMAGE_VALUES] = std::array::from_fn(|k| seen().map(|image| i64::from(image.values[k])).sum());

@@ -191,10 +191,7 @@ impl BlockOutliers {
         (blocks > 0).then(|| masked as f64 / blocks as f64)
     }
 
-    /// Checks values from a file.
-    ///
-    /// # Errors
-    /// Names what no run can have written.
+    /// Checks values from a file. Errors: names what no run can have written.
     pub fn check(&self) -> Result<(), &'static str> {
         let is_possible = |view: &Vec<BlockState>| {
             let masked = || view.iter().filter(|state| state.is_masked());

@@ -199,10 +199,7 @@ impl ViewOutliers {
         found
     }
 
-    /// Checks values from a file.
-    ///
-    /// # Errors
-    /// Names what no run can have written.
+    /// Checks values from a file. Errors: names what no run can have written.
     pub fn check(&self) -> Result<(), &'static str> {
         let is_possible = |view: &ViewState| {
             f64::from(view.measure).abs() <= STORED_MOST

@@ -101,9 +101,7 @@ pub struct Live(Arc<Shared>);
 
 impl Live {
     /// Starts the server of a page at `address`; port 0 takes a free one.
-    ///
-    /// # Errors
-    /// The address cannot be used, or the program was built without the feature `serve`.
+    /// Errors: the address cannot be used, or the program was built without the feature `serve`.
     pub fn begin(address: SocketAddr) -> InputResult<Live> {
         let remedy = "choose another port, or leave --serve out";
         let fail = |e: std::io::Error| InputError::new("--serve", format!("{address} cannot be served: {e}"), remedy);
@@ -191,10 +189,7 @@ impl Drop for Request {
     }
 }
 
-/// The address that `text` names: `HOST:PORT`, or a port of this machine alone.
-///
-/// # Errors
-/// As text, for a command line.
+/// The address that `text` names: `HOST:PORT`, or a port of this machine alone. Errors: as text, for a command line.
 pub fn parse_address(text: &str) -> Result<SocketAddr, String> {
     let port = text.strip_prefix(':').unwrap_or(text).parse::<u16>();
     let full = port.map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
