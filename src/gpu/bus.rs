@@ -50,9 +50,7 @@ impl EmulatedBus {
     }
 
     /// The bus that the environment requests.
-    ///
-    /// # Errors
-    /// The variable is set to something else than a rate and a latency.
+    /// Errors: the variable is set to something else than a rate and a latency.
     #[cfg(feature = "gpu")]
     pub(super) fn from_environment() -> GpuResult<Option<EmulatedBus>> {
         match std::env::var_os(VARIABLE) {

@@ -107,9 +107,7 @@ impl fmt::Debug for Gpu {
 
 impl Gpu {
     /// Opens the device that `choice` requests.
-    ///
-    /// # Errors
-    /// No adapter fits the request, or the driver refused to open it.
+    /// Errors: no adapter fits the request, or the driver refused to open it.
     pub fn open_with(choice: &DeviceChoice, options: &GpuOptions) -> GpuResult<Gpu> {
         let (adapter, summary) = choose(choice)?;
         let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && options.subgroups != Some(false);
@@ -186,26 +184,20 @@ impl Gpu {
     }
 
     /// The pipeline of an entry point of a shader in [`SOURCES`]; compiled on first use.
-    ///
-    /// # Errors
-    /// The shader does not exist or does not compile, or a define is unknown to it.
+    /// Errors: the shader does not exist or does not compile, or a define is unknown to it.
     pub fn pipeline(&self, shader: &str, entry: &str, defines: Defines<'_>) -> GpuResult<Arc<Pipeline>> {
         let source = SOURCES.iter().find(|s| s.name == shader);
         self.pipeline_from(source.ok_or_else(|| GpuError::shader(shader, "no such shader"))?, entry, defines)
     }
 
     /// As [`Gpu::pipeline`], for a source outside the table; its imports still come from the table.
-    ///
-    /// # Errors
-    /// As [`Gpu::pipeline`].
+    /// Errors: as [`Gpu::pipeline`].
     pub fn pipeline_from(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Arc<Pipeline>> {
         self.pipelines.get(source, entry, defines)
     }
 
     /// A buffer of `size` bytes with arbitrary contents; see [`super::Recorder::clear`].
-    ///
-    /// # Errors
-    /// The buffer exceeds the budget or the device's memory.
+    /// Errors: the buffer exceeds the budget or the device's memory.
     pub fn buffer(&self, label: &'static str, size: u64) -> GpuResult<Buffer> {
         self.pool.take(label, size, Purpose::Work)
     }
@@ -236,9 +228,7 @@ impl Gpu {
     }
 
     /// Time of every stage so far, in order of first use; empty without profiling. Waits for the device.
-    ///
-    /// # Errors
-    /// The device was lost.
+    /// Errors: the device was lost.
     pub fn stage_times(&self) -> GpuResult<Vec<StageTime>> {
         lock(&self.profiler).times()
     }

@@ -77,9 +77,7 @@ pub struct Readback {
 
 impl Readback {
     /// Waits, then returns the elements.
-    ///
-    /// # Errors
-    /// The recorder was not submitted, the device was lost, or its work failed.
+    /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn to_vec<T: bytemuck::Pod>(self) -> GpuResult<Vec<T>> {
         let mut out = vec![T::zeroed(); usize::try_from(self.size).unwrap_or(0) / size_of::<T>().max(1)];
         self.copy_to(&mut out)?;
@@ -87,9 +85,7 @@ impl Readback {
     }
 
     /// Waits, then copies all elements to the front of `out`.
-    ///
-    /// # Errors
-    /// The recorder was not submitted, the device was lost, or its work failed.
+    /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn copy_to<T: bytemuck::Pod>(mut self, out: &mut [T]) -> GpuResult<()> {
         self.wait()?;
         let out = bytemuck::cast_slice_mut::<T, u8>(out);

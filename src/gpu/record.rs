@@ -82,9 +82,7 @@ impl Gpu {
     }
 
     /// Submits without waiting, unless [`super::GpuOptions::serial`] is set.
-    ///
-    /// # Errors
-    /// The API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
+    /// Errors: the API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
     pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
         // One reference is the device's own, one that of `recorder`.
         if Arc::strong_count(&self.recordings) > 2 {
@@ -98,9 +96,7 @@ impl Gpu {
     }
 
     /// Waits until the device has finished a submission.
-    ///
-    /// # Errors
-    /// The device was lost or ran out of memory.
+    /// Errors: the device was lost or ran out of memory.
     pub fn wait(&self, submission: &Submission) -> GpuResult<()> {
         self.driver.faults.set_stage(submission.name);
         self.driver.wait(submission.name, Some(&submission.ticket))
@@ -114,17 +110,13 @@ impl Recorder<'_> {
     }
 
     /// Uploads a uniform struct for dispatches of this recorder; binds as binding 0.
-    ///
-    /// # Errors
-    /// The device has no memory left.
+    /// Errors: the device has no memory left.
     pub fn uniform<T: bytemuck::NoUninit>(&mut self, value: &T) -> GpuResult<BufferView> {
         lock(&self.gpu.uniforms).pack(&mut self.work.uniforms, bytemuck::bytes_of(value))
     }
 
     /// A new buffer containing `data`.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`] and [`Recorder::upload`].
+    /// Errors: as [`Gpu::buffer`] and [`Recorder::upload`].
     pub fn buffer_with<T: bytemuck::NoUninit>(&mut self, label: &'static str, data: &[T]) -> GpuResult<Buffer> {
         let buffer = self.gpu.buffer(label, size_of_val(data) as u64)?;
         self.upload(&buffer.view(), data)?;
@@ -132,9 +124,7 @@ impl Recorder<'_> {
     }
 
     /// A new zeroed buffer.
-    ///
-    /// # Errors
-    /// As [`Gpu::buffer`].
+    /// Errors: as [`Gpu::buffer`].
     pub fn buffer_zeroed(&mut self, label: &'static str, size: u64) -> GpuResult<Buffer> {
         let buffer = self.gpu.buffer(label, size)?;
         self.clear(&buffer.view())?;
@@ -142,9 +132,7 @@ impl Recorder<'_> {
     }
 
     /// Uploads `data` to the start of `view`; the last word is padded with zero bytes.
-    ///
-    /// # Errors
-    /// The data is longer than the view, or the device failed.
+    /// Errors: the data is longer than the view, or the device failed.
     pub fn upload<T: bytemuck::NoUninit>(&mut self, view: &BufferView, data: &[T]) -> GpuResult<()> {
         let bytes = bytemuck::cast_slice::<T, u8>(data);
         if bytes.is_empty() {
@@ -180,9 +168,7 @@ impl Recorder<'_> {
     }
 
     /// Zeroes `view`.
-    ///
-    /// # Errors
-    /// The view is not aligned to 4 bytes.
+    /// Errors: the view is not aligned to 4 bytes.
     pub fn clear(&mut self, view: &BufferView) -> GpuResult<()> {
         self.check_copy("clear", view, view.size)?;
         self.work.pass = None;
@@ -192,9 +178,7 @@ impl Recorder<'_> {
     }
 
     /// Copies `from` to the start of `to`, which is another buffer.
-    ///
-    /// # Errors
-    /// `to` is shorter, both are in one buffer, or one is not aligned to 4 bytes.
+    /// Errors: `to` is shorter, both are in one buffer, or one is not aligned to 4 bytes.
     pub fn copy(&mut self, from: &BufferView, to: &BufferView) -> GpuResult<()> {
         self.check_copy("copy", from, from.size)?;
         self.check_copy("copy", to, from.size)?;
@@ -208,9 +192,7 @@ impl Recorder<'_> {
     }
 
     /// Records the read-back of `view` as it is at this point.
-    ///
-    /// # Errors
-    /// The view is not aligned to 4 bytes, or there is no memory for staging.
+    /// Errors: the view is not aligned to 4 bytes, or there is no memory for staging.
     pub fn read_back(&mut self, stage: &'static str, view: &BufferView) -> GpuResult<Readback> {
         self.check_copy("read_back", view, view.size)?;
         self.work.pass = None;
@@ -222,9 +204,7 @@ impl Recorder<'_> {
 
     /// Dispatches a stage; `views` are in the order of the binding numbers that its entry point uses. Zero groups do
     /// nothing.
-    ///
-    /// # Errors
-    /// A view does not match its binding; the message names the stage and the variable.
+    /// Errors: a view does not match its binding; the message names the stage and the variable.
     pub fn dispatch(
         &mut self,
         stage: &'static str,

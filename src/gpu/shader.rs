@@ -153,9 +153,7 @@ impl Binding {
 }
 
 /// Parses and validates a preprocessed text.
-///
-/// # Errors
-/// The compiler's message with the faulty line.
+/// Errors: the compiler's message with the faulty line.
 pub fn validate(name: &str, text: &str, subgroups: bool) -> GpuResult<(naga::Module, naga::valid::ModuleInfo)> {
     let module = naga::front::wgsl::parse_str(text).map_err(|e| GpuError::shader(name, e.emit_to_string(text)))?;
     let mut capabilities = naga::valid::Capabilities::empty();
@@ -166,9 +164,7 @@ pub fn validate(name: &str, text: &str, subgroups: bool) -> GpuResult<(naga::Mod
 }
 
 /// Reflects an entry point of a preprocessed text.
-///
-/// # Errors
-/// The text does not validate, the entry point does not exist, or a binding is outside group 0.
+/// Errors: the text does not validate, the entry point does not exist, or a binding is outside group 0.
 fn reflect(name: &str, text: &str, entry: &str, subgroups: bool) -> GpuResult<Reflection> {
     let (module, info) = validate(name, text, subgroups)?;
     let index = module

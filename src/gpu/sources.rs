@@ -147,9 +147,7 @@ fn params(source: &Source) -> GpuResult<BTreeMap<String, Vec<String>>> {
 }
 
 /// All combinations of switches and parameter values of a shader.
-///
-/// # Errors
-/// An import is missing or a directive is malformed.
+/// Errors: an import is missing or a directive is malformed.
 pub fn variants(source: &Source) -> GpuResult<Vec<Vec<(String, String)>>> {
     let mut all = vec![Vec::new()];
     for switch in &switches(source)? {
@@ -165,9 +163,7 @@ pub fn variants(source: &Source) -> GpuResult<Vec<Vec<(String, String)>>> {
 }
 
 /// The WGSL text of a variant.
-///
-/// # Errors
-/// A define is unknown, a value is not in its list, an import is missing, or a condition is not closed.
+/// Errors: a define is unknown, a value is not in its list, an import is missing, or a condition is not closed.
 pub fn preprocess(source: &Source, defines: Defines<'_>) -> GpuResult<String> {
     let switches = switches(source)?;
     let lists = params(source)?;

@@ -159,18 +159,14 @@ pub(super) struct Submitter {
 
 impl Submitter {
     /// Submits to `queue`: on a thread if `beside_host` is set.
-    ///
-    /// # Errors
-    /// The thread could not be started.
+    /// Errors: the thread could not be started.
     pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, beside_host: bool) -> GpuResult<Submitter> {
         let worker = if beside_host { Some(Worker::start(device.clone(), queue.clone())?) } else { None };
         Ok(Submitter { device: device.clone(), queue: queue.clone(), worker, last: Mutex::default() })
     }
 
     /// Submits a recording called `name`, or has the thread do so.
-    ///
-    /// # Errors
-    /// The driver could not be asked for its progress, or the thread has ended.
+    /// Errors: the driver could not be asked for its progress, or the thread has ended.
     pub(super) fn submit(&self, name: &'static str, job: Job) -> GpuResult<()> {
         let Some(worker) = &self.worker else {
             return job.run(&self.device, &self.queue).map_err(|e| GpuError::validation(name, e));

@@ -147,9 +147,7 @@ impl GpuRenderer {
     }
 
     /// Coverage 1 - T of the last picture, `[height][width]`.
-    ///
-    /// # Errors
-    /// As [`Renderer::image`], or when the device failed.
+    /// Errors: as [`Renderer::image`], or when the device failed.
     pub fn alpha(&mut self) -> Result<Vec<f32>, RenderError> {
         self.sequence.image()?;
         self.with_view("coverage", |renderer, view| {

@@ -30,9 +30,7 @@ pub(super) struct Segment {
 }
 
 /// Runs `stage` on consecutive parts of `rows`: on all rows if device memory allows, else on half as many, and so on.
-///
-/// # Errors
-/// As `stage`, on the smallest part.
+/// Errors: as `stage`, on the smallest part.
 pub(super) fn in_chunks(rows: usize, mut stage: impl FnMut(Range<usize>) -> GpuResult<()>) -> GpuResult<()> {
     let (mut first, mut chunk) = (0, rows);
     while first < rows {

@@ -336,9 +336,7 @@ impl TileStages {
 
     /// Whether the buffers of a frame were large enough. If not, the sizes for the next frame grow to `demand`, and the
     /// caller records [`TileStages::frame`] again.
-    ///
-    /// # Errors
-    /// The view has more intersections than any device can hold.
+    /// Errors: the view has more intersections than any device can hold.
     pub fn fits(&mut self, frame: &Frame, demand: Demand) -> GpuResult<bool> {
         if u64::from(demand.isects) >= CAPACITY_MAX {
             let need = words(demand.isects);

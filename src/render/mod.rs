@@ -166,9 +166,7 @@ pub enum RenderError {
 }
 
 /// `None` where the device has too little memory for the work, which a caller can do in smaller parts or later.
-///
-/// # Errors
-/// Every other error.
+/// Errors: every other error.
 pub(crate) fn none_if_out_of_memory<T>(done: Result<T, RenderError>) -> Result<Option<T>, RenderError> {
     match done {
         Ok(done) => Ok(Some(done)),
@@ -264,34 +262,24 @@ pub trait Renderer: Send {
     /// Whether the backward passes of the next views also collect [`Gradients::weights`]. The error that they weigh is
     /// that of the picture which [`Renderer::loss`] compared, zero where the photo is masked. Changes no bit of picture,
     /// loss and gradients.
-    ///
-    /// # Errors
-    /// The device rejects a shader that this needs: shaders are compiled the first time.
+    /// Errors: the device rejects a shader that this needs: shaders are compiled the first time.
     fn weigh_rows(&mut self, is_wanted: bool) -> Result<(), RenderError>;
 
     /// Begins a view. Drops the previous view.
-    ///
-    /// # Errors
-    /// The picture is too large.
+    /// Errors: the picture is too large.
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError>;
 
     /// Projects and colours the rows of the next batch and appends the splats to those of the view.
-    ///
-    /// # Errors
-    /// The view has one batch, which was given already, the view has too many rows, the rows hold a lower SH degree than the options
+    /// Errors: the view has one batch, which was given already, the view has too many rows, the rows hold a lower SH degree than the options
     /// request, or device memory is exhausted.
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError>;
 
     /// Sorts the splats by depth, lists the splats of each tile and blends the lists.
-    ///
-    /// # Errors
-    /// The view has no batch of rows yet, or device memory is exhausted.
+    /// Errors: the view has no batch of rows yet, or device memory is exhausted.
     fn picture(&mut self) -> Result<(), RenderError>;
 
     /// The picture.
-    ///
-    /// # Errors
-    /// The view has no picture yet, or `picture_back` ran and `rows_out` of a batch is still due.
+    /// Errors: the view has no picture yet, or `picture_back` ran and `rows_out` of a batch is still due.
     fn image(&mut self) -> Result<&Image, RenderError>;
 
     /// The values of the picture in host memory, `[3][height][width]`, for the caller to correct. [`Renderer::loss`]
@@ -301,9 +289,7 @@ pub trait Renderer: Send {
     fn picture_mut(&mut self) -> Result<&mut [f32], RenderError>;
 
     /// Computes the loss of the picture against `target` and the gradient of the picture. Replaces an earlier gradient.
-    ///
-    /// # Errors
-    /// As [`Renderer::image`], or target and picture differ in size.
+    /// Errors: as [`Renderer::image`], or target and picture differ in size.
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError>;
 
     /// The gradient of the picture in host memory: the gradient of the loss, or zeros if no loss ran.
@@ -313,26 +299,20 @@ pub trait Renderer: Send {
     fn picture_gradient(&mut self) -> Result<&mut PictureGradient, RenderError>;
 
     /// Propagates the gradient of the picture back to the splats of the view.
-    ///
-    /// # Errors
-    /// The picture has no gradient, or the caller changed the size of the gradient.
+    /// Errors: the picture has no gradient, or the caller changed the size of the gradient.
     fn picture_back(&mut self) -> Result<(), RenderError>;
 
     /// Propagates the gradients of the splats back to the rows of one batch (counted from 0). The caller provides the
     /// same rows as to [`Renderer::rows_in`]. Batches may come in any order, each once. Every entry of `grads` is
     /// written; rows that were not drawn get zeros.
-    ///
-    /// # Errors
-    /// [`Renderer::picture_back`] has not run, the batch was processed already, or the batch had another number of
+    /// Errors: [`Renderer::picture_back`] has not run, the batch was processed already, or the batch had another number of
     /// rows.
     fn rows_out(&mut self, batch: usize, rows: &Columns, grads: &mut Gradients) -> Result<(), RenderError>;
 
     /// The number of rows of the view whose splats have a gradient that is not finite, or beyond
     /// [`crate::base::math::LARGEST_SPLAT_GRAD`]: too large for the optimizer. To be called after the first `rows_out`; a
     /// device does not wait then.
-    ///
-    /// # Errors
-    /// No batch is out yet, or the device failed.
+    /// Errors: no batch is out yet, or the device failed.
     fn unusable_splats(&mut self) -> Result<u64, RenderError>;
 
     /// The value of the last [`Renderer::loss`]. On a device, a call after `rows_out` does not wait.

@@ -94,9 +94,7 @@ pub struct StepDone {
 /// record_picture ──> record_update ─ ─ ─ ─ ─ > finish_step
 ///                         └──> record_picture ──> record_update ─ ─ > finish_step
 /// ```
-///
-/// # Errors
-/// Calls fail where the device failed or has no memory, where no pages are held, and out of order. Their comments name other errors.
+/// Errors: calls fail where the device failed or has no memory, where no pages are held, and out of order. Their comments name other errors.
 pub trait PageRenderer: Renderer {
     /// Prepares the device for pages of a run. Slots that exist are given up.
     fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError>;
@@ -128,22 +126,16 @@ pub trait PageRenderer: Renderer {
 
     /// As [`Renderer::rows_in`], for the rows of `pages` that the view's camera may draw, evaluated at the step. Returns how many.
     /// Waits for that number.
-    ///
-    /// # Errors
-    /// As [`Renderer::rows_in`]; the pages are stored with another SH degree than the view asks for; no pages are held.
+    /// Errors: as [`Renderer::rows_in`]; the pages are stored with another SH degree than the view asks for; no pages are held.
     fn pages_in(&mut self, pages: &[SlotPage], step: &StepNumbers) -> Result<usize, RenderError>;
 
     /// Propagates the gradients of the picture to the splats of a batch, as far as an update of the rows needs them.
-    ///
-    /// # Errors
-    /// As [`Renderer::rows_out`].
+    /// Errors: as [`Renderer::rows_out`].
     fn pages_out(&mut self, batch: usize) -> Result<(), RenderError>;
 
     /// Begins the step on the rows of a batch, in their slots, which collects statistics if `collects`. `pages` are those of
     /// [`PageRenderer::pages_in`], perhaps in other slots. Does not wait.
-    ///
-    /// # Errors
-    /// [`PageRenderer::pages_out`] of the batch has not run, or the device failed: some pages may be updated then.
+    /// Errors: [`PageRenderer::pages_out`] of the batch has not run, or the device failed: some pages may be updated then.
     fn begin_update(&mut self, batch: usize, pages: &[SlotPage], collects: bool) -> Result<(), RenderError>;
 
     /// Waits for the update that [`PageRenderer::begin_update`] began. Returns what it did to each page.
@@ -161,16 +153,12 @@ pub trait PageRenderer: Renderer {
 
     /// Records a step of one batch up to its picture, without waiting. False where memory is short or the sizes of its lists cannot be
     /// predicted yet: the caller then runs the stages above.
-    ///
-    /// # Errors
-    /// The device failed, or holds no pages; the pages are stored with another SH degree than the view asks for.
+    /// Errors: the device failed, or holds no pages; the pages are stored with another SH degree than the view asks for.
     fn record_picture(&mut self, job: &StepJob<'_>) -> Result<bool, RenderError>;
 
     /// Records loss, gradients and update of the step whose picture was recorded last, without waiting; the step is in flight then. The
     /// update changes nothing if the gate is closed by this step or an earlier one. False, and no step, where memory is short.
-    ///
-    /// # Errors
-    /// The device failed: pages may be updated then. There is no recorded picture.
+    /// Errors: the device failed: pages may be updated then. There is no recorded picture.
     fn record_update(&mut self, update: &RecordedUpdate<'_>) -> Result<bool, RenderError>;
 
     /// Waits for the first step in flight.

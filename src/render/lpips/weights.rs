@@ -19,9 +19,7 @@ const FILE_BYTES_MAX: u64 = 1 << 30;
 const REMEDY: &str = "make it with the one-line export in tools/README.md, section LPIPS";
 
 /// Reads a network with its weights.
-///
-/// # Errors
-/// The file cannot be read or is not a safetensors file; a tensor is missing, has another shape or is not finite.
+/// Errors: the file cannot be read or is not a safetensors file; a tensor is missing, has another shape or is not finite.
 pub fn read_lpips(path: &Path, simd: SimdPath) -> InputResult<Lpips> {
     let io = |e: std::io::Error| InputError::io(path, "reading the LPIPS weights", &e);
     if std::fs::metadata(path).map_err(io)?.len() > FILE_BYTES_MAX {

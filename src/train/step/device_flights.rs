@@ -222,9 +222,7 @@ impl Flights {
 
     /// Records a step on the pages of a device, without waiting for anything that the device computes. False, with nothing changed, where
     /// that cannot be done now.
-    ///
-    /// # Errors
-    /// A page could not be read, and nothing has changed; or the device failed ([`TrainError::Torn`]).
+    /// Errors: a page could not be read, and nothing has changed; or the device failed ([`TrainError::Torn`]).
     pub fn record(
         &mut self,
         cache: &mut SlotCache,
@@ -329,9 +327,7 @@ impl Flights {
 
     /// Waits for the first step in flight and takes over its effect on its pages. `None` if the step was not taken: no step is in flight
     /// any more then, and nothing has changed.
-    ///
-    /// # Errors
-    /// The device failed ([`TrainError::Torn`]).
+    /// Errors: the device failed ([`TrainError::Torn`]).
     pub fn finish(
         &mut self,
         cache: &mut SlotCache,

@@ -35,9 +35,7 @@ pub struct DeviceRows<'a> {
 
 impl<'a> DeviceRows<'a> {
     /// Begins 0-based `step` on the pages that `renderer` holds. The next step, if there is one, draws `next`.
-    ///
-    /// # Errors
-    /// The device failed.
+    /// Errors: the device failed.
     pub fn new(
         tier: &'a mut DeviceTier,
         scene: &mut PagedScene,

@@ -702,9 +702,7 @@ impl SlotCache {
 
     /// Waits for the copies back that began behind step `last` or before, fills the frames of their pages, and unpins those that no step
     /// has: `of_steps` are the pages of the steps.
-    ///
-    /// # Errors
-    /// The device failed: the pages exist nowhere else ([`TrainError::Torn`]).
+    /// Errors: the device failed: the pages exist nowhere else ([`TrainError::Torn`]).
     pub(super) fn finish_leaving(
         &mut self,
         scene: &mut PagedScene,

@@ -20,9 +20,7 @@ pub struct DeviceTier {
 
 impl DeviceTier {
     /// Prepares a device for the pages of a run of `steps` steps.
-    ///
-    /// # Errors
-    /// The device failed or has no room, or the run's optimizer is not one that devices have.
+    /// Errors: the device failed or has no room, or the run's optimizer is not one that devices have.
     pub fn new(scene: &PagedScene, renderer: &mut dyn Renderer, steps: u32) -> Result<DeviceTier, TrainError> {
         let name = renderer.name();
         let numbers = scene.rules.adam.numbers(steps);
@@ -44,9 +42,7 @@ impl DeviceTier {
     }
 
     /// The tier of a run, made if the run has none yet.
-    ///
-    /// # Errors
-    /// As [`DeviceTier::new`].
+    /// Errors: as [`DeviceTier::new`].
     pub fn of_run<'a>(
         tier: &'a mut Option<DeviceTier>,
         scene: &PagedScene,
@@ -70,9 +66,7 @@ impl DeviceTier {
 
     /// Copies all held pages back and adds the counts of the device to the histogram. The scene is then as if the host
     /// had taken all steps.
-    ///
-    /// # Errors
-    /// The device failed; the pages that are still held exist there alone.
+    /// Errors: the device failed; the pages that are still held exist there alone.
     pub fn drain(&mut self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
         if self.flights.in_flight() > 0 {
             return Err(RenderError::OutOfOrder { call: "drain", needs: "finish of every step in flight" }.into());
@@ -83,9 +77,7 @@ impl DeviceTier {
     }
 
     /// Adds the counts of the device to the histogram.
-    ///
-    /// # Errors
-    /// The device failed.
+    /// Errors: the device failed.
     pub(crate) fn take_bins(&self, scene: &mut PagedScene, renderer: &mut dyn Renderer) -> Result<(), TrainError> {
         scene.histogram.add_changes(&device_of(renderer)?.take_bins()?);
         Ok(())
