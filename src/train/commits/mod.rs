@@ -2,6 +2,5 @@
 
 pub mod checkpoint;
 pub(crate) mod first_commit;
-pub mod full_drive;
 pub(crate) mod results_wait;
 pub mod save;

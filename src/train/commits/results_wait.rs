@@ -3,12 +3,12 @@
 //! All results share one wait of `--disk-full-wait`. Meanwhile the run tries to commit its last step, so that no step is lost if
 //! no space is freed, and says what can be saved on another drive. A run that was asked to stop does not wait.
 //!
-//! Not here: commits and metrics between steps ([`super::full_drive`]), what the results are (`run_folder`).
+//! Not here: commits and metrics between steps ([`super::checkpoint`]), what the results are (`run_folder`).
 //!
 //! Invariant: waiting does not change the results.
 
 use super::checkpoint::Checkpoint;
-use super::full_drive::POLL;
+use super::checkpoint::POLL;
 use crate::base::units::format_bytes;
 use crate::page::folder::file_system::free_bytes;
 use crate::report::run_files::PLY_FILE;

@@ -1,6 +1,6 @@
 //! The drive of the pages: whether it holds them, how much a run writes to it, and how long a run waits for it.
 //!
-//! Not here: a drive that is full during a run ([`crate::train::commits::full_drive`]).
+//! Not here: a drive that is full during a run ([`crate::train::commits::checkpoint`]).
 //!
 //! Invariant: a drive that cannot hold the first pages is refused; one that may not hold the growth is a warning.
 

@@ -19,7 +19,7 @@ use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::StrategyName;
 use crate::page::format::spill_format::SlotLayout;
 use crate::scene::state::row_bytes;
-use crate::train::commits::full_drive::reserve_bytes;
+use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::log::report::Foreseen;
 use crate::train::memory::estimate::MemoryEstimate;
 

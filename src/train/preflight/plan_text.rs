@@ -6,7 +6,7 @@ use crate::config::file::TrainConfig;
 use crate::page::folder::file_system::free_bytes;
 use crate::paging::pager::PagerConfig;
 use crate::scene::partition::first_fill;
-use crate::train::commits::full_drive::reserve_bytes;
+use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::inputs::places::drive_of;
 use crate::train::memory::largest_view::LargestView;
 use crate::train::start::first_scene::Start;

@@ -11,8 +11,8 @@ use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::{CommitConfig, CommitError};
 use crate::page::map::opening::Opened;
 use crate::page::tool::uncommitted::holds_no_commit;
+use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::commits::first_commit::MAP_CACHE_BYTES;
-use crate::train::commits::full_drive::reserve_bytes;
 use crate::train::error::TrainError;
 use std::path::Path;
 
