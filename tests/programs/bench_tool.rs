@@ -15,7 +15,7 @@ fn help_lists_the_measurements_and_each_has_help() {
     assert_eq!(said("--help"), help);
     let commands: Vec<&str> =
         help.lines().filter_map(|line| line.strip_prefix("  gsscale-bench ")?.split_whitespace().next()).collect();
-    assert_eq!(commands, ["SCENE", "run", "compare", "sweep"]);
+    assert_eq!(commands, ["SCENE", "run", "doctor", "compare", "sweep"]);
     for command in &commands[1..] {
         let of_command = said(&format!("{command} --help"));
         assert!(of_command.contains("Examples:") && of_command.contains("Usage: gsscale-bench"), "{of_command}");

@@ -271,7 +271,7 @@ fn devices_are_listed_and_an_unknown_one_is_refused() {
     if let Some(device) = gpu::open(&GpuOptions::default()) {
         assert!(listed.contains(&device.summary().to_string()), "{listed}");
     }
-    let output = work.command(TRAIN, "scene --out run --device").arg("no such device").output().unwrap();
+    let output = work.command(TRAIN, "scene --out run").args(["--device", "no such device"]).output().unwrap();
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
     assert!(["--device", "'no such device'", "--list-devices"].iter().all(|word| said.contains(word)), "{said}");

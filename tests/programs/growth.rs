@@ -38,7 +38,7 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     let report = work.text("out/report.html");
     assert!(report.contains("Number of Gaussians") && report.contains("growth pays from"));
     // A higher price allows fewer, and the last check cannot come after the last round.
-    run("--quality draft --refine-stop 45");
+    run("--quality draft --refine-stop 40");
     let draft = work.summary("out")["growth"].clone();
     let last = draft.as_array().unwrap().last().unwrap();
     assert!(draft.as_array().unwrap().len() < 3 && of(last, "allowed") < of(&checks[2], "allowed"), "{draft}");

@@ -11,8 +11,8 @@ mod bombs;
 mod ckpt;
 mod cli;
 mod clients;
-#[cfg(unix)]
 mod doctor;
+#[cfg(unix)]
 mod drive_faults;
 mod dry_runs;
 mod exports;
