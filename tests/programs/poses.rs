@@ -28,8 +28,11 @@ fn refined_poses_win_back_what_noise_costs_and_lie_nearer_to_the_truth() {
     println!("{plain:.2} dB, refined {refined:.2} dB");
     // 1.1 dB were seen after these few steps without growth; half of that is asked, since the scene's draws are one sample.
     assert!(refined > plain + 0.5);
+    // The undisturbed scene, with the names of the disturbed one.
+    let dataset = prepare(&work.scene(), &TrainConfig::default()).unwrap().dataset;
+    write_disturbed(&work.path("clean"), &dataset, &Disturbance::Nothing, 3).unwrap();
     let [truth, given] =
-        ["scene", "noise"].map(|scene| read_scene(&work.path(scene), &ReadOptions::default()).unwrap());
+        ["clean", "noise"].map(|scene| read_scene(&work.path(scene), &ReadOptions::default()).unwrap());
     let mut squares = [0.0; 2];
     for image in work.json("refined/poses.json")["images"].as_array().unwrap() {
         let centre: Vec<f64> = image["centre"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect();
