@@ -154,7 +154,7 @@ fn an_order_that_was_chosen_has_the_rounds_of_the_same_order_by_name() {
 fn the_codec_follows_from_the_moments() {
     let work = small();
     for (moments, codec) in [("f32", "raw"), ("bf16", "halves")] {
-        let flags = "scene --frames 80 --page-rows 64 --spill-dir spill --dry-run --moments";
+        let flags = "scene --steps 12 --frames 80 --page-rows 64 --spill-dir spill --dry-run --moments";
         let said = told(&work.output(TRAIN, &format!("{flags} {moments}")));
         let line = said.lines().find(|line| line.contains("one version is ")).expect(&said);
         assert_eq!(line.split(['(', ')']).nth(1), Some(codec), "{line}");
