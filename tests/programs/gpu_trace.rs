@@ -41,10 +41,10 @@ fn an_emulated_bus_takes_its_time_and_changes_no_byte() {
     for place in ["host", "device"] {
         let flags = format!("scene --overwrite --steps 12 --device gpu --optimizer-on {place} --quiet");
         work.train(&format!("{flags} --out plain"));
-        let output = on_bus(&work, "100MB/s,300us", &format!("{flags} --out slow --trace trace"));
+        let output = on_bus(&work, "100MB/s,300us", &format!("{flags} --out slow --trace {place}.json"));
         assert!(output.status.success(), "{}", stderr(&output));
         assert!(work.ply("plain") == work.ply("slow"), "{place}: a slow bus gives another scene");
-        let spans = spans(&work, "trace");
+        let spans = spans(&work, &format!("{place}.json"));
         for span in spans.iter().filter(|span| ["upload", "read back"].contains(&span.name.as_str())) {
             // A hundred bytes take a microsecond. Times have three decimals.
             let least = 300.0 + span.of("bytes") as f64 / 100.0;
