@@ -109,7 +109,6 @@ pub struct CommitCost {
 /// Totals over the commits of a run, for its reports.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct CommitReport {
-    /// Commits so far.
     pub commits: u64,
     /// Bytes of pages written for them.
     pub commit_bytes: u64,
@@ -160,7 +159,6 @@ impl CommitInterval {
         self.seconds().is_some_and(|seconds| since >= seconds)
     }
 
-    /// Adds the cost of a commit.
     pub fn add(&mut self, cost: CommitCost) {
         let before = self.expected.unwrap_or(cost);
         let mean = |before: f64, last: f64| before + LAST_WEIGHT * (last - before);

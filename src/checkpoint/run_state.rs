@@ -111,7 +111,6 @@ pub struct RunState {
     pub origin: Origin,
     /// Name of the renderer.
     pub device: String,
-    /// The state of the trainer.
     pub trainer: TrainerState,
     /// What the run knows of its photos.
     pub photos: SavedValues,
@@ -128,27 +127,14 @@ pub struct RunState {
     pub traffic: PagerStats,
 }
 
-/// Why bytes are not the state of a run.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum RunStateError {
-    /// Written by another version of the program.
-    #[error("the run state has version {0}; this program knows version {VERSION}")]
-    Version(u32),
-    /// The encoding is invalid.
-    #[error("the run state is {0}")]
-    Encoding(#[from] EncodingError),
-    /// A value is impossible.
-    #[error("the run state is inconsistent: {0}")]
-    Impossible(&'static str),
+/// The message about values that no run has.
+fn impossible(what: &str) -> String {
+    format!("the run state is inconsistent: {what}")
 }
 
-impl From<ValuesError> for RunStateError {
-    fn from(error: ValuesError) -> RunStateError {
-        match error {
-            ValuesError::Encoding(error) => RunStateError::Encoding(error),
-            ValuesError::Impossible(what) => RunStateError::Impossible(what),
-        }
-    }
+/// The message about bytes that are no run state.
+fn unreadable(error: EncodingError) -> String {
+    format!("the run state is {error}")
 }
 
 impl RunState {
@@ -171,21 +157,21 @@ impl RunState {
 
     /// Encodes the state.
     /// Errors: the state is not valid; a valid one never fails.
-    pub fn to_bytes(&self) -> Result<Vec<u8>, RunStateError> {
+    pub fn to_bytes(&self) -> Result<Vec<u8>, String> {
         let mut bytes = VERSION.to_le_bytes().to_vec();
-        bytes.extend(self.encode()?);
+        bytes.extend(self.encode().map_err(unreadable)?);
         Ok(bytes)
     }
 
     /// Decodes a state.
     /// Errors: the bytes are not a run state, or have another version.
-    pub fn from_bytes(bytes: &[u8]) -> Result<RunState, RunStateError> {
-        let (version, body) = bytes.split_first_chunk().ok_or(RunStateError::Impossible("it is empty"))?;
+    pub fn from_bytes(bytes: &[u8]) -> Result<RunState, String> {
+        let (version, body) = bytes.split_first_chunk().ok_or_else(|| impossible("it is empty"))?;
         let version = u32::from_le_bytes(*version);
         if version != VERSION {
-            return Err(RunStateError::Version(version));
+            return Err(format!("the run state has version {version}; this program knows version {VERSION}"));
         }
-        let state = RunState::decode(body)?;
+        let state = RunState::decode(body).map_err(unreadable)?;
         state.check()?;
         Ok(state)
     }
@@ -223,13 +209,13 @@ impl RunState {
 
     /// The events as a log.
     /// Errors: the events are out of order.
-    pub fn event_log(&self) -> Result<EventLog, RunStateError> {
-        EventLog::from_events(self.events.clone()).ok_or(RunStateError::Impossible("its events are out of order"))
+    pub fn event_log(&self) -> Result<EventLog, String> {
+        EventLog::from_events(self.events.clone()).ok_or_else(|| impossible("its events are out of order"))
     }
 
-    fn check(&self) -> Result<(), RunStateError> {
+    fn check(&self) -> Result<(), String> {
         let log = self.event_log()?;
-        let refuse = |what| Err(RunStateError::Impossible(what));
+        let refuse = |what: &str| Err(impossible(what));
         if log.events().last().is_some_and(|last| last.step >= self.trainer.step) {
             return refuse("an event lies in its future");
         }
@@ -260,7 +246,10 @@ impl RunState {
         if test.is_some_and(|test| test.step > step || !test.psnr.is_finite() || !test.ssim.is_finite()) {
             return refuse("its last evaluation is invalid");
         }
-        photos::check(&self.photos)?;
+        photos::check(&self.photos).map_err(|error| match error {
+            ValuesError::Encoding(error) => unreadable(error),
+            ValuesError::Impossible(what) => impossible(what),
+        })?;
         self.trainer.growth.check(step).or_else(refuse)
     }
 }
@@ -382,7 +371,7 @@ mod tests {
         assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
         for other in [0, VERSION - 1, VERSION + 1] {
             bytes[..4].copy_from_slice(&other.to_le_bytes());
-            assert_eq!(RunState::from_bytes(&bytes), Err(RunStateError::Version(other)));
+            assert!(RunState::from_bytes(&bytes).is_err_and(|e| e.contains(&format!("version {other};"))));
         }
     }
 
@@ -399,7 +388,7 @@ mod tests {
             let mut state = sample();
             change(&mut state);
             let bytes = state.to_bytes().unwrap();
-            assert!(matches!(RunState::from_bytes(&bytes), Err(RunStateError::Impossible(_))));
+            assert!(RunState::from_bytes(&bytes).is_err_and(|e| e.contains("inconsistent")));
         };
         refused(|s| s.trainer.step = 8);
         refused(|s| s.events.reverse());

@@ -31,7 +31,8 @@ pub(super) struct Cuts {
     /// Pages of later commits that were not acknowledged. Such a commit may be durable all the same, and the next one starts
     /// from it.
     unsure: BTreeSet<PageId>,
-    frozen: Option<Frozen>,
+    /// The cut that is not committed yet.
+    pub frozen: Option<Frozen>,
 }
 
 /// A cut whose pages are being written.
@@ -83,21 +84,6 @@ impl Cuts {
         order.sort_unstable();
         frozen.order = order.into_iter().map(|(_, page)| page).collect();
         self.frozen = Some(frozen);
-    }
-
-    /// Gives up a cut that is not committed.
-    pub fn abort(&mut self) {
-        self.frozen = None;
-    }
-
-    /// Takes the cut out, to commit it.
-    pub fn take(&mut self) -> Option<Frozen> {
-        self.frozen.take()
-    }
-
-    /// Whether there is a cut that is not committed.
-    pub fn is_frozen(&self) -> bool {
-        self.frozen.is_some()
     }
 
     /// Whether every page of the cut is written.

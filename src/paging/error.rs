@@ -22,9 +22,7 @@ pub enum PagingError {
         what: String,
         /// Pages needed at once, at least.
         pages: usize,
-        /// Frames that there are.
         frames: usize,
-        /// Bytes of one frame.
         frame_bytes: usize,
     },
     /// No room on the drive for pages that a step will write back.

@@ -2,9 +2,9 @@
 //!
 //! Invariant: entries and slots are as many, and a page keeps its number for the life of a run.
 
+use super::stored::layout_of;
 use crate::base::ids::PageNo;
 use crate::page::format::slot_header::{SlotRef, transfer_bytes};
-use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 
 /// The pages of a scene by number.
@@ -26,12 +26,10 @@ impl PageIndex {
         &self.metas[page.index()]
     }
 
-    /// The slot of a page.
     pub fn slot(&self, page: PageNo) -> Option<SlotRef> {
         self.slots[page.index()]
     }
 
-    /// Whether a page has rows.
     pub fn has_rows(&self, page: PageNo) -> bool {
         self.meta(page).rows > 0
     }
@@ -60,8 +58,7 @@ impl PageIndex {
 
     /// Bytes that reading a page moves; of a page without a version, the bytes that a raw one would take.
     pub fn transfer_bytes(&self, page: PageNo) -> u64 {
-        let PageMeta { rows, sh_degree, .. } = *self.meta(page);
-        let raw = || transfer_bytes(PageLayout { rows: rows as usize, sh_degree }.bytes());
+        let raw = || transfer_bytes(layout_of(self.meta(page)).bytes());
         self.slot(page).map_or_else(raw, |slot| slot.transfer_bytes()) as u64
     }
 }

@@ -9,13 +9,12 @@
 
 use super::error::PagingError;
 use super::stats::SlotSpace;
-use super::stored::label;
+use super::stored::{label, layout_of};
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::versions::page_error::PageError;
 use crate::page::versions::paged_store::{PageDone, PageMoved, PageTraffic, PagedStore};
-use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageMeta;
 
 /// Writes in flight at once: each may need a buffer of its own to be encoded in.
@@ -72,7 +71,6 @@ impl Mover {
         self.store = Some(store);
     }
 
-    /// Whether there is a store.
     pub fn has_store(&self) -> bool {
         self.store.is_some()
     }
@@ -154,10 +152,9 @@ impl Mover {
         is_ahead: bool,
     ) -> Result<(), (PageError, PageBuffer)> {
         let Some(store) = &mut self.store else { return Ok(()) };
-        let layout = PageLayout { rows: meta.rows as usize, sh_degree: meta.sh_degree };
         let token = token(page, Direction::Write, is_ahead);
         let generation = cut.unwrap_or(store.generation());
-        store.write_for(generation, token, meta.id, &label(meta), layout.bytes(), buffer)?;
+        store.write_for(generation, token, meta.id, &label(meta), layout_of(meta).bytes(), buffer)?;
         self.ahead[Direction::Write as usize] += if is_ahead { self.frame_bytes } else { 0 };
         Ok(())
     }

@@ -221,7 +221,6 @@ impl Pager {
         self.tier.mover.staging_bytes()
     }
 
-    /// Bytes of one frame.
     pub fn frame_bytes(&self) -> usize {
         self.tier.mover.frame_bytes
     }
@@ -488,7 +487,7 @@ impl Pager {
     pub fn flush(&mut self) -> Result<(), PagingError> {
         let tier = &mut self.tier;
         debug_assert_eq!(tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
-        tier.cuts.abort();
+        tier.cuts.frozen = None;
         // Pages whose write failed are still dirty: they are written again here.
         tier.mover.take_failure();
         tier.mover.resume_writes();
@@ -534,12 +533,12 @@ impl Pager {
 
     /// Gives up a cut that is not committed.
     pub fn abort_cut(&mut self) {
-        self.tier.cuts.abort();
+        self.tier.cuts.frozen = None;
     }
 
     /// Whether there is a cut that is not committed yet; a failed write has given it up.
     pub fn is_frozen(&self) -> bool {
-        self.tier.cuts.is_frozen()
+        self.tier.cuts.frozen.is_some()
     }
 
     /// Whether every page of the cut is written.
@@ -564,7 +563,7 @@ impl Pager {
     ) -> Result<Option<(u64, u64)>, CommitError> {
         let Tier { mover, cuts, .. } = &mut self.tier;
         debug_assert!(mover.in_flight() == 0, "a commit comes after its writes");
-        let Some(frozen) = cuts.take() else { return Ok(None) };
+        let Some(frozen) = cuts.frozen.take() else { return Ok(None) };
         let Frozen { generation, mut changes, now, bytes, nowhere: lost, .. } = frozen;
         if let Some(page) = lost {
             return Err(nowhere(page));

@@ -3,6 +3,7 @@
 //! Invariants: 1. the buffer holds space for a slot's header, then the payload that [`PinnedPage::layout`] describes;
 //! 2. whoever changes rows, meta or layout sets `dirty`.
 
+use super::stored::layout_of;
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::format::slot_header::HEADER_BYTES;
@@ -26,7 +27,7 @@ pub struct PinnedPage {
 impl PinnedPage {
     /// Layout of the payload, by the meta.
     pub fn layout(&self) -> PageLayout {
-        PageLayout { rows: self.meta.rows as usize, sh_degree: self.meta.sh_degree }
+        layout_of(&self.meta)
     }
 
     /// The rows, numbered from `first_row` in the working set.

@@ -40,13 +40,13 @@ impl Prefetch<'_> {
     pub fn coming_steps(&mut self, step: u32, transfers: Transfers) {
         self.tier.write_frozen();
         // Without a limit on the frames nothing is read or evicted.
-        if self.tier.frames.frames_max() < usize::MAX && self.look_ahead.is_due(step) {
+        if self.tier.frames.frames_max() < usize::MAX && self.look_ahead.played != Some(step) {
             // By what is known now; a page that this step moves into the next one's view is a late miss at most.
             self.look_ahead.refresh(step, self.tier.index.metas());
             self.look_ahead.apply_changed(&mut self.tier.frames);
             self.look_ahead.play(step, self.tier.index.metas(), &self.tier.frames);
         }
-        let admits = self.look_ahead.take_admits();
+        let admits = std::mem::take(&mut self.look_ahead.admits);
         let mut clean = self.leaving(&admits);
         let mut lacking = 0;
         for admit in &admits {
@@ -67,7 +67,7 @@ impl Prefetch<'_> {
         {
             self.tier.write_back_early(victim.page);
         }
-        self.look_ahead.return_admits(admits);
+        self.look_ahead.admits = admits;
         self.tier.mover.begin_writes();
         while transfers == Transfers::Ahead && self.tier.mover.in_flight() > 0 {
             self.tier.poll(true);

@@ -10,7 +10,6 @@ use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::{PageBounds, PageMeta};
 use crate::scene::rows::{ColumnsRef, Rows};
 
-/// Bytes of a label.
 pub const LABEL_BYTES: usize = 40;
 
 /// The label of a page: rows, degree, events applied, bounds; little-endian.

@@ -106,7 +106,7 @@ impl Tier {
                 Ok(())
             }
             Err((source, buffer)) => {
-                self.cuts.abort();
+                self.cuts.frozen = None;
                 self.frames.finish_write(page, buffer, false);
                 Err(self.failure(page, true, source).error)
             }
@@ -131,7 +131,7 @@ impl Tier {
         {
             self.write_back_early(page);
         }
-        if self.cuts.is_frozen() {
+        if self.cuts.frozen.is_some() {
             self.counters.commit_seconds += started.elapsed().as_secs_f64();
         }
     }
@@ -173,7 +173,7 @@ impl Tier {
                     continue;
                 }
                 (Err(source), Direction::Write) => {
-                    self.cuts.abort();
+                    self.cuts.frozen = None;
                     self.frames.finish_write(page, buffer, false);
                     failures.push(self.failure(page, true, source));
                     continue;

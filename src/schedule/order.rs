@@ -96,7 +96,6 @@ impl ViewOrder {
         order
     }
 
-    /// Which order it is.
     pub fn order(&self) -> Order {
         self.order
     }

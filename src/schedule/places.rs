@@ -22,7 +22,6 @@ pub type Place = [f64; 6];
 /// Part of the mean curvature added to the system for the common point, so that parallel axes have one too: their centre.
 const RIDGE: f64 = 1e-6;
 
-/// The places of cameras.
 pub fn places(cameras: &[Camera]) -> Vec<Place> {
     let depth = depth_of_subject(cameras);
     let place = |camera: &Camera| {

@@ -34,7 +34,6 @@ fn step(places: &[Place], a: u32, b: u32) -> f64 {
     distance_sq(&places[a as usize], &places[b as usize]).sqrt()
 }
 
-/// Length of a way.
 pub fn length(places: &[Place], way: &[u32]) -> f64 {
     way.windows(2).map(|pair| step(places, pair[0], pair[1])).sum()
 }

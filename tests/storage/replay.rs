@@ -5,8 +5,9 @@ use gsscale::base::rng::{Purpose, Stream};
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::plan::batches::walk;
 use gsscale::paging::plan::cache_model::{FAR_STEPS, STEPS_AHEAD};
-use gsscale::paging::simulation::auto::automatic_order;
-use gsscale::paging::simulation::replay::{DriveModel, Replay, ReplayOptions, Stall, StepTraffic, replay};
+use gsscale::paging::simulation::replay::{
+    DriveModel, Replay, ReplayOptions, Stall, StepTraffic, automatic_order, replay,
+};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
 use gsscale::schedule::order::{Order, ViewOrder};

@@ -121,24 +121,22 @@ mod tests {
     const OFFSET: usize = 3 * ALIGNMENT;
 
     #[test]
-    fn a_transfer_without_progress_ends_with_an_error() {
+    fn what_cannot_go_on_is_an_error_at_once_or_after_some_tries() {
+        use io::ErrorKind::{TimedOut, UnexpectedEof, WriteZero};
+        let failed = io::Error::from_raw_os_error;
+        let advance = |resume: &mut Resume, direction, outcome| resume.advance(direction, outcome, ALIGNMENT);
+        let mut stuck = Resume::default();
+        let mut parts = (0..=TRIES_MAX).map(|_| advance(&mut stuck, Direction::Read, Ok(100)));
+        assert_eq!(parts.find_map(Result::err).unwrap().kind(), TimedOut);
         for raw in [4, 11, 125, 14] {
             let mut resume = Resume::default();
-            let mut again = || resume.advance(Direction::Read, Err(io::Error::from_raw_os_error(raw)), ALIGNMENT);
-            assert!((0..TRIES_MAX).all(|_| !again().unwrap()));
-            assert_eq!(again().unwrap_err().raw_os_error(), Some(raw));
+            assert!((0..TRIES_MAX).all(|_| !advance(&mut resume, Direction::Read, Err(failed(raw))).unwrap()));
+            assert_eq!(advance(&mut resume, Direction::Read, Err(failed(raw))).unwrap_err().raw_os_error(), Some(raw));
         }
-        let mut resume = Resume::default();
-        let end = (0..=TRIES_MAX).map(|_| resume.advance(Direction::Read, Ok(100), ALIGNMENT)).find_map(Result::err);
-        assert_eq!(end.unwrap().kind(), io::ErrorKind::TimedOut);
-    }
-
-    #[test]
-    fn end_of_file_and_lasting_errors_are_reported_at_once() {
-        let end = |direction, outcome| Resume::default().advance(direction, outcome, ALIGNMENT).unwrap_err();
-        assert_eq!(end(Direction::Read, Ok(0)).kind(), io::ErrorKind::UnexpectedEof);
-        assert_eq!(end(Direction::Write, Ok(0)).kind(), io::ErrorKind::WriteZero);
-        assert_eq!(end(Direction::Read, Err(io::Error::from_raw_os_error(5))).raw_os_error(), Some(5));
+        let end = |direction, outcome| advance(&mut Resume::default(), direction, outcome).unwrap_err();
+        assert_eq!(end(Direction::Read, Ok(0)).kind(), UnexpectedEof);
+        assert_eq!(end(Direction::Write, Ok(0)).kind(), WriteZero);
+        assert_eq!(end(Direction::Read, Err(failed(5))).raw_os_error(), Some(5));
     }
 
     /// Carries out a transfer against `drive`, which moves few bytes at a time and interrupts often. Returns the number

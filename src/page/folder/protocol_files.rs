@@ -16,14 +16,12 @@ use std::sync::Arc;
 pub const MAP_NAME: &str = "map.redb";
 /// File of the page map while it is created.
 pub const MAP_NEW_NAME: &str = "map.redb.new";
-/// File of the witness.
 pub const WITNESS_NAME: &str = "witness";
 /// File that reserves space for a last commit on a full drive.
 pub const RESERVE_NAME: &str = "reserve";
 /// The reserve while it is filled.
 pub const RESERVE_NEW_NAME: &str = "reserve.new";
 
-/// Files of one folder.
 pub trait Folder: Send {
     /// Opens the file `name` for reading and writing; `None` if it does not exist.
     /// Errors: the file exists and cannot be opened.

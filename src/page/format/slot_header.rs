@@ -32,7 +32,7 @@ const MAGIC: [u8; 8] = *b"gsscpage";
 const CHECKSUM_AT: usize = HEADER_BYTES - 16;
 const LABEL_AT: usize = 112;
 
-/// The stored form of a payload.
+/// The stored form of a payload. Its number is on the drive, and the place in lists by codec.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum StoredAs {
     /// The payload itself.
@@ -79,7 +79,6 @@ const FRONT_BYTES: usize = size_of::<HeaderFront>();
 /// Reference to one version of a page: its place and what its bytes must be. Kept by the index.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct SlotRef {
-    /// Place of the slot.
     pub place: Place,
     /// Bytes of the payload as stored, without padding.
     pub stored_bytes: u32,

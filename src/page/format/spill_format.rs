@@ -58,7 +58,6 @@ impl SlotLayout {
         SlotLayout { slot_bytes, slots_per_segment: slots as u32 }
     }
 
-    /// Bytes of a segment.
     pub fn segment_bytes(&self) -> u64 {
         self.slot_bytes * u64::from(self.slots_per_segment)
     }

@@ -44,7 +44,6 @@ pub struct Generations {
 }
 
 impl Generations {
-    /// The generations in a map.
     pub fn of(content: &MapContent) -> Generations {
         let mut generations = Generations {
             latest: content.counters.latest,
@@ -74,7 +73,6 @@ impl Generations {
         self.kept.iter().copied()
     }
 
-    /// Whether `generation` is kept.
     pub fn is_kept(&self, generation: u64) -> bool {
         self.kept.contains(&generation)
     }
@@ -82,6 +80,11 @@ impl Generations {
     /// Pinned generations by name.
     pub fn pins(&self) -> &BTreeMap<String, u64> {
         &self.pins
+    }
+
+    /// The names that `generation` is pinned under.
+    pub fn names_of(&self, generation: u64) -> Vec<String> {
+        self.pins.iter().filter(|(_, g)| **g == generation).map(|(name, _)| name.clone()).collect()
     }
 
     fn add(&mut self, version: &MapVersion) {

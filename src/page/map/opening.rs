@@ -146,8 +146,7 @@ impl Opened {
             let made = engine.create_segment(segment, layout.segment_bytes());
             made.map_err(CommitError::file("a segment file"))?;
         }
-        let mut paged = PagedStore::open(engine, config, number, used)
-            .map_err(|error| CommitError::Contradiction(error.to_string()))?;
+        let mut paged = PagedStore::open(engine, config, number, used).map_err(CommitError::Contradiction)?;
         for past in past {
             paged.free_from(&past.slot, past.until);
         }

@@ -27,7 +27,7 @@ use crate::page::tool::slot_reader::SlotReader;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fs::{File, TryLockError};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -85,20 +85,6 @@ pub struct StoreReader {
     used_by: Option<String>,
     /// Keeps writers out.
     _lock: Option<File>,
-}
-
-/// A kept generation.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct GenerationUse {
-    pub generation: u64,
-    /// The names it is pinned under.
-    pub names: Vec<String>,
-    /// Pages that it sees.
-    pub pages: u64,
-    /// Bytes of their slots, headers and padding included.
-    pub bytes: u64,
-    /// Bytes that no other kept generation sees.
-    pub bytes_alone: u64,
 }
 
 impl StoreReader {
@@ -194,31 +180,6 @@ impl StoreReader {
         self.content.generations.get(&generation).map_or(&[], Vec::as_slice)
     }
 
-    /// Every kept generation with its disk use, ascending.
-    /// Errors: the map contradicts itself.
-    pub fn disk_use(&self) -> Result<Vec<GenerationUse>, CommitError> {
-        let kept: Vec<u64> = self.generations.kept().collect();
-        let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
-        let mut uses = Vec::new();
-        for &generation in &kept {
-            let pages = self.pages_at(generation)?;
-            let mut bytes = 0;
-            for page in &pages {
-                let slot_bytes = page.slot.transfer_bytes() as u64;
-                bytes += slot_bytes;
-                seen.entry(page.slot.place).or_insert((0, generation, slot_bytes)).0 += 1;
-            }
-            let pins = self.generations.pins().iter().filter(|(_, g)| **g == generation);
-            let names = pins.map(|(name, _)| name.clone()).collect();
-            uses.push(GenerationUse { generation, names, pages: pages.len() as u64, bytes, bytes_alone: 0 });
-        }
-        for (times, generation, bytes) in seen.into_values() {
-            let of = uses.iter_mut().find(|u| u.generation == generation && times == 1);
-            of.into_iter().for_each(|u| u.bytes_alone += bytes);
-        }
-        Ok(uses)
-    }
-
     /// Every version that a kept generation sees, each once, ordered by place.
     /// Errors: the map contradicts itself.
     pub fn live_versions(&self) -> Result<Vec<(PageId, SlotRef, Vec<u8>)>, CommitError> {
@@ -254,7 +215,7 @@ impl StoreReader {
         let segments = check_segments(&engine, layout, pages.iter().map(|p| &p.slot))?.number;
         let used = pages.iter().map(|p| &p.slot);
         let opened = PagedStore::open(Box::new(engine), config, segments, used);
-        opened.map_err(|e| CommitError::Contradiction(e.to_string()).into())
+        opened.map_err(|e| CommitError::Contradiction(e).into())
     }
 }
 

@@ -34,7 +34,6 @@ pub struct SlotReader {
 }
 
 impl SlotReader {
-    /// A reader of the slots, of `slot_bytes` bytes each, of store `store` in `folder`.
     pub fn new(folder: &Path, store: u128, slot_bytes: u64) -> SlotReader {
         let buffer = || PageBuffer::zeroed(HEADER_BYTES);
         SlotReader { folder: folder.to_path_buf(), store, slot_bytes, file: None, stored: buffer(), decoded: buffer() }

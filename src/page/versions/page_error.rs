@@ -71,11 +71,9 @@ pub enum PageError {
     )]
     TooLong {
         page: PageId,
-        /// Bytes of the payload.
         payload_bytes: usize,
         /// Most bytes of a payload.
         capacity_bytes: usize,
-        /// Bytes of the label.
         label_bytes: usize,
     },
 }

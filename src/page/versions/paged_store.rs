@@ -24,7 +24,7 @@ use crate::page::format::slot_header::{
 use crate::page::format::verify::verify;
 use crate::page::mutants::{Mutant, active};
 use crate::page::versions::page_error::{PageError, SlotName};
-use crate::page::versions::slots::{SlotError, SlotLayout, Slots};
+use crate::page::versions::slots::{SlotLayout, Slots};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::io;
@@ -78,7 +78,7 @@ impl PagedStore {
         config: PagedStoreConfig,
         segments: u32,
         used: impl IntoIterator<Item = &'a SlotRef>,
-    ) -> Result<PagedStore, SlotError> {
+    ) -> Result<PagedStore, String> {
         let slots = Slots::with_used(config.layout, segments, used.into_iter().map(|slot| slot.place))?;
         Ok(PagedStore::with_slots(engine, config, slots))
     }
@@ -492,10 +492,7 @@ impl std::fmt::Debug for PagedStore {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PageMoved {
     /// The payload is in the buffer, behind its [`HEADER_BYTES`] of header room.
-    Read {
-        /// Bytes of the payload.
-        payload_bytes: usize,
-    },
+    Read { payload_bytes: usize },
     /// The version is in this slot; durable after the next [`PagedStore::sync`].
     Written(SlotRef),
 }
@@ -518,7 +515,6 @@ pub struct PageTraffic {
     pub bytes_written: u64,
     /// Payload bytes of the pages written.
     pub payload_bytes_written: u64,
-    /// Reads that were repeated.
     pub reads_repeated: u64,
 }
 

@@ -53,7 +53,6 @@ pub struct TooFewFrames {
     pub step: u32,
     /// Pages that the step needs.
     pub needed: usize,
-    /// Frames of the cache.
     pub frames: usize,
 }
 
@@ -119,7 +118,6 @@ impl CacheModel {
         self.frames
     }
 
-    /// Whether a page is in the cache.
     pub fn holds(&self, page: PageNo) -> bool {
         self.idle.contains(page) || self.is_present(page)
     }

@@ -56,8 +56,9 @@ pub(in crate::paging) struct LookAhead {
     /// Next uses of the pages that the present step still needs, where it walks its view in batches.
     in_step: BTreeMap<PageNo, u32>,
     /// The step that was played last.
-    played: Option<u32>,
-    admits: Vec<Admit>,
+    pub played: Option<u32>,
+    /// The pages that the played steps will have to read, in order.
+    pub admits: Vec<Admit>,
     model: CacheModel,
 }
 
@@ -110,11 +111,6 @@ impl LookAhead {
         pages.into_keys().for_each(|page| frames.set_next_use(page, self.next_use(page)));
     }
 
-    /// Whether the steps after `step` are still to be played.
-    pub fn is_due(&self, step: u32) -> bool {
-        self.played != Some(step)
-    }
-
     /// Makes the page lists anew that the next [`LookAhead::play`] depends on most.
     pub fn refresh(&mut self, step: u32, index: &[PageMeta]) {
         REFRESHED.into_iter().for_each(|far| self.views.refresh(step.saturating_add(far), index));
@@ -128,8 +124,8 @@ impl LookAhead {
         (1..=steps.min(planned)).for_each(|far| self.views.refresh(step + far, index));
     }
 
-    /// Plays the steps after `step`, whose pages are pinned, with the pages that `frames` holds. [`LookAhead::take_admits`]
-    /// gives the result.
+    /// Plays the steps after `step`, whose pages are pinned, with the pages that `frames` holds. The result is in
+    /// `admits`.
     pub fn play<M>(&mut self, step: u32, index: &[PageMeta], frames: &FrameTable<M>) {
         self.played = Some(step);
         self.admits.clear();
@@ -158,15 +154,5 @@ impl LookAhead {
                 break;
             }
         }
-    }
-
-    /// The pages that the played steps will have to read, in order. They come back by [`LookAhead::return_admits`].
-    pub fn take_admits(&mut self) -> Vec<Admit> {
-        std::mem::take(&mut self.admits)
-    }
-
-    /// Takes the list back, for further calls in the same step.
-    pub fn return_admits(&mut self, admits: Vec<Admit>) {
-        self.admits = admits;
     }
 }

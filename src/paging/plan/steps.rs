@@ -23,7 +23,6 @@ pub struct Plan {
     uses_max: usize,
     uses_held: usize,
     first_step: u32,
-    /// The pages of each step.
     steps: VecDeque<Vec<PageNo>>,
     /// By page: the planned steps that need it.
     uses: Vec<VecDeque<u32>>,

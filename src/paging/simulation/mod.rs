@@ -1,4 +1,3 @@
 //! Whole runs of the cache before they happen: for `gsscale-plan`, for preflight and for `--view-order auto`. No I/O.
 
-pub mod auto;
 pub mod replay;

@@ -13,7 +13,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
-use crate::paging::simulation::auto::automatic_order;
+use crate::paging::simulation::replay::automatic_order;
 use crate::scene::partition::first_fill;
 use crate::schedule::order::Order;
 use crate::schedule::visibility::ViewPages;

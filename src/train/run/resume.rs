@@ -16,7 +16,7 @@ use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
-use crate::checkpoint::run_state::{DatasetPrint, RunState, RunStateError};
+use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::choice::Chosen;
 use crate::config::facts::{Resolved, read_resolved};
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -43,8 +43,7 @@ use crate::train::start::first_scene::dataset_print;
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::pages::PagedScene;
-use crate::train::stores::opened::Stored;
-use crate::train::stores::ownership::{Claim, last_state, open_own};
+use crate::train::stores::ownership::{Claim, Stored, last_state, open_own};
 use std::path::{Path, PathBuf};
 
 /// Remedy for an unusable config.toml.
@@ -405,10 +404,9 @@ fn finished_outcome(
 }
 
 fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
-    let broken = |e: RunStateError| CommitError::Contradiction(e.to_string());
     let histogram = GradHistogram::from_filled(&state.histogram);
     let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
-    let events = state.event_log().map_err(broken)?;
+    let events = state.event_log().map_err(CommitError::Contradiction)?;
     Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
 }
 

@@ -27,7 +27,7 @@ use crate::train::inputs::places::drive_of;
 use crate::train::memory::budget::HostBudget;
 use crate::train::memory::estimate::MemoryEstimate;
 use crate::train::memory::staging::{PLAN_BYTES, PREFETCH_BYTES_MAX, staging_bytes};
-use crate::train::stores::opened::{Stored, commit_config};
+use crate::train::stores::ownership::{Stored, commit_config};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 

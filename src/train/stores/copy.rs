@@ -8,7 +8,7 @@ use crate::base::error::InputError;
 use crate::base::ids::PageId;
 use crate::page::engine::segment_files::segment_file_name;
 use crate::page::format::codec::Codec;
-use crate::page::format::slot_header::{SlotRef, StoredAs};
+use crate::page::format::slot_header::SlotRef;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::Access;
 use crate::page::versions::slots::SlotLayout;
@@ -60,9 +60,7 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> 
         }
         before.into_keys().for_each(|page| copy.remove(page));
         before = now;
-        let pins = store.generations().pins().iter().filter(|(_, g)| **g == generation);
-        let names: Vec<String> = pins.map(|(name, _)| name.clone()).collect();
-        copy.commit(&store.run_state(generation)?, store.note(generation), &names)?;
+        copy.commit(&store.run_state(generation)?, store.note(generation), &store.generations().names_of(generation))?;
     }
     copy.finish()?;
     Ok(Copied { to: to.to_path_buf(), generations, versions, bytes_read })
@@ -71,13 +69,7 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> 
 /// The codec of most pages, for new pages.
 pub(super) fn usual_codec<'a>(slots: impl Iterator<Item = &'a SlotRef>) -> Codec {
     let mut counts = [0u64; 3];
-    slots.for_each(|slot| {
-        counts[match slot.codec {
-            StoredAs::Raw => 0,
-            StoredAs::ShuffledZstd => 1,
-            StoredAs::Halves => 2,
-        }] += 1;
-    });
+    slots.for_each(|slot| counts[slot.codec as usize] += 1);
     match counts {
         [raw, zstd, halves] if zstd > raw && zstd >= halves => Codec::Zstd { level: 1 },
         [raw, _, halves] if halves > raw => Codec::Halves,

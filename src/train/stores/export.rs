@@ -169,10 +169,9 @@ pub(super) fn scene_at(
         prefetch_bytes: frame as usize,
         plan_bytes: 0,
     };
-    let contradiction = |what: String| CommitError::Contradiction(what);
-    let events = state.event_log().map_err(|e| contradiction(e.to_string()))?;
+    let events = state.event_log().map_err(CommitError::Contradiction)?;
     let histogram = GradHistogram::from_filled(&state.histogram);
-    let histogram = histogram.ok_or_else(|| contradiction("statistics without bins".to_string()))?;
+    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
     let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, events.len())?;
     Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
 }

@@ -204,11 +204,10 @@ fn first_state(
         ExportFrame::Local => (meta.origin, meta.scale),
         ExportFrame::Dataset => ([0.0; 3], 1.0),
     };
-    let fail = |e: String| CommitError::Contradiction(e);
-    let text = toml::to_string(config).map_err(|e| fail(e.to_string()))?;
+    let text = toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
     let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale, origin, scale };
     let simd = limits::simd_path(config).name().to_string();
     let origin = Origin { config: text, simd, sh_degree_start: sh_degree, dataset, run: RunIdentity::default() };
     let state = RunState::without_history(origin, "none".to_string(), rows);
-    Ok(state.to_bytes().map_err(|e| fail(e.to_string()))?)
+    Ok(state.to_bytes().map_err(CommitError::Contradiction)?)
 }

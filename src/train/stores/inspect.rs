@@ -1,4 +1,4 @@
-//! Inspection of a store: format, run state as text, and single pages.
+//! Looks at a store: its generations as a list, its format and run state as text, and single pages.
 
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
@@ -8,15 +8,16 @@ use crate::checkpoint::run_state::RunState;
 use crate::config::choice::Choice;
 use crate::config::file::TrainConfig;
 use crate::densify::strategy::{Effect, effect_of};
+use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_FEATURES, StoredAs};
+use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_FEATURES};
 use crate::page::tool::reading::Access;
-use crate::paging::stored::meta_from_label;
-use crate::paging::stored::{check_values, layout_of};
+use crate::paging::stored::{check_values, layout_of, meta_from_label};
 use crate::scene::events::EventKind;
 use crate::scene::rows::Rows;
 use crate::train::error::TrainError;
 use serde::Serialize;
+use std::collections::HashMap;
 
 /// Facts of a store and of one generation.
 #[derive(Debug, Clone, Serialize)]
@@ -26,15 +27,12 @@ pub struct Inspected {
     pub identity: String,
     /// The process that writes to it, if any.
     pub used_by: Option<String>,
-    /// Version of the format.
     pub format_version: u32,
     /// Feature bits that a reader must know.
     pub features_incompatible: u32,
     /// Feature bits that a reader may ignore.
     pub features_compatible: u32,
-    /// Bytes of a slot.
     pub slot_bytes: u64,
-    /// Slots in a segment.
     pub slots_per_segment: u32,
     pub segments: u64,
     /// Bytes of the segment files.
@@ -68,7 +66,7 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
     let segments = store.segments()?;
     let (mut by_codec, mut by_degree, mut payload, mut behind) = ([0; 3], [0; 4], [0; 2], 0);
     for page in &pages {
-        by_codec[codec_number(page.slot.codec)] += 1;
+        by_codec[page.slot.codec as usize] += 1;
         payload[0] += u64::from(page.slot.payload_bytes);
         payload[1] += u64::from(page.slot.stored_bytes);
         if let Some(meta) = meta_from_label(page.page, &page.label) {
@@ -97,15 +95,6 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
         pages_behind: behind,
         state: words_of(&state, &config),
     })
-}
-
-/// Index of a codec in lists.
-fn codec_number(codec: StoredAs) -> usize {
-    match codec {
-        StoredAs::Raw => 0,
-        StoredAs::ShuffledZstd => 1,
-        StoredAs::Halves => 2,
-    }
 }
 
 /// The run state as text.
@@ -225,7 +214,7 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
         file: segment_file_name(slot.place.segment),
         offset: slot.place.offset,
         serial: header.serial,
-        codec: ["raw", "shuffled zstd", "halves"][codec_number(slot.codec)].to_string(),
+        codec: ["raw", "shuffled zstd", "halves"][slot.codec as usize].to_string(),
         payload_bytes: [slot.payload_bytes, slot.stored_bytes],
         checksum: format!("{:032x}", slot.checksum),
         rows: meta.rows,
@@ -260,4 +249,77 @@ fn rows_without_moments(rows: &Rows<'_>) -> u64 {
         })
     };
     (0..rows.rows()).filter(|&row| is_zero(row)).count() as u64
+}
+
+/// A kept generation.
+#[derive(Debug, Clone, Serialize)]
+pub struct GenerationLine {
+    /// Its number.
+    pub generation: u64,
+    pub names: Vec<String>,
+    /// Whether `--resume` continues from it.
+    pub is_latest: bool,
+    /// Steps done.
+    pub step: u32,
+    /// Held-out PSNR of the last evaluation before it, dB; `None` without one.
+    pub psnr: Option<f64>,
+    /// Gaussians in its pages. Pages that no view has needed since the last events have not applied them.
+    pub gaussians: u64,
+    /// Gaussians at most, once all pages have applied all events.
+    pub gaussians_at_most: u64,
+    pub pages: u64,
+    /// Bytes on the drive that no other kept generation needs.
+    pub bytes_alone: u64,
+    /// Bytes on the drive.
+    pub bytes: u64,
+}
+
+/// All kept generations of a store.
+#[derive(Debug, Clone, Serialize)]
+pub struct Listed {
+    pub store: std::path::PathBuf,
+    /// The process that writes to it, if any.
+    pub used_by: Option<String>,
+    /// Bytes of its segment files.
+    pub segment_bytes: u64,
+    /// Generations, ascending.
+    pub generations: Vec<GenerationLine>,
+}
+
+/// Lists the kept generations.
+/// Errors: the store cannot be opened, or another version of the program wrote a run state.
+pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
+    let store = place.open(Access::Map)?;
+    let mut generations: Vec<GenerationLine> = Vec::new();
+    // By place of a slot: how many generations see it, the first of them, and its bytes.
+    let mut seen: HashMap<Place, (u32, u64, u64)> = HashMap::new();
+    for generation in store.generations().kept() {
+        let state = run_state_of(&store, generation)?;
+        let pages = store.pages_at(generation)?;
+        let mut bytes = 0;
+        for page in &pages {
+            let slot_bytes = page.slot.transfer_bytes() as u64;
+            bytes += slot_bytes;
+            seen.entry(page.slot.place).or_insert((0, generation, slot_bytes)).0 += 1;
+        }
+        generations.push(GenerationLine {
+            generation,
+            names: store.generations().names_of(generation),
+            is_latest: generation == store.generations().latest(),
+            step: state.trainer.step,
+            psnr: state.trainer.test.map(|test| test.psnr),
+            gaussians: state.rows,
+            gaussians_at_most: state.rows_bound,
+            pages: pages.len() as u64,
+            bytes_alone: 0,
+            bytes,
+        });
+    }
+    for (times, generation, bytes) in seen.into_values() {
+        let of = generations.iter_mut().find(|line| line.generation == generation && times == 1);
+        of.into_iter().for_each(|line| line.bytes_alone += bytes);
+    }
+    let segment_bytes = store.segments()?.iter().map(|(_, bytes)| bytes).sum();
+    let used_by = store.used_by().map(str::to_string);
+    Ok(Listed { store: place.folder.clone(), used_by, segment_bytes, generations })
 }

@@ -1,6 +1,6 @@
 //! The commands of gsscale-ckpt: list, inspect, verify, export, import, clone, salvage, rollback, prune.
 //!
-//! One file per command (rollback and prune share one). Each returns plain structs, which the tool prints as text or
+//! Each returns plain structs, which the tool prints as text or
 //! JSON.
 //!
 //! Invariants: 1. read-only commands write nothing ([`crate::page::tool::reading`]); 2. a command creates its store or
@@ -11,9 +11,7 @@ mod copy;
 mod export;
 mod import;
 mod inspect;
-mod list;
-pub mod opened;
-pub(crate) mod ownership;
+pub mod ownership;
 mod salvage;
 mod start;
 mod verify;
@@ -22,8 +20,7 @@ pub use change::{PruneRequest, Pruned, RolledBack, prune, rollback};
 pub use copy::{Copied, clone_store};
 pub use export::{ExportRequest, Exported, export};
 pub use import::{ImportRequest, Imported, import};
-pub use inspect::{Inspected, PageInspected, Spread, inspect, inspect_page};
-pub use list::{GenerationLine, Listed, list};
+pub use inspect::{GenerationLine, Inspected, Listed, PageInspected, Spread, inspect, inspect_page, list};
 pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 pub use start::StoredStart;
 pub use verify::{Fault, Verdict, verify};
@@ -116,10 +113,9 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
 pub fn run_state_of(store: &StoreReader, generation: u64) -> Result<RunState, TrainError> {
     let bytes = store.run_state(generation)?;
     let wrong = |problem: String| InputError::new(store.folder(), problem, "use the program that made it");
-    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e.to_string()).at(format!("generation {generation}")))?)
+    Ok(RunState::from_bytes(&bytes).map_err(|e| wrong(e).at(format!("generation {generation}")))?)
 }
 
-/// The config of a run, and its options.
 fn options_of(store: &Path, state: &RunState) -> InputResult<(TrainConfig, RunOptions)> {
     let config = TrainConfig::parse(&state.origin.config)
         .map_err(|problem| InputError::new(store, problem, "use the program that made it").at("config of the run"))?;

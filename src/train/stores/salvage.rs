@@ -18,7 +18,7 @@ use super::copy::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
-use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState, TrainerState};
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::facts::read_resolved;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -206,7 +206,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         let older = found.get(&page.page).into_iter().flatten().filter(|h| h.slot.generation <= latest);
         let usable = |h: &&SlotHeader| {
             let applied = meta_from_label(h.page, &h.label).map(|m| m.events_applied as usize);
-            applied.is_some_and(|applied| applied <= state.events.len()) && whole(&mut reader, h).is_ok()
+            applied.is_some_and(|applied| applied <= state.events.len()) && Whole::read(&mut reader, h).is_ok()
         };
         let instead = older.filter(|h| h.slot != page.slot).find(usable);
         lost.push(LostPage { page: page.page.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
@@ -222,6 +222,11 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         layout_for(source.layout, kept.len() as u64),
         usual_codec(kept.values().map(|k| &k.slot)),
     )?;
+    // Statistics of a round that their page has yet to apply are not in the next round's histogram.
+    let has_pending_round = |meta: &PageMeta| {
+        let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
+        missed.iter().any(|event| matches!(effect_of(&event.kind), Effect::Round(_)))
+    };
     let mut histogram = GradHistogram::default();
     for (id, Kept { slot, label, is_older }) in &kept {
         let payload = reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?;
@@ -229,7 +234,7 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
         match meta.filter(|_| *is_older) {
             Some(meta) => copy.put(*id, label, &without_statistics(&meta, payload))?,
             None => {
-                if let Some(meta) = meta.filter(|meta| !has_pending_round(meta, &state)) {
+                if let Some(meta) = meta.filter(|meta| !has_pending_round(meta)) {
                     histogram.add_rows(&layout_of(&meta).rows(payload, 0));
                 }
                 copy.put(*id, label, payload)?;
@@ -244,13 +249,6 @@ fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest)
     }
     let (step, pages, to) = (state.trainer.step, kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: true, step, gaussians: rows, pages, lost, notes: source.notes })
-}
-
-/// Whether the statistics of a page belong to a round that the page has yet to apply, so the next round's histogram
-/// does not count them.
-fn has_pending_round(meta: &PageMeta, state: &RunState) -> bool {
-    let missed = state.events.get(meta.events_applied as usize..).unwrap_or_default();
-    missed.iter().any(|event| matches!(effect_of(&event.kind), Effect::Round(_)))
 }
 
 /// A page with cleared statistics. The run's histogram counts the statistics of the newer, damaged version, and growth
@@ -271,13 +269,34 @@ fn clear_statistics(page: &mut SceneState) {
 }
 
 fn commit(mut copy: NewStore, state: &RunState, source: &Source) -> Result<(), TrainError> {
-    let bytes = state.to_bytes().map_err(|e| CommitError::Contradiction(e.to_string()))?;
+    let bytes = state.to_bytes().map_err(CommitError::Contradiction)?;
     copy.commit(&bytes, format!("salvaged from {}", source.folder.display()).as_bytes(), &[])?;
     Ok(copy.finish()?)
 }
 
 fn changed(folder: &Path, page: PageId, what: &str) -> InputError {
     InputError::new(folder, format!("page {page} changed while it was read: {what}"), "check the drive, then try again")
+}
+
+/// A version whose label, checksum and values are sound.
+struct Whole {
+    header: SlotHeader,
+    meta: PageMeta,
+    /// Step of its newest row.
+    step: u32,
+}
+
+impl Whole {
+    fn read(reader: &mut SlotReader, header: &SlotHeader) -> Result<Whole, String> {
+        let meta = meta_from_label(header.page, &header.label).ok_or("its label is invalid")?;
+        let payload = reader.payload(header.page, &header.slot)?;
+        if meta.rows == 0 || layout_of(&meta).bytes() != payload.len() {
+            return Err("the length of its slot differs from its label".to_string());
+        }
+        let rows = layout_of(&meta).rows(payload, 0);
+        check_values(&rows, u32::MAX)?;
+        Ok(Whole { header: header.clone(), meta, step: rows.stamp.iter().copied().max().unwrap_or(0) })
+    }
 }
 
 /// Rebuilds a store without its map from the newest undamaged version of every page.
@@ -287,46 +306,50 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
     let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
     for (id, versions) in &found {
         let mut first = None;
-        let is_whole = |h: &&SlotHeader| match whole(&mut reader, h) {
-            Ok(()) => true,
+        let instead = versions.iter().find_map(|h| match Whole::read(&mut reader, h) {
+            Ok(whole) => Some(whole),
             Err(what) => {
                 first.get_or_insert(what);
-                false
+                None
             }
-        };
-        let instead = versions.iter().find(is_whole);
+        });
         if let Some(what) = first {
             let rows = meta_from_label(*id, &versions[0].label).map(|m| m.rows);
-            lost.push(LostPage { page: id.to_string(), rows, taken: instead.map(|h| h.slot.generation), what });
+            let taken = instead.as_ref().map(|whole| whole.header.slot.generation);
+            lost.push(LostPage { page: id.to_string(), rows, taken, what });
         }
-        if let Some(h) = instead {
-            kept.insert(*id, h.clone());
-        }
+        kept.extend(instead.map(|whole| (*id, whole)));
     }
     drop_split_pages(&mut kept, &found, &mut lost);
     if kept.is_empty() {
         let problem = format!("none of its {} pages is whole", found.len());
         return Err(InputError::new(&place.folder, problem, "there is nothing to salvage").into());
     }
-    let mut config = config_for(place, request, &kept, &mut source)?;
-    let run = RunIdentity { id: place.id, ..RunIdentity::default() };
-    let degree =
-        kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label)).map(|m| m.sh_degree).max().unwrap_or(0);
-    let (rows, step) = measure(&mut reader, &kept, &source)?;
-    config.0.steps = config.0.steps.max(step);
-    let mut state = state_for(&config, run, (rows, step), degree)?;
+    let most = |of: fn(&Whole) -> u32| kept.values().map(of).max().unwrap_or(0);
+    let (page_rows, degree) = (most(|whole| whole.meta.rows), most(|whole| u32::from(whole.meta.sh_degree)) as u8);
+    let (step, applied) = (most(|whole| whole.step), most(|whole| whole.meta.events_applied));
+    let rows = kept.values().map(|whole| u64::from(whole.meta.rows)).sum();
+    let (mut config, dataset) = config_for(place, request, (page_rows, degree), &mut source)?;
+    config.steps = config.steps.max(step);
+    let mut state = {
+        let sh_degree_start = degree.min(RunOptions::new(&config, dataset.scene_scale).sh_degree);
+        let text = toml::to_string(&config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
+        let simd = limits::simd_path(&config).name().to_string();
+        let run = RunIdentity { id: place.id, ..RunIdentity::default() };
+        let origin = Origin { config: text, simd, sh_degree_start, dataset, run };
+        RunState::without_history(origin, "unknown".to_string(), rows)
+    };
+    state.trainer.step = step;
     let (_, options) = options_of(&source.folder, &state)?;
     let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
-    let mut copy = NewStore::create(&request.to, layout, usual_codec(kept.values().map(|h| &h.slot)))?;
+    let codec = usual_codec(kept.values().map(|whole| &whole.header.slot));
+    let mut copy = NewStore::create(&request.to, layout, codec)?;
     let rules = PageRules::new(&options);
     let mut words = vec![0u64; capacity_bytes(options.page_rows, options.sh_degree).div_ceil(8)];
-    let metas = kept.iter().filter_map(|(id, header)| meta_from_label(*id, &header.label));
-    let applied = metas.map(|meta| meta.events_applied).max().unwrap_or(0);
     let mut histogram = GradHistogram::default();
-    for (id, header) in &kept {
+    for (id, Whole { header, meta, .. }) in &kept {
         let payload = reader.payload(*id, &header.slot).map_err(|what| changed(&source.folder, *id, &what))?;
-        let Some(meta) = meta_from_label(*id, &header.label) else { continue };
-        let mut page = read_page(&layout_of(&meta).rows(payload, 0));
+        let mut page = read_page(&layout_of(meta).rows(payload, 0));
         page.raise_sh_degree(degree);
         if meta.events_applied < applied {
             clear_statistics(&mut page);
@@ -349,20 +372,10 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
     Ok(Salvaged { to, has_state: false, step, gaussians: rows, pages, lost, notes: source.notes })
 }
 
-/// Checks label, checksum and values of a version.
-fn whole(reader: &mut SlotReader, header: &SlotHeader) -> Result<(), String> {
-    let meta = meta_from_label(header.page, &header.label).ok_or("its label is invalid")?;
-    let payload = reader.payload(header.page, &header.slot)?;
-    if meta.rows == 0 || layout_of(&meta).bytes() != payload.len() {
-        return Err("the length of its slot differs from its label".to_string());
-    }
-    check_values(&layout_of(&meta).rows(payload, 0), u32::MAX)
-}
-
 /// Drops pages that were split later, and reports missing parts. Parts older than the whole page come from before a
 /// rollback and are dropped too.
 fn drop_split_pages(
-    kept: &mut BTreeMap<PageId, SlotHeader>,
+    kept: &mut BTreeMap<PageId, Whole>,
     found: &BTreeMap<PageId, Vec<SlotHeader>>,
     lost: &mut Vec<LostPage>,
 ) {
@@ -402,32 +415,14 @@ fn descendants(id: PageId, known: &BTreeSet<PageId>) -> Vec<PageId> {
     bounds.map_or_else(Vec::new, |(from, to)| known.range(from..=to).copied().filter(|p| *p != id).collect())
 }
 
-/// Rows of all pages, and the step of the newest.
-fn measure(
-    reader: &mut SlotReader,
-    kept: &BTreeMap<PageId, SlotHeader>,
-    source: &Source,
-) -> Result<(u64, u32), InputError> {
-    let (mut rows, mut step) = (0, 0);
-    for (id, header) in kept {
-        let payload = reader.payload(*id, &header.slot).map_err(|what| changed(&source.folder, *id, &what))?;
-        let Some(meta) = meta_from_label(*id, &header.label) else { continue };
-        rows += u64::from(meta.rows);
-        step = layout_of(&meta).rows(payload, 0).stamp.iter().copied().max().unwrap_or(0).max(step);
-    }
-    Ok((rows, step))
-}
-
-/// Config and frame of the run, from its config.toml, or the defaults.
+/// Config and frame of the run, from its config.toml, or the defaults; its pages have this many rows and this degree at most.
 fn config_for(
     place: &StorePlace,
     request: &SalvageRequest,
-    kept: &BTreeMap<PageId, SlotHeader>,
+    (rows, degree): (u32, u8),
     source: &mut Source,
 ) -> Result<(TrainConfig, DatasetPrint), InputError> {
     let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join(CONFIG_FILE)));
-    let metas = kept.iter().filter_map(|(id, h)| meta_from_label(*id, &h.label));
-    let (rows, degree) = metas.fold((0, 0), |(rows, degree), m| (m.rows.max(rows), m.sh_degree.max(degree)));
     let mut print =
         DatasetPrint { views: Vec::new(), first_rows: 0, points: 0, scene_scale: 1.0, origin: [0.0; 3], scale: 1.0 };
     let Some(file) = file else {
@@ -450,20 +445,4 @@ fn config_for(
     (print.origin, print.scale) = (resolved.origin, resolved.scale);
     print.scene_scale = (resolved.scene_scale / resolved.scale) as f32;
     Ok((config, print))
-}
-
-/// A run state at `step` without history.
-fn state_for(
-    (config, print): &(TrainConfig, DatasetPrint),
-    run: RunIdentity,
-    (rows, step): (u64, u32),
-    sh_degree_start: u8,
-) -> Result<RunState, TrainError> {
-    let options = RunOptions::new(config, print.scene_scale);
-    let text = toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
-    let simd = limits::simd_path(config).name().to_string();
-    let sh_degree_start = sh_degree_start.min(options.sh_degree);
-    let origin = Origin { config: text, simd, sh_degree_start, dataset: print.clone(), run };
-    let state = RunState::without_history(origin, "unknown".to_string(), rows);
-    Ok(RunState { trainer: TrainerState { step, ..TrainerState::default() }, ..state })
 }

@@ -52,7 +52,7 @@ impl StoredStart {
     /// Errors: the state cannot be encoded.
     pub fn digest(&self) -> InputResult<u64> {
         let bytes = self.state.to_bytes();
-        let bytes = bytes.map_err(|e| InputError::new(&self.folder, e.to_string(), "report this as a bug"))?;
+        let bytes = bytes.map_err(|e| InputError::new(&self.folder, e, "report this as a bug"))?;
         Ok(xxh3_64(&bytes))
     }
 

@@ -15,7 +15,7 @@ use crate::train::error::TrainError;
 use serde::Serialize;
 
 /// One fault of a store.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct Fault {
     /// The faulty part: map, state, segment, entry, header, payload, values.
     pub kind: &'static str,
@@ -108,21 +108,16 @@ fn check_states(store: &StoreReader, verdict: &mut Verdict) -> Option<(PageLimit
         verdict.generations += 1;
         let read = || -> Result<(PageLimits, u32), String> {
             let bytes = store.run_state(generation).map_err(|e| e.to_string())?;
-            let state = RunState::from_bytes(&bytes).map_err(|e| e.to_string())?;
+            let state = RunState::from_bytes(&bytes)?;
             let (config, _) = options_of(store.folder(), &state).map_err(|e| e.problem)?;
             let (page_rows, events) = (config.page_rows as usize, state.events.len());
             Ok((PageLimits { page_rows, sh_degree: config.sh_degree, events }, state.trainer.step))
         };
         match read() {
             Ok(limits) => last = Some(limits),
-            Err(what) => verdict.faults.push(Fault {
-                kind: "state",
-                page: None,
-                generation: Some(generation),
-                file: None,
-                offset: None,
-                what,
-            }),
+            Err(what) => {
+                verdict.faults.push(Fault { kind: "state", generation: Some(generation), what, ..Fault::default() })
+            }
         }
     }
     last
@@ -143,7 +138,7 @@ fn check_segments(store: &StoreReader, slots: &[SlotRef], verdict: &mut Verdict)
             Some(_) => continue,
         };
         let file = Some(segment_file_name(segment));
-        verdict.faults.push(Fault { kind: "segment", page: None, generation: None, file, offset: None, what });
+        verdict.faults.push(Fault { kind: "segment", file, what, ..Fault::default() });
     }
     Ok(())
 }
@@ -155,7 +150,7 @@ fn fault_of_map(error: &CommitError) -> Fault {
     };
     // Drop the remedy, which follows the first line.
     let what = error.to_string().lines().next().unwrap_or_default().to_string();
-    Fault { kind: "map", page: None, generation: None, file: Some(file.to_string()), offset: None, what }
+    Fault { kind: "map", file: Some(file.to_string()), what, ..Fault::default() }
 }
 
 fn fault_of_slot(kind: &'static str, page: &str, slot: &SlotRef, what: String) -> Fault {
