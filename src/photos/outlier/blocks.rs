@@ -2,7 +2,7 @@
 //!
 //! A car that drove on is visible on one photo only. All others agree on the road below, so the picture shows the road, and the mean
 //! colours of photo and picture differ over a whole area. Fine detail that the scene has not learnt yet differs less in the mean, and
-//! lies where the photo has much contrast. So the score of a block is the running mean of its residuals ([`super::grid`]) over the
+//! lies where the photo has much contrast. So the score of a block is the running mean of its residuals (`grid`) over the
 //! contrast of the photo around it.
 //!
 //! At each visit of a view, a block is masked if its score lies far above the median of the view, by the median absolute

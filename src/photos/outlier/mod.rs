@@ -1,6 +1,6 @@
 //! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
-//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by their residuals on a [`grid`].
+//! [`blocks`]: parts of photos that show what other photos do not (cars, people), by their residuals on a grid (`grid`).
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
 //! Invariant: every value is a function of photos, pictures and steps alone, so runs give the same bits for any number

@@ -2,7 +2,7 @@
 //!
 //! A run begins with frames for whole views where the budget holds them, else with frames for views in batches.
 //!
-//! Not here: frames of a scene that has grown ([`crate::train::state::fitting`]).
+//! Not here: frames of a scene that has grown (`state::fitting`).
 //!
 //! Invariant: a run that cannot fit is refused here, with numbers and alternatives: a budget that holds no batch of the largest view is
 //! refused with the smallest one that suffices. Growth that may not fit is a warning.

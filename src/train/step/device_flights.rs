@@ -35,7 +35,7 @@
 //!
 //! The list of pages of a step behind another comes from bounds that are as wide as the other step can make them
 //! ([`crate::optim::one_step`]). So the list contains all pages that the exact bounds give. Any other page in the list has no row in view
-//! and does not change. [`Flights::finish`] of the other step checks that no page is missing.
+//! and does not change. `Flights::finish` of the other step checks that no page is missing.
 //!
 //! Invariants: 1. the bytes of the result are those of a run that waits; 2. at most two steps are in flight; 3. a page of a
 //! step in flight is pinned in its slot and in its frame, and is neither held nor released; 4. a step that was not taken leaves pages,

@@ -6,8 +6,8 @@
 //! is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes nor evicts it.
 //!
 //! # Room for pages that come
-//! A step that waits for its numbers copies back first, and waits ([`SlotCache::load`]). Where nothing may wait, pages leave in the
-//! order of the device's queue ([`SlotCache::load_evicting`]): behind the queued work, and another payload takes the slot.
+//! A step that waits for its numbers copies back first, and waits (`SlotCache::load`). Where nothing may wait, pages leave in the
+//! order of the device's queue (`SlotCache::load_evicting`): behind the queued work, and another payload takes the slot.
 //!
 //! ```text
 //! host    submits update s │ submits copy back, copy up │ records step s+1 ...              │ finishes s │ fills the frame
@@ -19,7 +19,7 @@
 //! back is the payload from before the step, and the frame gets that.
 //!
 //! # Payloads of the next step
-//! They go up while the device computes this one ([`SlotCache::load_ahead`]). A step that is recorded without waiting has one place
+//! They go up while the device computes this one (`SlotCache::load_ahead`). A step that is recorded without waiting has one place
 //! for that, behind its update. So has a step of several batches, whose view needs all slots until its last update.
 //!
 //! ```text
@@ -404,7 +404,7 @@ impl SlotCache {
         Ok(())
     }
 
-    /// As [`SlotCache::load`], for a step that is recorded: room is made behind the steps in flight, and nothing waits. Without memory for
+    /// As `SlotCache::load`, for a step that is recorded: room is made behind the steps in flight, and nothing waits. Without memory for
     /// that, a step that is alone waits; `None` for a step behind another one.
     pub(super) fn load_after_queued_work(
         &mut self,
@@ -605,7 +605,7 @@ impl SlotCache {
         }
     }
 
-    /// The pages of a batch in the slots that [`SlotCache::load`] gave them.
+    /// The pages of a batch in the slots that `SlotCache::load` gave them.
     pub(super) fn loaded<'a>(&self, pinned: impl Iterator<Item = &'a PinnedPage>) -> Vec<SlotPage> {
         let in_slot =
             |page: &PinnedPage| Some(SlotPage { slot: self.in_use.get(&page.page)?.slot, layout: page.layout() });
