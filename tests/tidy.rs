@@ -83,7 +83,7 @@ const TRAIN_ROOMS: &[(&str, &[&str])] = &[
 const START_UP_ROOMS: &[&str] = &["inputs", "preflight", "run", "start", "stores"];
 
 /// Types whose own methods stand in several files of a top folder: to become none.
-const SPREAD_TYPES: &[&str] = &["dataset World", "gpu Gpu", "scene Columns"];
+const SPREAD_TYPES: &[&str] = &["gpu Gpu", "scene Columns"];
 
 /// Names that several types of src have: to become fewer.
 const SHARED_TYPE_NAMES_MAX: usize = 72;

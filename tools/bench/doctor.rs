@@ -121,12 +121,14 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let about = gpu.summary().clone();
     drop(gpu);
     gsscale::tell!("examining {about}");
-    let mut checks =
-        vec![doctor.told("same as the CPU", Doctor::parity), doctor.told("same bytes twice", Doctor::same_bytes)];
+    let mut checks = vec![
+        doctor.run_check("same as the CPU", Doctor::parity),
+        doctor.run_check("same bytes twice", Doctor::same_bytes),
+    ];
     if !args.quick {
-        checks.push(doctor.told("rates", Doctor::rates));
-        checks.push(doctor.told("steps", |doctor| doctor.steps(&about)));
-        checks.push(doctor.told("short training", Doctor::training));
+        checks.push(doctor.run_check("rates", Doctor::rates));
+        checks.push(doctor.run_check("steps", |doctor| doctor.steps(&about)));
+        checks.push(doctor.run_check("short training", Doctor::training));
     }
     let advice = advice(&checks, about.kind);
     let all = json!({
@@ -183,7 +185,7 @@ struct Doctor<'a> {
 
 impl Doctor<'_> {
     /// Runs a check, and says how it ended.
-    fn told(&self, name: &'static str, check: impl FnOnce(&Self) -> Result<(String, Value), String>) -> Check {
+    fn run_check(&self, name: &'static str, check: impl FnOnce(&Self) -> Result<(String, Value), String>) -> Check {
         let check = Check::of(name, check(self));
         gsscale::tell!("{name}: {}", check.found);
         check
@@ -306,7 +308,7 @@ impl Doctor<'_> {
     }
 
     fn steps_of(&self, rows: usize) -> Result<Value, String> {
-        let folder = tempdir()?;
+        let folder = Scratch::new()?;
         let city = CityOptions { views: 8, width: 640, height: 480, points: rows as u32, ..CityOptions::default() };
         let config = TrainConfig {
             strategy: StrategyName::None,
@@ -328,7 +330,7 @@ impl Doctor<'_> {
     }
 
     fn training(&self) -> Result<(String, Value), String> {
-        let folder = tempdir()?;
+        let folder = Scratch::new()?;
         let city = CityOptions { views: 24, width: 160, height: 112, points: 6000, ..CityOptions::default() };
         let config = TrainConfig { steps: STEPS, ..TrainConfig::default() };
         let scene = CityScene::new(&folder.0, &city, config)?;
@@ -517,18 +519,21 @@ fn bits(view: &View) -> Vec<u32> {
 /// A folder for a scene; removed when dropped.
 struct Scratch(PathBuf);
 
+impl Scratch {
+    fn new() -> Result<Scratch, String> {
+        // A process that was killed may have left folders of the same number.
+        let folders = (0..100).map(|n| std::env::temp_dir().join(format!("gsscale-doctor-{}-{n}", std::process::id())));
+        let made = folders.map(|folder| (std::fs::create_dir(&folder), folder)).find(|(made, _)| made.is_ok());
+        let nowhere = || format!("no folder can be made in {}: set TMPDIR to one", std::env::temp_dir().display());
+        made.map(|(_, folder)| Scratch(folder)).ok_or_else(nowhere)
+    }
+}
+
 impl Drop for Scratch {
     fn drop(&mut self) {
         // Made by this process, under a name of its own.
         let _ = std::fs::remove_dir_all(&self.0);
     }
-}
-
-fn tempdir() -> Result<Scratch, String> {
-    let name = format!("gsscale-doctor-{}-{:?}", std::process::id(), Instant::now());
-    let folder = std::env::temp_dir().join(name.replace(|c: char| !c.is_ascii_alphanumeric() && c != '-', ""));
-    std::fs::create_dir(&folder).map_err(|e| format!("{}: {e}", folder.display()))?;
-    Ok(Scratch(folder))
 }
 
 /// Writes doctor.json and doctor.html.

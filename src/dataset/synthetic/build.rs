@@ -11,42 +11,41 @@ use glam::DVec3;
 
 const HALF_PLOT: f64 = 0.5 * PITCH - HALF_STREET;
 
-impl World {
-    pub(super) fn build(seed: u64, blocks: u32) -> World {
-        let noise = Noise::new(seed);
-        let mut world = World { seed, blocks, noise, solids: Vec::new(), plots: Vec::new() };
-        let half = world.half();
-        let middle = 0.5 * f64::from(blocks);
-        for j in 0..blocks {
-            for i in 0..blocks {
-                let number = (u64::from(i) << 32) | u64::from(j);
-                let mut parts = Parts::new(Stream::new(seed, Purpose::City, number, 1));
-                let centre = [(f64::from(i) + 0.5) * PITCH - half, (f64::from(j) + 0.5) * PITCH - half];
-                let (a, b) = (f64::from(i) + 0.5 - middle, f64::from(j) + 0.5 - middle);
-                let from_middle = (a * a + b * b).sqrt() / middle.max(1.0);
-                let tall = parts.draws.uniform() > 0.25 + 0.8 * from_middle;
-                // The slot gives neighbours different kinds.
-                world.plots.push(match (i + 2 * j) % 5 {
-                    slot if tall && slot != 3 => offices(&mut parts, centre),
-                    0 | 4 => terraces(&mut parts, centre),
-                    1 => houses(&mut parts, centre),
-                    2 if parts.draws.uniform() < 0.5 => offices(&mut parts, centre),
-                    2 => houses(&mut parts, centre),
-                    _ => park(&mut parts, centre),
-                });
-                world.solids.append(&mut parts.solids);
-            }
+/// A city of so many blocks a side.
+pub(super) fn build_city(seed: u64, blocks: u32) -> World {
+    let noise = Noise::new(seed);
+    let mut world = World { seed, blocks, noise, solids: Vec::new(), plots: Vec::new() };
+    let half = world.half();
+    let middle = 0.5 * f64::from(blocks);
+    for j in 0..blocks {
+        for i in 0..blocks {
+            let number = (u64::from(i) << 32) | u64::from(j);
+            let mut parts = Parts::new(Stream::new(seed, Purpose::City, number, 1));
+            let centre = [(f64::from(i) + 0.5) * PITCH - half, (f64::from(j) + 0.5) * PITCH - half];
+            let (a, b) = (f64::from(i) + 0.5 - middle, f64::from(j) + 0.5 - middle);
+            let from_middle = (a * a + b * b).sqrt() / middle.max(1.0);
+            let tall = parts.draws.uniform() > 0.25 + 0.8 * from_middle;
+            // The slot gives neighbours different kinds.
+            world.plots.push(match (i + 2 * j) % 5 {
+                slot if tall && slot != 3 => offices(&mut parts, centre),
+                0 | 4 => terraces(&mut parts, centre),
+                1 => houses(&mut parts, centre),
+                2 if parts.draws.uniform() < 0.5 => offices(&mut parts, centre),
+                2 => houses(&mut parts, centre),
+                _ => park(&mut parts, centre),
+            });
+            world.solids.append(&mut parts.solids);
         }
-        for k in 0..=blocks {
-            for along_y in [true, false] {
-                let mut parts = Parts::new(Stream::new(seed, Purpose::City, u64::from(k), if along_y { 2 } else { 3 }));
-                furnish_street(&mut parts, f64::from(k) * PITCH - half, half, along_y);
-                world.solids.append(&mut parts.solids);
-            }
-        }
-        plant_countryside(&mut world);
-        world
     }
+    for k in 0..=blocks {
+        for along_y in [true, false] {
+            let mut parts = Parts::new(Stream::new(seed, Purpose::City, u64::from(k), if along_y { 2 } else { 3 }));
+            furnish_street(&mut parts, f64::from(k) * PITCH - half, half, along_y);
+            world.solids.append(&mut parts.solids);
+        }
+    }
+    plant_countryside(&mut world);
+    world
 }
 
 fn rectangle(centre: [f64; 2], half: [f64; 2], skin: Skin) -> Patch {

@@ -21,13 +21,13 @@ mod world;
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_model};
+use build::build_city;
 use flight::Flight;
 use glam::DVec3;
 use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
 use photo::Photo;
 use shade::Scene;
 use std::path::{Path, PathBuf};
-use world::World;
 
 const JPEG_QUALITY: u8 = 95;
 
@@ -138,7 +138,7 @@ pub fn write_city(
     check(options)?;
     prepare(folder, options.overwrite)?;
     let flight = flight::plan(options);
-    let scene = Scene::new(World::build(options.seed, flight.blocks));
+    let scene = Scene::new(build_city(options.seed, flight.blocks));
     let rays = write_photos(folder, options, &flight, &scene, progress)?;
     let points = points::sample(&scene, &flight, options);
     let offset = DVec3::from(options.offset);

@@ -389,11 +389,11 @@ impl Grid {
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
-    use crate::dataset::synthetic::world::World;
+    use crate::dataset::synthetic::build::build_city;
 
     #[test]
     fn the_grid_finds_what_a_search_of_all_solids_finds() {
-        let world = World::build(3, 2);
+        let world = build_city(3, 2);
         let grid = Grid::new(&world.solids);
         let mut draws = Stream::new(1, Purpose::Test, 0, 0);
         let mut hits = 0;

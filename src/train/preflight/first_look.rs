@@ -80,10 +80,10 @@ pub fn first_look(
         index.push(rules.meta(id, &state));
         Ok(())
     })?;
-    let mut world = World { config, start, index, folder };
-    let frames = look_for.frames_within.map(|bytes| world.frames_within(&options, bytes)).transpose()?;
-    let step = if look_for.step { world.step_time(options, host_mem)? } else { None };
-    let World { start, index, .. } = world;
+    let mut pages = FirstPages { config, start, index, folder };
+    let frames = look_for.frames_within.map(|bytes| pages.frames_within(&options, bytes)).transpose()?;
+    let step = if look_for.step { pages.step_time(options, host_mem)? } else { None };
+    let FirstPages { start, index, .. } = pages;
     let bytes = |page: &PageMeta| PageLayout { rows: page.rows as usize, sh_degree: config.sh_degree }.bytes() as u32;
     Ok(FirstLook {
         dataset: start.into_dataset(),
@@ -96,14 +96,14 @@ pub fn first_look(
 }
 
 /// The start of a run, with its pages' index.
-struct World<'a> {
+struct FirstPages<'a> {
     config: &'a TrainConfig,
     start: Start,
     index: Vec<PageMeta>,
     folder: &'a Path,
 }
 
-impl World<'_> {
+impl FirstPages<'_> {
     /// Frames within `host_mem`; renders the largest view to measure its memory.
     fn frames_within(&mut self, options: &RunOptions, host_mem: u64) -> Result<u64, TrainError> {
         let largest = largest_view(&self.start.dataset, &self.index);

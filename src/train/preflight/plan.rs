@@ -2,7 +2,7 @@
 //!
 //! A run begins with frames for whole views where the budget holds them, else with frames for views in batches.
 //!
-//! Not here: frames of a scene that has grown (`state::fitting`).
+//! Not here: frames of a scene that has grown (`state::run_memory`).
 //!
 //! Invariant: a run that cannot fit is refused here, with numbers and alternatives: a budget that holds no batch of the largest view is
 //! refused with the smallest one that suffices. Growth that may not fit is a warning.
@@ -90,7 +90,7 @@ pub fn plan_tiers(
     memory.iter_mut().for_each(|m| m.staging = staging);
     let (frames, host_mem) = plan_frames(config, trainer, &plan, host_mem, memory)?;
     plan.frames = Some(frames);
-    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.fitting.pages_most);
+    plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.memory.pages_most);
     if config.view_order.0.is_none() {
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
@@ -125,7 +125,7 @@ fn plan_in_memory(
     }
     if let Some(budget) = host_mem {
         let first = budget_in_memory(config, budget, &memory[0]);
-        trainer.fitting.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.memory.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
     }
     Ok(())
 }
@@ -140,12 +140,12 @@ fn plan_frames(
 ) -> InputResult<(u64, Option<u64>)> {
     let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
     let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
-    trainer.fitting.pages_most = pages_most;
+    trainer.memory.pages_most = pages_most;
     trainer.scene.pager.allow_frames(frames as usize);
     trainer.scene.pager.limit_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
         let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
-        trainer.fitting.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.memory.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
     }
     for memory in memory {
         memory.frames = memory.frames.min(frames * plan.frame_bytes);
@@ -340,7 +340,7 @@ pub fn allow_largest_view(
     if let Some(budget) = most.filter(|budget| needed * of_page > budget / 4 * PROBE_WHOLE_OF_4) {
         let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
         if (fewer as u64) < needed {
-            (frames, trainer.fitting.pages_most) = (fewer as u64, pages);
+            (frames, trainer.memory.pages_most) = (fewer as u64, pages);
         }
     }
     trainer.scene.pager.allow_frames(frames as usize);

@@ -73,7 +73,7 @@ pub fn estimate(
         .probe_views(dataset, &probe.views)
         .map_err(|error| device_memory::refusal(error, config, dataset, &trainer.scene, &probe.views))?;
     let pixels = pixels as u64;
-    let [working, rendering] = trainer.fit().view_bytes();
+    let [working, rendering] = trainer.run_memory().view_bytes();
     // Image, coverage, gradient, and per-tile copies of them.
     let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
     // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is

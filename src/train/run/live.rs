@@ -93,7 +93,7 @@ fn picture<'a>(trainer: &'a mut Trainer, dataset: &Dataset, orbit: Orbit) -> Res
     let pivot = median_depth(&trainer.scene, base).unwrap_or(dataset.scene_scale);
     let camera = orbit_camera(base, pivot, trainer.options.up, orbit);
     check_picture(trainer, &camera)?;
-    trainer.fit().for_picture(&camera);
+    trainer.run_memory().fit_frames_to_picture(&camera);
     let render = trainer.render_options();
     draw(&mut trainer.now(), &camera, &render)?;
     Ok(trainer.renderer.image()?)
@@ -103,7 +103,7 @@ fn picture<'a>(trainer: &'a mut Trainer, dataset: &Dataset, orbit: Orbit) -> Res
 /// not that of the splats, which the renderer keeps for every visible row.
 /// Errors: the camera may see too many Gaussians.
 fn check_picture(trainer: &Trainer, camera: &Camera) -> InputResult<()> {
-    let Some(budget) = trainer.fitting.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
+    let Some(budget) = trainer.memory.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
     let pager = &trainer.scene.pager;
     let rows: u64 = pager.pages_of_view(camera).iter().map(|page| u64::from(pager.index()[page.index()].rows)).sum();
     let needed = trainer.renderer.host_bytes_for_rows(rows);

@@ -112,7 +112,11 @@ impl TrainingLoop<'_> {
         let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;
         let is_due = self.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self.trainer));
         let is_shown = self.live.as_ref().is_some_and(LivePage::is_due);
-        !is_wanted && !is_due && !is_shown && self.stop.exit_code().is_none() && !self.trainer.fit().is_outgrown()
+        !is_wanted
+            && !is_due
+            && !is_shown
+            && self.stop.exit_code().is_none()
+            && !self.trainer.run_memory().is_outgrown()
     }
 
     /// The metrics of the last step, without an evaluation.
@@ -223,28 +227,28 @@ impl TrainingLoop<'_> {
     /// Errors: the commit failed for a reason other than space.
     fn start_paging_if_outgrown(&mut self) -> Result<(), TrainError> {
         let trainer = &mut *self.trainer;
-        if !trainer.fit().is_outgrown() {
+        if !trainer.run_memory().is_outgrown() {
             return Ok(());
         }
-        let Some(budget) = trainer.fitting.budget else { return Ok(()) };
-        let view = trainer.fit().view_memory();
+        let Some(budget) = trainer.memory.budget else { return Ok(()) };
+        let view = trainer.run_memory().view_memory();
         let needed = trainer.scene.pager.stats().pinned_max;
         let frames = budget.frames(&trainer.scene, view, needed);
         let is_tight = budget.frames_at_most(&trainer.scene, view) < needed;
-        if is_tight && trainer.fit().raise_for_all_pages(budget) {
+        if is_tight && trainer.run_memory().raise_for_all_pages(budget) {
             return Ok(());
         }
         let step = trainer.steps_done();
         let outgrown = format!("from step {step} on the scene does not fit into {}", format_bytes(budget.bytes));
         // Warn once: without the budget, later steps do not try again.
-        trainer.fitting.budget = None;
+        trainer.memory.budget = None;
         let Some(checkpoint) = self.checkpoint.as_deref_mut() else {
             crate::tell!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
             return Ok(());
         };
         let commits = Some(checkpoint.commits_done());
         if budget.failed_after == commits {
-            trainer.fitting.budget = Some(budget);
+            trainer.memory.budget = Some(budget);
             return Ok(());
         }
         match checkpoint.commit(trainer, self.metrics) {
@@ -258,7 +262,7 @@ impl TrainingLoop<'_> {
             Err(error) if error.is_out_of_space() => {
                 crate::tell!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
                 // Try again after the next successful commit.
-                trainer.fitting.budget = Some(budget.with_failure_after(commits));
+                trainer.memory.budget = Some(budget.with_failure_after(commits));
                 return Ok(());
             }
             Err(error) => return Err(error),
@@ -269,7 +273,7 @@ impl TrainingLoop<'_> {
              choose a view order that moves fewer pages",
             checkpoint.folder().display()
         );
-        trainer.fitting.budget = Some(budget);
+        trainer.memory.budget = Some(budget);
         trainer.scene.pager.begin_paging(frames, budget.prefetch_bytes, PLAN_BYTES);
         Ok(())
     }
@@ -291,9 +295,9 @@ impl TrainingLoop<'_> {
             }
         }
         let TrainError::Paging(source @ PagingError::WorkingSet { pages, .. }) = error else { return error };
-        let view = self.trainer.fit().view_memory();
+        let view = self.trainer.run_memory().view_memory();
         let scene = &self.trainer.scene;
-        let least = self.trainer.fitting.budget.map(|budget| budget.least_for(scene, view, pages));
+        let least = self.trainer.memory.budget.map(|budget| budget.least_for(scene, view, pages));
         TrainError::Outgrown { source, least }
     }
 }

@@ -2,8 +2,8 @@
 //! Gaussians the scene needs.
 
 pub mod eval;
-pub(crate) mod fitting;
 mod growth_checks;
 pub(crate) mod held_out;
+pub(crate) mod run_memory;
 pub mod trainer;
 mod turns;

@@ -9,8 +9,8 @@
 //! the run with the result of the last good step; 3. the events of a step are logged once.
 
 use super::eval::{EvalRequest, evaluate};
-use super::fitting::{Fit, Fitting};
 use super::growth_checks::{Comparing, growth_values};
+use super::run_memory::{MemoryState, RunMemory};
 use super::turns::Turns;
 use crate::base::trace;
 use crate::checkpoint::run_state::{LastTest, TrainerState};
@@ -77,7 +77,7 @@ pub struct Trainer {
     /// A step failed after it had changed rows, so the state must not be committed.
     pub(crate) is_torn: bool,
     /// The memory budget, and what views have taken so far.
-    pub(crate) fitting: Fitting,
+    pub(crate) memory: MemoryState,
     /// The steps since a row was last rewritten.
     pub(super) idle: Idle,
     /// Steps recorded ahead.
@@ -158,7 +158,7 @@ impl Trainer {
             options,
             state: TrainerState::default(),
             is_torn: false,
-            fitting: Fitting::default(),
+            memory: MemoryState::default(),
             idle: Idle::default(),
             ahead: Ahead::default(),
         }
@@ -171,10 +171,10 @@ impl Trainer {
     }
 
     /// The memory of the run, to be fitted.
-    pub(crate) fn fit(&mut self) -> Fit<'_> {
+    pub(crate) fn run_memory(&mut self) -> RunMemory<'_> {
         let sh_degree_last = self.sh_degrees().1;
-        let Trainer { scene, working, renderer, photos, fitting, state, .. } = self;
-        Fit { fitting, scene, renderer: &mut **renderer, working, photos, step: state.step, sh_degree_last }
+        let Trainer { scene, working, renderer, photos, memory, state, .. } = self;
+        RunMemory { memory, scene, renderer: &mut **renderer, working, photos, step: state.step, sh_degree_last }
     }
 
     /// Gives what is known of photos its start values, which the files of the dataset state. Returns warnings for the user.
@@ -208,13 +208,13 @@ impl Trainer {
             let mut comparison = Comparison { photos: &mut self.photos, ..Comparison::new(&target, self.options.loss) };
             let (scene, working, renderer) = (&mut self.scene, &mut self.working, &mut *self.renderer);
             let mut now = Now { scene, step: self.state.step, working, renderer };
-            let (pages_most, began) = (self.fitting.pages_most, Instant::now());
+            let (pages_most, began) = (self.memory.pages_most, Instant::now());
             let rows = rehearse(&mut now, camera, &render, &mut comparison, pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
             let index = self.scene.pager.index();
             let pages = self.scene.pager.pages_of_view(camera);
             let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
-            self.fitting.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
+            self.memory.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
             (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
             let sizes = self.renderer.device_sizes();
             probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.max(sizes)));
@@ -294,7 +294,7 @@ impl Trainer {
         targets.prefetch(&self.turns.coming(self.state.step, PREFETCH_VIEWS, &self.photos));
         if !self.is_ahead() {
             let camera = photos::camera(&self.photos, dataset, view);
-            self.fit().for_step(&camera);
+            self.run_memory().fit_frames(&camera);
         }
         self.prepare_device()?;
         self.look_ahead(dataset);
@@ -308,12 +308,12 @@ impl Trainer {
             self.is_torn = matches!(stepped, Err(TrainError::Torn { .. }));
             // A step that lacked frames can be repeated: it only applied pending events.
             match stepped {
-                Err(TrainError::Paging(error)) if self.fit().add_missing_frames(&error) => {}
+                Err(TrainError::Paging(error)) if self.run_memory().add_missing_frames(&error) => {}
                 stepped => break stepped,
             }
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
-        self.fitting.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
+        self.memory.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.ahead.note_rows_of(view, outcome.rows);
         note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
         self.idle.note(&outcome, self.state.step, self.scene.rows(), &target, dataset)?;
@@ -348,7 +348,7 @@ impl Trainer {
         let collects = self.options.strategy.collects(step);
         let mut rows = HostRows::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
-        let view = StepView { step, camera, render: &render, collects, pages_most: self.fitting.pages_most };
+        let view = StepView { step, camera, render: &render, collects, pages_most: self.memory.pages_most };
         train_step(scene, working, &mut rows, &view, &mut comparison)
     }
 
@@ -389,7 +389,7 @@ impl Trainer {
         let mut rows = DeviceRows::new(tier, scene, renderer, (step, next))?;
         let (camera, collects) = (&dataset.views[view].camera, self.options.strategy.collects(step));
         let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
-        let view = StepView { step, camera, render: &render, collects, pages_most: self.fitting.pages_most };
+        let view = StepView { step, camera, render: &render, collects, pages_most: self.memory.pages_most };
         train_step(scene, working, &mut rows, &view, &mut comparison)
     }
 
@@ -408,8 +408,8 @@ impl Trainer {
             loss: &self.options.loss,
             collects: self.options.strategy.collects(step),
             rows_before: self.ahead.rows_of_views.get(view).copied().unwrap_or(0),
-            share: self.fitting.visible_share,
-            pages_most: self.fitting.pages_most,
+            share: self.memory.visible_share,
+            pages_most: self.memory.pages_most,
         };
         let tier = DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
         if !tier.flights.may_record() {
@@ -519,7 +519,7 @@ impl Trainer {
         self.drain()?;
         let render = self.render_options();
         let views = dataset.test_views();
-        self.fit().for_widest(views.iter().map(|&view| &dataset.views[view].camera));
+        self.run_memory().fit_frames_to_widest(views.iter().map(|&view| &dataset.views[view].camera));
         let request = EvalRequest {
             views: &views,
             ssim: self.options.ssim_variant,
@@ -609,12 +609,12 @@ impl Trainer {
             positions.iter().map(view).map(camera).collect::<Vec<_>>()
         });
         self.drain()?;
-        self.fit().for_widest(held_out.iter().chain(&trained).map(|(_, camera)| camera));
+        self.run_memory().fit_frames_to_widest(held_out.iter().chain(&trained).map(|(_, camera)| camera));
         let compared = Comparing {
             targets,
             render: &self.render_options(),
             loss: &self.options.loss.clone(),
-            pages_most: self.fitting.pages_most,
+            pages_most: self.memory.pages_most,
             // A photo that was never trained on has no exposure yet.
             correct: self.photos.iter().any(|parameter| parameter.corrects()).then_some(ColorCorrect::Affine),
         };

@@ -26,7 +26,7 @@ const KEPT_SHARE: u64 = 16;
 
 /// The budget of a run, and what its views have taken so far.
 #[derive(Debug)]
-pub(crate) struct Fitting {
+pub(crate) struct MemoryState {
     /// Memory budget from which the number of frames follows; `None` without a budget.
     pub budget: Option<HostBudget>,
     /// The most pages of a batch of a step.
@@ -41,14 +41,14 @@ pub(crate) struct Fitting {
     row_bytes_due: u64,
 }
 
-impl Default for Fitting {
-    fn default() -> Fitting {
+impl Default for MemoryState {
+    fn default() -> MemoryState {
         let (budget, pages_most, visible_share) = (None, usize::MAX, 0.0);
-        Fitting { budget, pages_most, visible_share, whole_rows: 0, rendered_rows: 0, row_bytes_due: 0 }
+        MemoryState { budget, pages_most, visible_share, whole_rows: 0, rendered_rows: 0, row_bytes_due: 0 }
     }
 }
 
-impl Fitting {
+impl MemoryState {
     /// Stores how many of the rows in the pages of a view were drawn, and whether the view was one batch.
     pub fn note_view(&mut self, visible: usize, in_pages: usize, is_whole: bool) {
         self.whole_rows = self.whole_rows.max(if is_whole { in_pages as u64 } else { 0 });
@@ -58,8 +58,8 @@ impl Fitting {
 }
 
 /// A run whose memory is being fitted: the budget, and what holds the memory of a view.
-pub(crate) struct Fit<'a> {
-    pub fitting: &'a mut Fitting,
+pub(crate) struct RunMemory<'a> {
+    pub memory: &'a mut MemoryState,
     pub scene: &'a mut PagedScene,
     pub renderer: &'a mut dyn Renderer,
     pub working: &'a mut WorkingSet,
@@ -70,17 +70,17 @@ pub(crate) struct Fit<'a> {
     pub sh_degree_last: u8,
 }
 
-impl Fit<'_> {
+impl RunMemory<'_> {
     /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
     pub fn view_bytes(&self) -> [u64; 2] {
-        let due = self.fitting.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
+        let due = self.memory.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
         let photos: u64 = self.photos.iter().map(|parameter| parameter.buffer_bytes()).sum();
         [self.working.bytes() as u64, self.renderer.host_bytes() + due + photos]
     }
 
     /// Whether a scene in memory no longer fits into its budget.
     pub fn is_outgrown(&self) -> bool {
-        let budget = self.fitting.budget.filter(|_| self.scene.is_in_memory());
+        let budget = self.memory.budget.filter(|_| self.scene.is_in_memory());
         budget.is_some_and(|budget| !budget.holds_all(self.scene, self.view_memory().at_last))
     }
 
@@ -97,10 +97,10 @@ impl Fit<'_> {
     /// been one batch before.
     fn view_memory_of(&self, rows: u64) -> ViewMemory {
         let (held, [_, rendering]) = (self.view_memory(), self.view_bytes());
-        if rows <= self.fitting.whole_rows {
+        if rows <= self.memory.whole_rows {
             return held;
         }
-        let visible = (rows as f64 * self.fitting.visible_share) as u64;
+        let visible = (rows as f64 * self.memory.visible_share) as u64;
         let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degree_last]
             .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
         ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
@@ -109,51 +109,51 @@ impl Fit<'_> {
     /// Prepares memory for a view whose pages hold `rows` rows: frees what only far wider views need in the renderer and the
     /// working set, so that frames can have it, and expects what the renderer will need if no view as wide was rendered since.
     fn expect_rows(&mut self, rows: u64, budget: HostBudget) {
-        let visible = (rows as f64 * self.fitting.visible_share) as u64;
+        let visible = (rows as f64 * self.memory.visible_share) as u64;
         let due = self.renderer.host_bytes_for_rows(visible);
         let is_too_large =
             |held: u64, due: u64| held > due.saturating_mul(WIDER_KEPT) && held > budget.bytes / KEPT_SHARE;
         if is_too_large(self.renderer.host_bytes_of_rows(), due) {
             self.renderer.free_rows();
-            self.fitting.rendered_rows = 0;
+            self.memory.rendered_rows = 0;
         }
         let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree()) as u64;
         if is_too_large(self.working.bytes() as u64, working_due) {
             self.shrink_working_set(visible as usize);
         }
-        self.fitting.row_bytes_due = if rows <= self.fitting.rendered_rows { 0 } else { due };
+        self.memory.row_bytes_due = if rows <= self.memory.rendered_rows { 0 } else { due };
     }
 
     /// Frees the memory of a working set that has room for many more than `rows` rows, and what photos take beside it.
     fn shrink_working_set(&mut self, rows: usize) {
         if self.working.shrink_to(rows) {
             self.photos.iter_mut().for_each(|parameter| parameter.free_buffers());
-            self.fitting.whole_rows = 0;
+            self.memory.whole_rows = 0;
         }
     }
 
-    /// [`Fit::for_step`] for the camera that sees the most pages, before pictures outside of steps.
-    pub fn for_widest<'a>(&mut self, cameras: impl IntoIterator<Item = &'a Camera>) {
-        if self.fitting.budget.is_some() && !self.scene.is_in_memory() {
+    /// [`RunMemory::fit_frames`] for the camera that sees the most pages, before pictures outside of steps.
+    pub fn fit_frames_to_widest<'a>(&mut self, cameras: impl IntoIterator<Item = &'a Camera>) {
+        if self.memory.budget.is_some() && !self.scene.is_in_memory() {
             let widest = cameras.into_iter().max_by_key(|camera| self.scene.pager.pages_of_view(camera).len());
-            widest.into_iter().for_each(|camera| self.for_step(camera));
+            widest.into_iter().for_each(|camera| self.fit_frames(camera));
         }
     }
 
-    /// [`Fit::for_step`] before a picture of the live page: any camera may ask for one, so it never raises the budget. A picture is
+    /// [`RunMemory::fit_frames`] before a picture of the live page: any camera may ask for one, so it never raises the budget. A picture is
     /// drawn in batches.
-    pub fn for_picture(&mut self, camera: &Camera) {
-        self.frames_within(camera, false);
+    pub fn fit_frames_to_picture(&mut self, camera: &Camera) {
+        self.fit_frames_within(camera, false);
     }
 
     /// Adjusts the number of frames to the grown scene, in both directions, before a step with this camera. A view that does not
     /// fit in one batch is cut into batches that do.
-    pub fn for_step(&mut self, camera: &Camera) {
-        self.frames_within(camera, true);
+    pub fn fit_frames(&mut self, camera: &Camera) {
+        self.fit_frames_within(camera, true);
     }
 
-    fn frames_within(&mut self, camera: &Camera, may_raise: bool) {
-        let Some(budget) = self.fitting.budget.filter(|_| !self.scene.is_in_memory()) else { return };
+    fn fit_frames_within(&mut self, camera: &Camera, may_raise: bool) {
+        let Some(budget) = self.memory.budget.filter(|_| !self.scene.is_in_memory()) else { return };
         let pages = self.scene.pager.pages_of_view(camera);
         let index = self.scene.pager.index();
         let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
@@ -161,15 +161,15 @@ impl Fit<'_> {
         self.expect_rows(rows, budget);
         let view = self.view_memory_of(rows);
         let mut frames = budget.frames(self.scene, view, needed);
-        self.fitting.pages_most = usize::MAX;
+        self.memory.pages_most = usize::MAX;
         if frames < needed && may_raise && self.raise_for_frames(budget, needed) {
             frames = needed;
         } else if frames < needed {
             let row_bytes = WorkingSet::row_bytes(self.sh_degree_last);
             // Between the passes, the batches keep the numbers of their rows in view.
-            let numbers = (rows as f64 * self.fitting.visible_share) as u64 * size_of::<u32>() as u64;
-            (frames, self.fitting.pages_most) = budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
-            self.shrink_working_set(self.fitting.pages_most.saturating_mul(self.scene.rules.page_rows()));
+            let numbers = (rows as f64 * self.memory.visible_share) as u64 * size_of::<u32>() as u64;
+            (frames, self.memory.pages_most) = budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
+            self.shrink_working_set(self.memory.pages_most.saturating_mul(self.scene.rules.page_rows()));
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();
@@ -187,7 +187,7 @@ impl Fit<'_> {
     /// repeated, with more frames than before.
     pub fn add_missing_frames(&mut self, error: &PagingError) -> bool {
         let PagingError::WorkingSet { pages: needed, frames: now, .. } = *error else { return false };
-        let Some(budget) = self.fitting.budget.filter(|_| !self.scene.is_in_memory() && needed > now) else {
+        let Some(budget) = self.memory.budget.filter(|_| !self.scene.is_in_memory() && needed > now) else {
             return false;
         };
         let mut most = budget.frames_at_most(self.scene, self.view_memory());
@@ -199,7 +199,7 @@ impl Fit<'_> {
                 return false;
             }
             self.scene.pager.limit_plan(PLAN_BYTES_LEAST);
-            self.fitting.budget = Some(smaller);
+            self.memory.budget = Some(smaller);
         }
         let wanted = needed + needed / SPARE_SHARE;
         self.scene.pager.allow_frames(wanted.min(most).max(needed));
@@ -229,7 +229,7 @@ impl Fit<'_> {
                 format_bytes(budget.bytes)
             );
         }
-        self.fitting.budget = Some(raised);
+        self.memory.budget = Some(raised);
         true
     }
 }
