@@ -225,8 +225,10 @@ impl Chart {
                 let end = (point.0.clamp(place[0], place[2]), point.1.clamp(place[1], place[3]));
                 root.draw(&PathElement::new([here(*point), here(end)], AXIS.mix(0.5))).map_err(text)?;
             }
-            root.draw(&Text::new(label.clone(), here((place[0], place[1])), ("sans-serif", LABEL_SIZE)))
-                .map_err(text)?;
+            // Texts are narrower than their places: one on the left ends at its point, or at the end of its leader.
+            let (side, x) = if place[2] < point.0 { (HPos::Right, place[2]) } else { (HPos::Left, place[0]) };
+            let style = TextStyle::from(("sans-serif", LABEL_SIZE)).pos(Pos::new(side, VPos::Top));
+            root.draw(&Text::new(label.clone(), here((x, place[1])), style)).map_err(text)?;
         }
         Ok(())
     }
