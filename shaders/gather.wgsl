@@ -30,10 +30,9 @@ struct GatherUniforms {
     page_count: u32,
     /// Listed rows of this dispatch.
     row_count: u32,
-    /// Column to evaluate, floats per row of the output, and the first of them in the row of the page.
+    /// Column to evaluate, and floats per row of the output.
     column: u32,
     width: u32,
-    first_element: u32,
     /// Base rate of the column.
     rate: f32,
     /// Base rates for bounds.
@@ -43,6 +42,7 @@ struct GatherUniforms {
     grow_grad2d: f32,
     split_scale: f32,
     split_reach: f32,
+    pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> u: GatherUniforms;
@@ -251,7 +251,7 @@ fn gather(place: Place) {
     }
     let page = pages[listed.x];
     if page.slab == u.slab {
-        out[i] = element(page, u.column, listed.y, u.first_element + i - row * u.width, u.now, u.rate);
+        out[i] = element(page, u.column, listed.y, i - row * u.width, u.now, u.rate);
     }
 }
 

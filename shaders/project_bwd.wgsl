@@ -1,5 +1,6 @@
 // Stage "project", backward: gradients of footprints to gradients of means, quats, scales and opacities.
-// The twin of src/kernels/project_bwd.rs, which documents the formulas. Adds to v_means, which sh_bwd wrote before.
+// The twin of src/kernels/project_bwd.rs, which documents the formulas. Runs after sh_bwd: adds to v_means, and raises the largest
+// magnitude of a row's gradients, the last word of the row's record.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -12,16 +13,13 @@
 @group(0) @binding(3) var<storage, read> scales: array<f32>;
 @group(0) @binding(4) var<storage, read> opacities: array<f32>;
 @group(0) @binding(5) var<storage, read> splats: array<vec4<f32>>;
-@group(0) @binding(6) var<storage, read> v_splats: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read_write> v_splats: array<vec4<f32>>;
 @group(0) @binding(7) var<storage, read_write> v_means: array<f32>;
 @group(0) @binding(8) var<storage, read_write> v_quats: array<vec4<f32>>;
 /// With respect to the log of the standard deviations.
 @group(0) @binding(9) var<storage, read_write> v_scales: array<f32>;
 /// With respect to the logits.
 @group(0) @binding(10) var<storage, read_write> v_opacities: array<f32>;
-/// Input of densification for each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row. With WEIGHS a row
-/// has a second entry: weight, and weight times error.
-@group(0) @binding(11) var<storage, read_write> footprints: array<vec4<f32>>;
 
 /// The image of axis k times the conic, from the image and minor of axis k and of the two axes after it, cyclically.
 fn axis_by_conic(g: Geometry, eps2d: f32, k: vec2<f32>, l: vec2<f32>, m: vec2<f32>, by_l: f32, by_m: f32) -> vec2<f32> {
@@ -110,12 +108,6 @@ fn project_bwd(place: Place) {
             v_scales[3u * i + c] = 0.0;
         }
         v_opacities[i] = 0.0;
-#ifdef WEIGHS
-        footprints[2u * i] = vec4<f32>();
-        footprints[2u * i + 1u] = vec4<f32>();
-#else
-        footprints[i] = vec4<f32>();
-#endif
         return;
     }
     let a = v_splats[at];
@@ -124,16 +116,16 @@ fn project_bwd(place: Place) {
     let scale = exp32_vec3(vec3<f32>(scales[3u * i], scales[3u * i + 1u], scales[3u * i + 2u]));
     let g = geometry(view, mean, quats[i], scale);
     let v = geometry_vjp(g, a.xy, v_conic);
+    let v_mean = vec3<f32>(v_means[3u * i], v_means[3u * i + 1u], v_means[3u * i + 2u]) + v.mean;
     for (var c = 0u; c < 3u; c++) {
-        v_means[3u * i + c] += v.mean[c];
+        v_means[3u * i + c] = v_mean[c];
         v_scales[3u * i + c] = v.log_scale[c];
     }
     v_quats[i] = v.quat;
-    v_opacities[i] = a.w * sigmoid_slope(opacities[i]);
-#ifdef WEIGHS
-    footprints[2u * i] = vec4<f32>(a.xy, radius, splats[at + 2u].w);
-    footprints[2u * i + 1u] = vec4<f32>(a.z, v_splats[at + 1u].w, 0.0, 0.0);
-#else
-    footprints[i] = vec4<f32>(a.xy, radius, splats[at + 2u].w);
-#endif
+    let v_opacity = a.w * sigmoid_slope(opacities[i]);
+    v_opacities[i] = v_opacity;
+    let of_means = largest_magnitude(vec4<f32>(v_mean, v_opacity));
+    let of_shape = max(largest_magnitude(v.quat), largest_magnitude(vec4<f32>(v.log_scale, 0.0)));
+    let of_colors = bitcast<u32>(v_splats[at + 2u].w);
+    v_splats[at + 2u].w = bitcast<f32>(max(of_colors, max(of_means, of_shape)));
 }

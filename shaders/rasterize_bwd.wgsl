@@ -9,6 +9,7 @@
 // at a time. So every run on a device gives the same bits.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
+#import "shared/math.wgsl"
 #import "shared/raster.wgsl"
 
 @group(0) @binding(0) var<uniform> view: RasterUniforms;
@@ -18,25 +19,23 @@
 @group(0) @binding(4) var<storage, read> tile_offsets: array<u32>;
 @group(0) @binding(5) var<storage, read> t_final: array<f32>;
 @group(0) @binding(6) var<storage, read> stops: array<u32>;
-/// [3][height][width]
+/// [3][height][width], and a fourth plane with HAS_V_ALPHA.
 @group(0) @binding(7) var<storage, read> v_rgb: array<f32>;
-/// [height][width], read with HAS_V_ALPHA only.
-@group(0) @binding(8) var<storage, read> v_alpha: array<f32>;
 /// [intersections of the window][9]
-@group(0) @binding(9) var<storage, read_write> partials: array<f32>;
+@group(0) @binding(8) var<storage, read_write> partials: array<f32>;
 /// [height][width][2]: t and behind, if the list has more than one segment or part.
-@group(0) @binding(10) var<storage, read_write> carry: array<vec2<f32>>;
+@group(0) @binding(9) var<storage, read_write> carry: array<vec2<f32>>;
 /// Rows by rank.
-@group(0) @binding(11) var<storage, read> order: array<u32>;
+@group(0) @binding(10) var<storage, read> order: array<u32>;
 /// First intersection of each rank; row_count + 1 entries.
-@group(0) @binding(12) var<storage, read> offsets: array<u32>;
-@group(0) @binding(13) var<storage, read_write> v_splats: array<vec4<f32>>;
+@group(0) @binding(11) var<storage, read> offsets: array<u32>;
+@group(0) @binding(12) var<storage, read_write> v_splats: array<vec4<f32>>;
 /// Rows that count_unusable found.
-@group(0) @binding(14) var<storage, read_write> unusable: atomic<u32>;
+@group(0) @binding(13) var<storage, read_write> unusable: atomic<u32>;
 
 #ifdef WEIGHS
 /// [height][width]
-@group(0) @binding(15) var<storage, read> errors: array<f32>;
+@group(0) @binding(14) var<storage, read> errors: array<f32>;
 
 const SUMS: u32 = 11u;
 #else
@@ -101,7 +100,7 @@ fn pixels_behind(at: u32, plane: u32, inside: vec4<bool>) -> Pixels {
                 p.t[i] = t_final[here];
                 p.behind[i] = dot(view.background, vec3<f32>(p.v_red[i], p.v_green[i], p.v_blue[i]));
                 if (view.flags & HAS_V_ALPHA) != 0u {
-                    p.behind[i] -= v_alpha[here];
+                    p.behind[i] -= v_rgb[3u * plane + here];
                 }
             } else {
                 p.t[i] = carry[here].x;
@@ -444,12 +443,6 @@ fn fold_rows(place: Place) {
     v_splats[at + 2u] = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
 }
 
-/// The bits of four numbers without their signs: ordered as the magnitudes, with NaN and infinity after all others. A
-/// shader may assume that numbers are finite, but not that bits are.
-fn magnitudes(v: vec4<f32>) -> vec4<u32> {
-    return bitcast<vec4<u32>>(v) & vec4<u32>(0x7fffffffu);
-}
-
 /// Counts the rows with a gradient that is too large for the optimizer, or not finite.
 @compute @workgroup_size(256)
 fn count_unusable(place: Place) {
@@ -458,8 +451,9 @@ fn count_unusable(place: Place) {
         return;
     }
     let at = SPLAT_STRIDE * row;
-    let m = max(max(magnitudes(v_splats[at]), magnitudes(v_splats[at + 1u])), magnitudes(v_splats[at + 2u]));
-    if max(max(m.x, m.y), max(m.z, m.w)) > LARGEST_SPLAT_GRAD_BITS {
+    let color = vec4<f32>(v_splats[at + 2u].xyz, 0.0);
+    let largest = max(largest_magnitude(v_splats[at]), largest_magnitude(v_splats[at + 1u]));
+    if max(largest, largest_magnitude(color)) > LARGEST_SPLAT_GRAD_BITS {
         atomicAdd(&unusable, 1u);
     }
 }

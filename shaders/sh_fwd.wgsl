@@ -1,6 +1,5 @@
 // Stage "sh": colours of the rows that projection has not culled, written into their splats. The twin of
-// src/kernels/sh_fwd.rs. Each band has its own buffer, [rows][2 l + 1][3], so that none exceeds the size of a binding
-// before the others; SH_DEGREE_1 to SH_DEGREE_3 select the bands in use.
+// src/kernels/sh_fwd.rs. SH_DEGREE_1 to SH_DEGREE_3 select the bands in use.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -13,13 +12,11 @@
 @group(0) @binding(2) var<storage, read> sh0: array<f32>;
 #ifdef SH_DEGREE_1
 @group(0) @binding(3) var<storage, read> means: array<f32>;
-@group(0) @binding(4) var<storage, read> sh1: array<f32>;
-#ifdef SH_DEGREE_2
-@group(0) @binding(5) var<storage, read> sh2: array<f32>;
-#ifdef SH_DEGREE_3
-@group(0) @binding(6) var<storage, read> sh3: array<f32>;
-#endif
-#endif
+@group(0) @binding(4) var<storage, read> sh_n: array<f32>;
+
+fn coefficient(at: u32) -> vec3<f32> {
+    return vec3<f32>(sh_n[at], sh_n[at + 1u], sh_n[at + 2u]);
+}
 #endif
 
 @compute @workgroup_size(256)
@@ -39,20 +36,17 @@ fn sh_fwd(place: Place) {
     let dir = unit_direction(mean - view.centre).unit;
     var basis1 = sh_band1(dir);
     for (var k = 0u; k < 3u; k++) {
-        let first = 9u * i + 3u * k;
-        color += basis1[k] * vec3<f32>(sh1[first], sh1[first + 1u], sh1[first + 2u]);
+        color += basis1[k] * coefficient(SH_WIDTH * i + 3u * k);
     }
 #ifdef SH_DEGREE_2
     var basis2 = sh_band2(dir);
     for (var k = 0u; k < 5u; k++) {
-        let first = 15u * i + 3u * k;
-        color += basis2[k] * vec3<f32>(sh2[first], sh2[first + 1u], sh2[first + 2u]);
+        color += basis2[k] * coefficient(SH_WIDTH * i + SH_BAND_2 + 3u * k);
     }
 #ifdef SH_DEGREE_3
     var basis3 = sh_band3(dir);
     for (var k = 0u; k < 7u; k++) {
-        let first = 21u * i + 3u * k;
-        color += basis3[k] * vec3<f32>(sh3[first], sh3[first + 1u], sh3[first + 2u]);
+        color += basis3[k] * coefficient(SH_WIDTH * i + SH_BAND_3 + 3u * k);
     }
 #endif
 #endif

@@ -1,6 +1,6 @@
-// Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `judge`
-// finds whether the gradients of a row are usable, column by column; `step` rewrites a column of the rows whose gradients
-// all are; `finish` counts, stamps and collects statistics. The twin of tests/numerics/twins/update.rs.
+// Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `step` rewrites a
+// column of the rows whose gradients all are usable; `finish` counts, stamps and collects statistics. The twin of
+// tests/numerics/twins/update.rs.
 //
 // `clear_statistics` takes the place of a round that edits no row.
 //
@@ -11,28 +11,29 @@
 #import "shared/deferred.wgsl"
 #import "shared/page.wgsl"
 #import "shared/quotient.wgsl"
+#import "shared/splat.wgsl"
 
 struct UpdateUniforms {
     /// The slab that is bound.
     slab: u32,
     /// Listed rows of this dispatch; pages, in `clear_statistics`.
     row_count: u32,
-    /// Column to rewrite, floats per row of its values and gradients, and the first of them in the row of the page.
+    /// Column to rewrite, and floats per row of its values and gradients.
     column: u32,
     width: u32,
-    first_element: u32,
     /// Steps done.
     now: u32,
     /// Rate of the column over the bias of the first moment.
     step_size: f32,
-    /// 1 / sqrt(1 - beta2^t).
-    inv_root_correction: f32,
     /// Half of the image size, pixels.
     half_size: vec2<f32>,
+    /// 1 / sqrt(1 - beta2^t).
+    inv_root_correction: f32,
     /// 1: this step collects statistics.
     collects: u32,
     /// 1: blending weights are among them, and a row has two footprints.
     weighs: u32,
+    pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> u: UpdateUniforms;
@@ -42,10 +43,10 @@ struct UpdateUniforms {
 /// Number of the page, or UNLISTED, and number of the row in it.
 @group(0) @binding(4) var<storage, read> rows: array<vec2<u32>>;
 @group(0) @binding(5) var<storage, read> values: array<f32>;
-/// Gradients of a column, bits of floats.
-@group(0) @binding(6) var<storage, read> grads: array<u32>;
-/// `[listed row]`: the largest magnitude of a gradient so far, bits of a float.
-@group(0) @binding(7) var<storage, read_write> largest: array<u32>;
+/// Gradients of a column.
+@group(0) @binding(6) var<storage, read> grads: array<f32>;
+/// `[listed row]`: the records of shared/splat.wgsl, of which the last word is read: the largest magnitude of a gradient.
+@group(0) @binding(7) var<storage, read> v_splats: array<u32>;
 /// Gradient of the projected mean, radii; where rows are weighed, each is followed by the weight and three words of no use here.
 @group(0) @binding(8) var<storage, read> footprints: array<vec4<f32>>;
 /// `[page]`: the words of a PageResult.
@@ -70,23 +71,14 @@ const BINS: u32 = 32768u;
 const WEIGHT_LEAST: f32 = 1e-30;
 const WEIGHT_MOST: f32 = 1e30;
 
+/// Bits of the largest magnitude of a gradient of a listed row.
+fn largest(i: u32) -> u32 {
+    return v_splats[4u * SPLAT_STRIDE * i + 11u];
+}
+
 /// Without signs, floats are ordered as integers, with those that are not finite after all others.
 fn is_usable(bits: u32) -> bool {
     return bits != 0u && bits <= LARGEST_GRAD;
-}
-
-/// One invocation for each row.
-@compute @workgroup_size(256)
-fn judge(place: Place) {
-    let i = linear_index(place, 256u);
-    if i >= u.row_count {
-        return;
-    }
-    var most = largest[i];
-    for (var e = 0u; e < u.width; e++) {
-        most = max(most, grads[i * u.width + e] & 0x7fffffffu);
-    }
-    largest[i] = most;
 }
 
 /// First word of the decay over some steps: factor of the first moment, factor of the second, share that it loses.
@@ -107,10 +99,10 @@ fn step(place: Place) {
         return;
     }
     let page = pages[listed.x];
-    if page.slab != u.slab || !is_usable(largest[row]) {
+    if page.slab != u.slab || !is_usable(largest(row)) {
         return;
     }
-    let at = listed.y * column_width(u.column, page.sh_n_width) + u.first_element + i - row * u.width;
+    let at = listed.y * column_width(u.column, page.sh_n_width) + i - row * u.width;
     let value_at = column_at(page, u.column) + at;
     let m_at = value_at + table_words(page, u.column);
     let v_at = m_at + table_words(page, u.column);
@@ -119,7 +111,7 @@ fn step(place: Place) {
     let second = decay_at(missed + 1u) + 1u;
     let kept = bitcast<f32>(tables[second]);
     let lost = bitcast<f32>(tables[second + 1u]);
-    let g = bitcast<f32>(grads[i]);
+    let g = grads[i];
     let decayed = flush(bitcast<f32>(slab[m_at]) * first);
     let m = flush(decayed + (g - decayed) * bitcast<f32>(tables[ONE_MINUS_BETA1]));
     let gained = g * g * bitcast<f32>(tables[ONE_MINUS_BETA2]);
@@ -170,8 +162,8 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>, weight: f32
         return;
     }
     let sum = bitcast<f32>(slab[sum_at]);
-    // A sum that overflows stays the largest number.
-    let added = select(sum + score, 3.4028235e38, !is_finite(sum + score));
+    // A sum that overflows stays the largest number, for which compilers take no decimal literal.
+    let added = select(sum + score, bitcast<f32>(INFINITY_BITS - 1u), !is_finite(sum + score));
     if count > 0u {
         atomicSub(&bins[bin(sum, count)], 1u);
     }
@@ -201,10 +193,11 @@ fn finish(place: Place) {
     if page.slab != u.slab {
         return;
     }
-    if is_usable(largest[i]) {
+    let most = largest(i);
+    if is_usable(most) {
         slab[stamps_at(page) + listed.y] = u.now + 1u;
         atomicAdd(&results[RESULT_WORDS * listed.x + UPDATED], 1u);
-    } else if largest[i] != 0u {
+    } else if most != 0u {
         atomicAdd(&results[RESULT_WORDS * listed.x + SKIPPED], 1u);
     }
     let of_row = select(1u, 2u, u.weighs != 0u);

@@ -9,6 +9,15 @@ fn is_nan(x: f32) -> bool {
     return (bitcast<u32>(x) & 0x7fffffffu) > 0x7f800000u;
 }
 
+const INFINITY_BITS: u32 = 0x7f800000u;
+
+/// The bits of the largest magnitude of four numbers. Without signs, bits of floats are ordered as the magnitudes, with infinity and
+/// NaN after all others. A shader may assume that numbers are finite, but not that bits are.
+fn largest_magnitude(v: vec4<f32>) -> u32 {
+    let m = bitcast<vec4<u32>>(v) & vec4<u32>(0x7fffffffu);
+    return max(max(m.x, m.y), max(m.z, m.w));
+}
+
 /// e^x: 0 below -87, infinity above 88, NaN for NaN.
 fn exp32(x: f32) -> f32 {
     let y = clamp(x, -87.0, 88.0);
@@ -23,8 +32,7 @@ fn exp32(x: f32) -> f32 {
     p = p * r + 1.0;
     var value = p * bitcast<f32>(u32(i32(n) + 127) << 23u);
     value = select(value, 0.0, x < -87.0);
-    // 0x7f800000 is infinity, for which there is no literal.
-    var bits = select(bitcast<u32>(value), 0x7f800000u, x > 88.0);
+    var bits = select(bitcast<u32>(value), INFINITY_BITS, x > 88.0);
     bits = select(bits, bitcast<u32>(x), is_nan(x));
     return bitcast<f32>(bits);
 }

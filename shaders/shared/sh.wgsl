@@ -6,6 +6,18 @@ const SH_C0: f32 = 0.28209479;
 const SH_C1: f32 = 0.48860251;
 const SH_C2 = vec3<f32>(1.0925484, 0.31539157, 0.5462742);
 const SH_C3 = array<f32, 5>(0.5900436, 2.8906114, 0.4570458, 0.37317634, 1.4453057);
+/// Floats per row of the bands in use, [rows][(degree + 1)^2 - 1][3], and the first entry of bands 2 and 3.
+#ifdef SH_DEGREE_3
+const SH_WIDTH: u32 = 45u;
+#else
+#ifdef SH_DEGREE_2
+const SH_WIDTH: u32 = 24u;
+#else
+const SH_WIDTH: u32 = 9u;
+#endif
+#endif
+const SH_BAND_2: u32 = 9u;
+const SH_BAND_3: u32 = 24u;
 /// The smallest positive normal f32.
 const LEAST_NORMAL: f32 = 1.17549435e-38;
 

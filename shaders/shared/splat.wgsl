@@ -12,9 +12,9 @@
 //
 //   v_splats[3 row]     = v_mean2d.x, v_mean2d.y, weight, v_opacity
 //   v_splats[3 row + 1] = v_conic.xx, v_conic.xy, v_conic.yy, weight times error  (xy counted once: sigma holds conic.xy dx dy)
-//   v_splats[3 row + 2] = v_red, v_green, v_blue, 0              (with respect to the colour after its clamp at 0)
+//   v_splats[3 row + 2] = v_red, v_green, v_blue, largest        (with respect to the colour after its clamp at 0)
 //
-// sh_bwd and project_bwd ignore entries of culled rows.
+// sh_bwd and project_bwd ignore entries of culled rows, and leave in `largest` the largest magnitude of a gradient of the row.
 
 struct Splat {
     mean2d: vec2<f32>,

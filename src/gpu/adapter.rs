@@ -12,8 +12,8 @@ use super::error::{GpuError, GpuResult};
 pub const WORKGROUP: u32 = 256;
 /// Most workgroups in one dimension of a dispatch, on every device.
 pub(super) const GROUPS_MAX: u32 = 65_535;
-/// Storage buffers that a stage may use.
-const STORAGE_BUFFERS_NEEDED: u32 = 16;
+/// Storage buffers that a stage may use beside its uniform block: what drivers of older devices and SwiftShader offer.
+pub const STORAGE_BUFFERS_MOST: u32 = 10;
 /// Workgroup memory that every shader may use, bytes; up to twice this is requested if the adapter has it.
 const WORKGROUP_STORAGE_NEEDED: u32 = 16 << 10;
 /// Smallest accepted limit on bindings, bytes: the WebGPU default.
@@ -133,7 +133,7 @@ fn summarize(adapter: &wgpu::Adapter) -> AdapterSummary {
 /// The first limit of an adapter that is too low for the shaders.
 fn refusal(has: &wgpu::Limits) -> Option<String> {
     let needs: [(&str, u64, u64); 6] = [
-        ("storage buffers per stage", STORAGE_BUFFERS_NEEDED.into(), has.max_storage_buffers_per_shader_stage.into()),
+        ("storage buffers per stage", STORAGE_BUFFERS_MOST.into(), has.max_storage_buffers_per_shader_stage.into()),
         ("bytes of workgroup memory", WORKGROUP_STORAGE_NEEDED.into(), has.max_compute_workgroup_storage_size.into()),
         ("invocations per workgroup", WORKGROUP.into(), has.max_compute_invocations_per_workgroup.into()),
         ("workgroup size in x", WORKGROUP.into(), has.max_compute_workgroup_size_x.into()),
@@ -144,12 +144,17 @@ fn refusal(has: &wgpu::Limits) -> Option<String> {
     Some(format!("it has {has} {what}, but {need} are needed"))
 }
 
+/// Whether an adapter with these limits can bind a uniform as a storage buffer more.
+pub(super) fn uniforms_fit_storage(has: &wgpu::Limits) -> bool {
+    has.max_storage_buffers_per_shader_stage > STORAGE_BUFFERS_MOST
+}
+
 /// The limits to request from an adapter that has `has`: those of the shaders, and the largest buffers it offers.
 pub(super) fn limits_to_request(has: &wgpu::Limits) -> wgpu::Limits {
     wgpu::Limits {
         max_storage_buffer_binding_size: has.max_storage_buffer_binding_size,
         max_buffer_size: has.max_buffer_size,
-        max_storage_buffers_per_shader_stage: STORAGE_BUFFERS_NEEDED,
+        max_storage_buffers_per_shader_stage: has.max_storage_buffers_per_shader_stage.min(STORAGE_BUFFERS_MOST + 1),
         max_compute_workgroup_storage_size: has.max_compute_workgroup_storage_size.min(2 * WORKGROUP_STORAGE_NEEDED),
         max_compute_invocations_per_workgroup: WORKGROUP,
         max_compute_workgroup_size_x: WORKGROUP,
@@ -189,9 +194,9 @@ mod tests {
 
     #[test]
     fn an_adapter_below_a_limit_is_refused_with_the_name_of_the_limit() {
-        let enough = wgpu::Limits { max_storage_buffers_per_shader_stage: 16, ..Default::default() };
+        let enough = wgpu::Limits { max_storage_buffers_per_shader_stage: 10, ..Default::default() };
         assert_eq!(refusal(&enough), None);
         let few = wgpu::Limits { max_storage_buffers_per_shader_stage: 8, ..Default::default() };
-        assert_eq!(refusal(&few).as_deref(), Some("it has 8 storage buffers per stage, but 16 are needed"));
+        assert_eq!(refusal(&few).as_deref(), Some("it has 8 storage buffers per stage, but 10 are needed"));
     }
 }

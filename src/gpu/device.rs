@@ -6,7 +6,7 @@ use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request};
+use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request, uniforms_fit_storage};
 use super::belt::{Belt, UniformRing};
 use super::buffers::{Buffer, Pool, Purpose};
 use super::bus::EmulatedBus;
@@ -68,7 +68,7 @@ pub struct GpuOptions {
     /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
     /// Whether shaders read uniforms as uniform blocks (`Some(true)`) or as storage; `None`: as storage on software
-    /// adapters.
+    /// adapters that can bind a storage buffer more than stages use.
     ///
     /// Mesa's lavapipe specialises a shader for the uniform values that decide branches, once per set of values, and
     /// keeps every variant as long as the pipeline: a view with new counts then costs time and some 100 KB of host
@@ -131,7 +131,8 @@ impl Gpu {
             (true, false) => &["SUBGROUPS"],
             (true, true) => &["SUBGROUPS", "SUBGROUPS_OF_8"],
         };
-        let uniform_blocks = options.uniform_blocks.unwrap_or(summary.kind != DeviceKind::Software);
+        let as_storage = summary.kind == DeviceKind::Software && uniforms_fit_storage(&limits);
+        let uniform_blocks = options.uniform_blocks.unwrap_or(!as_storage);
         let alignment = limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment);
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
         Ok(Gpu {

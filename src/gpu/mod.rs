@@ -59,7 +59,7 @@ mod sources;
 mod submitter;
 
 #[cfg(feature = "gpu")]
-pub use adapter::{AdapterSummary, DeviceKind, WORKGROUP, list_adapters};
+pub use adapter::{AdapterSummary, DeviceKind, STORAGE_BUFFERS_MOST, WORKGROUP, list_adapters};
 #[cfg(feature = "gpu")]
 pub use belt::staging_bytes;
 #[cfg(feature = "gpu")]

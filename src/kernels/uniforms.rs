@@ -241,13 +241,13 @@ crate::wgsl_struct! {
         pub row_count: u32,
         pub column: u32,
         pub width: u32,
-        pub first_element: u32,
         pub rate: f32,
         pub means_rate: f32,
         pub scales_rate: f32,
         pub grow_grad2d: f32,
         pub split_scale: f32,
         pub split_reach: f32,
+        pub pad: u32,
     }
 
     /// Uniform of `update.wgsl`.
@@ -256,13 +256,13 @@ crate::wgsl_struct! {
         pub row_count: u32,
         pub column: u32,
         pub width: u32,
-        pub first_element: u32,
         pub now: u32,
         pub step_size: f32,
-        pub inv_root_correction: f32,
         pub half_size: [f32; 2],
+        pub inv_root_correction: f32,
         pub collects: u32,
         pub weighs: u32,
+        pub pad: u32,
     }
 }
 
@@ -290,15 +290,9 @@ impl GatherUniforms {
         }
     }
 
-    /// The same for a part of a column: `width` floats per row, from float `first_element` of the row on.
-    pub fn of_column(&self, run: &RunNumbers, column: Column, width: usize, first_element: usize) -> GatherUniforms {
-        GatherUniforms {
-            column: column as u32,
-            width: width as u32,
-            first_element: first_element as u32,
-            rate: run.base_rates[column as usize],
-            ..*self
-        }
+    /// The same for the first `width` floats of each row of a column.
+    pub fn of_column(&self, run: &RunNumbers, column: Column, width: usize) -> GatherUniforms {
+        GatherUniforms { column: column as u32, width: width as u32, rate: run.base_rates[column as usize], ..*self }
     }
 }
 
@@ -316,12 +310,11 @@ impl UpdateUniforms {
         }
     }
 
-    /// The same for a part of a column, as [`GatherUniforms::of_column`].
-    pub fn of_column(&self, step: &StepNumbers, column: Column, width: usize, first_element: usize) -> UpdateUniforms {
+    /// The same for the first `width` floats of each row of a column, as [`GatherUniforms::of_column`].
+    pub fn of_column(&self, step: &StepNumbers, column: Column, width: usize) -> UpdateUniforms {
         UpdateUniforms {
             column: column as u32,
             width: width as u32,
-            first_element: first_element as u32,
             step_size: step.step_sizes[column as usize],
             ..*self
         }

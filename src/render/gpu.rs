@@ -270,7 +270,7 @@ impl Renderer for GpuRenderer {
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
         let (view, place) = self.sequence.rows_in(rows.rows(), rows.sh_degree)?;
-        let mut source = HostRows { rows, band: &mut self.scratch.band };
+        let mut source = HostRows { rows, bands: &mut self.scratch.bands };
         let is_whole = self.sequence.batches() == Some(RowBatches::One);
         let submitted = self.stages.submit_batch(&mut source, &view, place.start, is_whole);
         Ok(self.append(submitted)?)

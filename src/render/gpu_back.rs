@@ -6,14 +6,15 @@
 //! Invariant: nothing of a loss is read before its picture is known to be valid.
 
 use super::gpu_frame::splat_bytes;
-use super::gpu_gradients::{RowGradients, RowsOut, Scratch, check_room};
+use super::gpu_gradients::{RowsOut, Scratch, check_room};
 use super::gpu_loss::value;
 use super::gpu_picture::ViewStages;
 use super::gpu_ranges::Ranges;
+use super::gpu_rows::RowGradients;
 use super::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use super::gpu_view::{DemandState, Lists, LossSums, Unusable, View, WholeLists};
 use super::{Gradients, LossValue, PictureGradient, RenderError};
-use crate::gpu::{Buffer, GpuResult, Recorder};
+use crate::gpu::{Buffer, Gpu, GpuResult, Recorder};
 use crate::scene::columns::Columns;
 use std::ops::Range;
 
@@ -42,21 +43,17 @@ pub(super) fn record_picture_back(
     stages.wait_for_valid_picture(view)?;
     let (gpu, blend) = (&stages.gpu, view.blend());
     let mut recorder = gpu.begin("backward");
-    let (mut uploaded, mut v_alpha) = (None, None);
-    if let Some(gradient) = of_host {
-        uploaded = Some(recorder.buffer_with("v_rgb", &gradient.v_rgb)?);
-        v_alpha = gradient.v_alpha.as_ref().map(|v| recorder.buffer_with("v_alpha", v)).transpose()?;
-    }
+    let uploaded = of_host.map(|gradient| upload_gradient(gpu, &mut recorder, gradient)).transpose()?;
     let v_rgb = uploaded.as_ref().or(view.loss.as_ref().map(|loss| &loss.v_rgb));
     let v_rgb = v_rgb.ok_or(RenderError::OutOfOrder { call: "picture_back", needs: "loss or picture_gradient" })?;
-    let (v_rgb, v_alpha) = (v_rgb.view(), v_alpha.as_ref().map(Buffer::view));
+    let (v_rgb, has_v_alpha) = (v_rgb.view(), of_host.is_some_and(|gradient| gradient.v_alpha.is_some()));
     // Without a loss no photo was compared.
     let no_errors = match (&view.loss, view.weighs) {
         (None, true) => Some(recorder.buffer_zeroed("squared errors", view.pixels.t_final.size())?),
         _ => None,
     };
     let errors = view.loss.as_ref().and_then(|loss| loss.errors.as_ref()).or(no_errors.as_ref()).map(Buffer::view);
-    let gradient = PictureGradientBuffers { v_rgb: &v_rgb, v_alpha: v_alpha.as_ref(), errors: errors.as_ref() };
+    let gradient = PictureGradientBuffers { v_rgb: &v_rgb, has_v_alpha, errors: errors.as_ref() };
     (view.tiles_back, view.unusable) = (None, Unusable::Uncounted);
     match &mut view.lists {
         Lists::Whole(lists) => {
@@ -88,6 +85,16 @@ pub(super) fn record_picture_back(
         check_room(gpu, view.of.options.sh_degree)?;
     }
     Ok(())
+}
+
+/// Uploads the planes of a gradient, of alpha last.
+fn upload_gradient(gpu: &Gpu, recorder: &mut Recorder<'_>, gradient: &PictureGradient) -> GpuResult<Buffer> {
+    let alpha = gradient.v_alpha.as_deref().unwrap_or_default();
+    let [of_rgb, of_alpha] = [&gradient.v_rgb[..], alpha].map(|planes| size_of_val(planes) as u64);
+    let planes = gpu.buffer("v_rgb", of_rgb + of_alpha)?;
+    recorder.upload(&planes.slice(0, of_rgb), &gradient.v_rgb)?;
+    recorder.upload(&planes.slice(of_rgb, of_alpha), alpha)?;
+    Ok(planes)
 }
 
 /// Propagates the gradients of the splats of the batch at `place` to its rows.

@@ -8,14 +8,12 @@
 //! Invariant: gradients have the same bits for any cut of the rows into batches, segments and chunks.
 
 use super::Gradients;
-use super::gpu_rows::{
-    BAND_WIDTHS, DeviceColumns, ROWS_OF_THREAD, RowStages, SplatRows, band_into_sh_n, footprint_bytes,
-};
+use super::gpu_rows::{DeviceColumns, ROWS_OF_THREAD, RowGradients, RowStages, SplatRows, footprint_bytes, put_bands};
 use super::gpu_segments::{CHUNK_STEP, Segment, gradients_of, in_chunks};
 use super::sequence::ViewOptions;
 use crate::base::room;
 use crate::gpu::{Buffer, Gpu, GpuResult, Readback, Recorder};
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Columns, sh_n_width};
 use rayon::prelude::*;
 use std::ops::Range;
 
@@ -26,32 +24,15 @@ type Footprint = [f32; 4];
 /// Host memory that is reused between views.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// One SH band of the rows.
-    pub band: Vec<f32>,
+    /// The SH bands in use of rows that have more.
+    pub bands: Vec<f32>,
     footprints: Vec<Footprint>,
 }
 
 impl Scratch {
     /// Host memory, bytes.
     pub fn bytes(&self) -> u64 {
-        (4 * self.band.capacity() + size_of::<Footprint>() * self.footprints.capacity()) as u64
-    }
-}
-
-/// Device memory of the gradients of rows.
-pub(super) struct RowGradients {
-    /// Gradients of the columns.
-    pub columns: DeviceColumns,
-    /// Gradient of the projected mean, and radii ([`super::gpu_rows::footprint_bytes`] a row).
-    pub footprints: Buffer,
-}
-
-impl RowGradients {
-    /// Allocates the gradients of `rows` rows, with weights if `weighs`.
-    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8, weighs: bool) -> GpuResult<Self> {
-        let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
-        let footprints = gpu.buffer("footprints", footprint_bytes(weighs) * u64::from(rows))?;
-        Ok(RowGradients { columns, footprints })
+        (4 * self.bands.capacity() + size_of::<Footprint>() * self.footprints.capacity()) as u64
     }
 }
 
@@ -78,11 +59,11 @@ pub(super) struct RowsOut<'a> {
 
 /// Pending readbacks of the gradients of rows.
 struct Readbacks {
-    /// sh0, then the bands in use.
-    colors: Vec<Readback>,
-    /// means, quats, scales, opacities.
-    geometry: Vec<Readback>,
+    sh0: Readback,
+    sh_n: Option<Readback>,
     footprints: Readback,
+    /// means, quats, scales, opacities.
+    geometry: [Readback; 4],
 }
 
 impl RowsOut<'_> {
@@ -147,7 +128,7 @@ impl RowsOut<'_> {
         let of_batch = begin + part.start..begin + part.end;
         let mut recorder = self.gpu.begin("backward");
         columns.upload_geometry(&mut recorder, rows, &of_batch)?;
-        columns.upload_colors(&mut recorder, rows, &of_batch, &mut scratch.band)?;
+        columns.upload_colors(&mut recorder, rows, &of_batch, &mut scratch.bands)?;
         let splats =
             [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, part.start as u64));
         let readbacks = self.submit(recorder, &columns, splats, &room)?;
@@ -160,12 +141,11 @@ impl RowsOut<'_> {
         recorder: &mut Recorder<'_>,
         columns: &DeviceColumns,
         [splats, v_splats]: [SplatRows<'_>; 2],
-        RowGradients { columns: grads, footprints }: &RowGradients,
+        room: &RowGradients,
     ) -> GpuResult<()> {
         let (gpu, stages, ViewOptions { camera, options }) = (self.gpu, self.stages, self.view);
-        let weighs = self.weighs;
-        stages.sh_bwd(gpu, recorder, camera, options.sh_degree, columns, splats, v_splats, grads)?;
-        stages.project_bwd(gpu, recorder, camera, options.eps2d, columns, splats, v_splats, grads, footprints, weighs)
+        stages.sh_bwd(gpu, recorder, camera, columns, splats, v_splats, room)?;
+        stages.project_bwd(gpu, recorder, camera, options.eps2d, columns, splats, v_splats, room)
     }
 
     /// Submits the stages on rows and the readbacks of the gradients. Does not wait. The work that `recorder` brings along is
@@ -175,29 +155,23 @@ impl RowsOut<'_> {
         mut recorder: Recorder<'_>,
         columns: &DeviceColumns,
         [splats, v_splats]: [SplatRows<'_>; 2],
-        RowGradients { columns: grads, footprints }: &RowGradients,
+        room: &RowGradients,
     ) -> GpuResult<Readbacks> {
         let (gpu, ViewOptions { camera, options }) = (self.gpu, self.view);
-        let into = &mut recorder;
-        let recorded = self
-            .stages
-            .sh_bwd(gpu, into, camera, options.sh_degree, columns, splats, v_splats, grads)
-            .and_then(|()| read_back(&mut recorder, "sh_bwd", std::iter::once(&grads.sh0).chain(&grads.bands)));
+        let grads = &room.columns;
+        let colors = self.stages.sh_bwd(gpu, &mut recorder, camera, columns, splats, v_splats, room).and_then(|()| {
+            let mut read = |buffer: &Buffer| recorder.read_back("sh_bwd", &buffer.view());
+            Ok((read(&grads.sh0)?, grads.sh_n.as_ref().map(&mut read).transpose()?, read(&room.footprints)?))
+        });
         gpu.submit(recorder)?;
-        let colors = recorded?;
+        let (sh0, sh_n, footprints) = colors?;
         // The host copies the gradients of colours, four fifths of a row, while the device runs `project_bwd`.
         let mut recorder = gpu.begin("backward");
-        let into = &mut recorder;
-        let (eps2d, weighs) = (options.eps2d, self.weighs);
-        self.stages.project_bwd(gpu, into, camera, eps2d, columns, splats, v_splats, grads, footprints, weighs)?;
-        let geometry = [&grads.means, &grads.quats, &grads.scales, &grads.opacities];
-        let readbacks = Readbacks {
-            colors,
-            geometry: read_back(&mut recorder, "project_bwd", geometry.into_iter())?,
-            footprints: recorder.read_back("project_bwd", &footprints.view())?,
-        };
+        self.stages.project_bwd(gpu, &mut recorder, camera, options.eps2d, columns, splats, v_splats, room)?;
+        let mut read = |buffer: &Buffer| recorder.read_back("project_bwd", &buffer.view());
+        let geometry = [read(&grads.means)?, read(&grads.quats)?, read(&grads.scales)?, read(&grads.opacities)?];
         gpu.submit(recorder)?;
-        Ok(readbacks)
+        Ok(Readbacks { sh0, sh_n, footprints, geometry })
     }
 
     /// Waits for the gradients and copies them to the rows `part` of `grads`.
@@ -206,18 +180,20 @@ impl RowsOut<'_> {
         readbacks: Readbacks,
         part: &Range<usize>,
         grads: &mut Gradients,
-        Scratch { band: values, footprints }: &mut Scratch,
+        Scratch { bands, footprints }: &mut Scratch,
     ) -> GpuResult<()> {
         let out = &mut grads.columns;
-        let mut colors = readbacks.colors.into_iter();
-        for bytes in colors.by_ref().take(1) {
-            bytes.copy_to(&mut out.sh0[3 * part.start..3 * part.end])?;
-        }
-        for (band, bytes) in colors.enumerate() {
-            values.clear();
-            values.resize(part.len() * BAND_WIDTHS[band], 0.0);
-            bytes.copy_to(values)?;
-            band_into_sh_n(values, part, band, out);
+        readbacks.sh0.copy_to(&mut out.sh0[3 * part.start..3 * part.end])?;
+        if let Some(bytes) = readbacks.sh_n {
+            let (width, row_width) = (sh_n_width(self.view.options.sh_degree), sh_n_width(out.sh_degree));
+            let of_part = &mut out.sh_n[row_width * part.start..row_width * part.end];
+            if width == row_width {
+                bytes.copy_to(of_part)?;
+            } else {
+                room::resize(bands, width * part.len(), 0.0);
+                bytes.copy_to(bands)?;
+                put_bands(bands, width, of_part, row_width);
+            }
         }
         let geometry = [(&mut out.means, 3), (&mut out.quats, 4), (&mut out.scales, 3), (&mut out.opacities, 1)];
         for ((to, width), bytes) in geometry.into_iter().zip(readbacks.geometry) {
@@ -238,13 +214,4 @@ impl RowsOut<'_> {
         }
         Ok(())
     }
-}
-
-/// Records the readbacks of some buffers.
-fn read_back<'a>(
-    recorder: &mut Recorder<'_>,
-    stage: &'static str,
-    buffers: impl Iterator<Item = &'a Buffer>,
-) -> GpuResult<Vec<Readback>> {
-    buffers.map(|buffer| recorder.read_back(stage, &buffer.view())).collect()
 }

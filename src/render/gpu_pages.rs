@@ -9,7 +9,7 @@
 //! Invariants: 1. a dispatch binds windows of columns, so no binding is too large; floats are independent, so the result has the
 //! same bits for any windows; 2. an update of a chunk is submitted at once, so a chunk is updated as a whole or not at all.
 
-use super::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, Window, footprint_bytes, windows};
+use super::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows, Window, footprint_bytes, windows};
 use super::gpu_slots::Slots;
 use super::pages::{PageRules, SlotPage};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
@@ -29,19 +29,6 @@ pub(super) const WORKGROUP: u32 = 256;
 const BINS: u64 = 1 << 15;
 /// Bytes of a listed row: number of the page, number of the row.
 const LISTED_BYTES: u64 = 8;
-/// Bytes of the widest part of a column, per row.
-const WIDEST: u64 = 4 * 21;
-
-/// A part of a column that is a buffer of its own: the column, floats per row, and the first of them in the row of a page.
-type Part = (Column, usize, usize);
-
-/// The parts of [`DeviceColumns::columns`], in the same order.
-fn parts() -> impl Iterator<Item = Part> {
-    let narrow = [Column::Means, Column::Quats, Column::Scales, Column::Opacities, Column::Sh0];
-    let bands = (0..BAND_WIDTHS.len()).map(|band| (Column::ShN, BAND_WIDTHS[band], BAND_WIDTHS[..band].iter().sum()));
-    narrow.into_iter().map(|column| (column, column.width(0), 0)).chain(bands)
-}
-
 #[derive(Debug)]
 pub(super) struct Stages {
     pub(super) cull: Arc<Pipeline>,
@@ -52,7 +39,6 @@ pub(super) struct Stages {
     bounds: Arc<Pipeline>,
     survey: Arc<Pipeline>,
     clear: Arc<Pipeline>,
-    judge: Arc<Pipeline>,
     step: Arc<Pipeline>,
     finish: Arc<Pipeline>,
     pub(super) decide: Arc<Pipeline>,
@@ -122,7 +108,6 @@ impl DevicePages {
             bounds: of("gather.wgsl", "bounds")?,
             survey: of("gather.wgsl", "survey")?,
             clear: of("update.wgsl", "clear_statistics")?,
-            judge: of("update.wgsl", "judge")?,
             step: of("update.wgsl", "step")?,
             finish: of("update.wgsl", "finish")?,
             decide: of("gate.wgsl", "decide")?,
@@ -245,32 +230,25 @@ impl DevicePages {
         buffers: &UpdateBuffers<'_>,
     ) -> GpuResult<()> {
         let PageRows { view, batch, table, .. } = *source;
-        let UpdateBuffers { values, grads, .. } = *buffers;
-        let uniforms = UpdateUniforms::new(&view.camera, &view.step, buffers.collects, buffers.weighs);
-        recorder.clear(&buffers.largest.view())?;
-        for window in windows(gpu, values.rows, WIDEST) {
+        let UpdateBuffers { values, grads, v_splats, results, collects } = *buffers;
+        let uniforms = UpdateUniforms::new(&view.camera, &view.step, collects, grads.weighs);
+        for window in windows(gpu, values.rows, values.widest()) {
             let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
-            let largest = window.of(buffers.largest, 4);
-            for ((buffer, _), (_, width, _)) in grads.columns().zip(parts()) {
-                let uniforms = UpdateUniforms { row_count: window.rows, width: width as u32, ..uniforms };
-                let views = [recorder.uniform(&uniforms)?, window.of(buffer, 4 * width as u64), largest.clone()];
-                recorder.dispatch("update", &self.stages.judge, &views, groups_1d(window.rows, WORKGROUP))?;
-            }
+            let v_splats = v_splats.window(window);
             for slab in table.slabs() {
                 let uniforms = UpdateUniforms { slab, row_count: window.rows, ..uniforms };
                 let of_slab = [table.on_device.view(), self.slots.slab(slab)?, self.tables.view(), rows.clone()];
-                let columns = values.columns().zip(grads.columns()).zip(parts());
-                for (((values, _), (grads, _)), (column, width, first)) in columns {
-                    let uniform = recorder.uniform(&uniforms.of_column(&view.step, column, width, first))?;
+                for ((column, values, width), (_, grads, _)) in values.columns().zip(grads.columns.columns()) {
+                    let uniform = recorder.uniform(&uniforms.of_column(&view.step, column, width))?;
                     let [values, grads] = [values, grads].map(|buffer| window.of(buffer, 4 * width as u64));
-                    let own = [values, grads, largest.clone(), self.gate.view()];
+                    let own = [values, grads, v_splats.clone(), self.gate.view()];
                     let views: Vec<BufferView> = [uniform].into_iter().chain(of_slab.clone()).chain(own).collect();
                     let groups = groups_1d(window.rows * width as u32, WORKGROUP);
                     recorder.dispatch("update", &self.stages.step, &views, groups)?;
                 }
                 let [pages, slab, _, rows] = of_slab;
-                let footprints = window.of(buffers.footprints, footprint_bytes(buffers.weighs));
-                let own = [largest.clone(), footprints, buffers.results.view(), self.bins.view(), self.gate.view()];
+                let footprints = window.of(&grads.footprints, footprint_bytes(grads.weighs));
+                let own = [v_splats.clone(), footprints, results.view(), self.bins.view(), self.gate.view()];
                 let views: Vec<BufferView> =
                     [recorder.uniform(&uniforms)?, pages, slab, rows].into_iter().chain(own).collect();
                 recorder.dispatch("update", &self.stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
@@ -308,7 +286,7 @@ impl DevicePages {
         let table = self.table(&mut recorder, pages, &[])?;
         let surveys = recorder.buffer_zeroed("surveys", (size_of::<PageSurvey>() * pages.len()) as u64)?;
         let uniforms = GatherUniforms { page_count: pages.len() as u32, ..GatherUniforms::zeroed() };
-        let uniforms = uniforms.of_column(&self.rules.numbers, Column::Opacities, 1, 0);
+        let uniforms = uniforms.of_column(&self.rules.numbers, Column::Opacities, 1);
         let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
         for slab in table.slabs() {
             let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
@@ -349,18 +327,14 @@ impl DevicePages {
 pub struct UpdateBuffers<'a> {
     /// Values of the rows, from [`PageRows`].
     pub values: &'a DeviceColumns,
-    /// Their gradients.
-    pub grads: &'a DeviceColumns,
-    /// Gradient of the projected mean, and radii: [`footprint_bytes`] a row.
-    pub footprints: &'a Buffer,
-    /// `[row of the chunk]`: the largest magnitude of a gradient.
-    pub largest: &'a Buffer,
+    /// Their gradients; rows are weighed only if the run's rules allow it.
+    pub grads: &'a RowGradients,
+    /// The gradients of their splats, whose last words hold the largest gradient of each row.
+    pub v_splats: SplatRows<'a>,
     /// `[page of the batch]`: what the update did.
     pub results: &'a Buffer,
     /// Whether statistics are collected.
     pub collects: bool,
-    /// Whether blending weights are among them; the run's rules allow it.
-    pub weighs: bool,
 }
 
 /// The listed rows of a batch, as a source of columns.
@@ -388,14 +362,14 @@ impl RowSource for PageRows<'_> {
     ) -> GpuResult<()> {
         let PageRows { pages, view, batch, table } = *self;
         let uniforms = pages.uniforms(view, table.pages.len());
-        for window in windows(gpu, columns.rows, WIDEST) {
+        for window in windows(gpu, columns.rows, columns.widest()) {
             let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
             for slab in table.slabs() {
                 let uniforms = GatherUniforms { slab, row_count: window.rows, ..uniforms };
                 let [slab, tables, recent] = [pages.slots.slab(slab)?, pages.tables.view(), view.recent.view()];
                 let buffers = [table.on_device.view(), slab, tables, recent, rows.clone()];
-                for ((buffer, _), (column, width, first)) in columns.columns().zip(parts()) {
-                    let uniforms = uniforms.of_column(&pages.rules.numbers, column, width, first);
+                for (column, buffer, width) in columns.columns() {
+                    let uniforms = uniforms.of_column(&pages.rules.numbers, column, width);
                     let (uniform, out) = (recorder.uniform(&uniforms)?, window.of(buffer, 4 * width as u64));
                     let views: Vec<BufferView> = [uniform].into_iter().chain(buffers.clone()).chain([out]).collect();
                     let groups = groups_1d(window.rows * width as u32, WORKGROUP);

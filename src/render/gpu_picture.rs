@@ -61,7 +61,7 @@ impl ViewStages {
         // The device projects and sorts during the upload of the colours, four fifths of a row.
         let mut recorder = gpu.begin("forward");
         rows.colors(&mut recorder, &columns, &all)?;
-        self.rows.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, into)?;
+        self.rows.sh_fwd(gpu, &mut recorder, camera, &columns, into)?;
         let whole = Box::new(WholeRows { columns, ranks, colors: recorder.set_aside() });
         let segment = Segment { first: 0, rows: count, splats, v_splats: None };
         Ok(RowsIn { segments: vec![segment], whole: Some(whole) })

@@ -54,7 +54,7 @@ pub(super) fn rows_and_picture(
     rows.project_fwd(gpu, &mut recorder, camera, of.options.eps2d, &columns, into)?;
     let grid = Grid::new(camera.width, camera.height);
     let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
-    rows.sh_fwd(gpu, &mut recorder, camera, sh_degree, &columns, into)?;
+    rows.sh_fwd(gpu, &mut recorder, camera, &columns, into)?;
     let pixels = Pixels::new(gpu, blend.grid)?;
     let frame = tiles.frame_of(gpu, &mut recorder, &splats.view(), &ranks, (blend, room), &pixels)?;
     gpu.submit(recorder)?;

@@ -2,28 +2,26 @@
 //!
 //! Not here: the choice of rows, the tile stages, the order of a step.
 //!
-//! Invariants: 1. no binding exceeds the device's limit: longer columns are bound in windows of rows, and because rows
-//! are independent the result has the same bits; 2. each SH band above 0 is a buffer of its own.
+//! Invariant: no binding exceeds the device's limit: longer columns are bound in windows of rows, and because rows are independent
+//! the result has the same bits.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::uniforms::RowsUniforms;
 use crate::scene::camera::Camera;
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Column, Columns, sh_n_width};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::Arc;
 
 /// Bytes per row of `splats` and `v_splats`: see `shaders/shared/splat.wgsl`.
 pub const SPLAT_BYTES: u64 = 48;
-/// Bytes per row of the densification input from `project_bwd`: gradient with respect to the projected mean, and radii; if
+/// Bytes per row of the densification input from `sh_bwd`: gradient with respect to the projected mean, and radii; if
 /// `weighs`, also weight, weight times error, and two unused words.
 pub fn footprint_bytes(weighs: bool) -> u64 {
     if weighs { 32 } else { 16 }
 }
 /// The define of the shaders that weigh rows.
 pub(super) const WEIGHS: [(&str, &str); 1] = [("WEIGHS", "")];
-/// Floats per row of the SH bands 1, 2 and 3.
-pub const BAND_WIDTHS: [usize; 3] = [9, 15, 21];
 /// Windows begin at multiples of this many rows. Every column's offset is then a multiple of 256 bytes, the largest
 /// alignment that a device may require.
 pub const WINDOW_STEP: u64 = 64;
@@ -46,15 +44,17 @@ pub struct DeviceColumns {
     pub opacities: Buffer,
     /// `[rows][3]`.
     pub sh0: Buffer,
-    /// `[rows][2 l + 1][3]` for each band l in use, from l = 1.
-    pub bands: Vec<Buffer>,
+    /// `[rows][(degree + 1)^2 - 1][3]`: the bands in use above 0; `None` if there are none.
+    pub sh_n: Option<Buffer>,
+    /// The highest band.
+    pub sh_degree: u8,
 }
 
 impl DeviceColumns {
     /// Allocates `rows` rows with the bands 1 to `sh_degree`, uninitialised.
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
         let column = |label, width: usize| gpu.buffer(label, 4 * width as u64 * u64::from(rows));
-        let band_labels = ["sh1", "sh2", "sh3"];
+        let (sh_degree, sh_n_width) = (sh_degree.min(3), sh_n_width(sh_degree.min(3)));
         Ok(DeviceColumns {
             rows,
             means: column("means", 3)?,
@@ -62,21 +62,21 @@ impl DeviceColumns {
             scales: column("scales", 3)?,
             opacities: column("opacities", 1)?,
             sh0: column("sh0", 3)?,
-            bands: (0..usize::from(sh_degree.min(3)))
-                .map(|band| column(band_labels[band], BAND_WIDTHS[band]))
-                .collect::<GpuResult<_>>()?,
+            sh_n: if sh_n_width > 0 { Some(column("sh_n", sh_n_width)?) } else { None },
+            sh_degree,
         })
     }
 
     /// Bytes per row over all columns, with the bands 1 to `sh_degree`.
     pub fn row_bytes(sh_degree: u8) -> u64 {
-        4 * (14 + BAND_WIDTHS[..usize::from(sh_degree.min(3))].iter().sum::<usize>()) as u64
+        4 * (14 + sh_n_width(sh_degree.min(3))) as u64
     }
 
-    /// Each column with its floats per row; bands last.
-    pub fn columns(&self) -> impl Iterator<Item = (&Buffer, usize)> {
-        let narrow = [(&self.means, 3), (&self.quats, 4), (&self.scales, 3), (&self.opacities, 1), (&self.sh0, 3)];
-        narrow.into_iter().chain(self.bands.iter().zip(BAND_WIDTHS))
+    /// Each column that has entries, in the order of [`Column::ALL`], with its floats per row.
+    pub fn columns(&self) -> impl Iterator<Item = (Column, &Buffer, usize)> {
+        let narrow = [&self.means, &self.quats, &self.scales, &self.opacities, &self.sh0];
+        let narrow = Column::ALL.into_iter().zip(narrow).map(|(column, buffer)| (column, buffer, column.width(0)));
+        narrow.chain(self.sh_n.as_ref().map(|buffer| (Column::ShN, buffer, sh_n_width(self.sh_degree))))
     }
 
     /// Uploads means, quats, scales and opacities of the rows `part`, which are `self.rows` rows.
@@ -87,8 +87,8 @@ impl DeviceColumns {
         recorder.upload(&self.opacities.view(), &rows.opacities[part.clone()])
     }
 
-    /// Uploads the colours of the rows `part`, which are `self.rows` rows with at least the bands in use. `scratch` holds one
-    /// band at a time.
+    /// Uploads the colours of the rows `part`, which are `self.rows` rows with at least the bands in use. `scratch` holds the bands
+    /// in use, if the rows have more.
     pub fn upload_colors(
         &self,
         recorder: &mut Recorder<'_>,
@@ -97,11 +97,19 @@ impl DeviceColumns {
         scratch: &mut Vec<f32>,
     ) -> GpuResult<()> {
         recorder.upload(&self.sh0.view(), &rows.sh0[3 * part.start..3 * part.end])?;
-        for (band, buffer) in self.bands.iter().enumerate() {
-            band_from_sh_n(rows, part, band, scratch);
-            recorder.upload(&buffer.view(), scratch)?;
+        let Some(sh_n) = &self.sh_n else { return Ok(()) };
+        let width = rows.sh_n.len() / rows.rows().max(1);
+        let of_part = &rows.sh_n[width * part.start..width * part.end];
+        if width == sh_n_width(self.sh_degree) {
+            return recorder.upload(&sh_n.view(), of_part);
         }
-        Ok(())
+        take_bands(of_part, width, sh_n_width(self.sh_degree), scratch);
+        recorder.upload(&sh_n.view(), scratch)
+    }
+
+    /// Bytes per row of the widest binding of a stage on the columns.
+    pub fn widest(&self) -> u64 {
+        SPLAT_BYTES.max(4 * sh_n_width(self.sh_degree) as u64)
     }
 
     /// The part of each column inside `window`.
@@ -113,28 +121,22 @@ impl DeviceColumns {
             scales: view(&self.scales, 3),
             opacities: view(&self.opacities, 1),
             sh0: view(&self.sh0, 3),
-            bands: self.bands.iter().zip(BAND_WIDTHS).map(|(buffer, width)| view(buffer, width)).collect(),
+            sh_n: self.sh_n.as_ref().map(|buffer| view(buffer, sh_n_width(self.sh_degree))),
         }
     }
 }
 
-/// Copies one band (index 0 is l = 1) of the rows `part` from `sh_n` to `out`, `[rows][2 l + 1][3]`, on all threads.
-pub fn band_from_sh_n(rows: &Columns, part: &Range<usize>, band: usize, out: &mut Vec<f32>) {
-    let row_width = rows.sh_n.len() / rows.rows().max(1);
-    let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
-    out.resize(if row_width == 0 { 0 } else { width * part.len() }, 0.0);
-    let rows = rows.sh_n[row_width * part.start..row_width * part.end].par_chunks_exact(row_width.max(1));
-    let pairs = out.par_chunks_exact_mut(width).zip(rows).with_min_len(ROWS_OF_THREAD);
-    pairs.for_each(|(out, row)| out.copy_from_slice(&row[first..first + width]));
+/// Copies the first `width` of `row_width` floats of each row to `out`, on all threads.
+pub fn take_bands(rows: &[f32], row_width: usize, width: usize, out: &mut Vec<f32>) {
+    out.resize(rows.len() / row_width.max(1) * width, 0.0);
+    let rows = rows.par_chunks_exact(row_width.max(1)).with_min_len(ROWS_OF_THREAD);
+    out.par_chunks_exact_mut(width.max(1)).zip(rows).for_each(|(out, row)| out.copy_from_slice(&row[..width]));
 }
 
-/// Copies one band of the rows `part` from `values` back into `sh_n`, on all threads.
-pub fn band_into_sh_n(values: &[f32], part: &Range<usize>, band: usize, rows: &mut Columns) {
-    let row_width = rows.sh_n.len() / rows.rows().max(1);
-    let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
-    let rows = rows.sh_n[row_width * part.start..row_width * part.end].par_chunks_exact_mut(row_width.max(1));
-    let pairs = rows.zip(values.par_chunks_exact(width)).with_min_len(ROWS_OF_THREAD);
-    pairs.for_each(|(row, values)| row[first..first + width].copy_from_slice(values));
+/// Copies `bands`, `width` floats a row, to the first floats of rows of `row_width`, on all threads.
+pub fn put_bands(bands: &[f32], width: usize, rows: &mut [f32], row_width: usize) {
+    let rows = rows.par_chunks_exact_mut(row_width.max(1)).with_min_len(ROWS_OF_THREAD);
+    rows.zip(bands.par_chunks_exact(width.max(1))).for_each(|(row, bands)| row[..width].copy_from_slice(bands));
 }
 
 /// Where the columns of the rows of a batch come from.
@@ -160,8 +162,8 @@ pub trait RowSource {
 pub(super) struct HostRows<'a> {
     /// The rows of the batch.
     pub rows: &'a Columns,
-    /// Memory for one SH band.
-    pub band: &'a mut Vec<f32>,
+    /// Memory for the SH bands in use.
+    pub bands: &'a mut Vec<f32>,
 }
 
 impl RowSource for HostRows<'_> {
@@ -180,7 +182,7 @@ impl RowSource for HostRows<'_> {
     }
 
     fn colors(&mut self, recorder: &mut Recorder<'_>, columns: &DeviceColumns, part: &Range<usize>) -> GpuResult<()> {
-        columns.upload_colors(recorder, self.rows, part, self.band)
+        columns.upload_colors(recorder, self.rows, part, self.bands)
     }
 }
 
@@ -197,7 +199,8 @@ impl<'a> SplatRows<'a> {
         SplatRows { buffer, first }
     }
 
-    fn window(&self, window: Window) -> BufferView {
+    /// The records of the rows of `window`.
+    pub(super) fn window(&self, window: Window) -> BufferView {
         Window { first: self.first + window.first, ..window }.of(self.buffer, SPLAT_BYTES)
     }
 }
@@ -229,7 +232,27 @@ struct WindowViews {
     scales: BufferView,
     opacities: BufferView,
     sh0: BufferView,
-    bands: Vec<BufferView>,
+    sh_n: Option<BufferView>,
+}
+
+/// Device memory of the gradients of rows.
+#[derive(Debug)]
+pub struct RowGradients {
+    /// Gradients of the columns.
+    pub columns: DeviceColumns,
+    /// Gradient of the projected mean, and radii ([`footprint_bytes`] a row).
+    pub footprints: Buffer,
+    /// Whether rows are weighed.
+    pub weighs: bool,
+}
+
+impl RowGradients {
+    /// Allocates the gradients of `rows` rows, with weights if `weighs`.
+    pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8, weighs: bool) -> GpuResult<Self> {
+        let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
+        let footprints = gpu.buffer("footprints", footprint_bytes(weighs) * u64::from(rows))?;
+        Ok(RowGradients { columns, footprints, weighs })
+    }
 }
 
 /// Splits `rows` rows into windows so that no binding of `row_bytes` per row exceeds the device's limit.
@@ -245,33 +268,37 @@ pub(super) fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Ite
 pub struct RowStages {
     project_fwd: Arc<Pipeline>,
     project_bwd: Arc<Pipeline>,
+    sh_fwd: OfDegree,
+    sh_bwd: OfDegree,
     /// `None` before [`RowStages::weigh_rows`].
-    project_bwd_weighing: Option<Arc<Pipeline>>,
-    /// Indexed by SH degree.
-    sh_fwd: [Arc<Pipeline>; 4],
-    sh_bwd: [Arc<Pipeline>; 4],
+    sh_bwd_weighing: Option<OfDegree>,
+}
+
+/// A stage for each SH degree.
+type OfDegree = [Arc<Pipeline>; 4];
+
+/// Compiles a stage for each SH degree.
+fn of_degrees(gpu: &Gpu, shader: &str, entry: &str, more: &[(&str, &str)]) -> GpuResult<OfDegree> {
+    let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
+    let of = |degree: usize| gpu.pipeline(shader, entry, &[&defines[..degree], more].concat());
+    Ok([of(0)?, of(1)?, of(2)?, of(3)?])
 }
 
 impl RowStages {
     /// Compiles the stages.
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
-        let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
-        let sh = |shader: &str, entry: &str, degree: usize| gpu.pipeline(shader, entry, &defines[..degree]);
-        let all = |shader: &str, entry: &str| -> GpuResult<[Arc<Pipeline>; 4]> {
-            Ok([sh(shader, entry, 0)?, sh(shader, entry, 1)?, sh(shader, entry, 2)?, sh(shader, entry, 3)?])
-        };
         Ok(RowStages {
             project_fwd: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[])?,
             project_bwd: gpu.pipeline("project_bwd.wgsl", "project_bwd", &[])?,
-            project_bwd_weighing: None,
-            sh_fwd: all("sh_fwd.wgsl", "sh_fwd")?,
-            sh_bwd: all("sh_bwd.wgsl", "sh_bwd")?,
+            sh_fwd: of_degrees(gpu, "sh_fwd.wgsl", "sh_fwd", &[])?,
+            sh_bwd: of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", &[])?,
+            sh_bwd_weighing: None,
         })
     }
 
-    /// Compiles what [`RowStages::project_bwd`] needs to pass weights on.
+    /// Compiles what [`RowStages::sh_bwd`] needs to pass weights on.
     pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
-        self.project_bwd_weighing = Some(gpu.pipeline("project_bwd.wgsl", "project_bwd", &WEIGHS)?);
+        self.sh_bwd_weighing = Some(of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", &WEIGHS)?);
         Ok(())
     }
 
@@ -294,58 +321,62 @@ impl RowStages {
         Ok(())
     }
 
-    /// Records the colours of the visible rows into `splats`, from the bands up to `sh_degree`.
+    /// Records the colours of the visible rows into `splats`.
     pub fn sh_fwd(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
         camera: &Camera,
-        sh_degree: u8,
         rows: &DeviceColumns,
         splats: SplatRows<'_>,
     ) -> GpuResult<()> {
-        let degree = usize::from(sh_degree);
-        for window in windows(gpu, rows.rows, widest_row(degree)) {
+        for window in windows(gpu, rows.rows, rows.widest()) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
             let w = rows.window(window);
             let mut views = vec![uniform, splats.window(window), w.sh0];
             // Band 0 does not depend on the view direction, so degree 0 needs no means.
-            views.extend((degree > 0).then_some(w.means));
-            views.extend(w.bands.into_iter().take(degree));
-            recorder.dispatch("sh_fwd", &self.sh_fwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
+            views.extend(w.sh_n.into_iter().flat_map(|sh_n| [w.means.clone(), sh_n]));
+            recorder.dispatch(
+                "sh_fwd",
+                &self.sh_fwd[usize::from(rows.sh_degree)],
+                &views,
+                groups_1d(window.rows, WORKGROUP),
+            )?;
         }
         Ok(())
     }
 
-    /// Records the gradients of sh0, of the bands up to `sh_degree`, and the colour's part of the gradients of means.
+    /// Records the gradients of sh0, of the bands in use, and the colour's part of the gradients of means; what densification reads
+    /// of the rows, where weights need [`RowStages::weigh_rows`]; and the largest gradient of each row.
     pub fn sh_bwd(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
         camera: &Camera,
-        sh_degree: u8,
         rows: &DeviceColumns,
         splats: SplatRows<'_>,
         v_splats: SplatRows<'_>,
-        grads: &DeviceColumns,
+        into: &RowGradients,
     ) -> GpuResult<()> {
-        let degree = usize::from(sh_degree);
-        for window in windows(gpu, rows.rows, widest_row(degree)) {
+        let stages = self.sh_bwd_weighing.as_ref().filter(|_| into.weighs).unwrap_or(&self.sh_bwd);
+        for window in windows(gpu, rows.rows, rows.widest()) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
-            let (w, v) = (rows.window(window), grads.window(window));
-            let splats = [splats.window(window), v_splats.window(window)];
-            let mut views = vec![uniform];
-            views.extend(splats.into_iter().chain([v.means, v.sh0]));
-            views.extend((degree > 0).then_some(w.means));
-            views.extend(w.bands.into_iter().zip(v.bands).take(degree).flat_map(|(band, v_band)| [band, v_band]));
-            recorder.dispatch("sh_bwd", &self.sh_bwd[degree], &views, groups_1d(window.rows, WORKGROUP))?;
+            let (w, v) = (rows.window(window), into.columns.window(window));
+            let footprints = window.of(&into.footprints, footprint_bytes(into.weighs));
+            let mut views = vec![uniform, splats.window(window), v_splats.window(window), footprints, v.means, v.sh0];
+            views.extend(w.sh_n.zip(v.sh_n).into_iter().flat_map(|(sh_n, v_sh_n)| [w.means.clone(), sh_n, v_sh_n]));
+            recorder.dispatch(
+                "sh_bwd",
+                &stages[usize::from(rows.sh_degree)],
+                &views,
+                groups_1d(window.rows, WORKGROUP),
+            )?;
         }
         Ok(())
     }
 
-    /// Records the gradients of quats, scales and opacities, adds the projection's part to the gradients of means, and
-    /// records `footprints` ([`footprint_bytes`] per row), with weights if `weighs`, which needs
-    /// [`RowStages::weigh_rows`].
+    /// Records the gradients of quats, scales and opacities, after [`RowStages::sh_bwd`]: adds the projection's part to the gradients
+    /// of means, and raises the largest gradients.
     pub fn project_bwd(
         &self,
         gpu: &Gpu,
@@ -355,35 +386,16 @@ impl RowStages {
         rows: &DeviceColumns,
         splats: SplatRows<'_>,
         v_splats: SplatRows<'_>,
-        grads: &DeviceColumns,
-        footprints: &Buffer,
-        weighs: bool,
+        into: &RowGradients,
     ) -> GpuResult<()> {
-        let pipeline = self.project_bwd_weighing.as_ref().filter(|_| weighs).unwrap_or(&self.project_bwd);
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
             let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
-            let (w, v) = (rows.window(window), grads.window(window));
-            let views = [
-                uniform,
-                w.means,
-                w.quats,
-                w.scales,
-                w.opacities,
-                splats.window(window),
-                v_splats.window(window),
-                v.means,
-                v.quats,
-                v.scales,
-                v.opacities,
-                window.of(footprints, footprint_bytes(weighs)),
-            ];
-            recorder.dispatch("project_bwd", pipeline, &views, groups_1d(window.rows, WORKGROUP))?;
+            let (w, v) = (rows.window(window), into.columns.window(window));
+            let (splats, v_splats) = (splats.window(window), v_splats.window(window));
+            let rows = [uniform, w.means, w.quats, w.scales, w.opacities, splats, v_splats];
+            let views: Vec<_> = rows.into_iter().chain([v.means, v.quats, v.scales, v.opacities]).collect();
+            recorder.dispatch("project_bwd", &self.project_bwd, &views, groups_1d(window.rows, WORKGROUP))?;
         }
         Ok(())
     }
-}
-
-/// Bytes per row of the widest binding of the colour stages.
-fn widest_row(degree: usize) -> u64 {
-    BAND_WIDTHS[..degree].iter().map(|w| 4 * *w as u64).fold(SPLAT_BYTES, u64::max)
 }

@@ -84,7 +84,7 @@ fn submit_chunk(
     rows.geometry(gpu, &mut recorder, &columns, part)?;
     stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, splats)?;
     rows.colors(&mut recorder, &columns, part)?;
-    stages.sh_fwd(gpu, &mut recorder, camera, options.sh_degree, &columns, splats)?;
+    stages.sh_fwd(gpu, &mut recorder, camera, &columns, splats)?;
     gpu.submit(recorder).map(|_| ())
 }
 

@@ -21,10 +21,10 @@ use std::sync::Arc;
 /// Gradient of the picture on the device: the input of the backward pass.
 #[derive(Debug, Clone, Copy)]
 pub struct PictureGradientBuffers<'a> {
-    /// `[3][height][width]` f32.
+    /// `[3][height][width]` f32, and a fourth plane if `has_v_alpha`.
     pub v_rgb: &'a BufferView,
-    /// `[height][width]` f32; `None` stands for zeros.
-    pub v_alpha: Option<&'a BufferView>,
+    /// Whether alpha has a gradient other than zero.
+    pub has_v_alpha: bool,
     /// `[height][width]` f32: the error of each pixel; `None` if the rows are not weighed. Needs [`BackStages::weigh_rows`].
     pub errors: Option<&'a BufferView>,
 }
@@ -172,11 +172,11 @@ impl BackStages {
         frame: &Frame,
         segments: u32,
         isects: Range<u32>,
-        PictureGradientBuffers { v_rgb, v_alpha, errors }: PictureGradientBuffers<'_>,
+        PictureGradientBuffers { v_rgb, has_v_alpha, errors }: PictureGradientBuffers<'_>,
         (splats, pixels, carry, partials): (&BufferView, &Pixels, &BufferView, &BufferView),
     ) -> GpuResult<()> {
         for segment in (0..segments).rev() {
-            let mut flags = if v_alpha.is_some() { HAS_V_ALPHA } else { 0 };
+            let mut flags = if has_v_alpha { HAS_V_ALPHA } else { 0 };
             flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_FIRST } else { 0 };
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_LAST } else { 0 };
             let mut views = vec![
@@ -188,7 +188,6 @@ impl BackStages {
                 pixels.t_final.view(),
                 pixels.stops.view(),
                 v_rgb.clone(),
-                v_alpha.unwrap_or(v_rgb).clone(),
                 partials.clone(),
                 carry.clone(),
             ];

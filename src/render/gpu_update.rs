@@ -6,10 +6,10 @@
 //! ([`super::gpu_gradients::check_room`]).
 
 use super::RenderError;
-use super::gpu_gradients::{RowGradients, RowsOut};
+use super::gpu_gradients::RowsOut;
 use super::gpu_pages::{DevicePages, PageRows, PagesView, PendingResults, UpdateBuffers};
 use super::gpu_picture::ViewStages;
-use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
+use super::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use super::gpu_segments::{Segment, gradients_of, in_chunks};
 use super::gpu_view::View;
 use super::pages::SlotPage;
@@ -96,11 +96,9 @@ impl Update<'_> {
         Ok(())
     }
 
-    /// Memory of the update of `rows` rows: gradients, and the largest of each row.
-    pub fn room(&self, rows: u32) -> GpuResult<(RowGradients, Buffer)> {
-        let gpu = &self.stages.gpu;
-        let grads = RowGradients::new(gpu, rows, self.of.options.sh_degree, self.weighs)?;
-        Ok((grads, gpu.buffer("largest gradients", 4 * u64::from(rows))?))
+    /// Memory of the gradients of `rows` rows.
+    pub fn room(&self, rows: u32) -> GpuResult<RowGradients> {
+        RowGradients::new(&self.stages.gpu, rows, self.of.options.sh_degree, self.weighs)
     }
 
     /// Records the gradients and the update of gathered rows, which begin at row `at` of the segment and are `part` of the batch.
@@ -109,15 +107,14 @@ impl Update<'_> {
         recorder: &mut Recorder<'_>,
         (segment, at, part): (&Segment, usize, &Range<usize>),
         values: &DeviceColumns,
-        (grads, largest): &(RowGradients, Buffer),
+        grads: &RowGradients,
     ) -> GpuResult<()> {
         let Update { stages, of, weighs, source, results, collects } = self;
-        let (gpu, weighs) = (&stages.gpu, *weighs);
-        let out = RowsOut { gpu, stages: &stages.rows, view: of, weighs };
+        let gpu = &stages.gpu;
+        let out = RowsOut { gpu, stages: &stages.rows, view: of, weighs: *weighs };
         let splats = [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, at as u64));
         out.record(recorder, values, splats, grads)?;
-        let RowGradients { columns: grads, footprints } = grads;
-        let buffers = UpdateBuffers { values, grads, footprints, largest, results, collects: *collects, weighs };
+        let buffers = UpdateBuffers { values, grads, v_splats: splats[1], results, collects: *collects };
         source.pages.update(gpu, recorder, source, part, &buffers)
     }
 }

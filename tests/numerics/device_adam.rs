@@ -6,7 +6,7 @@ use crate::support::gpu::open;
 use crate::twins::deferred::TableWords;
 use crate::twins::gather::{GatherInput, gather};
 use crate::twins::page_words::{Table, Words};
-use crate::twins::update::{UpdateInput, finish, judge, step};
+use crate::twins::update::{UpdateInput, finish, judge, records, step};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::gpu::{Buffer, Gpu, GpuOptions};
@@ -16,7 +16,7 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::render::gpu_pages::{DevicePages, PageBatch, PageTable, UpdateBuffers};
-use gsscale::render::gpu_rows::{DeviceColumns, RowSource, footprint_bytes};
+use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SPLAT_BYTES};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
@@ -139,7 +139,7 @@ fn gpu_adam_matches_dense_adam() {
             let mut parts = Vec::new();
             for (column, of_column) in columns().zip(of_columns) {
                 let width = column.width(0);
-                let uniforms = gathers.of_column(&numbers, column, width, 0);
+                let uniforms = gathers.of_column(&numbers, column, width);
                 let input = GatherInput {
                     uniforms: &uniforms,
                     pages: &pages,
@@ -155,7 +155,7 @@ fn gpu_adam_matches_dense_adam() {
                 parts.push((column, values, grads));
             }
             for (column, values, grads) in parts {
-                let uniforms = of_step.of_column(&numbers_now, column, column.width(0), 0);
+                let uniforms = of_step.of_column(&numbers_now, column, column.width(0));
                 let input = UpdateInput { uniforms: &uniforms, pages: &pages, rows: &rows, tables, largest: &largest };
                 step(&input, &values, &grads, &mut slab);
             }
@@ -183,10 +183,9 @@ struct OnDevice {
     slot: SlotPage,
     listed: (PageBatch, PageTable),
     values: DeviceColumns,
-    grads: DeviceColumns,
     /// Of rows that are not drawn.
-    footprints: Buffer,
-    largest: Buffer,
+    grads: RowGradients,
+    v_splats: Buffer,
 }
 
 impl OnDevice {
@@ -200,27 +199,30 @@ impl OnDevice {
         let view = begin_view(&gpu, &pages, &camera(), &dense.adam.at(0).numbers());
         let listed = pages.list(&gpu, &view, &[slot]).unwrap();
         assert_eq!(listed.0.rows as usize, ROWS, "a row is out of view");
-        let [values, grads] = [0; 2].map(|_| DeviceColumns::new(&gpu, ROWS as u32, 0).unwrap());
+        let values = DeviceColumns::new(&gpu, ROWS as u32, 0).unwrap();
+        let grads = RowGradients::new(&gpu, ROWS as u32, 0, false).unwrap();
         let mut recorder = gpu.begin("adam");
-        let footprints = recorder.buffer_zeroed("footprints", footprint_bytes(false) * ROWS as u64).unwrap();
+        recorder.clear(&grads.footprints.view()).unwrap();
         gpu.submit(recorder).unwrap();
-        let largest = gpu.buffer("largest", 4 * ROWS as u64).unwrap();
-        OnDevice { pages, slot, listed, values, grads, footprints, largest, gpu }
+        let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * ROWS as u64).unwrap();
+        OnDevice { pages, slot, listed, values, grads, v_splats, gpu }
     }
 
     /// Takes a step; with `is_checked` returns what it did to the page.
     fn step(&self, adam: &DeferredAdam, now: u32, of_columns: &[Vec<f32>], is_checked: bool) -> Option<PageResult> {
-        let OnDevice { gpu, pages, values, grads, footprints, largest, .. } = self;
+        let OnDevice { gpu, pages, values, grads, v_splats, .. } = self;
         let view = begin_view(gpu, pages, &camera(), &adam.at(now).numbers());
         let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
         let mut recorder = gpu.begin("adam");
         source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
-        for ((buffer, _), of_column) in grads.columns().zip(of_columns) {
+        let mut largest = vec![0; ROWS];
+        for ((_, buffer, width), of_column) in grads.columns.columns().zip(of_columns) {
             recorder.upload(&buffer.view(), of_column).unwrap();
+            judge(width, of_column, &mut largest);
         }
+        recorder.upload(&v_splats.view(), &records(&largest)).unwrap();
         let results = recorder.buffer_zeroed("results", size_of::<PageResult>() as u64).unwrap();
-        let buffers =
-            UpdateBuffers { values, grads, footprints, largest, results: &results, collects: false, weighs: false };
+        let buffers = UpdateBuffers { values, grads, v_splats: v_splats.into(), results: &results, collects: false };
         pages.update(gpu, &mut recorder, &source, &(0..ROWS), &buffers).unwrap();
         gpu.submit(recorder).unwrap();
         is_checked.then(|| pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap()[0])
@@ -234,7 +236,7 @@ impl OnDevice {
         let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
         source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
         let reads: Vec<_> =
-            values.columns().map(|(buffer, _)| recorder.read_back("adam", &buffer.view()).unwrap()).collect();
+            values.columns().map(|(_, buffer, _)| recorder.read_back("adam", &buffer.view()).unwrap()).collect();
         gpu.submit(recorder).unwrap();
         reads.into_iter().map(|read| read.to_vec().unwrap()).collect()
     }

@@ -1,7 +1,7 @@
 //! Every shader in every variant, without a device: the shader parses and validates; its bindings, workgroup sizes,
 //! struct layouts and constants equal those of the Rust side. All failures are reported at once.
 
-use gsscale::gpu::{SOURCES, Source, StructLayout, preprocess, validate, variants};
+use gsscale::gpu::{SOURCES, STORAGE_BUFFERS_MOST, Source, StructLayout, preprocess, validate, variants};
 use gsscale::kernels::{constants, gate, uniforms};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -81,6 +81,16 @@ fn module_problems(
         let expected = listed.map_or([256, 1, 1], |(_, _, size, _)| *size);
         if entry.workgroup_size != expected {
             wrong.push(format!("{}: workgroups of {:?}, expected {expected:?}", entry.name, entry.workgroup_size));
+        }
+    }
+    for (e, entry) in module.entry_points.iter().enumerate() {
+        let storage = module.global_variables.iter().filter(|(handle, variable)| {
+            let is_storage = matches!(variable.space, naga::AddressSpace::Storage { .. });
+            is_storage && !info.get_entry_point(e)[*handle].is_empty()
+        });
+        let count = storage.count();
+        if count > STORAGE_BUFFERS_MOST as usize {
+            wrong.push(format!("{}: {count} storage buffers, more than {STORAGE_BUFFERS_MOST}", entry.name));
         }
     }
     wrong.extend(binding_problems(module, info, is_shared));
@@ -245,6 +255,10 @@ fn the_checks_find_faults() {
         problems(&Source { name: "x.wgsl", text }, &[twin]).join("\n")
     };
     assert_eq!(found("u", "u"), "");
+    let more: Vec<u32> = (2..12).collect();
+    let sum = more.iter().map(|i| format!("b{i}[0]")).collect::<Vec<_>>().join(" + ");
+    let declared = more.iter().map(|i| format!("@group(0) @binding({i}) var<storage, read> b{i}: array<f32>;\n"));
+    let crowded = format!("out[id.x] = {sum}; }} }}\n{}fn rest() {{", declared.collect::<String>());
     let cases = [
         ("out[id.x] = u.scale", "out[id.x] = u.count", "x.wgsl"),
         ("@workgroup_size(256)", "@workgroup_size(16, 16)", "workgroups of [16, 16, 1]"),
@@ -259,6 +273,7 @@ fn the_checks_find_faults() {
         ("out[id.x] = u.scale", "\n#repeat N 0 1 x\nout[N] = u.scale;\n#end\n", "x"),
         ("@compute", "#repeat N 0 1\n@compute", "#repeat has no #end"),
         ("@compute", "#end\n@compute", "out of place"),
+        ("out[id.x] = u.scale; }", &crowded, "main: 11 storage buffers"),
     ];
     for (from, to, expected) in cases {
         let report = found(from, to);

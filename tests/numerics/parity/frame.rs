@@ -201,7 +201,7 @@ fn buffers_that_are_too_small_are_made_larger() {
 fn columns_in_windows_give_the_same_bits() {
     let (Some(mut whole), Some(mut cut)) = (
         renderer(&GpuOptions::default()),
-        // The widest column, sh3, has 84 bytes a row: 4000 rows are cut in three, the splats (48 bytes) just fit.
+        // The widest column has 180 bytes a row: 4000 rows are cut in four, the splats (48 bytes) just fit.
         renderer(&GpuOptions { max_binding_bytes: Some(48 * 4000), ..GpuOptions::default() }),
     ) else {
         return;

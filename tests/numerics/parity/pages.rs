@@ -20,7 +20,7 @@ use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;
 use gsscale::render::gpu_pages::{DevicePages, UpdateBuffers};
-use gsscale::render::gpu_rows::{BAND_WIDTHS, DeviceColumns, RowSource, footprint_bytes};
+use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SPLAT_BYTES};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::optimizer_numbers::SplitLimits;
@@ -106,11 +106,10 @@ impl World {
     }
 }
 
-/// The parts of the columns on a device: column, floats per row, and the first of them.
-fn parts(sh_degree: u8) -> Vec<(Column, usize, usize)> {
-    let narrow = Column::ALL[..5].iter().map(|column| (*column, column.width(0), 0));
-    let bands = (0..usize::from(sh_degree)).map(|b| (Column::ShN, BAND_WIDTHS[b], BAND_WIDTHS[..b].iter().sum()));
-    narrow.chain(bands).collect()
+/// The columns on a device with their floats per row.
+fn columns_of(sh_degree: u8) -> Vec<(Column, usize)> {
+    let columns = Column::ALL.map(|column| (column, column.width(sh_degree)));
+    columns.into_iter().filter(|(_, width)| *width > 0).collect()
 }
 
 pub fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T> {
@@ -137,9 +136,9 @@ fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let mut list = vec![[0; 2]; listed as usize];
     gather::list(&pages, &counts, &found, &mut list);
     let mut values = Vec::new();
-    for (column, width, first) in parts(world.layouts[0].sh_degree) {
+    for (column, width) in columns_of(world.layouts[0].sh_degree) {
         let mut out = vec![f32::NAN; listed as usize * width];
-        let uniforms = uniforms.of_column(&numbers, column, width, first);
+        let uniforms = uniforms.of_column(&numbers, column, width);
         let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
         gather::gather(&input, &list, &mut out);
         values.push(out);
@@ -203,10 +202,10 @@ fn exact(world: &World, tables: &DriftTables, page: usize, column: Column, row: 
 
 fn assert_gathered(world: &World, list: &[[u32; 2]], values: &[Vec<f32>], by: &str) {
     let tables = DriftTables::new(Rates::new(1.0, STEPS), AdamConfig::default());
-    for ((column, width, first), values) in parts(world.layouts[0].sh_degree).into_iter().zip(values) {
+    for ((column, width), values) in columns_of(world.layouts[0].sh_degree).into_iter().zip(values) {
         for (i, got) in values.iter().enumerate() {
             let [page, row] = list[i / width].map(|x| x as usize);
-            let [want, moved] = exact(world, &tables, page, column, row, first + i % width);
+            let [want, moved] = exact(world, &tables, page, column, row, i % width);
             let slack = f64::from(f32::EPSILON) * want.abs() + 3e-6 * moved;
             assert!((f64::from(*got) - want).abs() <= slack, "{by}: {column:?} page {page} row {row}: {got} {want}");
         }
@@ -237,30 +236,30 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
         on.pages.source(&view, &batch, &table).geometry(&gpu, &mut recorder, &columns, &all).unwrap();
         gpu.submit(recorder).unwrap();
         let of_device: Vec<Vec<f32>> =
-            columns.columns().map(|(buffer, width)| read(&gpu, buffer, width * batch.rows as usize)).collect();
+            columns.columns().map(|(_, buffer, width)| read(&gpu, buffer, width * batch.rows as usize)).collect();
         assert_gathered(&world, &listed, &of_device, "device");
     }
 }
 
-/// Gradients of listed rows by part, and footprints: a tenth of the rows have none, and `poison` of them are not finite or too
+/// Gradients of listed rows by column, and footprints: a tenth of the rows have none, and `poison` of them are not finite or too
 /// large in one element. With weights every footprint is followed by a second one, some of which are extreme.
 fn random_gradients(rows: usize, sh_degree: u8, (poison, weighs): (f64, bool)) -> (Vec<Vec<f32>>, Vec<[f32; 4]>) {
     let mut draws = Stream::new(5, Purpose::Test, rows as u64, 3);
     let kinds: Vec<[f64; 2]> = (0..rows).map(|_| [draws.uniform(), draws.uniform()]).collect();
-    let parts = parts(sh_degree);
+    let columns = columns_of(sh_degree);
     let bad = [f32::NAN, f32::INFINITY, -2e18];
     let mut grads = Vec::new();
-    for (p, (_, width, _)) in parts.iter().enumerate() {
-        let mut of_part = Vec::new();
+    for (p, (_, width)) in columns.iter().enumerate() {
+        let mut of_column = Vec::new();
         for (row, kind) in kinds.iter().enumerate() {
             let is_zero = kind[0] > 0.9;
             let size = libm::pow(10.0, -draws.range(0.0, 9.0));
-            of_part.extend((0..*width).map(|_| if is_zero { 0.0 } else { (draws.normal() * size) as f32 }));
-            if kind[1] < poison && row % parts.len() == p {
-                of_part[row * width + row % width] = bad[row % 3];
+            of_column.extend((0..*width).map(|_| if is_zero { 0.0 } else { (draws.normal() * size) as f32 }));
+            if kind[1] < poison && row % columns.len() == p {
+                of_column[row * width + row % width] = bad[row % 3];
             }
         }
-        grads.push(of_part);
+        grads.push(of_column);
     }
     let mut footprints = Vec::new();
     for kind in &kinds {
@@ -291,11 +290,11 @@ fn updated_by_twin(
     let weighs = footprints.len() > list.len();
     let uniforms = UpdateUniforms::new(&camera(), &step, true, weighs);
     let mut largest = vec![0; list.len()];
-    let parts = parts(world.layouts[0].sh_degree);
-    parts.iter().zip(grads).for_each(|((_, width, _), grads)| update::judge(*width, grads, &mut largest));
+    let columns = columns_of(world.layouts[0].sh_degree);
+    columns.iter().zip(grads).for_each(|((_, width), grads)| update::judge(*width, grads, &mut largest));
     let (pages, rows, tables, largest) = (&pages[..], list, (&tables).into(), &largest[..]);
-    for (((column, width, first), values), grads) in parts.into_iter().zip(values).zip(grads) {
-        let uniforms = uniforms.of_column(&step, column, width, first);
+    for (((column, width), values), grads) in columns.into_iter().zip(values).zip(grads) {
+        let uniforms = uniforms.of_column(&step, column, width);
         let input = UpdateInput { uniforms: &uniforms, pages, rows, tables, largest };
         update::step(&input, values, grads, &mut slab);
     }
@@ -321,31 +320,27 @@ fn updated_by_device(
     let view = begin_view(gpu, &on.pages, &camera(), &world.adam.at(world.now).numbers());
     let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
     let rows = batch.rows as usize;
-    let [values, grads] = [0; 2].map(|_| DeviceColumns::new(gpu, batch.rows, sh_degree).unwrap());
+    let values = DeviceColumns::new(gpu, batch.rows, sh_degree).unwrap();
+    let grads = RowGradients::new(gpu, batch.rows, sh_degree, weighs).unwrap();
     let (of_rows, footprints) = random_gradients(rows, sh_degree, (poison, weighs));
     let mut source = on.pages.source(&view, &batch, &table);
     let mut recorder = gpu.begin("parity");
     source.geometry(gpu, &mut recorder, &values, &(0..rows)).unwrap();
-    for ((buffer, _), of_rows) in grads.columns().zip(&of_rows) {
+    let mut largest = vec![0; rows];
+    for ((_, buffer, width), of_rows) in grads.columns.columns().zip(&of_rows) {
         recorder.upload(&buffer.view(), of_rows).unwrap();
+        update::judge(width, of_rows, &mut largest);
     }
-    let on_device = gpu.buffer("footprints", footprint_bytes(weighs) * rows as u64).unwrap();
-    recorder.upload(&on_device.view(), &footprints).unwrap();
-    let largest = gpu.buffer("largest", 4 * rows as u64).unwrap();
+    recorder.upload(&grads.footprints.view(), &footprints).unwrap();
+    let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * rows as u64).unwrap();
+    recorder.upload(&v_splats.view(), &update::records(&largest)).unwrap();
     let results = recorder.buffer_zeroed("results", (size_of::<PageResult>() * on.slots.len()) as u64).unwrap();
-    let buffers = UpdateBuffers {
-        values: &values,
-        grads: &grads,
-        footprints: &on_device,
-        largest: &largest,
-        results: &results,
-        collects: true,
-        weighs,
-    };
+    let (values_of, v_splats) = (&values, (&v_splats).into());
+    let buffers = UpdateBuffers { values: values_of, grads: &grads, v_splats, results: &results, collects: true };
     on.pages.update(gpu, &mut recorder, &source, &(0..rows), &buffers).unwrap();
     gpu.submit(recorder).unwrap();
     let results = on.pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap();
-    let gathered = values.columns().map(|(buffer, width)| read(gpu, buffer, width * rows)).collect();
+    let gathered = values.columns().map(|(_, buffer, width)| read(gpu, buffer, width * rows)).collect();
     let bins = on.pages.take_bins(gpu).unwrap();
     ((on.payloads(), results, bins), read(gpu, &batch.listed, rows), gathered)
 }
@@ -411,7 +406,7 @@ fn assert_bounds_of_device(on: &OnDevice<'_>, world: &World, results: &[PageResu
         on.pages.source(&view, &batch, &table).geometry(on.gpu, &mut recorder, &columns, &all).unwrap();
         on.gpu.submit(recorder).unwrap();
         let mut outside = 0;
-        for ((buffer, width), (column, ..)) in columns.columns().zip(parts(world.layouts[0].sh_degree)) {
+        for (column, buffer, width) in columns.columns() {
             let values: Vec<f32> = read(on.gpu, buffer, width * listed.len());
             for ([page, _], row) in listed.iter().zip(values.chunks(width)) {
                 let Some(bounds) = results[*page as usize].bounds() else { continue };
@@ -461,7 +456,7 @@ fn surveys_hold_all_rows_and_only_statistics_are_cleared() {
     let tables = DeferredTables::new(&numbers);
     let (mut slab, pages) = world.slab();
     let uniforms = GatherUniforms::new(&camera(), &numbers, 700, &SPLITS, pages.len() as u32);
-    let uniforms = uniforms.of_column(&numbers, Column::Opacities, 1, 0);
+    let uniforms = uniforms.of_column(&numbers, Column::Opacities, 1);
     let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables: (&tables).into(), recent: &[] };
     let mut twin = vec![<PageSurvey as bytemuck::Zeroable>::zeroed(); pages.len()];
     gather::survey(&input, &mut twin);

@@ -4,6 +4,7 @@
 //! last place, so every quantity differs by some roundings of 6e-8. On lavapipe a conic differs by at most 2.6e-6.
 
 use crate::support::gpu::open;
+use crate::twins::update::judge;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, Recorder};
@@ -12,10 +13,10 @@ use gsscale::kernels::project_fwd::{Projected, project_fwd};
 use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::sh_fwd::sh_fwd;
 use gsscale::render::gpu_rows::{
-    BAND_WIDTHS, DeviceColumns, RowStages, SPLAT_BYTES, SplatRows, band_into_sh_n, footprint_bytes,
+    DeviceColumns, RowGradients, RowStages, SPLAT_BYTES, SplatRows, put_bands, take_bands,
 };
 use gsscale::scene::camera::Camera;
-use gsscale::scene::columns::Columns;
+use gsscale::scene::columns::{Column, Columns, sh_n_width};
 
 const EPS2D: f32 = 0.3;
 /// Numbers of rows: none, one, below, at and above the workgroup, several workgroups.
@@ -91,14 +92,15 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     let n = rows.rows();
     let stages = RowStages::new(gpu).unwrap();
     let columns = DeviceColumns::new(gpu, n as u32, degree).unwrap();
-    let grads = DeviceColumns::new(gpu, n as u32, degree).unwrap();
+    let room = RowGradients::new(gpu, n as u32, degree, false).unwrap();
+    let grads = &room.columns;
     let splats = gpu.buffer("splats", SPLAT_BYTES * n as u64).unwrap();
     let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * n as u64).unwrap();
     let projected = read(gpu, &splats, |r| {
         columns.upload_geometry(r, rows, &(0..n)).unwrap();
         columns.upload_colors(r, rows, &(0..n), &mut Vec::new()).unwrap();
         // Every entry must be overwritten: earlier contents must not show.
-        for (buffer, width) in grads.columns() {
+        for (_, buffer, width) in grads.columns() {
             r.upload(&buffer.view(), &vec![f32::NAN; width * n]).unwrap();
         }
         r.upload(&splats.view(), &vec![f32::NAN; 12 * n]).unwrap();
@@ -107,18 +109,17 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     });
     let colored = read(gpu, &splats, |r| {
         r.upload(&splats.view(), &cpu.projected).unwrap();
-        stages.sh_fwd(gpu, r, camera, degree, &columns, (&splats).into()).unwrap();
+        stages.sh_fwd(gpu, r, camera, &columns, (&splats).into()).unwrap();
     });
     let with_colors: Vec<_> = cpu.projected.iter().zip(&cpu.colors).map(|(p, c)| with_color(*p, *c)).collect();
     let mut out = Columns::zeros(n, 3);
-    let footprints = gpu.buffer("footprints", footprint_bytes(false) * n as u64).unwrap();
     out.opacities = read(gpu, &grads.opacities, |r| {
         r.upload(&splats.view(), &with_colors).unwrap();
         let [s, v_s] = [&splats, &v_splats].map(SplatRows::from);
-        stages.sh_bwd(gpu, r, camera, degree, &columns, s, v_s, &grads).unwrap();
-        stages.project_bwd(gpu, r, camera, EPS2D, &columns, s, v_s, &grads, &footprints, false).unwrap();
+        stages.sh_bwd(gpu, r, camera, &columns, s, v_s, &room).unwrap();
+        stages.project_bwd(gpu, r, camera, EPS2D, &columns, s, v_s, &room).unwrap();
     });
-    let packed = read(gpu, &footprints, |_| {});
+    let packed = read(gpu, &room.footprints, |_| {});
     for (i, (got, record)) in packed.as_chunks::<4>().0.iter().zip(&with_colors).enumerate() {
         let want = if record[7] > 0.0 { [v[i][0], v[i][1], record[7], record[11]] } else { [0.0; 4] };
         assert_eq!(got.map(f32::to_bits), want.map(f32::to_bits), "row {i}: {got:?}, want {want:?}");
@@ -127,9 +128,16 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     out.quats = read(gpu, &grads.quats, |_| {});
     out.scales = read(gpu, &grads.scales, |_| {});
     out.sh0 = read(gpu, &grads.sh0, |_| {});
-    for (band, buffer) in grads.bands.iter().enumerate() {
-        band_into_sh_n(&read(gpu, buffer, |_| {}), &(0..n), band, &mut out);
+    if let Some(sh_n) = &grads.sh_n {
+        put_bands(&read(gpu, sh_n, |_| {}), sh_n_width(degree), &mut out.sh_n, sh_n_width(3));
     }
+    let mut largest = vec![0; n];
+    for column in Column::ALL {
+        judge(column.width(3), out.column(column), &mut largest);
+    }
+    let records = read(gpu, &v_splats, |_| {});
+    let of_device: Vec<u32> = records.iter().skip(11).step_by(12).map(|largest| largest.to_bits()).collect();
+    assert!(of_device == largest, "the largest gradient of each row");
     let (projected, _) = projected.as_chunks::<12>();
     let (colored, _) = colored.as_chunks::<12>();
     for (got, want) in colored.iter().zip(&cpu.projected) {
@@ -331,8 +339,8 @@ fn non_finite_rows_are_culled_as_on_the_cpu_and_do_not_spread() {
 fn windows_and_runs_change_no_bit() {
     let Some(whole) = open(&GpuOptions::default()) else { return };
     let n = 1000;
-    // 84 bytes of the widest band: windows of 384 rows, so three of them; and of 64 rows.
-    for limit in [33_000, 8_000] {
+    // 180 bytes of the widest column: windows of 384 rows, so three of them; and of 64 rows.
+    for limit in [70_000, 16_000] {
         let options = GpuOptions { max_binding_bytes: Some(limit), ..GpuOptions::default() };
         let cut = open(&options).expect("it opened before");
         assert!(cut.max_binding_bytes() <= limit);
@@ -353,18 +361,12 @@ fn windows_and_runs_change_no_bit() {
 fn bands_are_cut_out_and_put_back() {
     for n in [7, 9001] {
         let rows = random_rows(n);
-        let mut back = Columns::zeros(n, 3);
-        let (mut values, mut part) = (Vec::new(), Vec::new());
-        for band in 0..BAND_WIDTHS.len() {
-            let (first, width) = (BAND_WIDTHS[..band].iter().sum::<usize>(), BAND_WIDTHS[band]);
-            gsscale::render::gpu_rows::band_from_sh_n(&rows, &(0..n), band, &mut values);
-            let want: Vec<f32> =
-                rows.sh_n.chunks_exact(45).flat_map(|row| row[first..first + width].to_vec()).collect();
-            assert_eq!(values, want);
-            gsscale::render::gpu_rows::band_from_sh_n(&rows, &(2..n - 2), band, &mut part);
-            assert_eq!(part, values[2 * width..(n - 2) * width]);
-            band_into_sh_n(&values, &(0..n), band, &mut back);
+        for width in [9, 24] {
+            let (mut bands, mut back) = (Vec::new(), vec![0.0; rows.sh_n.len()]);
+            take_bands(&rows.sh_n, 45, width, &mut bands);
+            put_bands(&bands, width, &mut back, 45);
+            let want = |(i, value): (usize, &f32)| if i % 45 < width { *value } else { 0.0 };
+            assert_eq!(back, rows.sh_n.iter().enumerate().map(want).collect::<Vec<_>>());
         }
-        assert_eq!(back.sh_n, rows.sh_n);
     }
 }

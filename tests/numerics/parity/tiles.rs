@@ -269,15 +269,13 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let grid = scene.blend.grid;
     let mut recorder = gpu.begin("upload");
     let splats = recorder.buffer_with("splats", &scene.records()).unwrap();
-    let v_rgb = recorder.buffer_with("v_rgb", v_rgb).unwrap();
-    let v_alpha = v_alpha.map(|v| recorder.buffer_with("v_alpha", v).unwrap());
-    let v_alpha_view = v_alpha.as_ref().map(|b| b.view());
+    let v_rgb = recorder.buffer_with("v_rgb", &[v_rgb, v_alpha.unwrap_or_default()].concat()).unwrap();
     let v_splats = recorder.buffer_zeroed("v_splats", splat_bytes(rows)).unwrap();
     gpu.submit(recorder).unwrap();
     let (ranks, frame, pixels, demand) = forward(gpu, stages, &splats.view(), rows, scene.blend);
     let mut recorder = gpu.begin("backward");
     let (from, to) = (splats.view(), v_splats.view());
-    let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), v_alpha: v_alpha_view.as_ref(), errors: None };
+    let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), has_v_alpha: v_alpha.is_some(), errors: None };
     let (into, fold) = (&mut recorder, Fold::Whole);
     stages.back.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, &to, fold).unwrap();
     let read = [

@@ -144,7 +144,7 @@ pub fn list(pages: &[DevicePage], counts: &[u32], found: &[u32], rows: &mut [[u3
 
 /// Evaluates a column of the listed rows whose pages are in the slab.
 pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
-    let GatherUniforms { column, width, first_element, now, rate, .. } = *input.uniforms;
+    let GatherUniforms { column, width, now, rate, .. } = *input.uniforms;
     let column = Column::ALL[column as usize];
     for (listed, out) in rows.iter().zip(out.chunks_exact_mut(width as usize)) {
         if listed[0] == UNLISTED {
@@ -154,7 +154,7 @@ pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
         let page = &input.pages[listed[0] as usize];
         if input.is_bound(page) {
             for (e, out) in out.iter_mut().enumerate() {
-                *out = input.element(page, column, listed[1] as usize, first_element as usize + e, now, rate);
+                *out = input.element(page, column, listed[1] as usize, e, now, rate);
             }
         }
     }

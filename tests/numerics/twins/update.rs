@@ -1,8 +1,8 @@
 //! Stage "update": one step of Adam on the listed rows of pages, in the words of their payloads, and their statistics.
 //! The twin of `shaders/update.wgsl`, in which the functions are entry points.
 //!
-//! [`judge`] finds whether the gradients of a row are usable, column by column; [`step`] rewrites a column of the rows
-//! whose gradients all are; [`finish`] counts, stamps and collects statistics.
+//! [`judge`] finds the largest gradient of a row, as the stages that make gradients do; [`step`] rewrites a column of the rows
+//! whose gradients all are usable; [`finish`] counts, stamps and collects statistics.
 //!
 //! [`clear_statistics`] takes the place of a round that edits no row.
 //!
@@ -38,6 +38,11 @@ pub struct UpdateInput<'a> {
     pub largest: &'a [u32],
 }
 
+/// The records of gradients of splats with the largest magnitudes in their last words, as the stages that make gradients leave them.
+pub fn records(largest: &[u32]) -> Vec<[u32; 12]> {
+    largest.iter().map(|bits| [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, *bits]).collect()
+}
+
 /// Bins of mean scores; those of mean weights follow.
 const BINS: usize = 1 << 15;
 
@@ -55,7 +60,7 @@ pub fn judge(width: usize, grads: &[f32], largest: &mut [u32]) {
 
 /// Rewrites a column of the listed rows in the slab whose gradients are usable, from the values of stage "gather".
 pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [u32]) {
-    let UpdateUniforms { column, width, first_element, now, step_size, inv_root_correction, .. } = *input.uniforms;
+    let UpdateUniforms { column, width, now, step_size, inv_root_correction, .. } = *input.uniforms;
     let (column, width, tables) = (Column::ALL[column as usize], width as usize, input.tables);
     let [one_minus_beta1, one_minus_beta2] = tables.one_minus_betas();
     for (i, &[p, row]) in input.rows.iter().enumerate() {
@@ -67,7 +72,7 @@ pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [
         let ([first, ..], [_, kept, lost]) = (tables.decay(missed), tables.decay(missed + 1));
         for e in 0..width {
             let [value_at, m_at, v_at] = [Table::Values, Table::ExpAvg, Table::ExpAvgSq]
-                .map(|table| page.row_at(column, table, row as usize) + first_element as usize + e);
+                .map(|table| page.row_at(column, table, row as usize) + e);
             let g = grads[i * width + e];
             let decayed = flush(f32::from_bits(slab[m_at]) * first);
             let m = flush(decayed + (g - decayed) * one_minus_beta1);
