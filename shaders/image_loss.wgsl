@@ -14,7 +14,7 @@
 // iterations.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
-#import "shared/subgroup_place.wgsl"
+#import "shared/subgroups.wgsl"
 
 struct LossUniforms {
     width: u32,
@@ -160,15 +160,15 @@ fn down_4(t: u32) -> array<vec4<f32>, 4> {
 /// Adds the lanes' sums in the memory of the patch, which is no longer needed; the first lane gets the result.
 #ifdef SUBGROUPS
 fn sum_lanes(place: SubgroupPlace, lanes: u32, value: vec3<f32>) -> vec3<f32> {
-    let part = subgroupAdd(value);
-    if place.subgroup_lane == 0u {
-        patch_two[place.subgroup] = part.xy;
-        patch_one[place.subgroup] = part.z;
+    let part = subgroup_sum_vec3(value, place);
+    if subgroup_lane_of(place) == 0u {
+        patch_two[subgroup_of(place)] = part.xy;
+        patch_one[subgroup_of(place)] = part.z;
     }
     workgroupBarrier();
     var sum = vec3<f32>();
     if place.lane == 0u {
-        for (var k = 0u; k < place.subgroups; k++) {
+        for (var k = 0u; k < subgroups_of(place, lanes); k++) {
             sum += vec3<f32>(patch_two[k], patch_one[k]);
         }
     }

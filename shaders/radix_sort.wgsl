@@ -5,7 +5,7 @@
 // No workgroup waits for another, and the execution order of workgroups cannot change a place.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
-#import "shared/subgroup_place.wgsl"
+#import "shared/subgroups.wgsl"
 #import "shared/splat.wgsl"
 
 struct SortUniforms {
@@ -102,11 +102,11 @@ fn radix_histogram(place: SubgroupPlace) {
         }
     }
 #ifdef SUBGROUPS
-    let parts = place.subgroups;
+    let parts = subgroups_of(place, 256u);
     for (var word = 0u; word < WORDS; word++) {
-        let sum = subgroupAdd(digit_word(counts, word));
-        if place.subgroup_lane == 0u {
-            counts_of_parts[word * parts + place.subgroup] = sum;
+        let sum = subgroup_scan_u32(digit_word(counts, word), place).y;
+        if subgroup_lane_of(place) == 0u {
+            counts_of_parts[word * parts + subgroup_of(place)] = sum;
         }
     }
     workgroupBarrier();
@@ -155,20 +155,19 @@ fn radix_sort(place: SubgroupPlace) {
         }
     }
 #ifdef SUBGROUPS
+    let parts = subgroups_of(place, 256u);
     for (var word = 0u; word < WORDS; word++) {
-        let mine = digit_word(counts, word);
-        let before = subgroupExclusiveAdd(mine);
-        let sum = subgroupAdd(mine);
-        counts_before[counts_at(word, place.lane)] = before;
-        if place.subgroup_lane == 0u {
-            part_counts[word * place.subgroups + place.subgroup] = sum;
+        let sums = subgroup_scan_u32(digit_word(counts, word), place);
+        counts_before[counts_at(word, place.lane)] = sums.x;
+        if subgroup_lane_of(place) == 0u {
+            part_counts[word * parts + subgroup_of(place)] = sums.y;
         }
     }
     workgroupBarrier();
     for (var word = 0u; word < WORDS; word++) {
         var base = 0u;
-        for (var part = 0u; part < place.subgroup; part++) {
-            base += part_counts[word * place.subgroups + part];
+        for (var part = 0u; part < subgroup_of(place); part++) {
+            base += part_counts[word * parts + part];
         }
         // An invocation's own entry.
         counts_before[counts_at(word, place.lane)] += base;

@@ -9,6 +9,7 @@
 // at a time. So every run on a device gives the same bits.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
+#import "shared/subgroups.wgsl"
 #import "shared/math.wgsl"
 #import "shared/raster.wgsl"
 
@@ -43,17 +44,18 @@ const SUMS: u32 = 9u;
 #endif
 /// The bits of LARGEST_SPLAT_GRAD in src/base/math.rs, 1e12.
 const LARGEST_SPLAT_GRAD_BITS: u32 = 0x5368d4a5u;
-/// Parts of the sums of one splat, times the splats of a batch.
+/// Parts of the sums of one splat, times the splats of a batch. Subgroups of 32 and more give at most two parts, so that a whole batch
+/// takes half of the memory, and more workgroups run at a time.
+#ifdef SUBGROUPS_OF_32
+const PARTS_OF_BATCH: u32 = 128u;
+#else
 const PARTS_OF_BATCH: u32 = 256u;
+#endif
 
 var<workgroup> batch: array<TileSplat, TILE_LANES>;
 var<workgroup> batch_isects: array<u32, TILE_LANES>;
 /// [splats of the batch][SUMS][parts]
-#ifdef WEIGHS
-var<workgroup> sums: array<f32, 2816>;
-#else
-var<workgroup> sums: array<f32, 2304>;
-#endif
+var<workgroup> sums: array<f32, PARTS_OF_BATCH * SUMS>;
 /// Largest stop of the tile.
 var<workgroup> tile_stop: atomic<u32>;
 
@@ -215,26 +217,19 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
 #endif
 
 @compute @workgroup_size(64)
-fn rasterize_bwd(
-    place: Place,
-#ifdef SUBGROUPS_OF_8
-    @builtin(subgroup_id) part: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#else
+fn rasterize_bwd(place: SubgroupPlace) {
 #ifdef SUBGROUPS
-    @builtin(subgroup_id) part: u32,
-    @builtin(num_subgroups) parts: u32,
-    @builtin(subgroup_invocation_id) subgroup_lane: u32,
-#endif
-#endif
-) {
+    let part = subgroup_of(place);
+    let subgroup_lane = subgroup_lane_of(place);
 #ifdef SUBGROUPS_OF_8
     let parts = 8u;
 #else
-#ifndef SUBGROUPS
-    let part = place.lane;
-    let parts = TILE_LANES;
+    let parts = subgroups_of(place, TILE_LANES);
 #endif
+#else
+    let part = place.lane;
+    let subgroup_lane = 0u;
+    let parts = TILE_LANES;
 #endif
     let n = linear_group(place.workgroup, place.workgroups);
     // Uniform across the workgroup.
@@ -279,19 +274,28 @@ fn rasterize_bwd(
             let taking_part = (e >= vec4<f32>(LOG2_ALPHA_MIN)) & (vec4<u32>(view.list_base + first + i) < stop);
             let to = i * SUMS * parts + part;
 #ifdef SUBGROUPS
+#ifndef EMULATED_SUBGROUPS
             if !subgroupAny(any(taking_part)) {
                 if subgroup_lane == 0u {
                     write_sums(to, parts, Sums());
                 }
                 continue;
             }
+#endif
             var s = take_off(&pixels, splat, e, taking_part, dx, dy);
 #ifdef WEIGHS
-            let weights = subgroupAdd(s.weights);
-            s = Sums(subgroupAdd(s.h), subgroupAdd(s.firsts), subgroupAdd(s.seconds), subgroupAdd(s.color), weights);
-#else
-            s = Sums(subgroupAdd(s.h), subgroupAdd(s.firsts), subgroupAdd(s.seconds), subgroupAdd(s.color));
+            let weights = subgroup_sum_vec2(s.weights, place);
 #endif
+            let firsts = subgroup_sum_vec3(vec3<f32>(s.h, s.firsts), place);
+            s = Sums(
+                firsts.x,
+                firsts.yz,
+                subgroup_sum_vec3(s.seconds, place),
+                subgroup_sum_vec3(s.color, place),
+#ifdef WEIGHS
+                weights,
+#endif
+            );
             if subgroup_lane == 0u {
                 write_sums(to, parts, s);
             }

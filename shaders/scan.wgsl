@@ -24,6 +24,14 @@ struct ScanUniforms {
 
 const ITEMS: u32 = 8u;
 
+/// Whether a scan of ones counts the invocations in their order: 1 for each of a workgroup's. Sums over subgroups assume that
+/// invocations lie in subgroups in their order, which drivers need not promise.
+@compute @workgroup_size(256)
+fn check_order(place: SubgroupPlace) {
+    let scanned = workgroup_scan(1u, place);
+    offsets[place.lane] = u32(scanned.before == place.lane && scanned.total == 256u);
+}
+
 @compute @workgroup_size(256)
 fn scan_reduce(place: SubgroupPlace) {
     let block = linear_group(place.workgroup, place.workgroups);

@@ -1,6 +1,6 @@
 // Exclusive prefix sum over the 256 invocations of a workgroup. Sums saturate: 0xffffffff means "this or more" and
 // stays so whatever is added, so an overflow anywhere shows in the total.
-#import "shared/subgroup_place.wgsl"
+#import "shared/subgroups.wgsl"
 
 /// One entry per invocation, or per subgroup if the adapter has subgroups.
 var<workgroup> scan_parts: array<u32, 256>;
@@ -27,18 +27,17 @@ fn saturating_join(low: u32, high: u32) -> u32 {
 
 /// Every invocation of the workgroup must call this, and pass a barrier before the next call.
 fn workgroup_scan(value: u32, place: SubgroupPlace) -> WorkgroupScan {
-    let low = value & 0xffffu;
-    let high = value >> 16u;
-    var before = saturating_join(subgroupExclusiveAdd(low), subgroupExclusiveAdd(high));
-    let all = saturating_join(subgroupAdd(low), subgroupAdd(high));
-    if place.subgroup_lane == 0u {
-        scan_parts[place.subgroup] = all;
+    let low = subgroup_scan_u32(value & 0xffffu, place);
+    let high = subgroup_scan_u32(value >> 16u, place);
+    let before = saturating_join(low.x, high.x);
+    if subgroup_lane_of(place) == 0u {
+        scan_parts[subgroup_of(place)] = saturating_join(low.y, high.y);
     }
     workgroupBarrier();
     var total = 0u;
     var base = 0u;
-    for (var s = 0u; s < place.subgroups; s++) {
-        base = select(base, total, s == place.subgroup);
+    for (var s = 0u; s < subgroups_of(place, 256u); s++) {
+        base = select(base, total, s == subgroup_of(place));
         total = saturating_add(total, scan_parts[s]);
     }
     return WorkgroupScan(saturating_add(base, before), total);

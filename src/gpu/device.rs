@@ -6,7 +6,7 @@ use std::fmt;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-use super::adapter::{AdapterSummary, DeviceKind, choose, limits_to_request, uniforms_fit_storage};
+use super::adapter::{AdapterSummary, DeviceKind, WORKGROUP, choose, limits_to_request, uniforms_fit_storage};
 use super::belt::{Belt, UniformRing};
 use super::buffers::{Buffer, Pool, Purpose};
 use super::bus::EmulatedBus;
@@ -48,6 +48,46 @@ pub fn budget_for_buffers(bytes: u64) -> u64 {
     (0..8).fold(bytes, |budget, _| bytes + 6 * block_bytes(budget)).max(BLOCKS_COUNT_FROM + 6 * BLOCK_MIN)
 }
 
+/// How shaders add up what neighbouring invocations hold.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Subgroups {
+    /// With subgroup operations, if the adapter has them and its subgroups hold their invocations in order; where all subgroups have 8
+    /// invocations, on a path of their own.
+    #[default]
+    Best,
+    /// The same without that path.
+    AnySize,
+    /// In workgroup memory, as if subgroups had this size: 4, 8, 16, 32 or 64. For tests of sizes that no adapter at hand has.
+    Emulated(u32),
+    /// Without subgroups.
+    Off,
+}
+
+/// Least size of a subgroup: smaller ones have more sums than the memory of stages holds.
+const SUBGROUP_LEAST: u32 = 4;
+
+impl Subgroups {
+    /// The defines of shaders on an adapter whose subgroups have these sizes, if it has any.
+    fn defines(self, sizes: Option<(u32, u32)>) -> Defines<'static> {
+        let sizes = sizes.filter(|(least, _)| *least >= SUBGROUP_LEAST);
+        match (self, sizes) {
+            (Subgroups::Emulated(4), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "4u")],
+            (Subgroups::Emulated(8), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "8u")],
+            (Subgroups::Emulated(16), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "16u")],
+            (Subgroups::Emulated(32), _) => {
+                &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "32u"), ("SUBGROUPS_OF_32", "")]
+            }
+            (Subgroups::Emulated(_), _) => {
+                &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "64u"), ("SUBGROUPS_OF_32", "")]
+            }
+            (Subgroups::Off, _) | (_, None) => &[],
+            (Subgroups::Best, Some((8, 8))) => &[("SUBGROUPS", ""), ("SUBGROUPS_OF_8", "")],
+            (_, Some((32.., _))) => &[("SUBGROUPS", ""), ("SUBGROUPS_OF_32", "")],
+            _ => &[("SUBGROUPS", "")],
+        }
+    }
+}
+
 /// Options that a test or the user's budget sets.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct GpuOptions {
@@ -57,11 +97,7 @@ pub struct GpuOptions {
     pub window_rows: Option<u64>,
     /// Waits for each submission before continuing: the baseline in tests of overlap.
     pub serial: bool,
-    /// `Some(false)` disables subgroup operations.
-    pub subgroups: Option<bool>,
-    /// `Some(false)` disables the path for adapters whose subgroups all have 8 invocations, in favour of the general
-    /// one.
-    pub subgroups_of_8: Option<bool>,
+    pub subgroups: Subgroups,
     /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit. From 128 MiB on the limit holds for the memory
     /// blocks of the API, below for the buffers in them.
     pub budget: Option<u64>,
@@ -110,28 +146,37 @@ impl Gpu {
     /// Errors: no adapter fits the request, or the driver refused to open it.
     pub fn open_with(choice: &DeviceChoice, options: &GpuOptions) -> GpuResult<Gpu> {
         let (adapter, summary) = choose(choice)?;
-        let subgroups = adapter.features().contains(wgpu::Features::SUBGROUP) && options.subgroups != Some(false);
-        let profile = summary.timestamps && options.profile;
+        let defines = options.subgroups.defines(summary.subgroup_sizes);
+        let is_native = !defines.is_empty() && !matches!(options.subgroups, Subgroups::Emulated(_));
         let mut features = wgpu::Features::empty();
-        features.set(wgpu::Features::SUBGROUP, subgroups);
-        features.set(wgpu::Features::TIMESTAMP_QUERY, profile);
+        features.set(wgpu::Features::SUBGROUP, is_native);
+        features.set(wgpu::Features::TIMESTAMP_QUERY, summary.timestamps && options.profile);
         let limits = limits_to_request(&adapter.limits());
         let bus = options.bus.map_or_else(EmulatedBus::from_environment, |bus| Ok(Some(bus)))?;
         let blocks = options.budget.map(block_bytes);
         let driver = Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone(), blocks, bus)?);
+        let open = |defines| Gpu::on_driver(Arc::clone(&driver), summary.clone(), &limits, options, defines);
+        // The check has a device of its own, so that it leaves nothing on the one that is used.
+        let gpu = if is_native && !open(defines)?.has_subgroups_in_order()? { open(&[])? } else { open(defines)? };
+        let fault = options.fault.or_else(InjectedFault::from_environment);
+        Ok(Gpu { injector: Injector::new(fault), ..gpu })
+    }
+
+    /// A device with nothing on it yet, on an open driver.
+    fn on_driver(
+        driver: Arc<Driver>,
+        summary: AdapterSummary,
+        limits: &wgpu::Limits,
+        options: &GpuOptions,
+        subgroup_defines: Defines<'static>,
+    ) -> GpuResult<Gpu> {
         let budget = options.budget.map_or(u64::MAX, bytes_for_buffers);
         let block_limit = options.budget.filter(|budget| *budget >= BLOCKS_COUNT_FROM);
         let pool = Pool::new(Arc::clone(&driver), budget, block_limit, limits.max_buffer_size);
         let staging = Staging::new(Arc::clone(&driver), Arc::clone(&pool));
-        let profiler = Profiler::new(&driver, Arc::clone(&staging), profile);
+        let profiler = Profiler::new(&driver, Arc::clone(&staging), summary.timestamps && options.profile);
         driver.faults.check()?;
-        let of_8 = summary.subgroup_sizes == Some((8, 8)) && options.subgroups_of_8 != Some(false);
-        let subgroup_defines: &[_] = match (subgroups, of_8) {
-            (false, _) => &[],
-            (true, false) => &["SUBGROUPS"],
-            (true, true) => &["SUBGROUPS", "SUBGROUPS_OF_8"],
-        };
-        let as_storage = summary.kind == DeviceKind::Software && uniforms_fit_storage(&limits);
+        let as_storage = summary.kind == DeviceKind::Software && uniforms_fit_storage(limits);
         let uniform_blocks = options.uniform_blocks.unwrap_or(!as_storage);
         let alignment = limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment);
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
@@ -140,7 +185,7 @@ impl Gpu {
             belt: Mutex::new(Belt::new(Arc::clone(&driver), Arc::clone(&pool), budget)),
             uniforms: Mutex::new(UniformRing::new(Arc::clone(&driver), Arc::clone(&pool), u64::from(alignment))),
             profiler: Mutex::new(profiler),
-            injector: Injector::new(options.fault.or_else(InjectedFault::from_environment)),
+            injector: Injector::default(),
             uploaded: AtomicU64::new(0),
             recordings: Arc::default(),
             serial: options.serial,
@@ -154,6 +199,17 @@ impl Gpu {
         })
     }
 
+    /// Whether subgroups hold the invocations of a workgroup in their order, found by a scan.
+    fn has_subgroups_in_order(&self) -> GpuResult<bool> {
+        let check = self.pipeline("scan.wgsl", "check_order", &[])?;
+        let mut recorder = self.begin("check of subgroups");
+        let in_order = recorder.buffer_zeroed("order of subgroups", 4 * u64::from(WORKGROUP))?;
+        recorder.dispatch("scan", &check, &[in_order.view()], [1, 1, 1])?;
+        let read = recorder.read_back("scan", &in_order.view())?;
+        self.submit(recorder)?;
+        Ok(read.to_vec::<u32>()?.iter().all(|is_in_order| *is_in_order == 1))
+    }
+
     /// Lets uploads take more staging memory, within the budget, instead of waiting for the device: for a host that records one step
     /// while the device works on another.
     pub fn allow_steps_in_flight(&self) {
@@ -164,7 +220,7 @@ impl Gpu {
         &self.summary
     }
 
-    /// Whether shaders are compiled with subgroup operations (the define `SUBGROUPS`).
+    /// Whether shaders add up over subgroups (the define `SUBGROUPS`).
     pub fn subgroups(&self) -> bool {
         self.pipelines.subgroups()
     }

@@ -66,7 +66,7 @@ pub use belt::staging_bytes;
 pub use buffers::{Buffer, BufferView};
 pub use bus::EmulatedBus;
 #[cfg(feature = "gpu")]
-pub use device::{Gpu, GpuOptions, budget_for_buffers, bytes_for_buffers};
+pub use device::{Gpu, GpuOptions, Subgroups, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
 #[cfg(feature = "gpu")]
 pub use injected::{FaultKind, InjectedFault};

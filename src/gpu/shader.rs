@@ -1,8 +1,8 @@
 //! Compiled shaders: reflection by the shader compiler (naga), and pipelines with explicit layouts.
 //!
 //! Invariants: (1) layouts are derived from the bindings that the entry point uses, never declared by a caller;
-//! (2) equal (shader, entry, defines) give the same pipeline, compiled once; (3) a shader that knows the define
-//! `SUBGROUPS` gets it on a device with subgroup operations, and `SUBGROUPS_OF_8` if all subgroups have 8 invocations.
+//! (2) equal (shader, entry, defines) give the same pipeline, compiled once; (3) a shader gets those of the
+//! defines of [`super::Subgroups`] that it knows.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -13,7 +13,7 @@ use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
 use super::injected::with_shader_fault;
-use super::sources::{Defines, Source, preprocess, switches};
+use super::sources::{Defines, Source, knows, preprocess};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum BindingKind {
@@ -62,7 +62,7 @@ type PipelineKey = (String, String, Vec<(String, String)>);
 #[derive(Debug)]
 pub(super) struct Pipelines {
     driver: Arc<Driver>,
-    subgroup_defines: &'static [&'static str],
+    subgroup_defines: Defines<'static>,
     uniform_blocks: bool,
     compiled: Mutex<BTreeMap<PipelineKey, Arc<Pipeline>>>,
 }
@@ -70,7 +70,7 @@ pub(super) struct Pipelines {
 impl Pipelines {
     /// No pipelines yet. `subgroup_defines` are set for every shader that knows them; without `uniform_blocks` shaders
     /// read uniforms as storage.
-    pub(super) fn new(driver: Arc<Driver>, subgroup_defines: &'static [&'static str], uniform_blocks: bool) -> Self {
+    pub(super) fn new(driver: Arc<Driver>, subgroup_defines: Defines<'static>, uniform_blocks: bool) -> Self {
         Pipelines { driver, subgroup_defines, uniform_blocks, compiled: Mutex::default() }
     }
 
@@ -82,8 +82,8 @@ impl Pipelines {
     /// The pipeline of an entry point; compiled on first use.
     pub(super) fn get(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Arc<Pipeline>> {
         let mut all = defines.to_vec();
-        let known = switches(source)?;
-        all.extend(self.subgroup_defines.iter().filter(|name| known.contains(**name)).map(|name| (*name, "")));
+        let known = knows(source)?;
+        all.extend(self.subgroup_defines.iter().filter(|(name, _)| known.contains(*name)));
         all.sort_unstable();
         all.dedup();
         let owned = all.iter().map(|(n, v)| (n.to_string(), v.to_string())).collect();

@@ -63,7 +63,7 @@ sources![
     "shared/raster.wgsl",
     "shared/sh.wgsl",
     "shared/splat.wgsl",
-    "shared/subgroup_place.wgsl",
+    "shared/subgroups.wgsl",
     "shared/workgroup_scan.wgsl",
 ];
 
@@ -126,8 +126,13 @@ fn directive(line: &str) -> Option<Vec<&str>> {
     line.trim_start().strip_prefix('#').map(|rest| rest.split_whitespace().collect())
 }
 
+/// The defines that a shader knows.
+pub(super) fn knows(source: &Source) -> GpuResult<BTreeSet<String>> {
+    Ok(switches(source)?.into_iter().chain(params(source)?.into_keys()).collect())
+}
+
 /// Names of the `#ifdef` and `#ifndef` lines of a shader and its imports.
-pub(super) fn switches(source: &Source) -> GpuResult<BTreeSet<String>> {
+fn switches(source: &Source) -> GpuResult<BTreeSet<String>> {
     let lines = stitched(source)?;
     let words = lines.iter().filter_map(|l| directive(l));
     Ok(words.filter(|w| w.len() > 1 && (w[0] == "ifdef" || w[0] == "ifndef")).map(|w| w[1].to_string()).collect())

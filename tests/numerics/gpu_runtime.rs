@@ -1,7 +1,7 @@
 //! The GPU runtime on any adapter, software adapters included: uploads, dispatches, read-backs, budgets and limits.
 //! Without an adapter the tests print a skip; in CI they fail.
 
-use gsscale::gpu::{DeviceChoice, DeviceKind, Gpu, GpuError, GpuOptions, Source, groups_1d};
+use gsscale::gpu::{DeviceChoice, DeviceKind, Gpu, GpuError, GpuOptions, Source, Subgroups, groups_1d};
 
 use crate::support::gpu::open;
 
@@ -298,7 +298,7 @@ fn shaders_take_the_plain_path_without_subgroups() {
             #endif
             }",
     };
-    for forced in [None, Some(false)] {
+    for forced in [Subgroups::Best, Subgroups::Off] {
         let Some(gpu) = open(&GpuOptions { subgroups: forced, ..GpuOptions::default() }) else { return };
         let pipeline = gpu.pipeline_from(&source, "main", &[]).unwrap();
         let mut pass = gpu.begin("test");
@@ -308,7 +308,7 @@ fn shaders_take_the_plain_path_without_subgroups() {
         gpu.submit(pass).unwrap();
         let sum = readback.to_vec::<u32>().unwrap()[0];
         match gpu.summary().subgroup_sizes {
-            Some((low, high)) if forced.is_none() => assert!((low..=high).contains(&sum), "{sum}"),
+            Some((low, high)) if forced == Subgroups::Best => assert!((low..=high).contains(&sum), "{sum}"),
             _ => assert_eq!(sum, 0),
         }
     }

@@ -38,7 +38,7 @@ const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
 ];
 
 /// The most variants that a shader may have: every variant is tested.
-const VARIANTS_MAX: usize = 64;
+const VARIANTS_MAX: usize = 256;
 
 fn all_layouts() -> Vec<StructLayout> {
     LAYOUTS.iter().flat_map(|table| table.iter().copied()).collect()

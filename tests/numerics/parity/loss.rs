@@ -3,7 +3,7 @@
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::gpu::{Gpu, GpuOptions};
+use gsscale::gpu::{Gpu, GpuOptions, Subgroups};
 use gsscale::kernels::image_loss::{ImageLoss, LossOptions, LossPlan, LossValue, SsimPadding};
 use gsscale::kernels::uniforms::pack_target;
 use gsscale::render::gpu_loss::{LossStage, value};
@@ -15,7 +15,8 @@ const SIZES: [[u32; 2]; 10] =
 
 /// The device as it is, with subgroup operations if supported, and on the plain path.
 fn devices() -> impl Iterator<Item = Gpu> {
-    [None, Some(false)].into_iter().filter_map(|subgroups| open(&GpuOptions { subgroups, ..GpuOptions::default() }))
+    let all = [Subgroups::Best, Subgroups::Off].into_iter().chain([4, 16, 64].map(Subgroups::Emulated));
+    all.filter_map(|subgroups| open(&GpuOptions { subgroups, ..GpuOptions::default() }))
 }
 
 fn options(ssim_lambda: f32, padding: SsimPadding) -> LossOptions {

@@ -3,7 +3,7 @@
 use crate::support::gpu;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::gpu::{BufferView, Gpu, GpuOptions};
+use gsscale::gpu::{BufferView, Gpu, GpuOptions, Subgroups};
 use gsscale::kernels::fold::{FoldPart, FootprintGradients, fold_rows};
 use gsscale::kernels::isect_emit::{Isect, count, emit};
 use gsscale::kernels::isect_offsets::isect_offsets;
@@ -20,24 +20,29 @@ use gsscale::render::gpu_tiles::TileStages;
 use gsscale::render::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
-/// The device on each supported path: subgroups of 8, subgroups of any size, none.
+/// The device on each path that it has.
 fn devices() -> Vec<Gpu> {
-    let open = |subgroups, subgroups_of_8| {
-        let options = GpuOptions { subgroups, subgroups_of_8, ..GpuOptions::default() };
-        gpu::open(&options)
-    };
-    let any_size = open(None, Some(false)).filter(Gpu::subgroups);
-    let of_8 = open(None, None).filter(|gpu| gpu.subgroups() && gpu.summary().subgroup_sizes == Some((8, 8)));
-    of_8.into_iter().chain(any_size).chain(open(Some(false), None)).collect()
+    let all = [Subgroups::Best, Subgroups::AnySize, Subgroups::Off];
+    all.into_iter().filter_map(|subgroups| gpu::open(&GpuOptions { subgroups, ..GpuOptions::default() })).collect()
+}
+
+/// The same, and with emulated subgroups of every size for at most so many values.
+fn devices_and_emulated() -> Vec<(Gpu, usize)> {
+    let emulated = [4, 8, 16, 32, 64].map(Subgroups::Emulated).into_iter();
+    let emulated = emulated.filter_map(|subgroups| gpu::open(&GpuOptions { subgroups, ..GpuOptions::default() }));
+    devices().into_iter().map(|gpu| (gpu, usize::MAX)).chain(emulated.map(|gpu| (gpu, 100_001))).collect()
 }
 
 #[test]
 fn sums_are_those_of_the_cpu() {
-    for gpu in devices() {
+    for (gpu, most) in devices_and_emulated() {
         let stages = TileStages::new(&gpu).unwrap();
         let mut draws = Stream::new(31, Purpose::Test, 0, 0);
         // One block, its borders, two levels, three levels; the last beyond 2^24 values.
-        for n in [0, 1, 7, 2047, 2048, 2049, 100_001, 5_000_000, 20_000_000] {
+        for n in [0, 1, 7, 2047, 2048, 2049, 100_001, 5_000_000, 20_000_000u32] {
+            if n as usize > most {
+                continue;
+            }
             let values: Vec<u32> = (0..n).map(|i| if n > 1 << 24 { i & 31 } else { draws.below(800) as u32 }).collect();
             let mut want = Vec::new();
             scan(&values.iter().map(|&x| u64::from(x)).collect::<Vec<_>>(), &mut want);
@@ -68,7 +73,7 @@ fn gpu_scan(gpu: &Gpu, stages: &TileStages, values: &[u32]) -> Vec<u32> {
 
 #[test]
 fn sorted_pairs_are_those_of_a_stable_sort() {
-    for gpu in devices() {
+    for (gpu, most) in devices_and_emulated() {
         let stages = TileStages::new(&gpu).unwrap();
         let mut draws = Stream::new(32, Purpose::Test, 0, 0);
         for (n, bits, distinct) in [
@@ -82,6 +87,9 @@ fn sorted_pairs_are_those_of_a_stable_sort() {
             (60_000, 17, 90_000),
             (1_000_000, 32, 1 << 32),
         ] {
+            if n > most {
+                continue;
+            }
             let keys: Vec<u32> = (0..n).map(|_| draws.below(distinct) as u32).collect();
             let mut want: Vec<(u32, u32)> = keys.iter().copied().zip(0..).collect();
             want.sort_by_key(|pair| pair.0);
@@ -364,7 +372,7 @@ fn compare(want: &Outcome, got: &Outcome, what: &str) {
 
 #[test]
 fn pictures_and_gradients_are_those_of_the_cpu() {
-    for gpu in devices() {
+    for (gpu, _) in devices_and_emulated() {
         let mut stages = TileStages::new(&gpu).unwrap();
         for (rows, width, height, needles) in [
             (0, 40, 30, false),
