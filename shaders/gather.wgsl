@@ -164,8 +164,8 @@ fn is_seen(page: DevicePage, row: u32) -> bool {
 
 /// One workgroup for each page.
 @compute @workgroup_size(256)
-fn cull(place: SubgroupPlace) {
-    let p = linear_group(place.workgroup, place.workgroups);
+fn cull(workgroup: Group, place: SubgroupPlace) {
+    let p = linear_group(workgroup);
     // The same for the whole workgroup.
     if p >= u.page_count || pages[p].slab != u.slab {
         return;
@@ -192,7 +192,7 @@ fn cull(place: SubgroupPlace) {
 
 /// One workgroup, for the pages of all slabs: where the listed rows of each page begin, and how many there are.
 @compute @workgroup_size(256)
-fn place(place: SubgroupPlace) {
+fn place(workgroup: Group, place: SubgroupPlace) {
     var before = 0u;
     for (var first = 0u; first < u.page_count; first += 256u) {
         let p = first + place.lane;
@@ -214,8 +214,8 @@ fn place(place: SubgroupPlace) {
 
 /// One invocation for each row that the list has room for.
 @compute @workgroup_size(256)
-fn pad(place: Place) {
-    let i = linear_index(place, 256u);
+fn pad(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i < u.row_count && i >= counts[u.page_count] {
         rows[i] = vec2<u32>(UNLISTED, 0u);
     }
@@ -223,8 +223,8 @@ fn pad(place: Place) {
 
 /// One workgroup for each page, of any slab.
 @compute @workgroup_size(256)
-fn list(place: Place) {
-    let p = linear_group(place.workgroup, place.workgroups);
+fn list(workgroup: Group, place: Place) {
+    let p = linear_group(workgroup);
     if p >= u.page_count {
         return;
     }
@@ -237,8 +237,8 @@ fn list(place: Place) {
 
 /// One invocation for each float of the output.
 @compute @workgroup_size(256)
-fn gather(place: Place) {
-    let i = linear_index(place, 256u);
+fn gather(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= u.row_count * u.width {
         return;
     }
@@ -279,8 +279,8 @@ fn split_reach(page: DevicePage, row: u32, sigma: f32) -> f32 {
 
 /// Bounds of the pages that an update has changed: one workgroup for each page.
 @compute @workgroup_size(256)
-fn bounds(place: Place) {
-    let p = linear_group(place.workgroup, place.workgroups);
+fn bounds(workgroup: Group, place: Place) {
+    let p = linear_group(workgroup);
     if p >= u.page_count || pages[p].slab != u.slab {
         return;
     }
@@ -332,8 +332,8 @@ fn bounds(place: Place) {
 
 /// One workgroup for each page. The uniform names the column of the opacities.
 @compute @workgroup_size(256)
-fn survey(place: Place) {
-    let p = linear_group(place.workgroup, place.workgroups);
+fn survey(workgroup: Group, place: Place) {
+    let p = linear_group(workgroup);
     if p >= u.page_count || pages[p].slab != u.slab {
         return;
     }

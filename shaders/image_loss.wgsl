@@ -160,7 +160,7 @@ fn down_4(t: u32) -> array<vec4<f32>, 4> {
 /// Adds the lanes' sums in the memory of the patch, which is no longer needed; the first lane gets the result.
 #ifdef SUBGROUPS
 fn sum_lanes(place: SubgroupPlace, lanes: u32, value: vec3<f32>) -> vec3<f32> {
-    let part = subgroup_sum_vec3(value, place);
+    let part = subgroup_sum_vec3(value, place.lane);
     if subgroup_lane_of(place) == 0u {
         patch_two[subgroup_of(place)] = part.xy;
         patch_one[subgroup_of(place)] = part.z;
@@ -219,8 +219,8 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
 }
 
 @compute @workgroup_size(64)
-fn ssim_map(place: SubgroupPlace) {
-    let j = job(linear_group(place.workgroup, place.workgroups));
+fn ssim_map(workgroup: Group, place: SubgroupPlace) {
+    let j = job(linear_group(workgroup));
     for (var at = place.lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
         var both = vec2<f32>();
@@ -272,8 +272,8 @@ fn ssim_map(place: SubgroupPlace) {
 }
 
 @compute @workgroup_size(64)
-fn gradient(place: SubgroupPlace) {
-    let j = job(linear_group(place.workgroup, place.workgroups));
+fn gradient(workgroup: Group, place: SubgroupPlace) {
+    let j = job(linear_group(workgroup));
     let pixels = loss.width * loss.height;
     for (var at = place.lane; at < PATCH_LEN; at += LANES) {
         let pixel = pixel_of_patch(j, at);
@@ -329,8 +329,8 @@ fn gradient(place: SubgroupPlace) {
 }
 
 @compute @workgroup_size(256)
-fn sum_partials(place: SubgroupPlace) {
-    let group = linear_group(place.workgroup, place.workgroups);
+fn sum_partials(workgroup: Group, place: SubgroupPlace) {
+    let group = linear_group(workgroup);
     let each = PARTIALS_EACH * WORKGROUP;
     var sum = vec3<f32>();
     for (var k = 0u; k < PARTIALS_EACH; k++) {
@@ -347,8 +347,8 @@ fn sum_partials(place: SubgroupPlace) {
 
 /// Squared difference of picture and photo at each pixel, mean over the channels; 0 where the pixel is excluded.
 @compute @workgroup_size(256)
-fn squared_errors(place: Place) {
-    let pixel = linear_index(place, WORKGROUP);
+fn squared_errors(workgroup: Group, place: Place) {
+    let pixel = linear_index(workgroup, place, WORKGROUP);
     if pixel >= loss.width * loss.height {
         return;
     }

@@ -48,8 +48,8 @@ fn rows_in_range(reach: Reach, tile_x: u32) -> vec2<u32> {
 
 /// Counts intersections before any is emitted.
 @compute @workgroup_size(256)
-fn isect_count(place: Place) {
-    let rank = linear_index(place, 256u);
+fn isect_count(workgroup: Group, place: Place) {
+    let rank = linear_index(workgroup, place, 256u);
     if rank >= view.row_count {
         return;
     }
@@ -80,8 +80,8 @@ fn rank_from_isect(isect: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn isect_emit(place: Place) {
-    let isect = linear_index(place, 256u);
+fn isect_emit(workgroup: Group, place: Place) {
+    let isect = linear_index(workgroup, place, 256u);
     if isect >= min(offsets[view.row_count], view.capacity) {
         return;
     }

@@ -35,8 +35,8 @@ fn first_of_tile(tile: u32, count: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn isect_offsets(place: Place) {
-    let tile = linear_index(place, 256u);
+fn isect_offsets(workgroup: Group, place: Place) {
+    let tile = linear_index(workgroup, place, 256u);
     if tile > lists.tile_count {
         return;
     }

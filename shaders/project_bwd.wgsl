@@ -94,8 +94,8 @@ fn sigmoid_slope(logit: f32) -> f32 {
 }
 
 @compute @workgroup_size(256)
-fn project_bwd(place: Place) {
-    let i = linear_index(place, 256u);
+fn project_bwd(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= view.row_count {
         return;
     }

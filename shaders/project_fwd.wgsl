@@ -33,8 +33,8 @@ fn on_screen(mean: f32, radius: f32, size: f32) -> bool {
 }
 
 @compute @workgroup_size(256)
-fn project_fwd(place: Place) {
-    let i = linear_index(place, 256u);
+fn project_fwd(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= view.row_count {
         return;
     }

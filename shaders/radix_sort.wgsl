@@ -76,8 +76,8 @@ fn counts_at(word: u32, lane: u32) -> u32 {
 /// Keys and values of the sort by depth: the bits of a drawn row's depth (positive, so they sort like the depths) and
 /// the row. Rows that are not drawn come last. The capacity is the number of rows.
 @compute @workgroup_size(256)
-fn depth_keys(place: Place) {
-    let row = linear_index(place, 256u);
+fn depth_keys(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= sort.capacity {
         return;
     }
@@ -91,8 +91,8 @@ var<workgroup> counts_of_parts: array<u32, 2048>;
 
 /// First half of a pass: fills the histogram.
 @compute @workgroup_size(256)
-fn radix_histogram(place: SubgroupPlace) {
-    let block = linear_group(place.workgroup, place.workgroups);
+fn radix_histogram(workgroup: Group, place: SubgroupPlace) {
+    let block = linear_group(workgroup);
     let count = min(live[sort.live_at], sort.capacity);
     let first = block * BLOCK_KEYS + place.lane * KEYS;
     var counts = DigitCounts(0u, 0u);
@@ -104,7 +104,7 @@ fn radix_histogram(place: SubgroupPlace) {
 #ifdef SUBGROUPS
     let parts = subgroups_of(place, 256u);
     for (var word = 0u; word < WORDS; word++) {
-        let sum = subgroup_scan_u32(digit_word(counts, word), place).y;
+        let sum = subgroup_scan_u32(digit_word(counts, word), place.lane).y;
         if subgroup_lane_of(place) == 0u {
             counts_of_parts[word * parts + subgroup_of(place)] = sum;
         }
@@ -135,8 +135,8 @@ fn radix_histogram(place: SubgroupPlace) {
 
 /// Second half of a pass, after the scan of the histogram: moves keys and values.
 @compute @workgroup_size(256)
-fn radix_sort(place: SubgroupPlace) {
-    let block = linear_group(place.workgroup, place.workgroups);
+fn radix_sort(workgroup: Group, place: SubgroupPlace) {
+    let block = linear_group(workgroup);
     let count = min(live[sort.live_at], sort.capacity);
     let first = block * BLOCK_KEYS + place.lane * KEYS;
     if place.lane < DIGITS && block < sort.blocks {
@@ -157,7 +157,7 @@ fn radix_sort(place: SubgroupPlace) {
 #ifdef SUBGROUPS
     let parts = subgroups_of(place, 256u);
     for (var word = 0u; word < WORDS; word++) {
-        let sums = subgroup_scan_u32(digit_word(counts, word), place);
+        let sums = subgroup_scan_u32(digit_word(counts, word), place.lane);
         counts_before[counts_at(word, place.lane)] = sums.x;
         if subgroup_lane_of(place) == 0u {
             part_counts[word * parts + subgroup_of(place)] = sums.y;

@@ -217,21 +217,35 @@ fn take_off_8(pixels: ptr<function, Pixels>, first: u32, list_index: u32, size: 
 #endif
 
 @compute @workgroup_size(64)
-fn rasterize_bwd(place: SubgroupPlace) {
+fn rasterize_bwd(
+    workgroup: Group,
+    place: Place,
 #ifdef SUBGROUPS
-    let part = subgroup_of(place);
-    let subgroup_lane = subgroup_lane_of(place);
+#ifndef EMULATED_SUBGROUPS
+    // Not in a struct: the number is the same for all invocations, which compilers would not see there.
+    @builtin(num_subgroups) subgroups: u32,
+    @builtin(subgroup_id) part: u32,
+    @builtin(subgroup_invocation_id) subgroup_lane: u32,
+#endif
+#endif
+) {
+#ifdef SUBGROUPS
+#ifdef EMULATED_SUBGROUPS
+    let part = place.lane / SUBGROUP_SIZE;
+    let subgroup_lane = place.lane % SUBGROUP_SIZE;
+    let subgroups = TILE_LANES / SUBGROUP_SIZE;
+#endif
 #ifdef SUBGROUPS_OF_8
     let parts = 8u;
 #else
-    let parts = subgroups_of(place, TILE_LANES);
+    let parts = subgroups;
 #endif
 #else
     let part = place.lane;
     let subgroup_lane = 0u;
     let parts = TILE_LANES;
 #endif
-    let n = linear_group(place.workgroup, place.workgroups);
+    let n = linear_group(workgroup);
     // Uniform across the workgroup.
     if n >= tiles_in_range(view.range) {
         return;
@@ -241,8 +255,11 @@ fn rasterize_bwd(place: SubgroupPlace) {
     let stop = pixels.stop;
     atomicMax(&tile_stop, max(max(stop.x, stop.y), max(stop.z, stop.w)));
 
-    let list = tile_offsets[here.tile];
-    let count = tile_offsets[here.tile + 1u] - list;
+    let stop_of_tile = workgroupUniformLoad(&tile_stop);
+    // Not from `here`, in which compilers would see what differs between invocations.
+    let tile = tile_of_range(n, view.range, view.grid);
+    let list = tile_offsets[tile];
+    let count = tile_offsets[tile + 1u] - list;
     let batch_size = min(TILE_LANES, PARTS_OF_BATCH / parts);
     var end = min(count, view.end);
     while end > view.first {
@@ -257,8 +274,7 @@ fn rasterize_bwd(place: SubgroupPlace) {
             batch[place.lane] = tile_splat(splat_unpack(splats[record], splats[record + 1u], splats[record + 2u]));
         }
         workgroupBarrier();
-        // Uniform: nothing changes it after the first barrier.
-        let reached = view.list_base + first < atomicLoad(&tile_stop);
+        let reached = view.list_base + first < stop_of_tile;
 #ifdef SUBGROUPS_OF_8
         for (var i = (size + 7u) / 8u * 8u; reached && i > 0u;) {
             i -= 8u;
@@ -284,14 +300,14 @@ fn rasterize_bwd(place: SubgroupPlace) {
 #endif
             var s = take_off(&pixels, splat, e, taking_part, dx, dy);
 #ifdef WEIGHS
-            let weights = subgroup_sum_vec2(s.weights, place);
+            let weights = subgroup_sum_vec2(s.weights, place.lane);
 #endif
-            let firsts = subgroup_sum_vec3(vec3<f32>(s.h, s.firsts), place);
+            let firsts = subgroup_sum_vec3(vec3<f32>(s.h, s.firsts), place.lane);
             s = Sums(
                 firsts.x,
                 firsts.yz,
-                subgroup_sum_vec3(s.seconds, place),
-                subgroup_sum_vec3(s.color, place),
+                subgroup_sum_vec3(s.seconds, place.lane),
+                subgroup_sum_vec3(s.color, place.lane),
 #ifdef WEIGHS
                 weights,
 #endif
@@ -370,8 +386,8 @@ fn isects_at(rank: u32) -> vec2<u32> {
 /// in a later range of tiles, stores its sums in place of its gradients, in the order of the sums, and the next window
 /// or range continues from there.
 @compute @workgroup_size(256)
-fn fold_rows(place: Place) {
-    let group = linear_group(place.workgroup, place.workgroups);
+fn fold_rows(workgroup: Group, place: Place) {
+    let group = linear_group(workgroup);
     let rank = group * GROUP_ROWS + place.lane / SUMS;
     let which = place.lane % SUMS;
     var sum = 0.0;
@@ -449,8 +465,8 @@ fn fold_rows(place: Place) {
 
 /// Counts the rows with a gradient that is too large for the optimizer, or not finite.
 @compute @workgroup_size(256)
-fn count_unusable(place: Place) {
-    let row = linear_index(place, 256u);
+fn count_unusable(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= view.row_count {
         return;
     }

@@ -111,12 +111,13 @@ var<workgroup> finished: atomic<u32>;
 
 @compute @workgroup_size(64)
 fn rasterize_fwd(
+    workgroup: Group,
     place: Place,
 #ifdef SUBGROUPS_OF_8
     @builtin(subgroup_invocation_id) subgroup_lane: u32,
 #endif
 ) {
-    let n = linear_group(place.workgroup, place.workgroups);
+    let n = linear_group(workgroup);
     // Uniform across the workgroup.
     if n >= tiles_in_range(view.range) {
         return;
@@ -124,8 +125,10 @@ fn rasterize_fwd(
     let here = pixels_of(n, place.lane, view.range, view.grid);
     var pixels = pixels_before(here.at, here.plane, here.inside);
 
-    let list = tile_offsets[here.tile];
-    let count = tile_offsets[here.tile + 1u] - list;
+    // Not from `here`, in which compilers would see what differs between invocations.
+    let tile = tile_of_range(n, view.range, view.grid);
+    let list = tile_offsets[tile];
+    let count = tile_offsets[tile + 1u] - list;
     let end = min(count, view.end);
 #ifdef SUBGROUPS_OF_8
     for (var first = view.first; first < end; first += 8u) {
@@ -155,9 +158,8 @@ fn rasterize_fwd(
         atomicAdd(&finished, 1u);
     }
     for (var first = view.first; first < end; first += TILE_LANES) {
-        workgroupBarrier();
-        // Every invocation reads between two barriers and adds after the second: all see the same number.
-        if atomicLoad(&finished) == TILE_LANES {
+        // Waits for all, before and after.
+        if workgroupUniformLoad(&finished) == TILE_LANES {
             break;
         }
         if first + place.lane < end {

@@ -27,14 +27,14 @@ const ITEMS: u32 = 8u;
 /// Whether a scan of ones counts the invocations in their order: 1 for each of a workgroup's. Sums over subgroups assume that
 /// invocations lie in subgroups in their order, which drivers need not promise.
 @compute @workgroup_size(256)
-fn check_order(place: SubgroupPlace) {
+fn check_order(workgroup: Group, place: SubgroupPlace) {
     let scanned = workgroup_scan(1u, place);
     offsets[place.lane] = u32(scanned.before == place.lane && scanned.total == 256u);
 }
 
 @compute @workgroup_size(256)
-fn scan_reduce(place: SubgroupPlace) {
-    let block = linear_group(place.workgroup, place.workgroups);
+fn scan_reduce(workgroup: Group, place: SubgroupPlace) {
+    let block = linear_group(workgroup);
     let first = (block * 256u + place.lane) * ITEMS;
     var sum = 0u;
     for (var i = 0u; i < ITEMS; i++) {
@@ -49,8 +49,8 @@ fn scan_reduce(place: SubgroupPlace) {
 }
 
 @compute @workgroup_size(256)
-fn scan(place: SubgroupPlace) {
-    let block = linear_group(place.workgroup, place.workgroups);
+fn scan(workgroup: Group, place: SubgroupPlace) {
+    let block = linear_group(workgroup);
     let first = (block * 256u + place.lane) * ITEMS;
     var before: array<u32, ITEMS>;
     var sum = 0u;

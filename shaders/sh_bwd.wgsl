@@ -63,8 +63,8 @@ fn clear_row(i: u32) {
 }
 
 @compute @workgroup_size(256)
-fn sh_bwd(place: Place) {
-    let i = linear_index(place, 256u);
+fn sh_bwd(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= view.row_count {
         return;
     }

@@ -20,8 +20,8 @@ fn coefficient(at: u32) -> vec3<f32> {
 #endif
 
 @compute @workgroup_size(256)
-fn sh_fwd(place: Place) {
-    let i = linear_index(place, 256u);
+fn sh_fwd(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= view.row_count {
         return;
     }

@@ -75,8 +75,8 @@ fn is_in_range(row: u32) -> bool {
 
 /// Adds each splat to the counts of the tiles that it can reach.
 @compute @workgroup_size(256)
-fn range_tally(place: Place) {
-    let row = linear_index(place, 256u);
+fn range_tally(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= segment.row_count {
         return;
     }
@@ -98,8 +98,8 @@ fn range_tally(place: Place) {
 
 /// Flags the splats that reach the range.
 @compute @workgroup_size(256)
-fn range_select(place: Place) {
-    let row = linear_index(place, 256u);
+fn range_select(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= segment.row_count {
         return;
     }
@@ -108,8 +108,8 @@ fn range_select(place: Place) {
 
 /// Adds each splat that reaches the range at a wanted depth to the bin of its depth.
 @compute @workgroup_size(256)
-fn range_depths(place: Place) {
-    let row = linear_index(place, 256u);
+fn range_depths(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= segment.row_count || !is_in_range(row) {
         return;
     }
@@ -124,8 +124,8 @@ fn place_of(row: u32) -> u32 {
 
 /// Copies the records of the flagged rows to their places.
 @compute @workgroup_size(256)
-fn range_gather(place: Place) {
-    let row = linear_index(place, 256u);
+fn range_gather(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= segment.row_count {
         return;
     }
@@ -139,8 +139,8 @@ fn range_gather(place: Place) {
 
 /// Copies the records of the flagged rows back from their places.
 @compute @workgroup_size(256)
-fn range_scatter(place: Place) {
-    let row = linear_index(place, 256u);
+fn range_scatter(workgroup: Group, place: Place) {
+    let row = linear_index(workgroup, place, 256u);
     if row >= segment.row_count {
         return;
     }

@@ -88,8 +88,8 @@ fn decay_at(steps: u32) -> u32 {
 
 /// One invocation for each float of the column.
 @compute @workgroup_size(256)
-fn step(place: Place) {
-    let i = linear_index(place, 256u);
+fn step(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= u.row_count * u.width || gate[0] != 0u {
         return;
     }
@@ -180,8 +180,8 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>, weight: f32
 
 /// One invocation for each row; after all columns.
 @compute @workgroup_size(256)
-fn finish(place: Place) {
-    let i = linear_index(place, 256u);
+fn finish(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= u.row_count || gate[0] != 0u {
         return;
     }
@@ -212,8 +212,8 @@ fn finish(place: Place) {
 
 /// One workgroup for each page.
 @compute @workgroup_size(256)
-fn clear_statistics(place: Place) {
-    let p = linear_group(place.workgroup, place.workgroups);
+fn clear_statistics(workgroup: Group, place: Place) {
+    let p = linear_group(workgroup);
     if p >= u.row_count || pages[p].slab != u.slab {
         return;
     }

@@ -27,8 +27,8 @@ fn saturating_join(low: u32, high: u32) -> u32 {
 
 /// Every invocation of the workgroup must call this, and pass a barrier before the next call.
 fn workgroup_scan(value: u32, place: SubgroupPlace) -> WorkgroupScan {
-    let low = subgroup_scan_u32(value & 0xffffu, place);
-    let high = subgroup_scan_u32(value >> 16u, place);
+    let low = subgroup_scan_u32(value & 0xffffu, place.lane);
+    let high = subgroup_scan_u32(value >> 16u, place.lane);
     let before = saturating_join(low.x, high.x);
     if subgroup_lane_of(place) == 0u {
         scan_parts[subgroup_of(place)] = saturating_join(low.y, high.y);

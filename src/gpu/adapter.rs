@@ -76,6 +76,13 @@ impl fmt::Display for AdapterSummary {
             Some((low, high)) => write!(f, ", subgroups of {low} to {high}")?,
             None => write!(f, ", no subgroup operations")?,
         }
+        if self.subgroup_sizes.is_none() && self.backend.starts_with("Dx12") {
+            // The old compiler of Direct3D knows none.
+            write!(
+                f,
+                " (faster with dxcompiler.dll and dxil.dll, of the DirectX Shader Compiler, beside the program)"
+            )?;
+        }
         match &self.refusal {
             Some(reason) => write!(f, "; cannot be used: {reason}"),
             None => Ok(()),
@@ -191,6 +198,25 @@ pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, Adapter
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn direct3d_without_its_new_compiler_says_what_is_missing() {
+        let summary = AdapterSummary {
+            name: "card".into(),
+            kind: DeviceKind::Discrete,
+            backend: "Dx12, driver 1".into(),
+            max_binding_bytes: 0,
+            max_buffer_bytes: 0,
+            workgroup_storage_bytes: 0,
+            subgroup_sizes: None,
+            timestamps: false,
+            refusal: None,
+        };
+        assert!(summary.to_string().contains("dxcompiler.dll"));
+        let with_subgroups = AdapterSummary { subgroup_sizes: Some((32, 32)), ..summary.clone() };
+        let of_vulkan = AdapterSummary { backend: "Vulkan".into(), ..summary };
+        assert!([with_subgroups, of_vulkan].iter().all(|other| !other.to_string().contains("dxcompiler")));
+    }
 
     #[test]
     fn an_adapter_below_a_limit_is_refused_with_the_name_of_the_limit() {

@@ -24,8 +24,8 @@ struct TestUniforms { count: u32, add: u32 }
 @group(0) @binding(1) var<storage, read> values_in: array<u32>;
 @group(0) @binding(2) var<storage, read_write> values_out: array<u32>;
 @compute @workgroup_size(256)
-fn main(place: Place) {
-    let i = linear_index(place, 256u);
+fn main(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i >= u.count { return; }
     values_out[i] = values_in[i] * FACTOR + u.add;
 }
@@ -41,8 +41,8 @@ struct TestUniforms { count: u32, add: u32 }
 @group(0) @binding(0) var<uniform> u: TestUniforms;
 @group(0) @binding(1) var<storage, read_write> marks: array<atomic<u32>>;
 @compute @workgroup_size(1)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>) {
-    let i = linear_group(group, groups);
+fn main(workgroup: Group) {
+    let i = linear_group(workgroup);
     if i >= u.count { return; }
     atomicAdd(&marks[i], i + u.add);
 }

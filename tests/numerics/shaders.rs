@@ -282,3 +282,31 @@ fn the_checks_find_faults() {
     let no_twin = problems(&Source { name: "x.wgsl", text: GOOD }, &[]);
     assert!(no_twin[0].contains("no Rust twin"), "{no_twin:?}");
 }
+
+/// Chrome's compiler judges stricter than naga: literals that are no f32, barriers that it cannot prove to be reached by all. Files of
+/// `shared/` have no entry points and are judged as imports.
+#[test]
+fn every_variant_passes_tint() {
+    let modules = std::env::var_os("GSSCALE_NODE_BIN").map(|bin| PathBuf::from(bin).parent().unwrap().to_path_buf());
+    let Some(modules) = modules.filter(|modules| modules.join("webgpu").is_dir()) else {
+        return println!("SKIPPED: no npm package webgpu beside GSSCALE_NODE_BIN");
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let mut files = Vec::new();
+    for source in SOURCES.iter().filter(|source| !source.name.contains('/')) {
+        for (i, variant) in variants(source).unwrap().iter().enumerate() {
+            let defines: Vec<(&str, &str)> = variant.iter().map(|(n, v)| (n.as_str(), v.as_str())).collect();
+            let is_native = variant.iter().any(|(name, _)| name == "SUBGROUPS" || name == "SUBGROUPS_OF_8");
+            // Tint does not take what all of a subgroup have voted for as the same for all of it.
+            let enable = "enable subgroups;\ndiagnostic(off, subgroup_uniformity);\n";
+            let enable = if is_native { enable } else { "" };
+            let text = format!("{enable}// {defines:?}\n{}", preprocess(source, &defines).unwrap());
+            files.push(folder.path().join(format!("{i}-{}", source.name)));
+            std::fs::write(files.last().unwrap(), text).unwrap();
+        }
+    }
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/numerics/tint.mjs");
+    let tint = std::process::Command::new("node").arg(script).arg(modules).args(&files).output().unwrap();
+    let said = [tint.stdout, tint.stderr].map(|text| String::from_utf8_lossy(&text).into_owned()).concat();
+    assert!(tint.status.success() && said.is_empty(), "{said}");
+}

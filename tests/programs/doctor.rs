@@ -7,8 +7,11 @@ use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 use std::process::{Command, Output};
 
-fn doctor(work: &Workdir, flags: &[&str]) -> Output {
-    Command::new(BENCH).current_dir(work.path("")).args(["doctor", "--quick"]).args(flags).output().unwrap()
+/// Runs the doctor, on a device that compiles a shader wrongly if `fault` says so.
+fn doctor(work: &Workdir, flags: &[&str], fault: Option<&str>) -> Output {
+    let mut doctor = Command::new(BENCH);
+    doctor.current_dir(work.path("")).args(["doctor", "--quick"]).args(flags);
+    doctor.envs(fault.map(|fault| ("GSSCALE_SHADER_FAULT", fault))).output().unwrap()
 }
 
 fn json(text: &str) -> Value {
@@ -21,20 +24,28 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
         return;
     }
     let work = Workdir::new();
-    let sound = doctor(&work, &[]);
+    let sound = doctor(&work, &[], None);
     assert!(sound.status.success(), "{}", stderr(&sound));
     let found = json(&work.text("doctor/doctor.json"));
     let checks = found["checks"].as_array().unwrap();
     assert!(checks.len() == 2 && checks.iter().all(|check| check["verdict"] == "good"), "{found}");
     assert!(work.text("doctor/doctor.html").contains("8 views agree with the CPU"));
+    let has_subgroups = &found["subgroups"];
 
-    let poor = doctor(&work, &["--device-mem", "100KiB", "--out", "poor"]);
+    // A driver whose subgroups hold their invocations in another order computes without them, and is sound.
+    let shuffled =
+        doctor(&work, &["--out", "shuffled"], Some("scan.wgsl:workgroup_scan(1u=workgroup_scan(place.lane & 1u"));
+    assert!(shuffled.status.success(), "{}", stderr(&shuffled));
+    let found = json(&work.text("shuffled/doctor.json"));
+    assert_eq!((has_subgroups.as_bool(), found["subgroups"].as_bool()), (Some(true), Some(false)), "{found}");
+
+    let poor = doctor(&work, &["--device-mem", "100KiB", "--out", "poor"], None);
     assert_eq!(poor.status.code(), Some(1), "{}", stderr(&poor));
     let found = json(&work.text("poor/doctor.json"));
     assert_eq!(found["checks"][0]["verdict"], "failed", "{found}");
     assert!(found["checks"][0]["found"].as_str().unwrap().contains("memory"), "{found}");
 
-    let none = doctor(&work, &["--device", "no such card"]);
+    let none = doctor(&work, &["--device", "no such card"], None);
     assert!(!none.status.success() && stderr(&none).contains("--list-devices"), "{}", stderr(&none));
 }
 
@@ -51,12 +62,7 @@ fn a_wrong_constant_is_found_and_its_stage_is_named() {
         ("project_bwd.wgsl:-2.0 * (s=-2.1 * (s", "project_bwd"),
         ("rasterize_bwd.wgsl:alpha * over=1.01 * alpha * over", "rasterize_bwd"),
     ] {
-        let wrong = Command::new(BENCH)
-            .current_dir(work.path(""))
-            .args(["doctor", "--quick"])
-            .env("GSSCALE_SHADER_FAULT", fault)
-            .output()
-            .unwrap();
+        let wrong = doctor(&work, &[], Some(fault));
         assert_eq!(wrong.status.code(), Some(1), "{fault}: {}", stderr(&wrong));
         let said = stderr(&wrong);
         assert!(said.contains(stage) && said.contains("--device cpu"), "{fault}: {said}");

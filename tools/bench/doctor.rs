@@ -118,7 +118,7 @@ impl Check {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let doctor = Doctor { args, choice: args.device.clone().map_or(DeviceChoice::Gpu, DeviceChoice::Named) };
     let gpu = doctor.open(false).map_err(|e| InputError::new("--device", e, "see gsscale-train --list-devices"))?;
-    let about = gpu.summary().clone();
+    let (about, subgroups) = (gpu.summary().clone(), gpu.subgroups());
     drop(gpu);
     gsscale::tell!("examining {about}");
     let mut checks = vec![
@@ -133,6 +133,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let advice = advice(&checks, about.kind);
     let all = json!({
         "version": env!("CARGO_PKG_VERSION"), "device": about.to_string(), "kind": format!("{:?}", about.kind),
+        "subgroups": subgroups,
         "cpu": cpu_model(), "cores": std::thread::available_parallelism().map_or(0, usize::from), "checks": checks,
         "advice": advice,
     });

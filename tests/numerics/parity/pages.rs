@@ -497,8 +497,8 @@ const DIVISIONS: &str = r#"
 @group(0) @binding(1) var<storage, read> counts: array<u32>;
 @group(0) @binding(2) var<storage, read_write> quotients: array<f32>;
 @compute @workgroup_size(256)
-fn divide(place: Place) {
-    let i = linear_index(place, 256u);
+fn divide(workgroup: Group, place: Place) {
+    let i = linear_index(workgroup, place, 256u);
     if i < arrayLength(&sums) {
         quotients[i] = quotient(sums[i], counts[i]);
     }
