@@ -52,7 +52,6 @@ use tempfile::TempDir;
 
 type Lines = Result<Vec<Value>, TrainError>;
 
-/// The command line of a benchmark.
 fn arguments(args: &[&str]) -> Vec<OsString> {
     std::iter::once("bench").chain(args.iter().copied()).map(OsString::from).collect()
 }

@@ -121,7 +121,6 @@ fn rust_files(folders: &[&str]) -> Vec<(String, String)> {
     files
 }
 
-/// A source text without its comment lines.
 fn without_comments(text: &str) -> String {
     text.lines().filter(|l| !l.trim_start().starts_with("//")).collect::<Vec<_>>().join("\n")
 }
@@ -215,7 +214,6 @@ fn rooms_of_train_have_an_order() {
     assert!(wrong.is_empty(), "these name what they may not:\n{}", wrong.join("\n"));
 }
 
-/// Rooms, and folders of rooms.
 fn rooms() -> Vec<String> {
     let names = rust_files(&["src"]).into_iter().map(|(name, _)| name);
     let folder = |name: String| Some(Path::new(name.strip_prefix("src/")?).parent()?.to_str()?.to_string());

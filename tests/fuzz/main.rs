@@ -39,7 +39,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Seed of a plain run.
 const SEED: u64 = 2026;
 /// A case that takes longer counts as an endless loop, however busy the machine is.
 const ENDLESS: Duration = Duration::from_secs(100);

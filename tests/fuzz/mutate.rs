@@ -23,11 +23,9 @@ const NUMBERS: &[&str] = &[
     "+",
 ];
 
-/// Random numbers of one case.
 pub struct Draws(Stream);
 
 impl Draws {
-    /// Random numbers of case `case` of `target` under `seed`.
     pub fn of(target: &str, seed: u64, case: u64) -> Draws {
         let name = target.bytes().fold(0u64, |hash, byte| hash.wrapping_mul(31).wrapping_add(u64::from(byte)));
         Draws(Stream::new(seed, Purpose::Test, name, case))

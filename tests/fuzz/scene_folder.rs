@@ -19,7 +19,6 @@ pub fn stays_in(folder: &Path, path: &Path) -> bool {
     rest.components().all(|part| matches!(part, Component::Normal(_)))
 }
 
-/// Reads the scene in `folder` and checks its consistency.
 pub fn read_and_check(folder: &Path) -> Option<RawScene> {
     check(folder, read_scene(folder, &ReadOptions { allow_missing: true, ..ReadOptions::default() }))
 }

@@ -26,7 +26,6 @@ fn numbers(value: &Value) -> Vec<f64> {
     value.as_array().unwrap().iter().map(|v| v.as_f64().unwrap()).collect()
 }
 
-/// RGBA pixels of a picture.
 fn pixels(path: &Path) -> (usize, Vec<[u8; 4]>) {
     let mut decoder = image_webp::WebPDecoder::new(std::io::Cursor::new(std::fs::read(path).unwrap())).unwrap();
     assert!(!decoder.is_lossy(), "{}", path.display());

@@ -155,7 +155,6 @@ fn files_of_other_programs_may_lack_what_ours_have() {
     );
 }
 
-/// All levels of a folder.
 fn read_all(path: &Path) -> InputResult<Vec<Columns>> {
     let reader = SogReader::open(path)?;
     (0..reader.levels().len()).map(|level| reader.rows(level)).collect()

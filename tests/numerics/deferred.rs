@@ -206,7 +206,6 @@ fn reading_any_number_of_times_changes_no_bit_and_late_equals_on_time() {
     assert_eq!(evaluate_all(&quiet, &adam, 3000), evaluate_all(&read, &adam, 3000));
 }
 
-/// All floats of a state, and its stamps.
 fn bits_of(state: &SceneState) -> Vec<u32> {
     let tables = [&state.columns, &state.exp_avg, &state.exp_avg_sq];
     let floats = tables.iter().flat_map(|t| Column::ALL.into_iter().flat_map(|c| t.column(c)));
@@ -460,7 +459,6 @@ fn rows_beside_it_change_no_bit(simd: SimdPath) {
     }
 }
 
-/// Every case on every SIMD path of this machine.
 fn each_path<T: Clone, const N: usize>(cases: [T; N]) -> impl Iterator<Item = (SimdPath, T)> {
     let paths = paths();
     paths.flat_map(move |simd| cases.clone().map(|case| (simd, case)))

@@ -242,7 +242,6 @@ impl OnDevice {
     }
 }
 
-/// `steps` steps on a device.
 fn follows_on_a_device(eps: f64, steps: u32) {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let (mut dense, words, layout) = Dense::new(eps, steps);

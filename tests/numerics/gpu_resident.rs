@@ -15,7 +15,6 @@ use gsscale::scene::image::Target;
 const ROWS: usize = 1500;
 /// Views before the measurement: they fill all size classes of buffers, their free lists and the driver's pools.
 const WARM: usize = 40;
-/// Measured views.
 const VIEWS: usize = 60;
 /// Allowed growth of resident memory over [`VIEWS`] views, bytes. Measured: under 1.5 MB, which is heap that worker
 /// threads distribute differently. A driver that keeps a copy of each shader for every new count of rows (see

@@ -13,7 +13,6 @@ gsscale::wgsl_struct! {
     }
 }
 
-/// Adds a number to every element.
 const ADD: Source = Source {
     name: "test/add.wgsl",
     text: r#"

@@ -38,7 +38,6 @@ pub(super) fn camera() -> Camera {
     crate::support::camera(viewmat, [30.0, 28.0, 16.5, 11.0], [32, 24])
 }
 
-/// Parameters of a random scene.
 pub(super) struct Recipe {
     rows: usize,
     stored_degree: u8,
@@ -103,7 +102,6 @@ impl Recipe {
     }
 }
 
-/// Central differences of `loss` by every value of a column.
 fn differences(rows: &Columns, column: Column, loss: impl Fn(&Rows64) -> f64) -> Vec<f64> {
     let mut moved = Rows64::new(rows);
     (0..rows.column(column).len())

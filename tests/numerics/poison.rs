@@ -188,7 +188,6 @@ fn each_input_has_its_tests() {
     }
 }
 
-/// The renderers of this machine.
 fn renderers() -> Vec<Box<dyn Renderer>> {
     let gpu = open(&GpuOptions::default()).map(|gpu| Box::new(GpuRenderer::new(gpu).unwrap()) as Box<dyn Renderer>);
     let cpu = Box::new(CpuRenderer::new()) as Box<dyn Renderer>;

@@ -44,7 +44,6 @@ fn all_layouts() -> Vec<StructLayout> {
     LAYOUTS.iter().flat_map(|table| table.iter().copied()).collect()
 }
 
-/// All faults of a shader.
 fn problems(source: &Source, layouts: &[StructLayout]) -> Vec<String> {
     let all = match variants(source) {
         Ok(all) if all.len() > VARIANTS_MAX => return vec![format!("{}: {} variants", source.name, all.len())],

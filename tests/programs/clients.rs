@@ -140,13 +140,11 @@ fn splat_transform() -> Option<PathBuf> {
     None
 }
 
-/// Converts with the program.
 fn convert(work: &Workdir, program: &Path, flags: &str) {
     let output = Command::new(program).arg("-w").args(flags.split(' ')).current_dir(work.path("")).output().unwrap();
     assert!(output.status.success(), "{flags}: {}", stderr(&output));
 }
 
-/// Rows of a PLY.
 fn rows_of(work: &Workdir, ply: &str) -> u64 {
     let bytes = work.bytes(ply);
     let header = String::from_utf8_lossy(&bytes[..bytes.len().min(4096)]).into_owned();

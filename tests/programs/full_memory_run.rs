@@ -6,7 +6,6 @@ use crate::support::small_drive::Small;
 use crate::support::workdir::{CKPT, TRAIN, Workdir, says};
 use std::path::PathBuf;
 
-/// Enough for everything, bytes.
 const ROOM: u64 = 400 << 20;
 
 const FLAGS: &str = "scene --steps 100 --page-rows 32 --max-gaussians 9000 --view-order groups:4 --test-every 8 --device cpu \

@@ -25,7 +25,6 @@ pub(super) struct Span {
     pub args: Value,
 }
 
-/// What a run left behind.
 #[derive(PartialEq)]
 pub(super) struct Result {
     pub ply: Vec<u8>,
@@ -34,7 +33,6 @@ pub(super) struct Result {
     pub pages: BTreeMap<u64, (Vec<u8>, u128)>,
 }
 
-/// A scene, and the runs on it.
 pub(super) struct Bench(Workdir);
 
 impl Deref for Bench {
@@ -68,7 +66,6 @@ impl Bench {
         is_done
     }
 
-    /// The lines of `metrics.jsonl`.
     pub fn metrics(&self, name: &str) -> Vec<Value> {
         self.0.metrics(&format!("{name}.out"))
     }

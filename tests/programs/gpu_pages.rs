@@ -14,7 +14,6 @@ fn has_device() -> bool {
     gpu::open(&GpuOptions::default()).is_some()
 }
 
-/// The loss of every step.
 fn losses(work: &Workdir, out: &str) -> Vec<f64> {
     work.metrics(out).iter().map(|line| line["loss"].as_f64().unwrap()).collect()
 }

@@ -27,7 +27,6 @@ fn spans(work: &Workdir, trace: &str) -> Vec<Span> {
     serde_json::from_slice(&work.bytes(trace)).unwrap()
 }
 
-/// A run on an emulated bus.
 fn on_bus(work: &Workdir, bus: &str, flags: &str) -> Output {
     work.command(TRAIN, flags).env("GSSCALE_EMULATE_BUS", bus).output().unwrap()
 }

@@ -4,7 +4,6 @@
 use crate::support::workdir::Workdir;
 use gsscale::scene::columns::Columns;
 
-/// Mean distance of positions.
 fn distance(a: &Columns, b: &Columns) -> f64 {
     assert_eq!(a.rows(), b.rows());
     let squares = a

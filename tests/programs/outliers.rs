@@ -9,7 +9,6 @@ use gsscale::train::start::first_scene::prepare;
 
 const SWAPPED: Disturbance = Disturbance::Swapped { share: 0.1, are_removed: false };
 
-/// A disturbed scene.
 struct Disturbed<'a> {
     work: &'a Workdir,
     name: &'static str,
@@ -33,7 +32,6 @@ impl Disturbed<'_> {
     }
 }
 
-/// The views that a run names.
 fn named(work: &Workdir, out: &str) -> Vec<String> {
     let summary = work.summary(out);
     let views = summary["outlier_views"].as_array().map_or(&[][..], Vec::as_slice);
@@ -105,7 +103,6 @@ fn masking_what_stands_on_one_photo_only_wins_back_part_of_what_masks_by_hand_wi
     assert!(!work.text("a/report.html").contains("Parts of photos"));
 }
 
-/// A GPU masks the blocks and names the views of the CPU.
 #[test]
 fn a_gpu_masks_and_names_what_the_cpu_does() {
     if gpu::open(&GpuOptions::default()).is_none() {

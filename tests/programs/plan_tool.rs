@@ -6,14 +6,12 @@ use serde_json::Value;
 
 const PLAN: &str = env!("CARGO_BIN_EXE_gsscale-plan");
 
-/// A plan of the scene as text.
 fn plan(work: &Workdir, flags: &str) -> String {
     let output = work.output(PLAN, &format!("scene {flags}"));
     assert!(output.status.success(), "{flags}: {}", stderr(&output));
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// The same with `--json`.
 fn json(work: &Workdir, flags: &str) -> Value {
     serde_json::from_str(&plan(work, &format!("{flags} --json"))).unwrap()
 }

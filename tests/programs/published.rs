@@ -55,7 +55,6 @@ fn find(name: &str) -> PublishedRun {
     PublishedRun::find(Path::new(name)).unwrap_or_else(|e| panic!("{e}"))
 }
 
-/// The values shared by all scenes.
 const SHARED: &str = r#"steps = 200000, seed = 42, sh-degree = 3, sh-start = 0, sh-every = 1000, init-opacity = 0.1, init-scale = 1.0,
     ssim-lambda = 0.2, ssim-padding = "valid", near-plane = 0.01, max-alpha = 0.999, background = [0.0; 0.0; 0.0], means-lr-final = 0.01,
     quats-lr = 0.001, opacities-lr = 0.05, sh0-lr = 0.0025, shn-lr = 0.000125, adam-eps = 1e-15, strategy = "default", max-gaussians = 0,

@@ -5,7 +5,6 @@ use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::Duration;
 
-/// A run with a page.
 struct Served<'a> {
     run: Running<'a>,
     address: SocketAddr,

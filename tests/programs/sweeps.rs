@@ -48,7 +48,6 @@ fn lines(work: &Workdir, flags: &str) -> Vec<Value> {
     parse(&said(work, &format!("{flags} --json")))
 }
 
-/// The record of a run.
 fn of<'a>(records: &'a [Value], name: &str, seed: u64) -> &'a Value {
     let found = records.iter().find(|r| r["name"] == name && r["seed"] == seed);
     found.unwrap_or_else(|| panic!("{name} {seed} in {records:?}"))

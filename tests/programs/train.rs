@@ -19,7 +19,6 @@ fn run(work: &Workdir, out: &str, more: &str) {
     work.train(&format!("scene --out {out} --quiet {more}"));
 }
 
-/// With few photos the schedule ends before the run, and a resumed run keeps it.
 #[test]
 fn the_schedule_of_few_photos_ends_before_the_run() {
     let work = Workdir::city(4, 48, 32, 200);

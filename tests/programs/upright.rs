@@ -23,7 +23,6 @@ fn run(work: &Workdir, out: &str, more: &str) {
     work.run(out, &format!("--steps 60 --refine-start 10 --refine-every 20 {more}"));
 }
 
-/// Largest difference of two scenes' values, `column` by `column`.
 fn largest_difference(a: &Columns, b: &Columns, column: Column) -> f32 {
     assert_eq!(a.rows(), b.rows());
     a.column(column).iter().zip(b.column(column)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)

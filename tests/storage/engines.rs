@@ -52,7 +52,6 @@ fn transfer(token: u64, direction: Direction, segment: u32, offset: u64, buffer:
     Transfer { token, direction, place: Place { segment, offset }, bytes: buffer.len(), buffer }
 }
 
-/// Performs one transfer alone.
 fn move_one(store: &mut dyn PageEngine, transfer: Transfer) -> Completion {
     let mut done = Vec::new();
     store.submit(transfer);
@@ -64,7 +63,6 @@ fn move_one(store: &mut dyn PageEngine, transfer: Transfer) -> Completion {
     done.remove(0)
 }
 
-/// Waits for all that is in flight.
 fn drain(store: &mut dyn PageEngine) -> Vec<Completion> {
     let mut done = Vec::new();
     while store.in_flight() > 0 {

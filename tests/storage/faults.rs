@@ -94,7 +94,6 @@ impl Store {
         Ok(())
     }
 
-    /// Commits every page.
     fn commit(&mut self) -> Result<u64, CommitError> {
         let version = |slot: &Option<SlotRef>| slot.map(|slot| (slot, vec![9]));
         let pages = self.slots.iter().zip(0..).filter(|(slot, _)| slot.is_some());

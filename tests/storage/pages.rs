@@ -166,7 +166,6 @@ fn long_axis(max_gaussians: u64) -> LongAxisStrategy {
     }
 }
 
-/// Relocation and noise.
 fn mcmc(max_gaussians: u64) -> McmcStrategy {
     McmcStrategy {
         dead_opacity: 0.005,

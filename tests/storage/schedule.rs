@@ -27,7 +27,6 @@ fn next_use(steps: &Steps, page: PageNo, from: usize) -> Option<u32> {
     (from..steps.len()).find(|&s| steps[s].contains(&page)).map(|s| s as u32)
 }
 
-/// The set of these pages, as bits.
 fn set_of(pages: &[PageNo]) -> usize {
     pages.iter().fold(0, |set, p| set | 1 << p.0)
 }

@@ -49,7 +49,6 @@ fn assert_refused(folder: &Path, words: &str) {
     assert!(contents(folder) == before, "something in the folder changed");
 }
 
-/// Writes a segment whose first slot belongs to `store`.
 fn write_segment(folder: &Path, segment: u32, store: u128) {
     let place = Place { segment, offset: 0 };
     let slot = SlotRef { place, stored_bytes: 1, payload_bytes: 1, generation: 1, checksum: 0, codec: StoredAs::Raw };

@@ -113,7 +113,6 @@ fn write(store: &mut PagedStore, page: u64, payload: &[u8]) -> SlotRef {
     try_write(store, page, payload).expect("written")
 }
 
-/// The payload, or the error.
 fn try_read(store: &mut PagedStore, page: u64, slot: &SlotRef) -> Result<Vec<u8>, PageError> {
     let mut buffer = store.new_buffer();
     buffer.as_mut_slice().fill(0x11);

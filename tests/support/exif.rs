@@ -2,12 +2,10 @@
 
 use std::path::Path;
 
-/// Settings of a camera.
 #[derive(Debug, Clone, Copy)]
 pub struct Settings {
     /// Exposure time, seconds.
     pub seconds: f64,
-    /// f-number.
     pub aperture: f64,
     pub iso: u16,
 }

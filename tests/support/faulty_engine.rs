@@ -24,7 +24,6 @@ pub enum Operation {
     Create,
 }
 
-/// How an operation fails.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
     /// An error is reported and nothing is done. `Other` stands for EIO.
@@ -44,7 +43,6 @@ pub enum Fault {
 /// A rule: which operation fails, and how.
 #[derive(Debug, Clone, Copy)]
 pub struct Rule {
-    /// Kind of operation.
     pub on: Operation,
     /// Number of the operation of this kind, from 0.
     pub nth: u64,
@@ -66,7 +64,6 @@ struct Plan {
 pub struct Faults(Arc<Mutex<Plan>>);
 
 impl Faults {
-    /// No faults yet.
     pub fn new() -> Faults {
         Faults::default()
     }
@@ -86,7 +83,6 @@ impl Faults {
         self.plan().reorder = Some(seed);
     }
 
-    /// Operations of a kind so far.
     pub fn count(&self, on: Operation) -> u64 {
         self.plan().counts.get(&on).copied().unwrap_or(0)
     }
@@ -95,7 +91,6 @@ impl Faults {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Counts an operation and returns its fault.
     fn next(&self, on: Operation) -> Option<Fault> {
         let mut plan = self.plan();
         let count = plan.counts.entry(on).or_default();

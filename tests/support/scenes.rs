@@ -8,7 +8,6 @@ use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-/// A view of a [`TextModel`].
 #[derive(Debug, Clone)]
 pub struct TextView {
     /// Photo, relative to images/.
@@ -20,13 +19,11 @@ pub struct TextView {
 }
 
 impl TextView {
-    /// The rotation, world to camera.
     pub fn rotation(&self) -> DQuat {
         let [w, x, y, z] = self.qvec;
         DQuat::from_xyzw(x, y, z, w).normalize()
     }
 
-    /// Sets it.
     pub fn set_rotation(&mut self, q: DQuat) {
         self.qvec = [q.w, q.x, q.y, q.z];
     }
@@ -35,12 +32,10 @@ impl TextView {
 /// A COLMAP text model with one PINHOLE camera.
 #[derive(Debug, Clone)]
 pub struct TextModel {
-    /// Width, height.
     pub size: [u32; 2],
     /// fx, fy, cx, cy.
     pub pinhole: [f64; 4],
     pub views: Vec<TextView>,
-    /// Positions.
     pub points: Vec<[f64; 3]>,
     pub colors: Vec<[u8; 3]>,
 }
@@ -62,7 +57,6 @@ pub fn wide_city(folder: &Path, points: u32) -> PathBuf {
 }
 
 impl TextModel {
-    /// Reads the model of a scene.
     pub fn of(scene: &Path) -> TextModel {
         let raw = read_scene(scene, &ReadOptions::default()).unwrap();
         let i = raw.views[0].intrinsics;
@@ -181,7 +175,6 @@ impl TextModel {
         std::fs::write(file.with_file_name("points.ply"), self.points_ply()).unwrap();
     }
 
-    /// The points as a PLY.
     fn points_ply(&self) -> String {
         let mut ply = format!("ply\nformat ascii 1.0\nelement vertex {}\n", self.points.len());
         for property in ["double x", "double y", "double z", "uchar red", "uchar green", "uchar blue"] {
@@ -231,12 +224,10 @@ pub fn told(output: &Output) -> String {
     String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(output)
 }
 
-/// The stderr of a program.
 pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The path as text.
 pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }

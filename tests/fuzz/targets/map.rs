@@ -38,7 +38,6 @@ use std::sync::{Arc, Mutex};
 const STORE: u128 = 0xf00d;
 const CONFIG: CommitConfig = CommitConfig { store: STORE, cache_bytes: 1 << 18, reserve_bytes: 0 };
 
-/// Files in memory.
 #[derive(Clone, Default)]
 struct MemoryFolder(Arc<Mutex<BTreeMap<String, Arc<dyn StorageBackend>>>>);
 

@@ -53,7 +53,6 @@ fn array<const N: usize>(input: &[u8], sealed: bool) -> [u8; N] {
     bytes
 }
 
-/// Rows of the pages of a small scene.
 pub const PAGE_ROWS: usize = 16;
 
 const LAYOUT_OF_A_PAGE: PageLayout = PageLayout { rows: 12, sh_degree: 1 };

@@ -29,7 +29,6 @@ fn model_files(name: &[u8], extension: &str) -> [Vec<u8>; 3] {
     [model.cameras_txt().into_bytes(), images, model.points_txt().into_bytes()]
 }
 
-/// A scene with these model files.
 fn scene_of(files: &[Vec<u8>; 3], extension: &str) -> TempDir {
     let scene = scratch();
     let model = scene.path().join("sparse/0");

@@ -110,7 +110,6 @@ pub fn store_dir() -> Target {
     Target { name: "store_dir", run, seeds, words: &[], cases: 600, memory: [96 << 20, 1000] }
 }
 
-/// Files of the damaged directory.
 fn damaged(input: &[u8]) -> Files {
     let Template { now, past } = template();
     let mut files = now.clone();

@@ -20,7 +20,6 @@ fn pickle_of(file: &[u8]) -> Vec<u8> {
     bytes
 }
 
-/// The archive with another pickle in it.
 fn with_pickle(file: &[u8], pickle: &[u8]) -> Vec<u8> {
     let mut archive = ZipArchive::new(Cursor::new(file)).unwrap();
     let mut writer = ZipWriter::new(Cursor::new(Vec::new()));

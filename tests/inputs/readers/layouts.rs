@@ -17,7 +17,6 @@ use tempfile::TempDir;
 const VIEWS: u32 = 8;
 const TEST_EVERY: usize = 3;
 
-/// The same city in a layout.
 fn lookalike(layout: Layout) -> TempDir {
     let folder = TempDir::new().unwrap();
     let options = CityOptions { views: VIEWS, width: 48, height: 32, points: 60, ..CityOptions::default() };
@@ -162,7 +161,6 @@ fn matrix_city_is_read_from_both_kinds_of_its_files() {
     check(&read(folder.path()));
 }
 
-/// A file of JSON, changed.
 fn edit(path: &Path, change: impl FnOnce(&mut Value)) {
     let mut value: Value = serde_json::from_slice(&fs::read(path).unwrap()).unwrap();
     change(&mut value);

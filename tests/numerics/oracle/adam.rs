@@ -57,7 +57,6 @@ impl Case {
     }
 }
 
-/// Largest |got - want|.
 fn max_abs(got: impl Iterator<Item = f64>, want: &[f64]) -> f64 {
     got.zip(want).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }

@@ -20,7 +20,6 @@ const SCHEDULES: usize = GAPS.len() + 3;
 const COPIES: usize = 2;
 /// Gradient sizes: 1, 1e-2, .. 1e-14.
 const SIZES: usize = 8;
-/// Values of a schedule.
 const VALUES: usize = COPIES * SIZES;
 
 /// One run: its length, learning rate, eps, and random stream.
@@ -69,7 +68,6 @@ impl Errors {
     }
 }
 
-/// The result of a run.
 struct Outcome {
     /// By value; each schedule has [`VALUES`], with alternating gradient sizes.
     errors: Vec<Errors>,

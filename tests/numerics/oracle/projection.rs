@@ -307,7 +307,6 @@ fn each_upstream_alone_agrees() {
     }
 }
 
-/// The stages on stored columns.
 #[test]
 fn stages_on_stored_columns_agree() {
     for name in ["random", "quats", "scales"] {

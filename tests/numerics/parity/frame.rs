@@ -56,7 +56,6 @@ pub fn photo(width: u32, height: u32, masked: bool) -> Target {
     Target { width, height, rgb, mask }
 }
 
-/// The results of a view.
 pub struct Results {
     pub image: Image,
     pub value: LossValue,
@@ -83,7 +82,6 @@ pub fn results_with(
     Ok(Results { image: renderer.image()?.clone(), value, grads })
 }
 
-/// Relative L2 distance.
 fn l2(got: &[f32], want: &[f32]) -> f64 {
     assert_eq!(got.len(), want.len());
     let norm = |v: &mut dyn Iterator<Item = f64>| v.map(|x| x * x).sum::<f64>().sqrt();

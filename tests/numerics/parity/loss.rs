@@ -68,7 +68,6 @@ fn on_gpu(gpu: &Gpu, image: &Image, target: &Target, options: &LossOptions) -> (
     (value(&plan, sums), v_rgb)
 }
 
-/// Compares loss and gradient.
 #[track_caller]
 fn assert_same(what: &str, gpu: &Gpu, image: &Image, target: &Target, options: &LossOptions) {
     let (want, want_v) = on_cpu(image, target, options);

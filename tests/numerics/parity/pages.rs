@@ -121,7 +121,6 @@ pub fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T
     values
 }
 
-/// Lists and values of the twin.
 fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let numbers = world.adam.numbers(STEPS).unwrap();
     let (tables, step) = (DeferredTables::new(&numbers), world.adam.at(world.now).numbers());

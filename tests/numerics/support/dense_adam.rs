@@ -7,7 +7,6 @@ use std::ops::{Add, Div, Mul, Sub};
 
 /// A float type for dense Adam.
 pub trait Real: Copy + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> {
-    /// Rounds to the type.
     fn from_f64(x: f64) -> Self;
     fn sqrt(self) -> Self;
 }
@@ -34,7 +33,6 @@ impl Real for f64 {
 #[derive(Debug, Clone, PartialEq)]
 pub struct DenseAdam<F> {
     config: AdamConfig,
-    /// Steps taken.
     pub steps: u32,
     pub values: Vec<F>,
     /// First moments, without bias correction.
@@ -44,13 +42,11 @@ pub struct DenseAdam<F> {
 }
 
 impl<F: Real> DenseAdam<F> {
-    /// These values with zero moments.
     pub fn new(config: AdamConfig, values: Vec<F>) -> Self {
         let zeros = vec![F::from_f64(0.0); values.len()];
         DenseAdam { config, steps: 0, values, exp_avg: zeros.clone(), exp_avg_sq: zeros }
     }
 
-    /// Takes one step at rate `lr`, with a gradient for every value.
     pub fn step(&mut self, grads: &[F], lr: f64) {
         assert_eq!(grads.len(), self.values.len());
         self.steps += 1;

@@ -26,7 +26,6 @@ impl Fixture {
         Some(Fixture { tensors: tensors.collect(), metadata })
     }
 
-    /// Shape of a tensor.
     pub fn shape(&self, name: &str) -> &[usize] {
         &self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}")).0
     }
@@ -47,7 +46,6 @@ impl Fixture {
         (0..3).flat_map(|c| interleaved.iter().skip(c).step_by(3).copied()).collect()
     }
 
-    /// The file's camera.
     pub fn camera(&self) -> Camera {
         let (m, k, wh) = (self.f32("viewmat"), self.f32("K"), self.f64("wh"));
         let viewmat = std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j]));

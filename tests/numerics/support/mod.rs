@@ -20,7 +20,6 @@ use gsscale::render::gpu_pages::{DevicePages, PagesView};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::optimizer_numbers::StepNumbers;
 
-/// Begins a view of pages at a step.
 pub fn begin_view(gpu: &Gpu, pages: &DevicePages, camera: &Camera, step: &StepNumbers) -> PagesView {
     let mut recorder = gpu.begin("view");
     let view = pages.begin(&mut recorder, camera, step).unwrap();
@@ -45,7 +44,6 @@ pub fn random_rotation(draws: &mut Stream) -> [[f64; 3]; 3] {
     ]
 }
 
-/// The instruction paths of this machine.
 pub fn paths() -> impl Iterator<Item = SimdPath> {
     SimdPath::ALL.into_iter().filter(|path| path.is_supported())
 }

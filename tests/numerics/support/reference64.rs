@@ -46,10 +46,8 @@ impl Rows64 {
     }
 }
 
-/// One row on the screen.
 #[derive(Debug, Clone, Copy)]
 pub struct Splat64 {
-    /// Number of the row.
     pub row: usize,
     pub mean2d: [f64; 2],
     /// xx, yy of the covariance with its blur, px^2.
@@ -149,7 +147,6 @@ fn color(rows: &Rows64, row: usize, centre: [f64; 3], sh_degree: u8) -> ([f64; 3
     (raw.map(|x| x.max(0.0)), raw.iter().fold(f64::INFINITY, |m, x| m.min(x.abs())))
 }
 
-/// The pose of a camera as it is.
 pub fn pose_of(camera: &Camera) -> Pose64 {
     camera.viewmat.map(|r| r.map(f64::from))
 }

@@ -46,13 +46,9 @@ const HIDDEN_LOGIT: f32 = -100.0;
 /// Input of the stage: the pages of a batch, the slab that is bound, and the optimizer's numbers.
 #[derive(Debug, Clone, Copy)]
 pub struct GatherInput<'a> {
-    /// Uniforms of the dispatch.
     pub uniforms: &'a GatherUniforms,
-    /// Pages of the batch.
     pub pages: &'a [DevicePage],
-    /// Words of the slab.
     pub slab: &'a [u32],
-    /// Tables of the run.
     pub tables: TableWords<'a>,
     /// Sums of this step by missed steps.
     pub recent: &'a [SeriesSums],
@@ -160,7 +156,6 @@ pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
     }
 }
 
-/// Finds the bounds of the pages in the slab.
 pub fn bounds(input: &GatherInput<'_>, results: &mut [PageResult]) {
     let GatherUniforms { means_rate, scales_rate, .. } = *input.uniforms;
     for (page, result) in input.pages.iter().zip(results).filter(|(page, _)| input.is_bound(page)) {

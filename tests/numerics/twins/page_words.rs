@@ -7,13 +7,10 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::page_layout::{TABLE_ALIGNMENT, capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
 
-/// The three tables of a column.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Table {
     Values,
-    /// First moments.
     ExpAvg,
-    /// Second moments.
     ExpAvgSq,
 }
 
@@ -31,7 +28,6 @@ pub trait Words {
     /// Word of a row's number of views.
     fn count_at(&self, row: usize) -> usize;
 
-    /// First word of a row in a table of a column.
     fn row_at(&self, column: Column, table: Table, row: usize) -> usize;
 }
 

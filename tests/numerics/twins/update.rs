@@ -26,13 +26,10 @@ use gsscale::scene::sightings::{is_full, with_view};
 /// What the stage reads beside the slab.
 #[derive(Debug, Clone, Copy)]
 pub struct UpdateInput<'a> {
-    /// Uniforms of the dispatch.
     pub uniforms: &'a UpdateUniforms,
-    /// Pages of the batch.
     pub pages: &'a [DevicePage],
     /// Listed rows: number of the page, number of the row in it.
     pub rows: &'a [[u32; 2]],
-    /// Tables of the run.
     pub tables: TableWords<'a>,
     /// `[listed row]`: the largest magnitude of a gradient, bits.
     pub largest: &'a [u32],
@@ -123,7 +120,6 @@ pub fn finish(
     }
 }
 
-/// Clears the statistics of all rows of the pages in a slab.
 pub fn clear_statistics(pages: &[DevicePage], bound: u32, slab: &mut [u32]) {
     for page in pages.iter().filter(|page| page.slab == bound) {
         let rows = page.rows as usize;

@@ -59,7 +59,6 @@ impl Bench {
         self.ply("alone")
     }
 
-    /// A run in progress.
     pub fn running(&self, more: &str) -> Running<'_> {
         self.begin(&format!("{BUSY} --out out --spill-dir spill {more}")).after_lines("out", 19)
     }
@@ -70,7 +69,6 @@ impl Bench {
         self.go_on_until_stopped("");
     }
 
-    /// Resumes the run to its end.
     pub fn go_on(&self, more: &str) {
         self.train(&format!("--resume out --quiet {more}"));
     }
@@ -91,7 +89,6 @@ impl Bench {
         self.output(CKPT, flags)
     }
 
-    /// The output of a successful call.
     pub fn ckpt(&self, flags: &str) -> String {
         let output = self.ckpt_output(flags);
         assert!(output.status.success(), "{flags}: {}", stderr(&output));
@@ -117,12 +114,10 @@ impl Bench {
         self.ckpt_json(&format!("verify {dir} --deep"))["faults"].as_array().unwrap().is_empty()
     }
 
-    /// Numbers of the generations of a store.
     pub fn generations(&self, dir: &str) -> Vec<u64> {
         generations(&self.ckpt_json(&format!("ls {dir}")))
     }
 
-    /// The PLY of an export.
     pub fn export(&self, dir: &str, more: &str) -> Vec<u8> {
         self.ckpt(&format!("export {dir} --out exported.ply {more}"));
         let bytes = self.bytes("exported.ply");
@@ -178,7 +173,6 @@ impl Ply {
         Ply { names, rows }
     }
 
-    /// The median of each coordinate.
     pub fn median(&self) -> [f64; 3] {
         std::array::from_fn(|i| {
             let mut values: Vec<f32> = self.rows.iter().map(|row| row[i]).collect();

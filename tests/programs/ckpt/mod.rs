@@ -317,7 +317,6 @@ fn flip(file: &Path, at: u64) {
     file.write_all_at(&[byte[0] ^ 0x10], at).unwrap();
 }
 
-/// A place in the payload of a slot.
 const IN_PAYLOAD: u64 = 4096 + 77;
 
 #[test]

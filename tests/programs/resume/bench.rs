@@ -4,10 +4,8 @@ use crate::support::workdir::{Running, Workdir};
 use std::ops::Deref;
 use std::path::PathBuf;
 
-/// Steps of a run.
 pub const STEPS: u32 = 200;
 
-/// Flags of every run.
 pub const BUSY: &str = "scene --steps 200 --page-rows 32 --grow-grad2d 0.001 --refine-start 60 --refine-every 30 --reset-every 80 \
     --sh-every 50 --view-order groups:4 --log-every 7 --test-every 24 --device cpu --quiet";
 
@@ -17,7 +15,6 @@ pub const SELDOM: &str = "--commit-every 0";
 /// Where a run keeps its pages.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Place {
-    /// In memory.
     Memory,
     /// In a spill directory, with this many frames.
     Spill(u64),
@@ -34,12 +31,10 @@ impl Deref for Bench {
     }
 }
 
-/// The result of an uninterrupted run.
 pub struct Alone {
     pub ply: Vec<u8>,
     /// Steps in metrics.jsonl.
     pub logged: Vec<u64>,
-    /// Pages at the end.
     pub pages: u64,
     /// The most pages of a step.
     pub fewest: u64,
@@ -50,7 +45,6 @@ impl Bench {
         Bench(Workdir::city_of(24, [64, 48], 6000, 20))
     }
 
-    /// The uninterrupted run, in memory.
     pub fn alone(&self, more: &str) -> Alone {
         self.train(&format!("{BUSY} --out alone {more}"));
         let [rows, pages, fewest] = ["gaussians", "pages", "pages_pinned_max"].map(|key| self.count("alone", key));
@@ -60,7 +54,6 @@ impl Bench {
         alone
     }
 
-    /// The flags of a run in `out`.
     pub fn flags(&self, place: Place, more: &str) -> String {
         match place {
             Place::Memory => format!("{BUSY} --out out {more}"),
@@ -71,7 +64,6 @@ impl Bench {
         }
     }
 
-    /// Starts a run in `out`.
     pub fn start(&self, place: Place, more: &str) -> Running<'_> {
         self.begin(&self.flags(place, more))
     }
@@ -81,7 +73,6 @@ impl Bench {
         self.start(place, &format!("{SELDOM} {more}")).after_lines("out", lines).stop()
     }
 
-    /// Resumes the run in `out`.
     pub fn resume(&self, more: &str) -> Running<'_> {
         self.begin(&format!("--resume out --quiet {more}"))
     }
@@ -96,7 +87,6 @@ impl Bench {
         self.refuses(&format!("--resume out --quiet {more}"), words)
     }
 
-    /// The checkpoint of the run in `out`.
     pub fn checkpoint(&self, place: Place) -> PathBuf {
         self.path(if place == Place::Memory { "out/checkpoint" } else { "spill" })
     }

@@ -8,7 +8,6 @@ use std::process::Command;
 pub struct Small(pub PathBuf);
 
 impl Small {
-    /// Mounts it on a new folder.
     pub fn mount(folder: &Path, bytes: u64) -> Option<Small> {
         std::fs::create_dir(folder).unwrap();
         let options = format!("size={bytes}");

@@ -44,7 +44,6 @@ pub fn least_memory(said: &str) -> f64 {
     least.split(' ').next().unwrap().parse().unwrap()
 }
 
-/// Asserts that a text has all of these words.
 pub fn says(text: &str, words: &[&str]) {
     for word in words {
         assert!(text.contains(word), "'{word}' is not in: {text}");
@@ -78,7 +77,6 @@ impl Workdir {
         work
     }
 
-    /// With a small city as a text model.
     pub fn small_model() -> (Workdir, TextModel) {
         let work = Workdir::city(12, 96, 64, 400);
         let model = TextModel::of(&work.scene());
@@ -102,7 +100,6 @@ impl Workdir {
         photos
     }
 
-    /// A program in this folder.
     pub fn command(&self, program: &str, flags: &str) -> Command {
         let (mut command, flags) = (Command::new(program), words(flags));
         command.args(&flags).current_dir(self.0.path());
@@ -161,7 +158,6 @@ impl Workdir {
         said
     }
 
-    /// The JSON that a program prints.
     pub fn json_of(&self, program: &str, flags: &str) -> Value {
         let output = self.output(program, flags);
         assert!(output.status.success(), "{flags}: {}", stderr(&output));
@@ -173,7 +169,6 @@ impl Workdir {
         self.json_of(EVAL, flags)["test"]["psnr"].as_f64().unwrap()
     }
 
-    /// Starts the trainer.
     pub fn begin(&self, flags: &str) -> Running<'_> {
         Running::spawn(self, &mut self.command(TRAIN, flags))
     }
@@ -205,7 +200,6 @@ impl Workdir {
         }
     }
 
-    /// The Gaussians of a run.
     pub fn ply(&self, out: &str) -> Vec<u8> {
         self.bytes(&format!("{out}/point_cloud.ply"))
     }
@@ -218,18 +212,15 @@ impl Workdir {
         (columns, meta)
     }
 
-    /// summary.json of a run.
     pub fn summary(&self, out: &str) -> Value {
         self.json(&format!("{out}/summary.json"))
     }
 
-    /// A count of the summary.
     pub fn count(&self, out: &str, key: &str) -> u64 {
         let summary = self.summary(out);
         summary[key].as_u64().unwrap_or_else(|| panic!("{key}: {summary}"))
     }
 
-    /// Test PSNR of a run.
     pub fn psnr(&self, out: &str) -> f64 {
         self.summary(out)["test"]["psnr"].as_f64().unwrap()
     }
@@ -375,7 +366,6 @@ pub fn send(child: &Child, signal: &str) -> bool {
     Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
 }
 
-/// Copies a folder recursively.
 pub fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir(to).unwrap();
     for entry in std::fs::read_dir(from).unwrap().map(Result::unwrap) {

@@ -16,7 +16,6 @@ const BLOCK: usize = 4096;
 /// Length of the writes to the header of the map's file.
 const MAP_HEADER_BYTES: usize = 320;
 
-/// Random numbers from a seed.
 #[derive(Debug, Clone)]
 pub struct Rng(pub u64);
 
@@ -102,7 +101,6 @@ struct File {
     unsynced: Vec<Unsynced>,
 }
 
-/// An unsynced change of the folder.
 #[derive(Debug, Clone)]
 enum Entry {
     Create(String, usize),
@@ -127,11 +125,9 @@ pub enum Survival {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Fault {
-    /// EIO.
     Io,
     /// ENOSPC, for calls that need space.
     Full,
-    /// EMFILE.
     TooManyFiles,
     /// Writes report fewer bytes, reads report the end of the file.
     Short,
@@ -151,7 +147,6 @@ impl Fault {
     }
 }
 
-/// When calls fail.
 #[derive(Debug, Clone, Copy)]
 pub struct FaultPlan {
     /// Number of the first call that fails, reads included.
@@ -202,7 +197,6 @@ impl Disk {
         })))
     }
 
-    /// An independent copy.
     pub fn fork(&self) -> Disk {
         Disk(Arc::new(Mutex::new(self.state().clone())))
     }
@@ -233,7 +227,6 @@ impl Disk {
         self.state().fault = plan;
     }
 
-    /// Errors returned so far.
     pub fn faults_given(&self) -> u64 {
         self.state().faults_given
     }
@@ -341,7 +334,6 @@ impl Disk {
         file.unsynced.clear();
     }
 
-    /// Flips a bit on the drive.
     pub fn flip(&self, name: &str, bit: u64) {
         self.spoil(name, |file| {
             let mut byte = [0];
@@ -359,7 +351,6 @@ impl Disk {
         });
     }
 
-    /// The bytes of a file.
     pub fn contents(&self, name: &str) -> Vec<u8> {
         let state = self.state();
         let image = &state.files[state.entries[name]].now;
@@ -368,7 +359,6 @@ impl Disk {
         bytes
     }
 
-    /// Replaces the bytes of a file.
     pub fn replace(&self, name: &str, bytes: &[u8]) {
         self.spoil(name, |file| {
             file.set_len(bytes.len() as u64);
@@ -544,7 +534,6 @@ impl State {
     }
 }
 
-/// An open file of the disk.
 #[derive(Debug)]
 pub struct DiskFile {
     disk: Disk,

@@ -20,7 +20,6 @@ pub const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment:
 pub const CONFIG: CommitConfig = CommitConfig { store: STORE, cache_bytes: 1 << 18, reserve_bytes: 8192 };
 const PAGES_MAX: usize = 7;
 
-/// How a life ended.
 #[derive(Debug)]
 pub enum End {
     /// Power failure, or an error that ends the process.
@@ -251,7 +250,6 @@ impl Life<'_> {
         }
     }
 
-    /// Performs one random operation.
     pub fn step(&mut self, disk: &Disk, rng: &mut Rng) -> Result<(), End> {
         let ids: Vec<PageId> = self.pages.keys().copied().collect();
         let some = |rng: &mut Rng| ids.get(rng.below(ids.len() as u64) as usize).copied();

@@ -20,7 +20,6 @@ use disk::Fault;
 use random::run_many;
 use std::time::Instant;
 
-/// Crashes of a plain run.
 const CRASHES: u64 = 50_000;
 
 /// Crashes within which every mutant must be noticed.

@@ -4,7 +4,6 @@ use super::random::{Counts, run_seed};
 use gsscale::page::mutants::{Mutant, choose};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
-/// All mutants.
 pub const MUTANTS: &[Mutant] = &[
     Mutant::SegmentsNotSynced,
     Mutant::SegmentsSyncedAfterMap,

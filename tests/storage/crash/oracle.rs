@@ -16,7 +16,6 @@ pub struct Snapshot {
     pub run_state: Vec<u8>,
 }
 
-/// The state after a transaction.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Acknowledged {
     pub latest: u64,
@@ -31,7 +30,6 @@ pub struct Oracle {
     /// The states that pending transactions may leave: several after a transaction without space, which may be durable
     /// all the same.
     pub in_flight: Vec<Candidate>,
-    /// The kept generations.
     pub snapshots: BTreeMap<u64, Snapshot>,
     /// Largest generation number so far.
     pub highest: u64,
@@ -178,7 +176,6 @@ pub fn version_of(page: &StoredPage) -> u64 {
     page.label.first_chunk().map_or(u64::MAX, |bytes| u64::from_le_bytes(*bytes))
 }
 
-/// The state that a store reports.
 fn state_of(commits: &Commits) -> Acknowledged {
     Acknowledged { latest: commits.generations().latest(), pins: commits.generations().pins().clone() }
 }

@@ -10,7 +10,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Counts of events.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Counts {
     pub seeds: u64,
@@ -24,7 +23,6 @@ pub struct Counts {
 
 const LIVES: u64 = 6;
 const STEPS: u64 = 40;
-/// Interval of progress messages.
 const PROGRESS: Duration = Duration::from_secs(30);
 
 impl Counts {
@@ -39,7 +37,6 @@ impl Counts {
     }
 }
 
-/// Progress of all threads together.
 struct Progress {
     counts: Counts,
     said: Instant,

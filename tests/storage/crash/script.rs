@@ -117,10 +117,8 @@ pub fn every_crash_point() -> Result<u64, String> {
 /// All ways in which a call fails.
 pub const FAULTS: [Fault; 5] = [Fault::Io, Fault::Full, Fault::TooManyFiles, Fault::Short, Fault::Interrupted];
 
-/// Results of the failing calls.
 #[derive(Debug, Default)]
 pub struct Failing {
-    /// Calls of the workload.
     pub calls: u64,
     /// Cases in which an error was met, for each fault of [`FAULTS`]: failing once, failing permanently.
     pub met: [[u64; 2]; 5],

@@ -40,7 +40,6 @@ fn started(
     Ok((Run::new(pager, seed, PAGES, STEPS)?, opened.commits))
 }
 
-/// Commits a cut of the run as it is.
 fn commit_cut(run: &mut Run, commits: &mut Commits) {
     run.pager.freeze().unwrap();
     run.pager.finish_frozen().unwrap();

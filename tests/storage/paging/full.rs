@@ -129,7 +129,6 @@ fn steps_to(run: &mut Run, step: u32) {
 /// Effects of a commit that found no space.
 #[derive(Default)]
 struct Left {
-    /// Number of durable commits.
     durable: u32,
     /// Pages that only this commit held: neither the previous nor the next commit had them.
     short_lived: usize,

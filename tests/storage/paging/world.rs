@@ -79,7 +79,6 @@ pub fn fill(payload: &mut [u8], meta: &PageMeta, version: u64) {
 /// Metadata and version of every page, by id.
 pub type Model = BTreeMap<PageId, (PageMeta, u64)>;
 
-/// Asserts that a pinned page equals the model.
 pub fn check(page: &PinnedPage, model: &Model) {
     let (meta, version) = model[&page.meta.id];
     assert_eq!(page.meta, meta);
