@@ -1,9 +1,8 @@
 //! Photos that change exposure: what `--appearance` wins back, and what it finds, through the real binaries.
 
+use crate::support::a_device;
 use crate::support::exif::{Settings, add_exif};
-use crate::support::gpu;
 use crate::support::workdir::Workdir;
-use gsscale::gpu::GpuOptions;
 
 /// Stops by which a training photo is changed: 1.2 up or down, and back.
 fn stops(photo: usize) -> f64 {
@@ -99,9 +98,7 @@ fn a_black_photo_spoils_nothing_of_a_run_with_appearance() {
 
 #[test]
 fn a_gpu_finds_the_exposures_of_the_cpu() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let (work, _) = flickering_city();
     for device in ["cpu", "gpu"] {
         run(&work, device, &format!("--steps 63 --appearance full --device {device}"));

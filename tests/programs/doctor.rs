@@ -1,9 +1,8 @@
 //! `gsscale-bench doctor`: what it says of a sound device, of one with too little memory, and of one that computes wrongly.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{BENCH, Workdir};
-use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 use std::process::{Command, Output};
 
@@ -20,9 +19,7 @@ fn json(text: &str) -> Value {
 
 #[test]
 fn a_sound_device_is_told_from_one_with_too_little_memory() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::new();
     let sound = doctor(&work, &[], None);
     assert!(sound.status.success(), "{}", stderr(&sound));
@@ -52,9 +49,7 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
 /// Each is a shader that a driver compiles wrongly, and the stage that the doctor names.
 #[test]
 fn a_wrong_constant_is_found_and_its_stage_is_named() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::new();
     for (fault, stage) in [
         ("sh_fwd.wgsl:0.28209479=0.3", "sh_fwd"),

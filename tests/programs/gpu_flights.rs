@@ -1,10 +1,9 @@
 //! Steps in flight on a device that holds the pages (`--optimizer-on device`), through the real binary: the same bytes however many are
 //! in flight, whatever goes wrong with a step, and what a trace shows of them.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{TRAIN, Workdir};
-use gsscale::gpu::GpuOptions;
 use gsscale::page::format::slot_header::checksum;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
@@ -46,7 +45,7 @@ impl Deref for Bench {
 impl Bench {
     /// `None` without a device.
     pub fn new() -> Option<Bench> {
-        gpu::open(&GpuOptions::default())?;
+        a_device()?;
         Some(Bench(Workdir::wide_city(6000)))
     }
 

@@ -1,18 +1,13 @@
 //! Runs whose optimizer is on the device (`--optimizer-on device`), through the real binary: the same bytes after a lost device; what
 //! crosses the bus; what is refused. That slots, frames, threads, engines and kills change no byte is in `matrix`.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{TRAIN, Workdir};
-use gsscale::gpu::GpuOptions;
 
 /// Rounds, resets, raises and a cap within 54 steps.
 const GROWING: &str = "scene --device gpu --optimizer-on device --steps 54 --refine-start 9 --refine-every 10 --grow-grad2d 0.0005 \
     --reset-every 25 --sh-every 15 --max-gaussians 7000 --page-rows 32 --view-order groups:4 --log-every 1 --quiet";
-
-fn has_device() -> bool {
-    gpu::open(&GpuOptions::default()).is_some()
-}
 
 fn losses(work: &Workdir, out: &str) -> Vec<f64> {
     work.metrics(out).iter().map(|line| line["loss"].as_f64().unwrap()).collect()
@@ -20,9 +15,7 @@ fn losses(work: &Workdir, out: &str) -> Vec<f64> {
 
 #[test]
 fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
-    if !has_device() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::wide_city(6000);
     work.train(&format!("{GROWING} --out alone"));
     // A run whose device is lost at this submission; the variable strikes every device that the process opens. Whether it ended well, and
@@ -55,9 +48,7 @@ fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
 /// Steps without events, after every page has been loaded: only the photo, tables and counts cross the bus.
 #[test]
 fn a_step_with_all_pages_on_the_device_moves_no_row() {
-    if !has_device() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(8, 128, 96, 1200);
     let flags = "--steps 60 --strategy none --sh-every 0 --log-every 1 --device gpu --optimizer-on";
     for place in ["device", "host"] {
@@ -95,7 +86,7 @@ fn what_a_device_does_not_do_is_refused_with_a_remedy() {
         ("--device gpu --moments bf16", "use --moments f32"),
         ("--device gpu --optimizer sparse", "use --optimizer deferred"),
     ];
-    if has_device() {
+    if a_device().is_some() {
         // Without a device the lack of one is said first.
         let weighs = "--device gpu --strategy long-axis --max-gaussians 500 --growth-score mixed";
         cases.push((weighs, "use --growth-score gradient, or --optimizer-on host"));

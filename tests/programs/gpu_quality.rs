@@ -1,9 +1,8 @@
 //! Quality on a GPU and on the CPU when a run grows its scene, through the real binary: growth multiplies rounding differences, so single
 //! runs differ as seeds do, and their means must not.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::workdir::Workdir;
-use gsscale::gpu::GpuOptions;
 
 /// Rounds, a reset and raises of colour bands.
 const GROWS: &str = "--steps 400 --refine-start 60 --refine-every 40 --grow-grad2d 0.0006 --max-gaussians 4000 --reset-every 200 \
@@ -13,9 +12,7 @@ const GROWS: &str = "--steps 400 --refine-start 60 --refine-every 40 --grow-grad
 #[test]
 #[ignore = "trains for minutes"]
 fn the_means_of_three_seeds_agree_within_the_spread_of_the_seeds() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(32, 128, 96, 1200);
     let of_device = |flags: &str| {
         [1, 2, 3].map(|seed| {

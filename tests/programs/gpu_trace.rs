@@ -1,10 +1,9 @@
 //! The trace of a run (`--trace`) and the emulated bus (`GSSCALE_EMULATE_BUS`), through the real binary: what a span says, that bytes
 //! take their time, that neither changes a byte of the result, and what is refused.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{TRAIN, Workdir};
-use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 use std::process::Output;
 
@@ -33,9 +32,7 @@ fn on_bus(work: &Workdir, bus: &str, flags: &str) -> Output {
 
 #[test]
 fn an_emulated_bus_takes_its_time_and_changes_no_byte() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(6, 64, 48, 600);
     for place in ["host", "device"] {
         let flags = format!("scene --overwrite --steps 12 --device gpu --optimizer-on {place} --quiet");
@@ -61,9 +58,7 @@ fn an_emulated_bus_takes_its_time_and_changes_no_byte() {
 
 #[test]
 fn payloads_of_the_next_step_go_up_before_the_gradients_of_this_one_are_waited_for() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::wide_city(6000);
     let flags = "scene --steps 60 --strategy none --sh-every 0 --log-every 1 --device gpu --optimizer-on device --page-rows 32 \
         --view-order shuffle --quiet";
@@ -113,9 +108,7 @@ fn a_bus_or_a_trace_that_cannot_be_is_refused_with_a_remedy() {
     let flags = "scene --out out --steps 3 --quiet";
     work.refuses(&format!("{flags} --device cpu --trace none/trace.json"), &["trace.json", "check the path"]);
     assert!(!work.exists("out"));
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     for bus in ["12GB/s", "fast,20us", "12GB/s,20", ""] {
         let output = on_bus(&work, bus, &format!("{flags} --device gpu"));
         let said = stderr(&output);

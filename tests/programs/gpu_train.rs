@@ -1,6 +1,7 @@
 //! Whole runs on a GPU through the real binary: quality equal to the CPU renderer, bytes that cross the bus, and the
 //! choice of device with its reason.
 
+use crate::support::a_device;
 use crate::support::gpu;
 use crate::support::scenes::{stderr, told};
 use crate::support::workdir::{EVAL, TRAIN, Workdir};
@@ -69,9 +70,7 @@ fn a_gpu_trains_as_the_cpu_does() {
 
 #[test]
 fn little_device_memory_trains_the_same_scene() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(8, 128, 96, 400);
     run(&work, "plenty", "--device gpu");
     run(&work, "little", "--device gpu --device-mem 1500KiB");
@@ -113,9 +112,7 @@ fn assert_ends_with_last_good_step(work: &Workdir, fault: &str, address_space: O
 
 #[test]
 fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(8, 64, 48, 300);
     let cases = [("lost", "the device was lost"), ("validation", "refused the work"), ("memory", "out of memory")];
     for (kind, expected) in cases {
@@ -128,9 +125,7 @@ fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
 /// Nothing is committed on a schedule here, so the run resumes from the commit that the failure makes.
 #[test]
 fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(8, 64, 48, 300);
     let of_run = "--device gpu --steps 60 --strategy none --view-order shuffle";
     work.run("alone", of_run);

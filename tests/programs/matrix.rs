@@ -4,13 +4,12 @@
 //! is in some run of the matrix. All runs of a feature are compared with one run in memory that nothing disturbs. A feature that changed
 //! nothing would show nothing, so each has flags without which its scene is another.
 
+use crate::support::a_device;
 use crate::support::exif::{Settings, add_exif};
-use crate::support::gpu;
 use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{Running, TRAIN, Workdir, least_memory, send};
 use glam::{DQuat, DVec3};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::gpu::GpuOptions;
 use gsscale::page::engine::open::open_engine;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -341,7 +340,7 @@ struct Alone {
 
 fn holds(name: &str) {
     let (number, feature) = FEATURES.iter().enumerate().find(|(_, feature)| feature.name == name).unwrap();
-    if feature.flags.contains("--device gpu") && gpu::open(&GpuOptions::default()).is_none() {
+    if feature.flags.contains("--device gpu") && a_device().is_none() {
         return;
     }
     let work = (feature.scene)();

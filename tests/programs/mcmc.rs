@@ -1,8 +1,7 @@
 //! The strategy `mcmc` through the program: what it adds to every step arrives, on the CPU and where a GPU renders.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::workdir::Workdir;
-use gsscale::gpu::GpuOptions;
 
 #[test]
 fn noise_moves_means_and_regularisers_shrink_what_views_draw() {
@@ -27,9 +26,7 @@ fn noise_moves_means_and_regularisers_shrink_what_views_draw() {
 
 #[test]
 fn a_gpu_relocates_as_many_as_the_cpu() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::wide_city(6000);
     let flags = "--steps 60 --refine-start 10 --refine-every 8 --prune-opa 0.03 --page-rows 32 --strategy mcmc --max-gaussians 6100 \
         --init-opacity 0.05";

@@ -1,10 +1,9 @@
 //! Photos that contradict the scene, through the real binaries.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::workdir::Workdir;
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
-use gsscale::gpu::GpuOptions;
 use gsscale::train::start::first_scene::prepare;
 
 const SWAPPED: Disturbance = Disturbance::Swapped { share: 0.1, are_removed: false };
@@ -105,9 +104,7 @@ fn masking_what_stands_on_one_photo_only_wins_back_part_of_what_masks_by_hand_wi
 
 #[test]
 fn a_gpu_masks_and_names_what_the_cpu_does() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(24, 96, 64, 1500);
     for (name, how, flag) in [
         ("boxes", Disturbance::Boxes { count: 8, are_masked: false }, "--robust-pixels"),
@@ -135,9 +132,7 @@ fn a_gpu_masks_and_names_what_the_cpu_does() {
 /// The host looks at the picture of a step whose pages a device holds, and ends the step there if the picture contradicts its photo.
 #[test]
 fn pages_on_a_device_give_the_same_bytes_without_wrong_views() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(24, 96, 64, 1500);
     let swapped = disturbed(&work, "swapped", &SWAPPED);
     let flags = "--steps 130 --strategy none --robust-views --device gpu --optimizer-on device --page-rows 32 --view-order shuffle";

@@ -1,12 +1,11 @@
 //! Poses with noise: what `--refine-poses` wins back, and what it finds, through the real binaries.
 
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
 use gsscale::dataset::read::{ReadOptions, read_scene};
-use gsscale::gpu::GpuOptions;
 use gsscale::train::start::first_scene::prepare;
 
 /// Writes the scene with noise on its training poses to `noise`, half a percent of the scene along each axis, which costs this scene
@@ -50,9 +49,7 @@ fn refined_poses_win_back_what_noise_costs_and_lie_nearer_to_the_truth() {
 
 #[test]
 fn a_gpu_refines_poses_as_the_cpu_does() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = Workdir::city(32, 160, 112, 1500);
     let flags = with_noise(&work);
     let [want, got] = ["cpu", "gpu"].map(|device| {

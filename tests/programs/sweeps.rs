@@ -1,11 +1,10 @@
 //! `gsscale-bench sweep`, which trains runs in child processes, and `gsscale-bench compare` of its runs.
 
+use crate::support::a_device;
 use crate::support::bench::{number, parse};
 use crate::support::browser::in_a_browser;
-use crate::support::gpu;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{BENCH, Running, Workdir};
-use gsscale::gpu::GpuOptions;
 use serde_json::Value;
 
 /// A city whose views each see at most two thirds of it.
@@ -100,9 +99,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
 /// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
 #[test]
 fn rungs_on_a_device_end_alike() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let work = large_city();
     let flags = sweep("ladder-gpu", "--steps 30 --share 70");
     let records = lines(&work, &format!("{flags} --device-mem 6MiB --device gpu"));

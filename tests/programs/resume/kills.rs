@@ -4,11 +4,10 @@
 
 use super::bench::{Bench, Place};
 use super::events;
-use crate::support::gpu;
+use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::copy_folder;
 use gsscale::base::rng::{Purpose, Stream};
-use gsscale::gpu::GpuOptions;
 use std::os::unix::process::ExitStatusExt;
 use std::time::Duration;
 
@@ -100,9 +99,7 @@ fn live(
 /// so most kills hit a pass. The resumed runs keep the budgets and end with the bytes of a run that has plenty of both.
 #[test]
 fn a_run_on_a_gpu_that_is_killed_within_its_passes_ends_with_the_same_bytes() {
-    if gpu::open(&GpuOptions::default()).is_none() {
-        return;
-    }
+    let Some(()) = a_device() else { return };
     let bench = Bench::new();
     bench.train(&bench.flags(Place::Memory, "--device gpu"));
     let (want, fewest) = (bench.ply("out"), bench.count("out", "pages_pinned_max"));
