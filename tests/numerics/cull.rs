@@ -172,16 +172,3 @@ fn lists_do_not_depend_on_threads_or_on_the_instruction_path() {
         assert!(lists(simd, 3) == want, "{}", simd.name());
     }
 }
-
-#[test]
-fn gathered_rows_equal_evaluated_rows() {
-    let adam = DeferredAdam::new(Rates::new(1.0, 500), AdamConfig::default(), SimdPath::best());
-    let state = scene(4000, &adam);
-    let rows: Vec<u32> = (0..4000).step_by(3).collect();
-    let all = evaluate_all(&[state.view()], 0, &adam, 40);
-    let mut out = Columns::default();
-    gather(&[state.view()], 0, &adam, 40, &rows, &mut out);
-    for (i, &row) in rows.iter().enumerate() {
-        Column::ALL.iter().for_each(|&c| assert_eq!(out.row(c, i), all.row(c, row as usize)));
-    }
-}

@@ -334,12 +334,16 @@ fn every_way_of_reading_gives_the_same_bits() {
         let (adam, state, _) = eventful_steps(simd, 3, Moments::F32);
         for now in [60, 61, 77, 459, 460, 461, 5000] {
             let all = evaluate_all(&state, &adam, now);
+            let listed: Vec<u32> = (0..state.rows() as u32).step_by(13).collect();
+            let mut gathered = Columns::default();
+            catch_up::gather(&[state.view()], 3, &adam, now, &listed, &mut gathered);
             let at = adam.at(now);
-            for row in (0..state.rows()).step_by(13) {
+            for (place, row) in (0..state.rows()).step_by(13).enumerate() {
                 let mut block = [0.0; BLOCK_LANES];
                 at.evaluate_row(&state.view(), row, &mut block);
                 for column in Column::ALL {
                     for (i, &x) in all.row(column, row).iter().enumerate() {
+                        assert_eq!(x.to_bits(), gathered.row(column, place)[i].to_bits());
                         assert_eq!(x.to_bits(), block[first_lane(column) + i].to_bits());
                         assert_eq!(x.to_bits(), at.evaluate_element(&state.view(), column, row, i).to_bits());
                         let (m, v) = (state.exp_avg.row(column, row)[i], state.exp_avg_sq.row(column, row)[i]);

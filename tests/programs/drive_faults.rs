@@ -307,36 +307,6 @@ fn a_drive_that_fails_in_either_pass_loses_one_step_at_most() {
     assert!(writes.contains(&false), "each of 7 failed writes tore its step");
 }
 
-#[test]
-fn transient_io_errors_do_not_change_results() {
-    let world = World::new();
-    let life = world.live("once", &Faults::new(), |faults| {
-        let reads = faults.count(Operation::Read);
-        let ways = [Fault::Error(ErrorKind::Other), Fault::Short, Fault::FlipBit(70_001), Fault::Torn];
-        // The faults lie further apart than transfers in flight, so that the second try of a read succeeds.
-        (0..16).for_each(|i| faults.add(Operation::Read, reads + 5 + 150 * i, false, ways[i as usize % 4]));
-        faults.reorder(3);
-    });
-    life.unwrap();
-    assert!(world.work.ply("once") == world.want);
-}
-
-/// A drive that silently flips a bit of a page or writes half of it.
-#[test]
-fn a_page_that_is_not_what_was_written_is_named_and_never_used() {
-    let world = World::new();
-    for (i, fault) in [Fault::FlipBit(60_000), Fault::Torn, Fault::Lost].into_iter().enumerate() {
-        let name = format!("decay-{i}");
-        let life = world.live(&name, &Faults::new(), |faults| {
-            let first = faults.count(Operation::Write);
-            (first..first + 400).for_each(|n| faults.add(Operation::Write, n, false, fault));
-        });
-        let error = life.expect_err("damaged pages are read again").to_string();
-        assert!(["is damaged", "page ", "generation", "seg-", "remedy"].iter().all(|w| error.contains(w)), "{error}");
-        assert!(!world.work.exists(&format!("{name}/point_cloud.ply")), "nothing is exported from damaged pages");
-    }
-}
-
 /// Flags of runs through the program.
 const FLAGS: &str = "scene --spill-codec raw --steps 60 --page-rows 32 --refine-start 1000 --max-gaussians 7000 --view-order groups:4 \
     --test-every 24 --device cpu --log-every 7";
@@ -364,22 +334,6 @@ fn a_drive_is_refused_only_if_it_is_too_small_and_at_once() {
     work.refuses(&format!("{few} --overwrite"), &["the drive has", "free space on it"]);
     let is_kept = !work.exists("drive/spill") && work.exists("out/point_cloud.ply");
     assert!(is_kept, "it took something away or left something behind");
-}
-
-#[test]
-fn a_really_full_drive_pauses_the_run_until_there_is_space() {
-    let work = make_scene();
-    let Some(drive) = small_drive(&work) else { return };
-    work.train(&format!("{FLAGS} --out alone --quiet"));
-    let mut run = work.begin(&format!("{FLAGS} {TO_DRIVE} --disk-full-wait 120"));
-    run.says("paused:");
-    std::thread::sleep(std::time::Duration::from_millis(300));
-    assert!(run.child.try_wait().unwrap().is_none(), "it waits");
-    drive.resize(200 << 20);
-    let said = run.ends(0);
-    says(&said, &["No space", "needs", "free", "--disk-full-wait", "training goes on"]);
-    assert!(work.ply("out") == work.ply("alone"), "waiting changed the scene");
-    assert!(work.count("out", "commits") > 1 && work.summary("out")["commit_interval"] == 0.02);
 }
 
 #[test]

@@ -1,23 +1,13 @@
-//! Scenes as other programs export them train to the pictures of the same scene as a COLMAP model; what a folder of photos alone is told;
-//! and a run whose own export fails.
+//! Scenes as other programs export them are the same scene as a COLMAP model; what a folder of photos alone is told; and a run whose own
+//! export fails.
 
 use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{EVAL, TRAIN, Workdir, says};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::fs;
 
-/// Trains a few steps and returns the pixels of the held-out pictures, render beside photo.
-fn trained(work: &Workdir, out: &str) -> Vec<u8> {
-    work.run(out, "--steps 40 --refine-start 10 --refine-every 10");
-    let files: Vec<_> = work.files(&format!("{out}/renders/test")).into_keys().collect();
-    let pictures = files.iter().filter(|file| file.extension().is_some_and(|e| e == "png"));
-    let pictures: Vec<_> = pictures.map(|file| work.path(out).join("renders/test").join(file)).collect();
-    assert!(pictures.len() > 1);
-    pictures.iter().flat_map(|file| image::open(file).unwrap().into_rgb8().into_raw()).collect()
-}
-
 #[test]
-fn exports_of_other_programs_train_to_the_same_pictures() {
+fn exports_of_other_programs_are_the_scene_of_the_model_and_train() {
     let work = Workdir::city(12, 96, 64, 500);
     let scene = work.scene();
     let mut model = TextModel::of(&scene);
@@ -25,15 +15,18 @@ fn exports_of_other_programs_train_to_the_same_pictures() {
     (model.pinhole[2], model.pinhole[3]) = (50.0, 30.5);
     model.pinhole[1] = model.pinhole[0];
     model.write(&scene);
-    let colmap = trained(&work, "colmap");
     let of_colmap = read_scene(&scene, &ReadOptions::default()).unwrap();
     fs::remove_dir_all(scene.join("sparse")).unwrap();
-    for (name, file) in
-        [("opensfm", "reconstruction.json"), ("odm", "opensfm/reconstruction.json"), ("reality-capture", "cameras.csv")]
-    {
-        match file.ends_with("json") {
-            true => model.write_reconstruction(&scene.join(file)),
-            false => model.write_reality_capture(&scene.join(file)),
+    for (name, file) in [
+        ("transforms", "transforms.json"),
+        ("opensfm", "reconstruction.json"),
+        ("odm", "opensfm/reconstruction.json"),
+        ("reality-capture", "cameras.csv"),
+    ] {
+        match name {
+            "transforms" => model.write_transforms(&scene),
+            "reality-capture" => model.write_reality_capture(&scene.join(file)),
+            _ => model.write_reconstruction(&scene.join(file)),
         }
         let read = read_scene(&scene, &ReadOptions::default()).unwrap();
         assert_eq!(read.views.len(), of_colmap.views.len());
@@ -46,12 +39,9 @@ fn exports_of_other_programs_train_to_the_same_pictures() {
             let [i, j] = [a, b].map(|v| [v.intrinsics.fx, v.intrinsics.fy, v.intrinsics.cx, v.intrinsics.cy]);
             assert!(i.iter().zip(j).all(|(i, j)| (i - j).abs() < 1e-10), "{name}: {i:?} {j:?}");
         }
-        // The cameras differ in last bits of f64, some in the last of f32, which grow with the steps: a few pixels by a level.
-        let pictures = trained(&work, name);
-        assert_eq!(pictures.len(), colmap.len());
-        let apart: u64 = pictures.iter().zip(&colmap).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
-        let mean = apart as f64 / colmap.len() as f64;
-        assert!(mean < 0.2, "{name}: {mean} levels apart");
+        // The points too, which formats keep in files of their own.
+        work.run(name, "--steps 2");
+        assert_eq!(work.count(name, "gaussians"), of_colmap.points.positions.len() as u64, "{name}");
         fs::remove_file(scene.join(file)).unwrap();
     }
 }
@@ -79,8 +69,9 @@ fn the_levels_of_a_sog_are_measured_and_charted() {
     // A PLY in the folder of its run has the run's held-out photos as well.
     let report = work.json_of(EVAL, "out/point_cloud.ply --device cpu");
     // Values of the PLY are those of the run but for quaternions, which are normalised.
-    let off = report["test"]["psnr"].as_f64().unwrap() - exact;
-    assert!(off.abs() < 0.01 && report["levels"].is_null(), "{report}");
+    let off = ["psnr", "ssim"]
+        .map(|key| report["test"][key].as_f64().unwrap() - work.summary("out")["test"][key].as_f64().unwrap());
+    assert!(off.iter().all(|off| off.abs() < 2e-3) && report["levels"].is_null(), "{report}");
     work.refuses_with(EVAL, &format!("out {page}"), &["has no levels of detail"]);
 }
 

@@ -63,8 +63,9 @@ fn commits_of_a_run_in_memory_wait_for_space() {
     assert!(run.child.try_wait().unwrap().is_none(), "it waits");
     bench.drive.free();
     let said = run.ends(0);
-    says(&said, &["No space", "--disk-full-wait", "there is space again"]);
+    says(&said, &["No space", "needs", "free", "--disk-full-wait", "there is space again", "training goes on"]);
     assert!(bench.ply() == bench.want(), "waiting changed the scene");
+    assert_eq!(bench.work.summary("drive/out")["commit_interval"], 0.02);
     bench.is_whole();
 }
 

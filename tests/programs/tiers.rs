@@ -26,14 +26,6 @@ fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
     refuses(&work, "--host-mem 8MiB --spill-dir spill", &["8.0 MiB", "take", "at least"]);
     assert!(!work.exists("spill"), "a refused run leaves no spill directory");
     refuses(&work, "--frames 1 --page-rows 64", &["--frames: 1", "give at least 2"]);
-    // An unknown word of a flag is a usage error.
-    for [flag, word, known] in
-        [["--io", "floppy", "uring"], ["--spill-codec", "zip", "zstd:"], ["--view-order", "groups:0", "groups:"]]
-    {
-        let output = work.output(TRAIN, &format!("scene --out out {flag} {word}"));
-        assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
-        assert!(stderr(&output).contains(flag) && stderr(&output).contains(known), "{}", stderr(&output));
-    }
     refuses(&work, "--page-rows 3", &["--page-rows"]);
     refuses(&work, "--sh-degree 1 --sh-start 2", &["--sh-start"]);
 }

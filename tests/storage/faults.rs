@@ -22,7 +22,7 @@
 //! | folder read-only from the start | refused | spill_dir: read_only_folders_are_refused |
 //! | drive read-only or rights lost later | as EIO | store: any_operation_may_fail_in_any_way |
 //! | folder moved away in use | what was acknowledged is where the folder is; growing is an error | faults: a_folder_that_is_moved_away_keeps_its_commits |
-//! | few file handles | files are closed and opened again | spill_dir: sixty_four_files_are_enough_for_two_hundred_segments; engines: more_segments_than_open_files |
+//! | few file handles | files are closed and opened again | engines: more_segments_than_open_files |
 //! | two processes | exactly one has the folder | spill_dir: of_many_racing_processes_one_wins; spill_dir: two_processes_never_share_a_directory |
 //! | clock jumps, sleep | no decision reads the wall clock | faults: no_decision_reads_the_wall_clock |
 //! | slow drive | transfers in flight are bounded in bytes; others may end in any order and time | paging: what_moves_ahead_at_a_slow_drive_is_bounded_in_bytes; store: transfers_may_end_in_any_order |

@@ -256,11 +256,6 @@ fn second_process() {
             Err(error) => say(&format!("refused: {}", error.problem)),
         },
         "create" => say(&create(&folder).map_or_else(|e| e.to_string(), |_| "made".to_string()).replace('\n', " ")),
-        "many segments" => {
-            let limit = rustix::process::Rlimit { current: Some(64), maximum: Some(64) };
-            rustix::process::setrlimit(rustix::process::Resource::Nofile, limit).unwrap();
-            say(&fill_many_segments(&folder, 200).map_or_else(|e| e.to_string(), |()| "filled".to_string()));
-        }
         "no umask" => {
             rustix::process::umask(rustix::fs::Mode::empty());
             let spill = create(&folder).unwrap();
@@ -275,24 +270,6 @@ fn second_process() {
 fn say(line: &str) {
     println!("\nsays {line}");
     std::io::stdout().flush().unwrap();
-}
-
-fn fill_many_segments(folder: &Path, segments: u32) -> std::io::Result<()> {
-    let mut files = SegmentFiles::new(folder, false)?;
-    // The rest of the process holds files as well, more than expected: all but four.
-    let mut others: Vec<std::fs::File> = std::iter::from_fn(|| std::fs::File::open("/dev/null").ok()).collect();
-    others.truncate(others.len() - 4);
-    for segment in 0..segments {
-        files.create(segment, 8192)?;
-        files.file_for_write(segment)?.write_all_at(&segment.to_le_bytes(), 4096)?;
-    }
-    files.sync()?;
-    for segment in 0..segments {
-        let mut bytes = [0; 4];
-        files.file(segment)?.read_exact_at(&mut bytes, 4096)?;
-        assert_eq!(bytes, segment.to_le_bytes());
-    }
-    Ok(())
 }
 
 fn start(role: &str, folder: &Path, change: impl FnOnce(&mut Command) -> &mut Command) -> std::io::Result<Child> {
@@ -374,12 +351,6 @@ fn read_only_folders_are_refused() {
         create(&folder).unwrap_err().to_string()
     };
     assert!(said.contains("Permission denied") && said.contains("check the permissions"), "{said}");
-}
-
-#[test]
-fn sixty_four_files_are_enough_for_two_hundred_segments() {
-    let folder = tempfile::tempdir().unwrap();
-    assert_eq!(ask("many segments", folder.path()), "filled");
 }
 
 #[test]

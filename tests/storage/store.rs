@@ -453,37 +453,6 @@ impl Run {
     }
 }
 
-#[test]
-fn kept_generations_are_never_overwritten() {
-    for codec in CODECS {
-        let (mut store, _, shared) = faulty(codec);
-        let mut run = Run::default();
-        for step in 0..120 {
-            run.step(&mut store, step);
-            if step == 60 {
-                run.pinned.drain(..run.pinned.len() / 2);
-                let (kept, pinned) = (&mut run.kept, &run.pinned);
-                let last = kept.last_key_value().map(|(generation, _)| *generation);
-                kept.retain(|generation, _| pinned.contains(generation) || Some(*generation) == last);
-            }
-            assert_eq!(run.check_all(&mut store), 0);
-        }
-        assert!(run.kept.len() > 10 && store.slots().retired() > 10);
-        // Another process opens the last generation and an older, pinned one.
-        let (segments, generation) = (store.slots().segments(), store.generation());
-        let used: std::collections::BTreeSet<[u8; SlotRef::ENCODED_BYTES]> =
-            run.kept.values().flat_map(|index| index.values().map(|(_, slot)| slot.to_bytes())).collect();
-        let used: Vec<SlotRef> = used.iter().map(|bytes| SlotRef::from_bytes(bytes).unwrap()).collect();
-        let config = PagedStoreConfig { generation, serial: store.serial(), ..config(codec) };
-        drop(store);
-        let mut store = PagedStore::open(Box::new(shared), config, segments, &used).unwrap();
-        run.present = run.kept.last_key_value().unwrap().1.clone();
-        assert_eq!(run.check_all(&mut store), 0);
-        run.step(&mut store, 1000);
-        assert_eq!(run.check_all(&mut store), 0);
-    }
-}
-
 /// Makes every operation of a run fail, once and permanently, in every way: no panic, no lost buffer, no wrong bytes.
 /// Where the drive reports its results truthfully, every version reported as written is there.
 #[test]

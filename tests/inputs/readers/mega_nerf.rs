@@ -105,19 +105,3 @@ fn hostile_files_are_refused_by_name() {
     let said = read_scene(folder.path(), &ReadOptions::default()).unwrap_err().to_string();
     assert!(said.contains("coordinates.pt"), "{said}");
 }
-
-#[test]
-fn every_flipped_byte_gives_a_result_or_an_error() {
-    let good = std::fs::read(fixture("000000.pt")).unwrap();
-    let folder = scene_of_pytorch();
-    let path = folder.path().join("train/metadata/000000.pt");
-    let mut refused = 0;
-    for at in 0..good.len() {
-        let mut bad = good.clone();
-        bad[at] ^= 0x55;
-        std::fs::write(&path, &bad).unwrap();
-        refused += usize::from(read_scene(folder.path(), &ReadOptions::default()).is_err());
-    }
-    // Padding between entries and unused header fields may hold anything.
-    assert!(refused > good.len() / 3, "{refused} of {}", good.len());
-}

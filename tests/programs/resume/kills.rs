@@ -4,7 +4,6 @@
 
 use super::bench::{Bench, Place};
 use super::events;
-use crate::support::a_device;
 use crate::support::scenes::stderr;
 use crate::support::workdir::copy_folder;
 use gsscale::base::rng::{Purpose, Stream};
@@ -42,7 +41,7 @@ fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
                 let [threads, codec] = [lives % 2, lives / 2 % 2].map(|i| i as usize);
                 format!("{OFTEN} --threads {} --spill-codec {} {frames}", [1, 2][threads], ["raw", "zstd:1"][codec])
             };
-            let lives = live(&bench, &bench.flags(place, OFTEN), more, 0, &mut left, &mut draws);
+            let lives = live(&bench, &bench.flags(place, OFTEN), more, &mut left, &mut draws);
             assert!(bench.ply("out") == alone.ply, "{place:?}: after {lives} lives the scene is another");
             assert_eq!(bench.logged("out", "step"), alone.logged, "{place:?}: after {lives} lives");
             // The evaluation and each picture of the last step are events of their own.
@@ -65,22 +64,15 @@ fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
     }
 }
 
-/// One run from start to finish, killed while kills are left: some time after it has logged `lines` more lines, or within its start.
+/// One run from start to finish, killed while kills are left: some time after it has logged another line, or within its start.
 /// Returns its number of processes.
-fn live(
-    bench: &Bench,
-    begin: &str,
-    more: impl Fn(u32) -> String,
-    lines: usize,
-    left: &mut u32,
-    draws: &mut Stream,
-) -> u32 {
+fn live(bench: &Bench, begin: &str, more: impl Fn(u32) -> String, left: &mut u32, draws: &mut Stream) -> u32 {
     let mut run = bench.begin(begin).after_lines("out", 4);
     let mut lives = 1;
     loop {
         if *left > 0 {
             if draws.below(4) > 0 {
-                run = run.after_lines("out", bench.lines("out") + lines);
+                run = run.after_lines("out", bench.lines("out"));
             }
             std::thread::sleep(Duration::from_millis(draws.below(KILL_WITHIN)));
             let _ = run.child.kill();
@@ -93,26 +85,6 @@ fn live(
         (*left, lives) = (left.saturating_sub(1), lives + 1);
         run = bench.resume(&more(lives));
     }
-}
-
-/// On a GPU with half the device memory and half the frames that the largest view wants, a step is long and goes in batches,
-/// so most kills hit a pass. The resumed runs keep the budgets and end with the bytes of a run that has plenty of both.
-#[test]
-fn a_run_on_a_gpu_that_is_killed_within_its_passes_ends_with_the_same_bytes() {
-    let Some(()) = a_device() else { return };
-    let bench = Bench::new();
-    bench.train(&bench.flags(Place::Memory, "--device gpu"));
-    let (want, fewest) = (bench.ply("out"), bench.count("out", "pages_pinned_max"));
-    let (logged, memory) = (bench.logged("out", "step"), bench.logged("out", "device_bytes_peak").into_iter().max());
-    bench.clear();
-    let little = format!("--device-mem {} --commit-every 0.02", memory.unwrap() / 2);
-    let begin = bench.flags(Place::Spill((fewest / 2).max(2)), &format!("--device gpu {little}"));
-    let mut left = 6;
-    let lives = live(&bench, &begin, |_| little.clone(), 1, &mut left, &mut Stream::new(11, Purpose::Test, 0, 0));
-    assert!(lives > 1, "the run was never killed");
-    assert!(bench.ply("out") == want, "after {lives} lives the scene is another");
-    assert_eq!(bench.logged("out", "step"), logged);
-    assert!(bench.count("out", "frames") < fewest, "the frames hold the largest view whole");
 }
 
 /// A kill during the removal of a finished run's checkpoint leaves a map without its segments.
