@@ -381,82 +381,78 @@ fn settling_a_row_keeps_its_later_values() {
 
 #[test]
 fn gradients_that_are_not_finite_or_zero_leave_their_row_alone() {
-    paths().for_each(bad_gradients_leave_their_row_alone);
-}
-
-fn bad_gradients_leave_their_row_alone(simd: SimdPath) {
-    let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
-    let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
-    state.columns.scales[15] = 80.0;
-    let all: Vec<u32> = (0..6).collect();
-    let mut grads = grads_at(&all, 3, 0);
-    grads.row_mut(Column::ShN, 1)[44] = f32::NAN;
-    grads.row_mut(Column::Opacities, 2)[0] = f32::INFINITY;
-    grads.row_mut(Column::Means, 3)[1] = 1e30;
-    for column in Column::ALL {
-        grads.row_mut(column, 4).fill(-0.0);
-    }
-    let before = state.clone();
-    let counts = take_step(&adam, &mut state, &all, &grads, 9);
-    assert_eq!((counts.updated, counts.skipped_non_finite), (2, 3));
-    assert_eq!(state.stamp, [10, 0, 0, 0, 0, 10]);
-    for row in 1..5 {
+    for simd in paths() {
+        let adam = DeferredAdam::new(Rates::new(1.0, 2000), AdamConfig::default(), simd);
+        let mut state = SceneState::from_columns(random_columns(6, 3, 1.0, 5));
+        state.columns.scales[15] = 80.0;
+        let all: Vec<u32> = (0..6).collect();
+        let mut grads = grads_at(&all, 3, 0);
+        grads.row_mut(Column::ShN, 1)[44] = f32::NAN;
+        grads.row_mut(Column::Opacities, 2)[0] = f32::INFINITY;
+        grads.row_mut(Column::Means, 3)[1] = 1e30;
         for column in Column::ALL {
-            assert_eq!(state.columns.row(column, row), before.columns.row(column, row));
-            assert_eq!(state.exp_avg_sq.row(column, row), before.exp_avg_sq.row(column, row));
+            grads.row_mut(column, 4).fill(-0.0);
         }
+        let before = state.clone();
+        let counts = take_step(&adam, &mut state, &all, &grads, 9);
+        assert_eq!((counts.updated, counts.skipped_non_finite), (2, 3));
+        assert_eq!(state.stamp, [10, 0, 0, 0, 0, 10]);
+        for row in 1..5 {
+            for column in Column::ALL {
+                assert_eq!(state.columns.row(column, row), before.columns.row(column, row));
+                assert_eq!(state.exp_avg_sq.row(column, row), before.exp_avg_sq.row(column, row));
+            }
+        }
+        // A runaway log-scale is clamped to the limit when its row is updated.
+        assert_eq!(state.columns.scales[15], 30.0);
+        assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
     }
-    // A runaway log-scale is clamped to the limit when its row is updated.
-    assert_eq!(state.columns.scales[15], 30.0);
-    assert!(Column::ALL.into_iter().all(|c| state.columns.column(c).iter().all(|x| x.is_finite())));
 }
 
 /// A load of a row also reads a little of the next row, and the last row of a table takes a different code path.
 #[test]
 fn a_rows_result_does_not_depend_on_its_neighbours() {
-    paths().for_each(rows_beside_it_change_no_bit);
-}
-
-fn rows_beside_it_change_no_bit(simd: SimdPath) {
-    let bits = |values: &[f32]| -> Vec<u32> { values.iter().map(|x| x.to_bits()).collect() };
-    for (degree, moments, eps) in
-        [(0, Moments::F32, 1e-15), (1, Moments::F32, 1e-8), (2, Moments::Bf16, 1e-15), (3, Moments::F32, 1e-8)]
-    {
-        let rows = 23;
-        let config = AdamConfig { eps, ..AdamConfig::default() };
-        let adam = DeferredAdam::new(Rates::new(1.0, 2000), config, simd).with_moments(moments);
-        let mut together = SceneState::from_columns(random_columns(rows, degree, 1.0, 8));
-        let mut alone: Vec<SceneState> = (0..rows as u32).map(|row| together.select(&[row])).collect();
-        for (step, now) in [3, 4, 40, 900].into_iter().enumerate() {
-            let listed: Vec<u32> = (0..rows as u32).filter(|row| !(row + step as u32).is_multiple_of(4)).collect();
-            let mut grads = grads_at(&listed, degree, now);
-            for i in 0..listed.len() {
-                // Rows without a gradient and skipped rows lie before and after others.
-                let of = [None, Some(0.0), None, Some(f32::NAN), Some(0.0), None, None][(i + step) % 7];
-                if let Some(value) = of {
-                    Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(value));
-                }
-            }
-            let counts = take_step(&adam, &mut together, &listed, &grads, now);
-            let mut counted = (0, 0);
-            for (i, &row) in listed.iter().enumerate() {
-                let mut own = Columns::zeros(1, degree);
-                Column::ALL.into_iter().for_each(|c| own.row_mut(c, 0).copy_from_slice(grads.row(c, i)));
-                let of_row = take_step(&adam, &mut alone[row as usize], &[0], &own, now);
-                counted = (counted.0 + of_row.updated, counted.1 + of_row.skipped_non_finite);
-            }
-            assert_eq!((counts.updated, counts.skipped_non_finite), counted);
-            assert!(counted.0 > 0 && counted.1 > 0 && counted.0 + counted.1 < listed.len());
-            let values = evaluate_all(&together, &adam, now + 20);
-            for (row, own) in alone.iter().enumerate() {
-                let stored = together.select(&[row as u32]);
-                assert_eq!(&stored, own, "row {row} at degree {degree}");
-                let own_values = evaluate_all(own, &adam, now + 20);
-                for column in Column::ALL {
-                    for (a, b) in [(&stored.columns, &own.columns), (&stored.exp_avg, &own.exp_avg)] {
-                        assert_eq!(bits(a.row(column, 0)), bits(b.row(column, 0)));
+    for simd in paths() {
+        let bits = |values: &[f32]| -> Vec<u32> { values.iter().map(|x| x.to_bits()).collect() };
+        for (degree, moments, eps) in
+            [(0, Moments::F32, 1e-15), (1, Moments::F32, 1e-8), (2, Moments::Bf16, 1e-15), (3, Moments::F32, 1e-8)]
+        {
+            let rows = 23;
+            let config = AdamConfig { eps, ..AdamConfig::default() };
+            let adam = DeferredAdam::new(Rates::new(1.0, 2000), config, simd).with_moments(moments);
+            let mut together = SceneState::from_columns(random_columns(rows, degree, 1.0, 8));
+            let mut alone: Vec<SceneState> = (0..rows as u32).map(|row| together.select(&[row])).collect();
+            for (step, now) in [3, 4, 40, 900].into_iter().enumerate() {
+                let listed: Vec<u32> = (0..rows as u32).filter(|row| !(row + step as u32).is_multiple_of(4)).collect();
+                let mut grads = grads_at(&listed, degree, now);
+                for i in 0..listed.len() {
+                    // Rows without a gradient and skipped rows lie before and after others.
+                    let of = [None, Some(0.0), None, Some(f32::NAN), Some(0.0), None, None][(i + step) % 7];
+                    if let Some(value) = of {
+                        Column::ALL.into_iter().for_each(|column| grads.row_mut(column, i).fill(value));
                     }
-                    assert_eq!(bits(values.row(column, row)), bits(own_values.row(column, 0)));
+                }
+                let counts = take_step(&adam, &mut together, &listed, &grads, now);
+                let mut counted = (0, 0);
+                for (i, &row) in listed.iter().enumerate() {
+                    let mut own = Columns::zeros(1, degree);
+                    Column::ALL.into_iter().for_each(|c| own.row_mut(c, 0).copy_from_slice(grads.row(c, i)));
+                    let of_row = take_step(&adam, &mut alone[row as usize], &[0], &own, now);
+                    counted = (counted.0 + of_row.updated, counted.1 + of_row.skipped_non_finite);
+                }
+                assert_eq!((counts.updated, counts.skipped_non_finite), counted);
+                assert!(counted.0 > 0 && counted.1 > 0 && counted.0 + counted.1 < listed.len());
+                let values = evaluate_all(&together, &adam, now + 20);
+                for (row, own) in alone.iter().enumerate() {
+                    let stored = together.select(&[row as u32]);
+                    assert_eq!(&stored, own, "row {row} at degree {degree}");
+                    let own_values = evaluate_all(own, &adam, now + 20);
+                    for column in Column::ALL {
+                        for (a, b) in [(&stored.columns, &own.columns), (&stored.exp_avg, &own.exp_avg)] {
+                            assert_eq!(bits(a.row(column, 0)), bits(b.row(column, 0)));
+                        }
+                        assert_eq!(bits(values.row(column, row)), bits(own_values.row(column, 0)));
+                    }
                 }
             }
         }

@@ -5,7 +5,7 @@ use crate::support::dense_adam::DenseAdam;
 use crate::support::gpu::open;
 use crate::twins::deferred::TableWords;
 use crate::twins::gather::{GatherInput, gather};
-use crate::twins::page_words::{Table, Words};
+use crate::twins::page_words::{Table, row_at, stamp_at};
 use crate::twins::update::{UpdateInput, finish, judge, records, step};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -166,9 +166,9 @@ fn gpu_adam_matches_dense_adam() {
             if (now + 1) % CHECKED == 0 || now + 1 == STEPS {
                 let recent = adam.at(now + 1).numbers().recent;
                 dense.check(now + 1, |column, row, e| {
-                    let of = |table| f32::from_bits(slab[pages[0].row_at(column, table, row) + e]);
+                    let of = |table| f32::from_bits(slab[row_at(&pages[0], column, table, row) + e]);
                     let past = [of(Table::Values), of(Table::ExpAvg), of(Table::ExpAvgSq)];
-                    let (stamp, rate) = (slab[pages[0].stamp_at(row)], adam.rates().base(column) as f32);
+                    let (stamp, rate) = (slab[stamp_at(&pages[0], row)], adam.rates().base(column) as f32);
                     tables.evaluate(past, stamp, now + 1, &recent, column == Column::Means, rate)
                 });
             }

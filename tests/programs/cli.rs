@@ -165,17 +165,6 @@ fn scenes_that_are_not_there_say_what_was_looked_for() {
 }
 
 #[test]
-fn a_dry_run_writes_nothing_and_tells_the_memory() {
-    let (work, _) = Workdir::small_model();
-    let output = work.output(TRAIN, "scene --out dry --dry-run");
-    assert!(output.status.success(), "{}", stderr(&output));
-    // What was asked for is on standard output, so that it can be kept in a file.
-    let said = stdout(&output);
-    assert!(said.contains("memory") && said.contains("views to train on"), "{said}");
-    assert!(!work.exists("dry"));
-}
-
-#[test]
 fn flags_and_keys_are_read_in_any_order_and_unknown_ones_refused() {
     let (work, _) = Workdir::small_model();
     let output = work.output(TRAIN, "scene --out x --stepz 3");

@@ -36,7 +36,9 @@ fn a_dry_run_refuses_what_the_run_refuses() {
         });
         assert_eq!(dry, run, "{flags}");
     }
-    work.train(&format!("{SHORT} --out first --overwrite --dry-run --trace trace.json"));
+    let output = work.output(TRAIN, "scene --out first --overwrite --dry-run --trace trace.json");
+    let asked = String::from_utf8_lossy(&output.stdout);
+    assert!(["memory", "views to train on"].iter().all(|word| asked.contains(word)), "not on standard output: {asked}");
     assert!(work.files("") == before && !work.exists("new"), "nothing may change");
 }
 

@@ -7,22 +7,15 @@ use crate::support::scenes::{stderr, told};
 use crate::support::workdir::{EVAL, TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
-use gsscale::dataset::photo::decode;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::densify::strategy::StrategyName;
 use gsscale::gpu::GpuOptions;
 use gsscale::kernels::stages::STAGES;
-use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Traffic;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
-use gsscale::train::step::batch::HostRows;
-use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::PagedScene;
-use gsscale::train::step::train_step::{StepView, train_step};
-use gsscale::train::step::working_set::WorkingSet;
 use std::path::Path;
 
 const SHORT: &str = "--steps 60 --strategy none --sh-every 20 --log-every 1";
@@ -154,68 +147,6 @@ fn a_device_without_memory_left_leaves_the_last_good_step() {
     let work = Workdir::city(8, 64, 48, 300);
     let line = assert_ends_with_last_good_step(&work, "full@150", is_software.then_some(6 << 20));
     assert!(line.contains("the device is out of memory") && !line.contains("injected"), "{line}");
-}
-
-/// All bits that some steps with all colour bands on a small city give: values of the rows in view before each step,
-/// losses, gradients, radii. With the least of the steps' intersections, and the frames that were recorded again.
-fn bits_of_steps(scene: &Path, options: &GpuOptions, capacity: u32) -> Option<(Vec<u32>, u32, u64)> {
-    let mut renderer = GpuRenderer::new(gpu::open(options)?).unwrap();
-    renderer.set_capacity(capacity);
-    let config = TrainConfig { steps: 10, strategy: StrategyName::None, sh_every: 0, ..TrainConfig::default() };
-    let Prepared { dataset, mut columns, .. } = prepare(scene, &config).unwrap();
-    // Large enough for several tiles each.
-    columns.scales.iter_mut().for_each(|s| *s += 0.7);
-    let options = RunOptions::new(&config, dataset.scene_scale);
-    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
-    let mut scene = PagedScene::new(&columns, pager, &options).unwrap();
-    let mut working = WorkingSet::default();
-    let (mut bits, mut isects) = (Vec::new(), u32::MAX);
-    for (step, &view) in dataset.train_views().iter().cycle().take(10).enumerate() {
-        let view = &dataset.views[view];
-        let target = decode(&view.photo).unwrap();
-        let (step, camera, render) = (step as u32, &view.camera, &options.render);
-        let view = StepView { step, camera, render, collects: true, pages_most: usize::MAX };
-        let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
-        let done = train_step(&mut scene, &mut working, rows, &view, comparison).unwrap();
-        assert!(done.rows > 900 && done.updated > 300 && done.skipped.is_none(), "{done:?}");
-        isects = isects.min(renderer.isects());
-        let columns = [&working.columns, &working.gradients.columns];
-        let values = columns.into_iter().flat_map(|c| Column::ALL.into_iter().flat_map(|of| c.column(of)));
-        bits.extend(values.chain(working.gradients.means2d.as_flattened()).map(|x| x.to_bits()));
-        bits.extend(working.gradients.radii.as_flattened());
-        bits.extend([done.loss.loss.to_bits() as u32, (done.loss.loss.to_bits() >> 32) as u32]);
-    }
-    Some((bits, isects, renderer.frames_rerecorded()))
-}
-
-/// Cuts and waits affect the execution of a step, not its result: whole steps give the same bits.
-#[test]
-fn windows_waits_and_second_tries_change_no_bit_of_whole_steps() {
-    let work = Workdir::city(8, 64, 48, 1500);
-    let scene = work.scene();
-    let plain = GpuOptions::default();
-    let Some((want, isects, again)) = bits_of_steps(&scene, &plain, 1 << 16) else { return };
-    assert_eq!(again, 0);
-    // One binding must hold the splats, 48 bytes a row. Columns are cut into three parts or more (over 900 rows are in
-    // view), and so are the sums of the intersections.
-    let limit = 48 * 1500;
-    let windows = (36 * u64::from(isects)).div_ceil(limit);
-    println!("{isects} intersections in {windows} windows");
-    assert!(windows >= 3);
-    let cut = GpuOptions { max_binding_bytes: Some(limit), window_rows: Some(384), ..plain };
-    let serial = GpuOptions { serial: true, ..plain };
-    for (what, options, capacity) in [
-        ("windows", cut, limit as u32 / 4),
-        ("a wait for each submission", serial, 1 << 16),
-        ("lists that were too short at first", plain, 100),
-        ("all of it", GpuOptions { serial: true, ..cut }, 100),
-        ("windows, and uniforms in blocks", GpuOptions { uniform_blocks: Some(true), ..cut }, limit as u32 / 4),
-    ] {
-        let (got, _, again) = bits_of_steps(&scene, &options, capacity).unwrap();
-        assert_eq!(capacity == 100, again > 0, "{what}: {again} frames again");
-        let moved = got.iter().zip(&want).filter(|(g, w)| g != w).count();
-        assert!(got == want, "{what}: {moved} of {} words differ", want.len());
-    }
 }
 
 /// Uploads and allocations of the third and fourth step, on a scene `times` as large whose other rows no camera sees.

@@ -1,6 +1,6 @@
-//! Whole runs through the real binaries: the same quality far from the origin, and the same metrics from the PLY alone.
+//! Whole runs: the end of a schedule, the events of a run, and starts from a trained PLY.
 
-use crate::support::scenes::{TextModel, told};
+use crate::support::scenes::told;
 use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
@@ -10,10 +10,6 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
-
-fn medium() -> Workdir {
-    Workdir::city(24, 160, 112, 1500)
-}
 
 fn run(work: &Workdir, out: &str, more: &str) {
     work.train(&format!("scene --out {out} --quiet {more}"));
@@ -76,26 +72,8 @@ fn letter(kind: EventKind) -> char {
 }
 
 #[test]
-fn utm_offsets_cost_no_quality() {
-    let work = medium();
-    let steps = "--steps 300 --strategy none";
-    run(&work, "here", steps);
-    let mut model = TextModel::of(&work.scene());
-    model.shift([500_000.0, 4_600_000.0, 120.0]);
-    model.write(&work.scene());
-    run(&work, "far", steps);
-    // The documented bound is 0.05 dB; f64 subtraction leaves differences of some 1e-9 of the scene.
-    let (here, far) = (work.psnr("here"), work.psnr("far"));
-    assert!((here - far).abs() < 0.05, "{here} dB at the origin, {far} dB at UTM coordinates");
-    // The offset is far more than 1,000 radii of this small scene: the PLY stays in local coordinates, and evaluation
-    // knows the offset. Positions and scales are rounded to f32 in the PLY.
-    let again = work.eval_psnr("far scene");
-    assert!((again - far).abs() < 1e-2, "{again} dB from the PLY, {far} dB in the run");
-}
-
-#[test]
 fn training_can_start_from_a_trained_ply_and_its_bands_stay_in_use() {
-    let work = medium();
+    let work = Workdir::city(24, 160, 112, 1500);
     for (bands, steps, loss) in [
         // Ten steps with fresh moments cannot undo 400; a start from points would be some 10 dB lower.
         ("", 10, 1.5),

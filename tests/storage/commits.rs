@@ -1,10 +1,11 @@
 //! Commits in a real folder: which pages come back, which generations stay, which stores are refused, and how redb
 //! behaves.
 
+use crate::support::guarded::{Change, Guarded, GuardedFolder};
 use gsscale::base::ids::PageId;
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::engine::segment_files::segment_file_name;
-use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
+use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
@@ -19,6 +20,7 @@ use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
 use gsscale::page::versions::slots::SlotLayout;
 use redb::backends::InMemoryBackend;
 use redb::{Builder, ReadableDatabase, StorageBackend, TableDefinition};
+use std::io::ErrorKind;
 use std::ops::Range;
 use std::path::Path;
 use std::sync::Arc;
@@ -278,55 +280,27 @@ fn hostile_maps_cost_readers_nothing() {
     }
 }
 
-/// A folder in which the second piece of the reserve cannot be written, as if the process were killed there.
-struct Interrupted(DriveFolder);
-
-impl Folder for Interrupted {
-    fn open(&self, name: &str) -> std::io::Result<Option<Arc<dyn StorageBackend>>> {
-        self.0.open(name)
-    }
-    fn create(&self, name: &str) -> std::io::Result<Arc<dyn StorageBackend>> {
-        let file = self.0.create(name)?;
-        Ok(if name.starts_with(RESERVE_NAME) { Arc::new(Passed { to: file, stops: true }) } else { file })
-    }
-    fn rename(&self, from: &str, to: &str) -> std::io::Result<()> {
-        self.0.rename(from, to)
-    }
-    fn remove(&self, name: &str) -> std::io::Result<()> {
-        self.0.remove(name)
-    }
-    fn sync(&self) -> std::io::Result<()> {
-        self.0.sync()
-    }
-}
-
 /// A partly filled reserve is not taken for a reserve: the file gets its name only after every byte was written.
 #[test]
-fn a_reserve_that_was_not_filled_is_filled_again() {
+fn the_reserve_is_filled_whole_and_exists_until_it_is_given_up() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     drop(create(at).unwrap());
     let config = CommitConfig { reserve_bytes: 3 << 20, ..CONFIG };
-    let mut killed = Opened::open(Box::new(Interrupted(DriveFolder::new(at))), config).unwrap().commits;
+    // As if the process were killed after the first piece.
+    let stops = |change| if matches!(change, Change::WriteAt(1..)) { Err(ErrorKind::Other.into()) } else { Ok(()) };
+    let killed = GuardedFolder::new(at, RESERVE_NEW_NAME, Arc::new(stops));
+    let mut killed = Opened::open(Box::new(killed), config).unwrap().commits;
     assert!(killed.fill_reserve().is_err());
     drop(killed);
     let mut commits = Opened::open(Box::new(DriveFolder::new(at)), config).unwrap().commits;
-    assert!(commits.fill_reserve().unwrap());
+    assert!(commits.fill_reserve().unwrap() && commits.fill_reserve().unwrap());
     let bytes = std::fs::read(at.join(RESERVE_NAME)).unwrap();
     assert!(bytes.len() == 3 << 20 && bytes.iter().all(|&byte| byte == 0x5a), "it is hollow");
     assert!(!at.join(RESERVE_NEW_NAME).exists());
     std::fs::write(at.join(RESERVE_NEW_NAME), b"left by a process that was killed").unwrap();
-    assert!(commits.give_up_reserve().unwrap() && !at.join(RESERVE_NEW_NAME).exists());
-}
-
-#[test]
-fn the_reserve_exists_until_it_is_given_up() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut commits = create(folder.path()).unwrap().commits;
-    assert!(commits.fill_reserve().unwrap() && commits.fill_reserve().unwrap());
-    assert_eq!(std::fs::metadata(folder.path().join(RESERVE_NAME)).unwrap().len(), CONFIG.reserve_bytes);
     assert!(commits.give_up_reserve().unwrap() && !commits.give_up_reserve().unwrap());
-    assert!(!folder.path().join(RESERVE_NAME).exists());
+    assert!(!at.join(RESERVE_NAME).exists() && !at.join(RESERVE_NEW_NAME).exists());
 }
 
 #[cfg(unix)]
@@ -369,34 +343,8 @@ fn flip_primary(file: &dyn StorageBackend) {
     file.write(PRIMARY_BYTE, &[byte[0] ^ 1]).unwrap();
 }
 
-/// A file shared by several openings, whose writes stop in the middle as if a process had ended.
-#[derive(Debug, Clone)]
-struct Passed {
-    to: Arc<dyn StorageBackend>,
-    /// Only the first piece of a write succeeds.
-    stops: bool,
-}
-
-fn memory() -> Passed {
-    Passed { to: Arc::new(InMemoryBackend::new()), stops: false }
-}
-
-impl StorageBackend for Passed {
-    fn len(&self) -> std::io::Result<u64> {
-        self.to.len()
-    }
-    fn read(&self, offset: u64, out: &mut [u8]) -> std::io::Result<()> {
-        self.to.read(offset, out)
-    }
-    fn set_len(&self, len: u64) -> std::io::Result<()> {
-        self.to.set_len(len)
-    }
-    fn sync_data(&self) -> std::io::Result<()> {
-        self.to.sync_data()
-    }
-    fn write(&self, offset: u64, data: &[u8]) -> std::io::Result<()> {
-        if self.stops && offset > 0 { Err(std::io::ErrorKind::Other.into()) } else { self.to.write(offset, data) }
-    }
+fn memory() -> Guarded {
+    Guarded(Arc::new(InMemoryBackend::new()), Arc::new(|_| Ok(())))
 }
 
 /// A counterexample inside redb, kept as a test: one flipped bit silently undoes the last two-phase commit, even with

@@ -9,7 +9,7 @@
 //! | short, interrupted, EAGAIN | resumed a bounded number of times, then an error | src/page/engine/short_transfers: what_cannot_go_on_is_an_error_at_once_or_after_some_tries; src/page/engine/short_transfers: a_transfer_in_interrupted_parts_arrives_whole; engines: a_short_answer_of_the_ring_is_resumed; crash: every_call_of_a_small_run_may_fail |
 //! | EIO on read | read once more; then named with page, generation and place; an earlier generation can be gone back to | store: a_fault_that_a_second_read_mends_is_not_an_error; commits: generations_reopen_and_a_rollback_restores_an_older_one |
 //! | EIO on write or sync | nothing is written any more; the last acknowledged commit stands | store: a_failed_write_or_sync_ends_all_writing; crash: every_call_of_a_small_run_may_fail; paging: a_drive_that_fails_for_ever_loses_nothing_that_is_in_memory |
-//! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_exists_until_it_is_given_up |
+//! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_is_filled_whole_and_exists_until_it_is_given_up |
 //! | limit on the length of files | as ENOSPC, for segments and the map | faults: a_limit_on_the_length_of_files_is_a_full_drive |
 //! | flipped bit in a page or its header | found and named, never returned as good | store: every_flipped_bit_is_found_and_named |
 //! | flipped bit in map, witness or FORMAT | refused, or nothing is different | faults: a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless; spill_dir: left_over_directories_are_refused_with_the_remedy |
@@ -33,7 +33,7 @@
 //! meanwhile; other endianness does not compile.
 
 #[cfg(unix)]
-use crate::support::child::{one_test, run_one};
+use crate::support::child::in_child;
 use gsscale::base::ids::PageId;
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
@@ -237,17 +237,19 @@ fn a_folder_that_is_moved_away_keeps_its_commits() {
     assert!(!at.exists(), "nothing is made where the folder was");
 }
 
-/// The second process, in the folder `GSSCALE_TEST_FOLDER`. Without that variable the test does nothing.
 #[test]
 #[cfg(unix)]
-fn process_with_a_limit() {
+fn a_limit_on_the_length_of_files_is_a_full_drive() {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-    let Some(folder) = std::env::var_os("GSSCALE_TEST_FOLDER").map(PathBuf::from) else { return };
+    if !in_child(module_path!(), "a_limit_on_the_length_of_files_is_a_full_drive") {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
     let limit = |bytes: Option<u64>| {
         let maximum = getrlimit(Resource::Fsize).maximum;
         setrlimit(Resource::Fsize, Rlimit { current: bytes.or(maximum), maximum }).unwrap();
     };
-    let mut store = Store::create(&folder);
+    let mut store = Store::create(folder.path());
     (0..4).for_each(|page| store.write(page, 1).unwrap());
     store.commit().unwrap();
     // Neither a segment of 32 KiB nor the map may be written beyond the first 16 KiB.
@@ -260,16 +262,9 @@ fn process_with_a_limit() {
     store.write(4, 1).unwrap();
     let latest = store.commit().unwrap();
     drop(store);
-    let mut store = Store::open(&folder).unwrap();
+    let mut store = Store::open(folder.path()).unwrap();
     assert_eq!(store.commits.generations().latest(), latest);
     assert!((0..5).all(|page| store.read(page).unwrap() == 1));
-}
-
-#[test]
-#[cfg(unix)]
-fn a_limit_on_the_length_of_files_is_a_full_drive() {
-    let folder = tempfile::tempdir().unwrap();
-    run_one(one_test(module_path!(), "process_with_a_limit").env("GSSCALE_TEST_FOLDER", folder.path()));
 }
 
 /// The wall clock may jump. Only identities and the times in event files are read from it.

@@ -22,14 +22,9 @@ pub fn in_child(module: &str, name: &str) -> bool {
     if std::env::var_os(CHILD).is_some() {
         return true;
     }
-    run_one(one_test(module, name).env(CHILD, "1"));
-    false
-}
-
-/// Runs a command of [`one_test`]; panics unless exactly one test ran and passed.
-pub fn run_one(command: &mut Command) {
-    let output = command.output().unwrap();
+    let output = one_test(module, name).env(CHILD, "1").output().unwrap();
     let said = String::from_utf8_lossy(&output.stdout).into_owned() + &String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
     assert!(said.contains("1 passed"), "the test does not exist: {said}");
+    false
 }

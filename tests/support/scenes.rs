@@ -197,17 +197,6 @@ impl TextModel {
             v.set_rotation(v.rotation() * by.inverse());
         }
     }
-
-    /// Moves the whole scene by `offset`.
-    pub fn shift(&mut self, offset: [f64; 3]) {
-        let offset = DVec3::from_array(offset);
-        for p in &mut self.points {
-            *p = (DVec3::from_array(*p) + offset).to_array();
-        }
-        for v in &mut self.views {
-            v.tvec = (DVec3::from_array(v.tvec) - v.rotation() * offset).to_array();
-        }
-    }
 }
 
 /// Keeps lengths, rates and densification as the flags of a test and gsplat's defaults say, whatever the number of steps.

@@ -196,30 +196,29 @@ fn buffers_that_are_too_small_are_made_larger() {
 }
 
 #[test]
-fn columns_in_windows_give_the_same_bits() {
-    let (Some(mut whole), Some(mut cut)) = (
-        renderer(&GpuOptions::default()),
-        // The widest column has 180 bytes a row: 4000 rows are cut in four, the splats (48 bytes) just fit.
-        renderer(&GpuOptions { max_binding_bytes: Some(48 * 4000), ..GpuOptions::default() }),
-    ) else {
-        return;
-    };
-    let (view, options, target) = (few_isects(4000), RenderOptions::default(), photo(64, 48, false));
-    // No more intersections than the lowered binding holds with their gradients.
-    cut.set_capacity(5000);
+fn limits_and_forms_of_a_device_change_no_bit() {
+    let plain = GpuOptions::default();
+    let Some(mut whole) = renderer(&plain) else { return };
+    let (view, target) = (few_isects(4000), photo(64, 48, true));
+    let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
     let want = results(&mut whole, &view, &options, &target);
     assert!(want.grads.radii.iter().filter(|r| r[0] > 0).count() > 500, "most rows are drawn");
-    assert!(bits(&want) == bits(&results(&mut cut, &view, &options, &target)));
-}
-
-#[test]
-fn uniforms_in_blocks_and_in_storage_give_the_same_bits() {
-    let form = |blocks| renderer(&GpuOptions { uniform_blocks: Some(blocks), ..GpuOptions::default() });
-    let (Some(mut blocks), Some(mut storage)) = (form(true), form(false)) else { return };
-    let (view, target) = (scene(900, 65, 47), photo(65, 47, true));
-    let options = RenderOptions { background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
-    let want = results(&mut blocks, &view, &options, &target);
-    assert!(bits(&want) == bits(&results(&mut storage, &view, &options, &target)));
+    // The widest column has 180 bytes a row: 4000 rows are cut in four, the splats (48 bytes) just fit.
+    let cut = GpuOptions { max_binding_bytes: Some(48 * 4000), window_rows: Some(384), ..plain };
+    // No more intersections than the lowered binding holds with their gradients.
+    for (what, form, capacity) in [
+        ("windows", GpuOptions { window_rows: None, ..cut }, 5000),
+        ("uniforms in blocks", GpuOptions { uniform_blocks: Some(true), ..plain }, 5000),
+        ("uniforms in storage", GpuOptions { uniform_blocks: Some(false), ..plain }, 5000),
+        ("a wait for each submission", GpuOptions { serial: true, ..plain }, 5000),
+        ("windows, waits, lists that are too short at first", GpuOptions { serial: true, ..cut }, 100),
+        ("windows, uniforms in blocks", GpuOptions { uniform_blocks: Some(true), ..cut }, 5000),
+    ] {
+        let mut gpu = renderer(&form).unwrap();
+        gpu.set_capacity(capacity);
+        assert!(bits(&want) == bits(&results(&mut gpu, &view, &options, &target)), "{what}");
+        assert_eq!(gpu.frames_rerecorded() > 0, capacity == 100, "{what}");
+    }
 }
 
 #[test]

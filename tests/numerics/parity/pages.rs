@@ -7,7 +7,7 @@ use super::rows::camera;
 use crate::support::begin_view;
 use crate::support::gpu::open;
 use crate::twins::gather::{self, GatherInput};
-use crate::twins::page_words::Words;
+use crate::twins::page_words::count_at;
 use crate::twins::update::{self, UpdateInput};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -375,7 +375,8 @@ fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
             bytemuck::cast_slice_mut::<u64, u32>(&mut aligned).copy_from_slice(&payloads[p]);
             after.add_rows(&layout.rows(bytemuck::cast_slice(&aligned), 0));
             let page = &of_slab[p];
-            let words_of_views = page.count_at(0) - page.base as usize..page.count_at(layout.rows) - page.base as usize;
+            let words_of_views =
+                count_at(page, 0) - page.base as usize..count_at(page, layout.rows) - page.base as usize;
             // Steps of Adam are at most 32 rates long, and 1e-6 of that is the slack of the slowest arithmetic.
             for (i, (device, twin)) in payloads[p].iter().zip(&twin.0[p]).enumerate() {
                 let is_untouched = *twin == before[i];

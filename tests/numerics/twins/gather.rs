@@ -18,7 +18,7 @@
 //! for every later step, in the arithmetic of a device; 4. no row has a larger mean score or a lower opacity than a survey says.
 
 use super::deferred::{FOR_EVER, TableWords};
-use super::page_words::{Table, Words};
+use super::page_words::{Table, count_at, grad2d_at, row_at, stamp_at};
 use gsscale::base::math::exp32;
 use gsscale::densify::stats::WEIGHED_VIEWS;
 use gsscale::kernels::uniforms::{DevicePage, GatherUniforms, PageResult, PageSurvey};
@@ -57,9 +57,9 @@ pub struct GatherInput<'a> {
 impl GatherInput<'_> {
     /// The value of element `e` of a row after `end` steps.
     fn element(&self, page: &DevicePage, column: Column, row: usize, e: usize, end: u32, rate: f32) -> f32 {
-        let of = |table| f32::from_bits(self.slab[page.row_at(column, table, row) + e]);
+        let of = |table| f32::from_bits(self.slab[row_at(page, column, table, row) + e]);
         let state = [of(Table::Values), of(Table::ExpAvg), of(Table::ExpAvgSq)];
-        let stamp = self.slab[page.stamp_at(row)];
+        let stamp = self.slab[stamp_at(page, row)];
         self.tables.evaluate(state, stamp, end, self.recent, column == Column::Means, rate)
     }
 
@@ -86,7 +86,7 @@ impl GatherInput<'_> {
     }
 
     fn hull(&self, page: &DevicePage, column: Column, row: usize, e: usize, rate: f32) -> [f32; 2] {
-        let value = f32::from_bits(self.slab[page.row_at(column, Table::Values, row) + e]);
+        let value = f32::from_bits(self.slab[row_at(page, column, Table::Values, row) + e]);
         let limit = self.element(page, column, row, e, FOR_EVER, rate);
         let (low, high) = (value.min(limit), value.max(limit));
         let slack = MOVEMENT_SLACK * (high - low) + VALUE_SLACK * low.abs().max(high.abs()) + FLUSH_SLACK;
@@ -94,7 +94,7 @@ impl GatherInput<'_> {
     }
 
     fn mean_score(&self, page: &DevicePage, row: usize) -> f32 {
-        mean_grad2d(f32::from_bits(self.slab[page.grad2d_at(row)]), self.slab[page.count_at(row)])
+        mean_grad2d(f32::from_bits(self.slab[grad2d_at(page, row)]), self.slab[count_at(page, row)])
     }
 
     fn split_reach(&self, page: &DevicePage, row: usize, sigma: f32) -> f32 {
@@ -183,7 +183,7 @@ pub fn survey(input: &GatherInput<'_>, surveys: &mut [PageSurvey]) {
     for (page, survey) in input.pages.iter().zip(surveys).filter(|(page, _)| input.is_bound(page)) {
         let (mut lowest, mut largest, mut weight) = (3.4e38f32, 0.0f32, 3.4e38f32);
         for row in 0..page.rows as usize {
-            let word = input.slab[page.count_at(row)];
+            let word = input.slab[count_at(page, row)];
             if views(word) >= WEIGHED_VIEWS {
                 weight = mean_weight(word).map_or(weight, |mean| mean.min(weight));
             }

@@ -14,50 +14,35 @@ pub enum Table {
     ExpAvgSq,
 }
 
-/// Places in the slab that holds a page.
-pub trait Words {
-    /// Floats per row of a column.
-    fn width(&self, column: Column) -> usize;
-
-    /// Word of the number of steps that a row contains.
-    fn stamp_at(&self, row: usize) -> usize;
-
-    /// Word of a row's sum of growth scores.
-    fn grad2d_at(&self, row: usize) -> usize;
-
-    /// Word of a row's number of views.
-    fn count_at(&self, row: usize) -> usize;
-
-    fn row_at(&self, column: Column, table: Table, row: usize) -> usize;
-}
-
 /// Words of a table with so many words a row.
 fn padded(page: &DevicePage, words_per_row: usize) -> usize {
     (page.rows as usize * words_per_row).next_multiple_of(TABLE_ALIGNMENT / 4)
 }
 
-impl Words for DevicePage {
-    fn width(&self, column: Column) -> usize {
-        if column == Column::ShN { self.sh_n_width as usize } else { column.width(0) }
-    }
+/// Floats per row of a column.
+fn width(page: &DevicePage, column: Column) -> usize {
+    if column == Column::ShN { page.sh_n_width as usize } else { column.width(0) }
+}
 
-    fn stamp_at(&self, row: usize) -> usize {
-        self.base as usize + padded(self, 2) + row
-    }
+/// Word of the number of steps that a row contains.
+pub fn stamp_at(page: &DevicePage, row: usize) -> usize {
+    page.base as usize + padded(page, 2) + row
+}
 
-    fn grad2d_at(&self, row: usize) -> usize {
-        self.stamp_at(row) + padded(self, 1)
-    }
+/// Word of a row's sum of growth scores.
+pub fn grad2d_at(page: &DevicePage, row: usize) -> usize {
+    stamp_at(page, row) + padded(page, 1)
+}
 
-    fn count_at(&self, row: usize) -> usize {
-        self.grad2d_at(row) + padded(self, 1)
-    }
+/// Word of a row's number of views.
+pub fn count_at(page: &DevicePage, row: usize) -> usize {
+    grad2d_at(page, row) + padded(page, 1)
+}
 
-    fn row_at(&self, column: Column, table: Table, row: usize) -> usize {
-        let before = Column::ALL.iter().take_while(|c| **c != column).map(|c| 3 * padded(self, self.width(*c)));
-        let first = self.count_at(0) + padded(self, 1) + before.sum::<usize>();
-        first + table as usize * padded(self, self.width(column)) + row * self.width(column)
-    }
+pub fn row_at(page: &DevicePage, column: Column, table: Table, row: usize) -> usize {
+    let before = Column::ALL.iter().take_while(|c| **c != column).map(|c| 3 * padded(page, width(page, *c)));
+    let first = count_at(page, 0) + padded(page, 1) + before.sum::<usize>();
+    first + table as usize * padded(page, width(page, column)) + row * width(page, column)
 }
 
 #[test]
@@ -80,14 +65,15 @@ fn words_lie_where_the_layout_puts_them() {
         slab.extend_from_slice(bytemuck::cast_slice(&words));
         let page = DevicePage::new(layout, 0, 64, 0);
         for row in [0, rows / 2, rows - 1] {
-            assert_eq!(slab[page.stamp_at(row)], row as u32);
-            assert_eq!(f32::from_bits(slab[page.grad2d_at(row)]), row as f32 + 0.5);
-            assert_eq!(slab[page.count_at(row)], 9 + row as u32);
+            assert_eq!(slab[stamp_at(&page, row)], row as u32);
+            assert_eq!(f32::from_bits(slab[grad2d_at(&page, row)]), row as f32 + 0.5);
+            assert_eq!(slab[count_at(&page, row)], 9 + row as u32);
             for column in Column::ALL {
                 let tables = [&state.columns, &state.exp_avg, &state.exp_avg_sq];
                 for (table, of) in [Table::Values, Table::ExpAvg, Table::ExpAvgSq].into_iter().zip(tables) {
-                    let at = page.row_at(column, table, row);
-                    let got: Vec<f32> = slab[at..at + page.width(column)].iter().map(|w| f32::from_bits(*w)).collect();
+                    let at = row_at(&page, column, table, row);
+                    let got: Vec<f32> =
+                        slab[at..at + width(&page, column)].iter().map(|w| f32::from_bits(*w)).collect();
                     assert_eq!(got, of.row(column, row), "{column:?} {table:?} row {row} of {rows}");
                 }
             }

@@ -15,7 +15,7 @@
 //! scores go to the same bins as on the CPU.
 
 use super::deferred::{TableWords, flush};
-use super::page_words::{Table, Words};
+use super::page_words::{Table, count_at, grad2d_at, row_at, stamp_at};
 use gsscale::base::math::LARGEST_GRAD;
 use gsscale::densify::stats::weight_bin;
 use gsscale::kernels::uniforms::{DevicePage, PageResult, UpdateUniforms};
@@ -65,11 +65,11 @@ pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [
         if page.slab != input.uniforms.slab || !is_usable(input.largest[i]) {
             continue;
         }
-        let missed = now - slab[page.stamp_at(row as usize)];
+        let missed = now - slab[stamp_at(page, row as usize)];
         let ([first, ..], [_, kept, lost]) = (tables.decay(missed), tables.decay(missed + 1));
         for e in 0..width {
             let [value_at, m_at, v_at] = [Table::Values, Table::ExpAvg, Table::ExpAvgSq]
-                .map(|table| page.row_at(column, table, row as usize) + e);
+                .map(|table| row_at(page, column, table, row as usize) + e);
             let g = grads[i * width + e];
             let decayed = flush(f32::from_bits(slab[m_at]) * first);
             let m = flush(decayed + (g - decayed) * one_minus_beta1);
@@ -102,7 +102,7 @@ pub fn finish(
             continue;
         }
         if is_usable(input.largest[i]) {
-            slab[page.stamp_at(row as usize)] = input.uniforms.now + 1;
+            slab[stamp_at(page, row as usize)] = input.uniforms.now + 1;
             result.updated += 1;
         } else {
             result.skipped += u32::from(input.largest[i] != 0);
@@ -113,7 +113,7 @@ pub fn finish(
         if footprint[2] > 0.0 && footprint[3] > 0.0 {
             result.drawn += 1;
             if input.uniforms.collects != 0 {
-                let at = [page.grad2d_at(row as usize), page.count_at(row as usize)];
+                let at = [grad2d_at(page, row as usize), count_at(page, row as usize)];
                 result.collected += u32::from(collect((footprint, weight), input.uniforms.half_size, at, slab, bins));
             }
         }
@@ -123,8 +123,8 @@ pub fn finish(
 pub fn clear_statistics(pages: &[DevicePage], bound: u32, slab: &mut [u32]) {
     for page in pages.iter().filter(|page| page.slab == bound) {
         let rows = page.rows as usize;
-        slab[page.grad2d_at(0)..][..rows].fill(0);
-        slab[page.count_at(0)..][..rows].fill(0);
+        slab[grad2d_at(page, 0)..][..rows].fill(0);
+        slab[count_at(page, 0)..][..rows].fill(0);
     }
 }
 

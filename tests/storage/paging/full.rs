@@ -6,13 +6,12 @@ use super::run_in_memory;
 use super::world::{Model, Run, config, fill, meta};
 use super::{PAGES, STEPS};
 use crate::support::faulty_engine::Faults;
+use crate::support::guarded::{Change, GuardedFolder};
 use gsscale::base::ids::PageId;
-use gsscale::page::folder::protocol_files::{DriveFolder, Folder};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::map::commit::{CommitError, Commits, MAP_NAME};
 use gsscale::page::map::opening::Opened;
 use gsscale::paging::pager::Pager;
-use redb::StorageBackend;
 use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -41,75 +40,23 @@ impl Shortage {
         self.began.store(false, Ordering::Relaxed);
     }
 
-    fn check(&self) -> io::Result<()> {
-        match self.began.load(Ordering::Relaxed) && self.lasts.load(Ordering::Relaxed) {
+    fn check(&self, change: Change) -> io::Result<()> {
+        let number = if change == Change::Synced { Some(self.syncs.fetch_add(1, Ordering::Relaxed)) } else { None };
+        let begins = number.is_some() && *self.at_sync.lock().unwrap() == number;
+        let began = self.began.fetch_or(begins, Ordering::Relaxed);
+        match begins || (change != Change::Synced && began && self.lasts.load(Ordering::Relaxed)) {
             true => Err(ErrorKind::StorageFull.into()),
             false => Ok(()),
         }
     }
 }
 
-#[derive(Debug)]
-struct MapOnDrive(Arc<dyn StorageBackend>, Arc<Shortage>);
-
-impl StorageBackend for MapOnDrive {
-    fn len(&self) -> io::Result<u64> {
-        self.0.len()
-    }
-    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        self.0.read(offset, out)
-    }
-    fn set_len(&self, len: u64) -> io::Result<()> {
-        self.1.check()?;
-        self.0.set_len(len)
-    }
-    fn sync_data(&self) -> io::Result<()> {
-        self.1.check()?;
-        self.0.sync_data()?;
-        let number = self.1.syncs.fetch_add(1, Ordering::Relaxed);
-        if *self.1.at_sync.lock().unwrap() == Some(number) {
-            self.1.began.store(true, Ordering::Relaxed);
-            return Err(ErrorKind::StorageFull.into());
-        }
-        Ok(())
-    }
-    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        self.1.check()?;
-        self.0.write(offset, data)
-    }
-}
-
-struct FolderOnDrive(DriveFolder, Arc<Shortage>);
-
-impl FolderOnDrive {
-    fn noted(&self, name: &str, file: Arc<dyn StorageBackend>) -> Arc<dyn StorageBackend> {
-        if name == MAP_NAME { Arc::new(MapOnDrive(file, Arc::clone(&self.1))) } else { file }
-    }
-}
-
-impl Folder for FolderOnDrive {
-    fn open(&self, name: &str) -> io::Result<Option<Arc<dyn StorageBackend>>> {
-        Ok(self.0.open(name)?.map(|file| self.noted(name, file)))
-    }
-    fn create(&self, name: &str) -> io::Result<Arc<dyn StorageBackend>> {
-        Ok(self.noted(name, self.0.create(name)?))
-    }
-    fn rename(&self, from: &str, to: &str) -> io::Result<()> {
-        self.0.rename(from, to)
-    }
-    fn remove(&self, name: &str) -> io::Result<()> {
-        self.0.remove(name)
-    }
-    fn sync(&self) -> io::Result<()> {
-        self.0.sync()
-    }
-}
-
 /// A run over a store in `at`, with one commit after twenty steps, and the model at that commit.
 fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model) {
     let frames = run_in_memory(seed).1 + 5;
-    let folder = || Box::new(FolderOnDrive(DriveFolder::new(at), Arc::clone(shortage)));
-    let opened = Opened::create(folder(), COMMITS).unwrap();
+    let shortage = Arc::clone(shortage);
+    let folder = GuardedFolder::new(at, MAP_NAME, Arc::new(move |change| shortage.check(change)));
+    let opened = Opened::create(Box::new(folder), COMMITS).unwrap();
     let pager = Pager::new(config(frames), paged_store(&opened, at, Codec::Raw, &Faults::new()));
     let mut commits = opened.commits;
     let mut run = Run::new(pager, seed, PAGES, STEPS).unwrap();

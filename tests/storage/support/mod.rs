@@ -1,4 +1,4 @@
-//! An engine that fails on purpose, and tests that run in a process of their own.
+//! An engine and files that fail on purpose, and tests that run in a process of their own.
 
 #[path = "../../support/apply_event.rs"]
 pub mod apply_event;
@@ -7,3 +7,4 @@ pub mod apply_event;
 pub mod child;
 #[path = "../../support/faulty_engine.rs"]
 pub mod faulty_engine;
+pub mod guarded;
