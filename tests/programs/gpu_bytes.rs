@@ -1,5 +1,6 @@
 //! Bytes that go up to a device that holds a part of the pages (`--optimizer-on device`), through the real binary: in every step hardly
-//! more than any order of eviction needs, and at most two payloads for each page of a step that is taken again.
+//! more than any order of eviction needs, at most two payloads for each page of a step that is taken again, and
+//! none for a round of densification that only clears statistics.
 
 use super::gpu_flights::{Bench, same};
 use gsscale::scene::page_layout::capacity_bytes;
@@ -100,5 +101,32 @@ fn a_step_that_is_taken_again_takes_up_at_most_two_payloads_for_each_of_its_page
                 "{name} step {i}: {up} bytes up, {payloads} of payloads"
             );
         }
+    }
+}
+
+#[test]
+fn a_round_that_only_clears_statistics_moves_no_payload() {
+    let Some(bench) = Bench::new() else { return };
+    // A cap that is reached from the start, and no limit of the opacity: nothing grows and nothing is removed. A commit would copy all
+    // pages back.
+    let clears = "--steps 70 --refine-every 10 --reset-every 0 --sh-every 0 --max-gaussians 6000 --view-order shuffle --prune-opa 0";
+    assert!(bench.run("whole", "2", "", &format!("{clears} --commit-every 0")));
+    let lines = bench.metrics("whole");
+    let of = |i: usize, key: &str| lines[i]["slots"][key].as_u64().unwrap();
+    // After the first epoch every page that a view needs has been loaded. Rounds follow steps 30, 40, 50 and 60.
+    let from = (0..lines.len()).find(|i| of(*i, "bytes_loaded") == of(69, "bytes_loaded")).unwrap();
+    assert!(from < 35, "payloads went up until step {from}");
+    let [before, after] = [from, 69].map(|i| ["bytes_loaded", "bytes_drained", "cleared"].map(|key| of(i, key)));
+    println!("loaded, drained, cleared after step {from}: {before:?}, at the end: {after:?}");
+    assert_eq!(before[..2], after[..2], "a payload moved");
+    assert_eq!(after[1], 0, "a payload came back");
+    assert!(after[2] > before[2] + 50 && before[2] > 0, "{before:?}, {after:?}");
+    let pages = lines[69]["pages"].as_u64().unwrap();
+    for line in &lines[from + 1..69] {
+        let of = |key: &str| line[key].as_u64().unwrap();
+        let (up, down) = (of("bytes_uploaded"), of("bytes_read_back"));
+        assert!(up <= 4 * 48 * 36 + (128 << 10), "step {}: {up} bytes up", line["step"]);
+        // Results and surveys of pages; before a round the bins of growth scores.
+        assert!(down <= 80 * pages + 4096 + (4 << 15), "step {}: {down} bytes down", line["step"]);
     }
 }

@@ -2,7 +2,7 @@
 
 use crate::support::a_device;
 use crate::support::bench::{number, parse};
-use crate::support::browser::in_a_browser;
+use crate::support::browser::check_page;
 use crate::support::scenes::stderr;
 use crate::support::workdir::{BENCH, Running, Workdir};
 use serde_json::Value;
@@ -17,17 +17,6 @@ fn names(work: &Workdir, folder: &str) -> Vec<String> {
     let mut names: Vec<String> = entries.map(|e| e.unwrap().file_name().to_string_lossy().into_owned()).collect();
     names.sort();
     names
-}
-
-/// Asserts that a report page is complete and self-contained, and that it opens in a browser if one is installed.
-fn check_page(work: &Workdir, page: &str, parts: &[&str]) {
-    let html = work.text(page);
-    for part in parts.iter().chain(&["<svg", "</html>"]) {
-        assert!(html.contains(part), "{part} is missing in {page}");
-    }
-    let addresses = html.replace("http://www.w3.org/2000/svg", "");
-    assert!(!addresses.contains("http://") && !addresses.contains("https://") && !addresses.contains("src=\"/"));
-    in_a_browser(&work.path(page), &work.path(""));
 }
 
 /// The flags of a sweep into `out` on the scene with small pages; what it leaves is in `out/scene`.
@@ -204,7 +193,6 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
         ("sweep ladder /nowhere --out out", "nowhere"),
         ("sweep no-such-list scene --out out", "no-such-list"),
         ("compare scene scene --out out", "metrics.jsonl"),
-        ("scene --spill-dir out", "--spill-dir"),
     ] {
         refuses(flags, words);
     }

@@ -1,11 +1,24 @@
-//! Opens pages in a headless browser, if one is installed.
+//! Pages that the programs write, and a headless browser that opens them, if one is installed.
 
+use super::workdir::{Workdir, says};
 use std::path::Path;
 use std::process::Command;
 
+/// Asserts that a page has all `parts` and figures, loads nothing from elsewhere, and opens; returns its text.
+pub fn check_page(work: &Workdir, page: &str, parts: &[&str]) -> String {
+    let html = work.text(page);
+    says(&html, &[parts, &["<svg", "</html>"]].concat());
+    // The SVG namespace is a name, not a fetched address.
+    let addresses = html.replace("http://www.w3.org/2000/svg", "");
+    assert!(!addresses.contains("http://") && !addresses.contains("https://") && !addresses.contains("src=\"/"));
+    let sliders = in_a_browser(&work.path(page), &work.path(""));
+    assert!(sliders.is_none_or(|sliders| sliders > 0 || !html.contains("class=\"slider\"")), "{page}");
+    html
+}
+
 /// Opens the page in headless Chromium and asserts that its scripts ran without an error and set up every slider.
 /// Returns the number of sliders; `None` without Chromium.
-pub fn in_a_browser(page: &Path, scratch: &Path) -> Option<usize> {
+fn in_a_browser(page: &Path, scratch: &Path) -> Option<usize> {
     let names = ["chromium", "chromium-browser", "google-chrome"];
     let Some(browser) = names.into_iter().find(|n| Command::new(n).arg("--version").output().is_ok()) else {
         println!("no Chromium here: {} was not opened in a browser", page.display());
