@@ -2,7 +2,7 @@
 //! config files in other encodings, and results where a scene is expected.
 
 use crate::support::scenes::{TextModel, stderr};
-use crate::support::workdir::{CKPT, EVAL, TRAIN, Workdir};
+use crate::support::workdir::{CKPT, EVAL, TRAIN, Workdir, says, sorted_rows, split_ply};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
 use gsscale::scene::columns::Columns;
@@ -23,21 +23,13 @@ fn ckpt(work: &Workdir, flags: &str) -> (Value, String) {
     succeeds(work, CKPT, &format!("{flags} --json"))
 }
 
-fn refused(work: &Workdir, program: &str, flags: &str, words: &[&str]) {
-    let output = work.output(program, flags);
-    let said = stderr(&output);
-    assert!(!output.status.success(), "{flags}: {said}");
-    words.iter().for_each(|word| assert!(said.contains(word), "{flags}: '{word}' is not in: {said}"));
-}
-
 /// Saves a PLY as editors do, without its comments.
 fn save_without_comments(work: &Workdir, from: &str, to: &str) {
     let bytes = work.bytes(from);
-    let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap();
-    let header = std::str::from_utf8(&bytes[..end]).unwrap();
+    let (header, rows) = split_ply(&bytes);
     let kept: String =
         header.lines().filter(|line| !line.starts_with("comment")).map(|line| format!("{line}\n")).collect();
-    work.write(to, [kept.as_bytes(), &bytes[end..]].concat());
+    work.write(to, [kept.as_bytes(), rows].concat());
 }
 
 /// PSNR of a file on the held-out photos, and what was said.
@@ -89,7 +81,7 @@ fn a_saved_ply_is_read_in_the_frame_of_the_file_beside_it() {
     }
     // A transform that is none is named.
     work.write("bare.transform.json", "{\"file_to_dataset\": [[1,0,0,0],[0,2,0,0],[0,0,1,0],[0,0,0,1]]}");
-    refused(&work, EVAL, "bare.ply scene", &["bare.transform.json", "file_to_dataset", "remedy"]);
+    work.refuses_with(EVAL, "bare.ply scene", &["bare.transform.json", "file_to_dataset", "remedy"]);
     // The list of exports wrote both, and the report says so.
     let (summary, report) = (work.summary("run"), work.text("run/report.html"));
     let files = [&summary["export"]["file"], &summary["more_exports"][0]["file"]];
@@ -97,23 +89,20 @@ fn a_saved_ply_is_read_in_the_frame_of_the_file_beside_it() {
     for file in files.map(|file| file.as_str().unwrap()) {
         assert!(report.contains(&format!("{file}: ")) && work.path("run").join(file).is_file(), "{file}");
     }
-    results_in_the_place_of_a_scene(&work);
-}
-
-fn results_in_the_place_of_a_scene(work: &Workdir) {
-    refused(work, TRAIN, "run", &["output folder of a run", "--resume", "gsscale-eval"]);
-    refused(work, TRAIN, "run/point_cloud.ply", &["not a scene", "gsscale-eval", "--init-ply"]);
-    refused(work, TRAIN, "run/point_cloud_sog/lod-meta.json", &["not a scene", "gsscale-eval"]);
+    // Results in the place of a scene.
+    work.refuses_with(TRAIN, "run", &["output folder of a run", "--resume", "gsscale-eval"]);
+    work.refuses_with(TRAIN, "run/point_cloud.ply", &["not a scene", "gsscale-eval", "--init-ply"]);
+    work.refuses_with(TRAIN, "run/point_cloud_sog/lod-meta.json", &["not a scene", "gsscale-eval"]);
     for ending in ["splat", "ksplat", "spz", "sog", "SPLAT"] {
         let file = format!("run/x.{ending}");
         work.write(&file, [7; 64]);
         let words = &["splat-transform", "x.ply", "remedy"];
-        refused(work, EVAL, &format!("{file} scene"), words);
-        refused(work, TRAIN, &format!("scene --init-ply {file}"), words);
-        refused(work, CKPT, &format!("import {file} --out run/store"), words);
-        refused(work, TRAIN, &file, &["not a scene", "splat-transform"]);
+        work.refuses_with(EVAL, &format!("{file} scene"), words);
+        work.refuses_with(TRAIN, &format!("scene --init-ply {file}"), words);
+        work.refuses_with(CKPT, &format!("import {file} --out run/store"), words);
+        work.refuses_with(TRAIN, &file, &["not a scene", "splat-transform"]);
     }
-    refused(work, TRAIN, "scene --init-ply run/point_cloud_sog/lod-meta.json", &["splat-transform"]);
+    work.refuses_with(TRAIN, "scene --init-ply run/point_cloud_sog/lod-meta.json", &["splat-transform"]);
 }
 
 /// A file does not state how large its scene is: the size follows from its rows, so that few of them count as giants.
@@ -133,14 +122,7 @@ fn giants_of_an_imported_file_are_those_of_its_rows() {
     assert_eq!((done["always_shown"].as_u64(), done["levels"][0].as_u64()), (Some(5), Some(495)), "{done}");
     // The values are those of the file.
     ckpt(&work, "export store --out b.ply");
-    let rows_of = |name: &str| {
-        let bytes = work.bytes(name);
-        let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap();
-        let mut rows: Vec<Vec<u8>> = bytes[end + 11..].chunks(17 * 4).map(<[u8]>::to_vec).collect();
-        rows.sort();
-        rows
-    };
-    assert!(rows_of("a.ply") == rows_of("b.ply"));
+    assert!(sorted_rows(&work.bytes("a.ply")) == sorted_rows(&work.bytes("b.ply")));
 }
 
 /// Editors of Windows save text with a byte order mark or as UTF-16.
@@ -171,6 +153,6 @@ fn config_files_and_models_in_other_encodings_train() {
         assert!(work.exists("out/point_cloud.spz") && work.path("out/point_cloud_sog").is_dir());
     }
     work.write("run.toml", b"steps = 3\nimages = \"Geb\xe4ude\"\n");
-    refused(&work, TRAIN, "scene --config run.toml", &["line 2", "Geb\\xE4ude", "UTF-8"]);
-    refused(&work, TRAIN, "scene --export spz,splat", &["ply, spz or sog"]);
+    work.refuses_with(TRAIN, "scene --config run.toml", &["line 2", "Geb\\xE4ude", "UTF-8"]);
+    says(&stderr(&work.output(TRAIN, "scene --export spz,splat")), &["ply, spz or sog"]);
 }

@@ -3,7 +3,7 @@
 
 use crate::support::a_device;
 use crate::support::scenes::stderr;
-use crate::support::workdir::{TRAIN, Workdir};
+use crate::support::workdir::{TRAIN, Workdir, split_ply};
 use gsscale::page::format::slot_header::checksum;
 use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
@@ -149,17 +149,16 @@ fn views_whose_loss_is_not_finite_are_skipped_however_many_steps_are_in_flight()
     let Some(bench) = Bench::new() else { return };
     bench.run("first", "0", "", "--steps 1 --sh-degree 0");
     let bytes = bench.ply("first.out");
-    let head = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
-    let names = String::from_utf8_lossy(&bytes[..head]).into_owned();
-    let fields: Vec<&str> = names.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
-    let at = 4 * fields.iter().position(|field| *field == "f_dc_0").unwrap();
+    let (header, rows) = split_ply(&bytes);
+    let fields: Vec<&str> = header.lines().filter_map(|line| line.strip_prefix("property float ")).collect();
+    let at = bytes.len() - rows.len() + 4 * fields.iter().position(|field| *field == "f_dc_0").unwrap();
     for brightness in [1e20f32, 1e30] {
         let mut bytes = bytes.clone();
-        bytes[head + at..][..4].copy_from_slice(&brightness.to_le_bytes());
+        bytes[at..][..4].copy_from_slice(&brightness.to_le_bytes());
         bench.write("bright.ply", bytes);
         let of_run = |in_flight: &str| {
             let name = format!("bright{brightness:e}-{in_flight}");
-            let is_done = bench.run(&name, in_flight, "", "--init-ply bright.ply --view-order shuffle");
+            let is_done = bench.run(&name, in_flight, "", "--init-ply bright.ply --view-order shuffle --steps 50");
             let summary = bench.summary(&format!("{name}.out"));
             let counts =
                 ["steps", "steps_skipped_non_finite", "rows_skipped_non_finite"].map(|key| summary[key].to_string());

@@ -1,7 +1,7 @@
 //! Runs that are stopped early, and the output of `gsscale-ckpt` on their stores.
 
 use crate::support::scenes::stderr;
-use crate::support::workdir::{CKPT, Running, Workdir};
+use crate::support::workdir::{CKPT, Running, Workdir, split_ply};
 use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
 use gsscale::page::folder::spill_dir::SpillDir;
@@ -161,13 +161,12 @@ pub struct Ply {
 
 impl Ply {
     pub fn of(bytes: &[u8]) -> Ply {
-        let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-        let header = std::str::from_utf8(&bytes[..end]).unwrap();
+        let (header, rows) = split_ply(bytes);
         let names: Vec<String> =
             header.lines().filter_map(|l| l.strip_prefix("property float ")).map(str::to_string).collect();
         let value = |b: &[u8]| f32::from_le_bytes(b.try_into().unwrap());
         let rows: Vec<Vec<f32>> =
-            bytes[end..].chunks_exact(4 * names.len()).map(|row| row.chunks_exact(4).map(value).collect()).collect();
+            rows.chunks_exact(4 * names.len()).map(|row| row.chunks_exact(4).map(value).collect()).collect();
         let count = header.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap();
         assert_eq!(rows.len(), count.parse::<usize>().unwrap());
         Ply { names, rows }

@@ -2,19 +2,7 @@
 
 use super::bench::{Bench, Place, SELDOM};
 use crate::support::scenes::TextModel;
-use crate::support::workdir::copy_folder;
-
-/// The rows of a binary PLY as bytes, sorted.
-fn rows(ply: &[u8]) -> Vec<&[u8]> {
-    let end = b"end_header\n";
-    let first = ply.windows(end.len()).position(|w| w == end).unwrap() + end.len();
-    let header = std::str::from_utf8(&ply[..first]).unwrap();
-    let count = header.lines().find_map(|l| l.strip_prefix("element vertex ")).unwrap().parse::<usize>().unwrap();
-    let mut rows: Vec<&[u8]> = ply[first..].chunks((ply.len() - first) / count).collect();
-    rows.sort_unstable();
-    assert_eq!(rows.len(), count);
-    rows
-}
+use crate::support::workdir::{copy_folder, sorted_rows};
 
 #[test]
 fn what_changed_is_said_and_left_as_it_was() {
@@ -82,7 +70,7 @@ fn accepted_changes_are_the_same_in_any_memory() {
     let (stopped, steps) = (bench.ply("still"), bench.count("still", "steps"));
     bench.train(&format!("--resume still --quiet --means-lr 0.1 --scales-lr 0.5 --accept-changes --steps {steps}"));
     assert!(
-        rows(&bench.ply("still")) == rows(&stopped),
+        sorted_rows(&bench.ply("still")) == sorted_rows(&stopped),
         "rows did not take the steps that they missed at the old rates"
     );
     let other = "--means-lr 0.002 --opacities-lr 0.01 --accept-changes";

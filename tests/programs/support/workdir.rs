@@ -44,6 +44,22 @@ pub fn least_memory(said: &str) -> f64 {
     least.split(' ').next().unwrap().parse().unwrap()
 }
 
+/// The header of a PLY, with its last line, and its rows.
+pub fn split_ply(bytes: &[u8]) -> (&str, &[u8]) {
+    let end = bytes.windows(11).position(|window| window == b"end_header\n").unwrap() + 11;
+    (std::str::from_utf8(&bytes[..end]).unwrap(), &bytes[end..])
+}
+
+/// The rows of a PLY without lists as bytes, sorted.
+pub fn sorted_rows(ply: &[u8]) -> Vec<&[u8]> {
+    let (header, bytes) = split_ply(ply);
+    let count = header.lines().find_map(|line| line.strip_prefix("element vertex ")).unwrap().parse::<usize>().unwrap();
+    let mut rows: Vec<&[u8]> = bytes.chunks(bytes.len() / count).collect();
+    rows.sort_unstable();
+    assert_eq!(rows.len(), count);
+    rows
+}
+
 pub fn says(text: &str, words: &[&str]) {
     for word in words {
         assert!(text.contains(word), "'{word}' is not in: {text}");
