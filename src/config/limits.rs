@@ -4,7 +4,7 @@
 use super::file::TrainConfig;
 use super::values::Up;
 use crate::base::simd::SimdPath;
-use crate::dataset::load_options::LoadOptions;
+use crate::dataset::loader::LoadOptions;
 use crate::dataset::read::ReadOptions;
 use crate::densify::default::DefaultStrategy;
 use crate::densify::growth::GrowthRule;

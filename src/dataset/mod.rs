@@ -4,7 +4,6 @@
 //! [`loader::Dataset`] in the local frame. Pixels are decoded later, a few views ahead of their use, by
 //! [`target_cache`].
 
-mod checks;
 pub mod colmap;
 mod colmap_write;
 pub mod disturb;
@@ -13,7 +12,6 @@ pub mod frame;
 mod gathered;
 pub mod import;
 pub mod layout;
-pub mod load_options;
 pub mod loader;
 pub mod lookalike;
 mod loose_json;
@@ -24,10 +22,8 @@ mod name_index;
 pub mod opensfm;
 pub mod paths;
 pub mod photo;
-mod photo_checks;
 mod photo_files;
 pub mod photo_header;
-mod raw_names;
 pub mod read;
 pub mod reality_capture;
 pub mod resize;

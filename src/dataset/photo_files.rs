@@ -10,10 +10,11 @@
 use super::model::{RawView, ReadOptions};
 use super::name_index::{NameIndex, folded, split_ending, split_folder};
 use super::paths::{StatedName, read_name};
-use super::raw_names;
+use crate::base::text::{as_windows_1252, has_raw_bytes, raw_byte, raw_bytes};
 use rayon::prelude::*;
 use std::cell::{RefCell, RefMut};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 /// Endings appended to a name in turn: Blender's exporter omits `.png`.
@@ -24,6 +25,8 @@ const PHOTO_FOLDERS: [&str; 8] = ["images", "image", "photos", "rgbs", "rgb", "i
 const OTHER_PICTURES: [&str; 8] = ["mask", "_mask", ".", "depth", "normal", "thumb", "seg", "sparse"];
 /// Near matches and near misses that a message shows.
 const SHOWN: usize = 3;
+/// Stands for characters that are not ASCII.
+const OTHERS: char = '\u{1}';
 
 /// A photo named by a model.
 pub(super) struct Photo {
@@ -91,8 +94,8 @@ impl PhotoFiles {
         let is_outside = read.outside.is_some();
         let written = read.tails().flat_map(|tail| self.places(tail, is_outside)).find_map(|place| look(&place));
         let bases = || self.bases.iter().chain([&self.root]);
-        let in_code_page = || Some((bases().find_map(|base| raw_names::find(base, &read.name))?, String::new()));
-        let found = written.or_else(in_code_page);
+        let of_bytes = || Some((bases().find_map(|base| in_code_page(base, &read.name))?, String::new()));
+        let found = written.or_else(of_bytes);
         let name = read.name.clone() + found.as_ref().map_or(missing_ending, |(_, ending)| ending);
         if is_outside {
             self.outside.borrow_mut().insert(name.clone(), stated.to_string());
@@ -267,4 +270,63 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
     let mut path = path.as_os_str().to_os_string();
     path.push(ending);
     PathBuf::from(path)
+}
+
+/// The file inside `folder` that a cleaned name with bytes of a code page (Windows-1252, GBK, Shift-JIS) means; `None` if there is
+/// none, or if several may be meant, or if the name has no such bytes. The name on the drive decides: it has the same bytes, or it
+/// is the name in Windows-1252, or it is the only one that agrees in all ASCII characters.
+fn in_code_page(folder: &Path, name: &str) -> Option<PathBuf> {
+    if !has_raw_bytes(name) {
+        return None;
+    }
+    let part_in = |folder: PathBuf, part| {
+        if has_raw_bytes(part) { code_page_entry(&folder, part) } else { Some(folder.join(part)) }
+    };
+    let path = name.split('/').try_fold(folder.to_path_buf(), part_in)?;
+    path.is_file().then_some(path)
+}
+
+/// The entry of a folder that a part of a name means.
+fn code_page_entry(folder: &Path, part: &str) -> Option<PathBuf> {
+    let known = [os_name(raw_bytes(part)), Some(as_windows_1252(part).into())];
+    let mut known = known.into_iter().flatten().map(|name| folder.join(name));
+    if let Some(path) = known.find(|path| path.exists()) {
+        return Some(path);
+    }
+    let entries = std::fs::read_dir(folder).ok()?.flatten();
+    let entries: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+    [false, true].into_iter().find_map(|in_pairs| {
+        let wanted = ascii_of(part, in_pairs);
+        let mut fitting = entries.iter().filter(|entry| ascii_of(entry, false) == wanted);
+        fitting.next().filter(|_| fitting.next().is_none()).map(|entry| folder.join(entry))
+    })
+}
+
+/// A name with one mark for each run of characters that are not ASCII. In GBK and Shift-JIS the second byte of a character
+/// may be that of an ASCII character: with `in_pairs` it belongs to the run.
+fn ascii_of(name: &str, in_pairs: bool) -> String {
+    let (mut text, mut chars) = (String::new(), name.chars().peekable());
+    while let Some(c) = chars.next() {
+        if c.is_ascii() {
+            text.push(c);
+            continue;
+        }
+        if !text.ends_with(OTHERS) {
+            text.push(OTHERS);
+        }
+        if in_pairs {
+            chars.next_if(|&c| raw_byte(c).is_some() || ('\x40'..='\x7e').contains(&c));
+        }
+    }
+    text
+}
+
+#[cfg(unix)]
+fn os_name(bytes: Vec<u8>) -> Option<OsString> {
+    Some(std::os::unix::ffi::OsStringExt::from_vec(bytes))
+}
+
+#[cfg(not(unix))]
+fn os_name(_: Vec<u8>) -> Option<OsString> {
+    None
 }

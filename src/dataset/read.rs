@@ -1,11 +1,12 @@
 //! Chooses the reader for a path.
 
 use crate::base::error::{InputError, InputResult};
-use crate::base::text::head_of;
+use crate::base::text::{as_windows_1252, has_raw_bytes, head_of, shown};
+use crate::dataset::gathered::{listed, sort_views};
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::name_index::photos_in;
-use crate::dataset::{colmap, mega_nerf, opensfm, raw_names, reality_capture, transforms};
+use crate::dataset::{colmap, mega_nerf, opensfm, reality_capture, transforms};
 use std::path::{Path, PathBuf};
 
 /// Reads a scene: a folder with a COLMAP model, with a model for each of `train` and `val`, with `transforms*.json`, in
@@ -16,7 +17,7 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
     let mut scene = read_kind(path, facts.is_file(), options)?;
-    raw_names::make_readable(path, &mut scene)?;
+    make_readable(path, &mut scene)?;
     let is_above = !scene.root.as_os_str().is_empty();
     Ok(if is_above { scene } else { RawScene { root: root.to_path_buf(), ..scene } })
 }
@@ -151,4 +152,34 @@ fn without_poses(folder: &Path) -> Option<InputError> {
          photos outside images/ need --images; tools/POSES.md says more"
     );
     Some(InputError::new(folder, problem, remedy))
+}
+
+/// Gives the views whose names have bytes of a code page names to show, and says which they are.
+/// Errors: two views have the same name then.
+fn make_readable(file: &Path, scene: &mut RawScene) -> InputResult<()> {
+    let (mut found, mut lost) = (Vec::new(), Vec::new());
+    for view in scene.views.iter_mut().filter(|view| has_raw_bytes(&view.name)) {
+        let bytes = shown(&view.name);
+        let parts = view.name.split('/').count();
+        let components: Option<Vec<&str>> = view.image_path.iter().map(|part| part.to_str()).collect();
+        let of_path = components
+            .filter(|_| view.image_path.is_file())
+            .map(|all| all[all.len().saturating_sub(parts)..].join("/"));
+        let is_there = view.image_path.is_file();
+        view.name = of_path.unwrap_or_else(|| if is_there { as_windows_1252(&view.name) } else { bytes.clone() });
+        match is_there {
+            true => found.push(format!("{bytes} is {}", view.name)),
+            false => lost.push(bytes),
+        }
+    }
+    if found.is_empty() && lost.is_empty() {
+        return Ok(());
+    }
+    for (names, what) in [(&found, "matched with the photos"), (&lost, "no photo, or more than one, fits them")] {
+        if !names.is_empty() {
+            let (file, count, names) = (file.display(), names.len(), listed(names));
+            scene.warnings.push(format!("{file}: {count} name(s) are not UTF-8 but of a code page; {what}: {names}"));
+        }
+    }
+    sort_views(file, &mut scene.views)
 }

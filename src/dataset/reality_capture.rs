@@ -14,8 +14,7 @@
 //!
 //! Invariant: for any content of the file the result is a scene or an [`InputError`] that names file and line.
 
-use super::checks::checked_intrinsics;
-use super::gathered::{Gathered, PUT_THEM_THERE, Words};
+use super::gathered::{Gathered, PUT_THEM_THERE, Words, checked_intrinsics};
 use super::model::{Lens, RawScene, ReadOptions};
 use super::photo_files::PhotoFiles;
 use super::photo_header::read_size;

@@ -13,8 +13,7 @@ pub mod parts;
 mod text;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::MAX_COORDINATE;
-use crate::dataset::gathered::{Gathered, PUT_THEM_THERE, Words};
+use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, Words};
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::photo_files::PhotoFiles;

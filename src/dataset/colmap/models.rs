@@ -2,7 +2,7 @@
 //!
 //! The table follows COLMAP's `src/colmap/sensor/models` (ids 0 to 17 in 2026).
 
-use crate::dataset::checks::checked_intrinsics;
+use crate::dataset::gathered::checked_intrinsics;
 use crate::dataset::model::{Intrinsics, Lens};
 
 pub(super) const UNDISTORT: &str =

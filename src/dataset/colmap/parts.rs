@@ -13,7 +13,7 @@
 
 use super::{Model, read_model};
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::sort_views;
+use crate::dataset::gathered::sort_views;
 use crate::dataset::model::{RawScene, RawView, ReadOptions, Split};
 use crate::dataset::name_index::{folded, photos_in};
 use std::collections::BTreeSet;

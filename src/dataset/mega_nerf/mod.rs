@@ -19,8 +19,7 @@ mod torch_file;
 pub mod write;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::checked_intrinsics;
-use crate::dataset::gathered::{Gathered, Words};
+use crate::dataset::gathered::{Gathered, Words, checked_intrinsics};
 use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions, Split};
 use crate::dataset::photo_files::{Photo, PhotoFiles};
 use crate::dataset::transforms::pose::make_pose;

@@ -6,7 +6,7 @@
 //! points, not the observations, meshes and metadata around them: at most some 16 times the size of the file.
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::gathered::MAX_COORDINATE;
 use crate::dataset::loose_json::{LooseJson, Number};
 use crate::dataset::model::PointCloud;
 use serde::Deserialize;

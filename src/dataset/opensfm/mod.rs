@@ -14,8 +14,7 @@
 mod json;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::{MAX_COORDINATE, checked_intrinsics};
-use crate::dataset::gathered::{Gathered, PUT_THEM_THERE, Words};
+use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, Words, checked_intrinsics};
 use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions};
 use crate::dataset::photo_files::PhotoFiles;
 use crate::dataset::photo_header::read_size;

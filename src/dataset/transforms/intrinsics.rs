@@ -5,7 +5,7 @@
 
 use super::json::{FIX_KEY, Node};
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::checked_intrinsics;
+use crate::dataset::gathered::checked_intrinsics;
 use crate::dataset::model::{Intrinsics, Lens};
 
 const UNDISTORT: &str = "undistort the photos first, or export a PINHOLE, OPENCV or OPENCV_FISHEYE camera";

@@ -21,8 +21,7 @@ mod matrix_city;
 pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::checks::left_out;
-use crate::dataset::gathered::{Gathered, Words};
+use crate::dataset::gathered::{Gathered, Words, left_out};
 use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::read_name;
 use crate::dataset::photo_files::{Photo, PhotoFiles, file_inside};

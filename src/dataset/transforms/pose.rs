@@ -2,7 +2,7 @@
 
 use super::json::{FIX_KEY, Node};
 use crate::base::error::InputResult;
-use crate::dataset::checks::MAX_COORDINATE;
+use crate::dataset::gathered::MAX_COORDINATE;
 use crate::dataset::loose_json::is_no_number;
 use crate::dataset::model::Pose;
 use glam::{DMat3, DVec3};
