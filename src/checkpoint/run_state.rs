@@ -261,28 +261,24 @@ mod tests {
     use crate::base::rng::mix64;
     use crate::densify::growth::GrowthCheck;
     use crate::photos::exposure::state::AppearanceState;
-    use crate::photos::outlier::blocks::{BlockOutliers, look};
+    use crate::photos::outlier::blocks::{BlockState, look};
     use crate::photos::outlier::views::ViewState;
     use crate::photos::parameter::Encoded;
-    use crate::photos::pose::MotionGradient;
     use crate::photos::pose::PoseState;
     use crate::scene::events::RoundThresholds;
     use crate::scene::image::Target;
 
     /// Three photos, the last of which was looked at: black, while its picture is black but for one white block.
-    fn looked_at() -> BlockOutliers {
+    fn looked_at() -> Vec<Vec<BlockState>> {
         let photo = Target { width: 8, height: 32, rgb: vec![0; 3 * 256], mask: None };
         let picture: Vec<f32> = (0..3 * 256).map(|i| f32::from(u8::from(i % 256 / 8 < 4 && i % 8 < 4))).collect();
-        let mut blocks = BlockOutliers::new(3);
-        blocks.learn(2, look(&[], &picture, &photo).unwrap());
-        assert!(blocks.masked_share() == Some(1.0 / 16.0));
-        blocks
+        vec![Vec::new(), Vec::new(), look(&[], &picture, &photo).unwrap()]
     }
 
     /// Three photos, the second of which has moved.
     fn moved() -> PoseState {
         let mut poses = PoseState::new(3);
-        poses.learn(1, &MotionGradient { shift: [0.0, 1.0, -0.5], turn: [0.25; 3] }, 1.5, 1e-3);
+        poses.learn(1, &[0.0, 1.0, -0.5, 0.25, 0.25, 0.25], 1.5, 1e-3);
         poses
     }
 

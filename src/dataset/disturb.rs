@@ -282,7 +282,6 @@ fn write_photo(folder: &Path, name: &str, photo: &Encoded) -> InputResult<()> {
     write_whole(&folder.join("masks").join(name).with_extension("png"), mask)
 }
 
-/// The points that the disturbance leaves.
 fn points(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> Vec<Point> {
     let of = |position: [f32; 3], rgb: [u8; 3]| Point {
         position: position.map(f64::from),

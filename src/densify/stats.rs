@@ -51,7 +51,6 @@ impl GradHistogram {
         self.bins[bin(mean)] += 1;
     }
 
-    /// Adds the rows of a view that have statistics.
     pub fn add_rows(&mut self, rows: &Rows<'_>) {
         rows.grad2d.iter().zip(rows.count).for_each(|(&grad2d, &count)| self.add_row(grad2d, count));
     }

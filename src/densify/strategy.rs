@@ -79,7 +79,6 @@ pub struct ViewGradients<'a> {
     pub rows_of_view: usize,
 }
 
-/// How many rows there are and may be.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RowCount {
     /// Upper bound of the rows before the first event.

@@ -54,7 +54,6 @@ pub trait GaussianSink {
     fn finish(self: Box<Self>) -> InputResult<Written>;
 }
 
-/// What a format does with the rows of a sink.
 pub(super) trait Format {
     /// Takes a row in the frame of the file; false if no file of this format can hold it.
     fn put(&mut self, row: &ExportRow) -> InputResult<bool>;

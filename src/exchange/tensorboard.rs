@@ -21,7 +21,6 @@ const SESSION_START: [u8; 2] = [0x08, 0x01];
 
 const RGB: u32 = 3;
 
-/// An event file that records are appended to.
 pub struct EventFile {
     path: PathBuf,
     file: File,

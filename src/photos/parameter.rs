@@ -102,7 +102,6 @@ pub struct PhotoOutcome<'a> {
     /// Mean squared error of the picture, of values in 0..1.
     pub mse: f64,
     pub photo: &'a Target,
-    /// The dataset, for names.
     pub dataset: &'a Dataset,
 }
 

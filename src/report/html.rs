@@ -92,7 +92,6 @@ impl Cell {
 }
 
 impl Page {
-    /// A page with a title and a line under it.
     pub fn new(title: &str, subtitle: &str) -> Page {
         let body = format!("<h1>{}</h1>\n<p class=\"dim\">{}</p>\n", escape(title), escape(subtitle));
         Page { title: title.to_string(), body }
@@ -146,7 +145,6 @@ impl Page {
         self.body += "</tbody></table></div>\n";
     }
 
-    /// Views in a grid, each made by [`slider`].
     pub fn views(&mut self, sliders: &[String]) {
         self.body += &format!("<div class=\"views\">\n{}</div>\n", sliders.concat());
     }

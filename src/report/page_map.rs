@@ -18,7 +18,6 @@ const OUTLINES: [&str; 2] = ["#ffffff", "#3a4450"];
 /// Behind the pages.
 const BACKGROUND: &str = "#10151c";
 
-/// The colour at `heat` of 0 to 1.
 fn color(heat: f64) -> String {
     let at = heat.clamp(0.0, 1.0) * (RAMP.len() - 1) as f64;
     let low = (at as usize).min(RAMP.len() - 2);

@@ -48,7 +48,7 @@ fn check(recipe: &Recipe) {
     renderer.backpropagate(&rows, &mut grads).unwrap();
     let mut sum = MotionSum::default();
     sum.add(&rows, &grads.columns, &camera, options.sh_degree);
-    let found = sum.gradient();
+    let [x, y, z, a, b, c] = sum.gradient();
     let (rows64, pose) = (Rows64::new(&rows), pose_of(&camera));
     let v_alpha = gradient.v_alpha.unwrap();
     let loss = |motion: &Motion| -> f64 {
@@ -65,7 +65,7 @@ fn check(recipe: &Recipe) {
         std::array::from_fn(|axis| difference(&|by| Motion { shift: along(axis, by), turn: [0.0; 3] }));
     let turn: [f64; 3] =
         std::array::from_fn(|axis| difference(&|by| Motion { shift: [0.0; 3], turn: along(axis, by) }));
-    for (what, want, got) in [("shift", shift, found.shift), ("turn", turn, found.turn)] {
+    for (what, want, got) in [("shift", shift, [x, y, z]), ("turn", turn, [a, b, c])] {
         let (want, got) = (DVec3::from(want), DVec3::from(got));
         let error = (got - want).length() / want.length();
         println!("{what}: {want:.4}, error {error:.1e}");

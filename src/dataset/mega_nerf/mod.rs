@@ -95,7 +95,6 @@ fn read_metadata(file: &Path, origin: &[f64], scale: f64) -> InputResult<(Intrin
     Ok((intrinsics, make_pose(&matrix)))
 }
 
-/// Files of a folder with an extension, sorted.
 fn files_with(folder: &Path, extension: &str) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
     let mut files: Vec<PathBuf> =

@@ -26,7 +26,6 @@ pub(super) struct TorchFile {
 }
 
 impl TorchFile {
-    /// Opens a file and reads its structure.
     pub fn open(path: &Path) -> InputResult<TorchFile> {
         let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
         let bytes = file.metadata().map_err(|e| InputError::io(path, "opening", &e))?.len();
@@ -87,7 +86,6 @@ impl TorchFile {
     }
 }
 
-/// The bytes of one entry of an archive.
 fn entry(archive: &mut ZipArchive<BufReader<File>>, name: &str) -> Result<Vec<u8>, String> {
     let mut file = archive.by_name(name).map_err(|e| format!("entry '{name}': {e}"))?;
     if file.size() > FILE_BYTES_MAX {

@@ -54,7 +54,6 @@ pub(super) struct Shot {
     pub rotation: [Number; 3],
     /// World to camera.
     pub translation: [Number; 3],
-    /// Name of its camera.
     pub camera: String,
 }
 

@@ -11,7 +11,6 @@ use glam::DVec3;
 
 const HALF_PLOT: f64 = 0.5 * PITCH - HALF_STREET;
 
-/// A city of so many blocks a side.
 pub(super) fn build_city(seed: u64, blocks: u32) -> World {
     let noise = Noise::new(seed);
     let mut world = World { seed, blocks, noise, solids: Vec::new(), plots: Vec::new() };

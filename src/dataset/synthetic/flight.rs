@@ -70,7 +70,6 @@ impl Shot {
         Pose { rotation: self.rotation, translation: -(self.rotation * (self.centre + offset)) }
     }
 
-    /// Ray through the picture position (x, y).
     pub(super) fn ray(&self, k: &Intrinsics, x: f64, y: f64) -> Ray {
         let d = DVec3::new((x - k.cx) / k.fx, (y - k.cy) / k.fy, 1.0);
         let ray = Ray::new(self.centre, self.rotation.transpose() * (d / d.length()));

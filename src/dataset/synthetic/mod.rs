@@ -31,7 +31,6 @@ use std::path::{Path, PathBuf};
 
 const JPEG_QUALITY: u8 = 95;
 
-/// Options of the city and of its photos.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CityOptions {
     /// Seed of the city, the flight, the points and the sensor noise.
@@ -86,7 +85,6 @@ impl Default for CityOptions {
 }
 
 impl CityOptions {
-    /// All photos.
     pub fn photos(&self) -> u32 {
         self.views.saturating_add(self.overviews)
     }

@@ -107,7 +107,6 @@ impl<'a> Levels<'a> {
         }
     }
 
-    /// Intrinsics of this frame at the given size.
     pub fn intrinsics(&self, size: (u64, u64)) -> InputResult<Intrinsics> {
         let focal = self.focal(size)?;
         let centre =

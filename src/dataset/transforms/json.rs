@@ -149,7 +149,6 @@ enum Part<'t> {
     Names(&'t mut Names),
     /// The top level, to pass on its frames until one is refused.
     TopOfFrames(&'t mut dyn FnMut(Value) -> bool),
-    /// The list of frames.
     Frames(&'t mut dyn FnMut(Value) -> bool),
     /// A frame: its known keys.
     Frame,
@@ -261,7 +260,6 @@ pub(super) struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    /// An error about a key of this object.
     pub fn error(&self, key: &str, problem: impl Into<String>, remedy: &str) -> InputError {
         let place = match self.frame {
             Some(i) => format!("frames[{i}].{key}"),

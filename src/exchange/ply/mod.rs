@@ -35,7 +35,6 @@ pub enum PlyContent {
         columns: Columns,
         meta: SceneMeta,
     },
-    /// Coloured points.
     Points {
         positions: Vec<[f64; 3]>,
         /// sRGB, one per position; mid grey if the file has no colours.

@@ -27,7 +27,6 @@ const COLOUR_COST: f64 = 2.0;
 /// Memory that merging takes for each row, bytes: blobs before and after a pass, and pairs.
 pub const MERGE_ROW_BYTES: usize = 2 * size_of::<Blob>() + BUCKET_ROWS / 2 * 16 + 64;
 
-/// Merges rows until at most `most` are left.
 pub fn merged(rows: &[ExportRow], most: usize) -> Vec<ExportRow> {
     let most = most.max(1);
     let mut blobs: Vec<Blob> = rows.iter().map(Blob::of).collect();

@@ -128,7 +128,6 @@ impl SogReader {
     }
 }
 
-/// The levels of a tree whose parts lie in `files`.
 fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>> {
     let mut by_level: BTreeMap<u32, Vec<Part>> = BTreeMap::new();
     let mut open = vec![tree];

@@ -133,7 +133,6 @@ impl SogWriter {
         self.files.len() - 1
     }
 
-    /// Writes a file and empties `rows`.
     fn write_file(&mut self, number: usize, rows: &mut Vec<ExportRow>) -> InputResult<()> {
         let inside = Path::new(&self.files[number]).parent().unwrap_or(Path::new("")).to_path_buf();
         write_chunk(&mut self.folder, &inside, rows, self.sh_degree)?;
@@ -174,7 +173,6 @@ impl SogWriter {
         self.write_file(file, &mut ordered)
     }
 
-    /// Adds rows of a leaf to the open file of a level.
     fn add(&mut self, level: usize, rows: Vec<ExportRow>) -> InputResult<Part> {
         if self.open[level].rows.is_empty() {
             self.open[level].number = self.new_file(level);

@@ -90,7 +90,6 @@ impl PageBuffer {
         matches!(self.memory, Memory::Mapped(_))
     }
 
-    /// Bytes of the buffer.
     #[allow(clippy::len_without_is_empty)] // nobody asks
     pub fn len(&self) -> usize {
         self.len

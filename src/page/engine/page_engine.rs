@@ -22,7 +22,6 @@ pub struct Place {
     pub offset: u64,
 }
 
-/// The direction of a transfer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Direction {
     /// From the store into the buffer.
@@ -37,7 +36,6 @@ pub struct Transfer {
     /// An identifier chosen by the caller.
     pub token: u64,
     pub direction: Direction,
-    /// The place in the store.
     pub place: Place,
     /// Number of bytes, from the start of the buffer; a multiple of [`crate::page::engine::buffer::ALIGNMENT`].
     pub bytes: usize,
@@ -47,7 +45,6 @@ pub struct Transfer {
 /// A finished transfer.
 #[derive(Debug)]
 pub struct Completion {
-    /// The transfer, with its buffer.
     pub transfer: Transfer,
     pub result: io::Result<()>,
 }

@@ -39,7 +39,6 @@ struct OpenFile {
     is_dirty: bool,
 }
 
-/// The segment files of one folder.
 #[derive(Debug)]
 pub struct SegmentFiles {
     folder: PathBuf,

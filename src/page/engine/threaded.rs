@@ -125,7 +125,6 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// A pool of threads that carry out transfers.
 struct TransferPool {
     /// `None` once the pool ends.
     queue: Option<Sender<Transfer>>,

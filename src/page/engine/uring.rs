@@ -58,7 +58,6 @@ pub struct UringEngine {
     broken: Option<i32>,
 }
 
-/// A transfer in flight.
 struct Flight {
     transfer: Transfer,
     /// Address of the buffer's first byte, as a number: only the kernel dereferences it.

@@ -29,7 +29,6 @@ const FILL_BYTES: usize = 1 << 20;
 /// Requests in flight during the first fill.
 const FILL_DEPTH: usize = 8;
 
-/// Limits of a measurement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Bytes on the drive, divided among the engines.
@@ -45,7 +44,6 @@ pub struct Limits {
 pub struct Case {
     /// The I/O engine.
     pub engine: IoEngine,
-    /// Bytes of a transfer.
     pub bytes: usize,
     /// Transfers in flight.
     pub depth: usize,
@@ -69,16 +67,13 @@ impl Measured {
     }
 }
 
-/// The result of a sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sweep {
     /// One entry per case, in the order of the cases.
     pub measured: Vec<Measured>,
     /// Messages for the user: engines that do not work here, missing direct I/O.
     pub notes: Vec<String>,
-    /// Finished rounds.
     pub rounds: usize,
-    /// Total bytes written to the drive.
     pub written_bytes: u64,
 }
 
@@ -144,9 +139,7 @@ struct Scratch {
     segment_bytes: u64,
     buffers: Vec<PageBuffer>,
     draws: Stream,
-    /// As in [`Sweep::notes`].
     pub notes: Vec<String>,
-    /// As in [`Sweep::written_bytes`].
     pub written_bytes: u64,
 }
 
@@ -327,7 +320,6 @@ const TRANSFER_BYTES: usize = 768 << 10;
 /// Measuring time per direction.
 const TIME: Duration = Duration::from_millis(450);
 
-/// Rates of a drive.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveRate {
     /// Bytes per second of random reads.

@@ -12,7 +12,6 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// File of the page map.
 pub const MAP_NAME: &str = "map.redb";
 /// File of the page map while it is created.
 pub const MAP_NEW_NAME: &str = "map.redb.new";
@@ -44,7 +43,6 @@ pub trait Folder: Send {
     fn sync(&self) -> io::Result<()>;
 }
 
-/// A folder on a drive.
 #[derive(Debug)]
 pub struct DriveFolder(PathBuf);
 

@@ -211,7 +211,6 @@ fn check_above(folder: &Path, above: &Path) -> InputResult<()> {
     Err(InputError::new(folder, problem, format!("make that folder first, or {OTHER_FOLDER}")))
 }
 
-/// The refusal of a folder that holds the checkpoint of another run.
 pub(in crate::page) fn of_another_run(folder: &Path) -> InputError {
     let remedy = format!(
         "see whose it is (gsscale-ckpt ls {0}), continue that run (gsscale-train --resume with its output folder), \
@@ -269,7 +268,6 @@ fn check_owner(folder: &Path, owner: u32, user: u32) -> InputResult<()> {
     Err(InputError::new(folder, problem, "name a folder of your own"))
 }
 
-/// Makes an empty folder private.
 fn make_private(folder: &Path) -> InputResult<()> {
     #[cfg(unix)]
     {
@@ -286,7 +284,6 @@ fn check_file_system(folder: &Path, allow_remote: bool) -> InputResult<Vec<Strin
     warnings_for(folder, kind, allow_remote)
 }
 
-/// Warnings about a kind of file system.
 fn warnings_for(folder: &Path, kind: FileSystem, allow_remote: bool) -> InputResult<Vec<String>> {
     let name = folder.display();
     match kind {

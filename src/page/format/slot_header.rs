@@ -88,7 +88,6 @@ pub struct SlotRef {
     pub generation: u64,
     /// xxh3-128 of the stored, padded payload.
     pub checksum: u128,
-    /// The stored form.
     pub codec: StoredAs,
 }
 
@@ -150,10 +149,8 @@ pub fn checksum(bytes: &[u8]) -> u128 {
     xxh3_128(bytes)
 }
 
-/// The decoded header of a slot.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SlotHeader {
-    /// Identity of the store.
     pub store: u128,
     pub page: PageId,
     /// Serial number of the write within the store: of two versions of a page the later one has the higher number.
@@ -165,7 +162,6 @@ pub struct SlotHeader {
     pub label: Vec<u8>,
 }
 
-/// Why bytes are not a slot header.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum HeaderError {
     /// Never written, or overwritten by something else.
@@ -177,7 +173,6 @@ pub enum HeaderError {
     /// Written by a newer program.
     #[error("the slot has format version {found} (features {features:#x}); this program knows {FORMAT_VERSION}")]
     Version {
-        /// Version of the slot.
         found: u32,
         /// Feature bits of the slot.
         features: u32,

@@ -70,7 +70,6 @@ pub enum MapError {
         /// Number of the last transaction in the witness.
         acknowledged: u64,
     },
-    /// redb panicked.
     #[error("the page map's library panicked: {0}")]
     Panicked(String),
     /// The drive is full. Nothing was lost; the map must be reopened.
@@ -131,7 +130,6 @@ pub struct Counters {
     pub(in crate::page) tally: u64,
 }
 
-/// One version of a page.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct MapVersion {
     pub page: PageId,
@@ -325,9 +323,7 @@ pub struct SealBroken;
 /// The store and table that a seal is bound to, beside the key.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SealScope {
-    /// Identity of the store.
     pub store: u128,
-    /// Number of the table.
     pub table: u8,
 }
 

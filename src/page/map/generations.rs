@@ -29,7 +29,6 @@ impl Superseded {
     }
 }
 
-/// Generations of a store.
 #[derive(Debug, Default)]
 pub struct Generations {
     latest: u64,
@@ -63,7 +62,6 @@ impl Generations {
         self.latest
     }
 
-    /// Number of the next generation.
     pub fn next(&self) -> u64 {
         self.next
     }
@@ -82,7 +80,6 @@ impl Generations {
         &self.pins
     }
 
-    /// The names that `generation` is pinned under.
     pub fn names_of(&self, generation: u64) -> Vec<String> {
         self.pins.iter().filter(|(_, g)| **g == generation).map(|(name, _)| name.clone()).collect()
     }
@@ -98,7 +95,6 @@ impl Generations {
         };
     }
 
-    /// Generation of a page's last entry.
     fn last_entry(&self, page: PageId) -> Option<u64> {
         self.last.get(&page).or_else(|| self.gone.get(&page)).copied()
     }

@@ -29,7 +29,6 @@ const SERIALS_PER_LIFE: u64 = 1 << 32;
 /// Most segments that an error lists, and most that are created again.
 const WRONG_SEGMENTS_LISTED: usize = 8;
 
-/// A page of a generation.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct StoredPage {
     pub page: PageId,
@@ -47,13 +46,11 @@ struct Past {
     until: u64,
 }
 
-/// A store as opened.
 #[derive(Debug)]
 pub struct Opened {
     pub commits: Commits,
     /// Pages of the last generation, ascending by id; empty before the first commit.
     pub pages: Vec<StoredPage>,
-    /// Run state of the last generation.
     pub run_state: Vec<u8>,
     /// The whole content of the map, for tools; the current pages are in `pages`.
     pub content: MapContent,
@@ -158,7 +155,6 @@ fn sync_entries(folder: &dyn Folder) -> io::Result<()> {
     if active(Mutant::FolderNotSyncedForMap) { Ok(()) } else { folder.sync() }
 }
 
-/// The segments of a store.
 pub(in crate::page) struct Segments {
     /// Their number: up to the last one with a kept page.
     pub number: u32,

@@ -74,7 +74,6 @@ pub enum WitnessRule {
     Ignored,
 }
 
-/// A store opened read-only.
 #[derive(Debug)]
 pub struct StoreReader {
     folder: PathBuf,
@@ -175,7 +174,6 @@ impl StoreReader {
         if self.generations.is_kept(generation) { Ok(()) } else { Err(CommitError::NotKept(generation)) }
     }
 
-    /// The note of a kept generation.
     pub fn note(&self, generation: u64) -> &[u8] {
         self.content.generations.get(&generation).map_or(&[], Vec::as_slice)
     }
@@ -198,7 +196,6 @@ impl StoreReader {
         segments_in(&self.folder)
     }
 
-    /// A reader of single slots.
     pub fn slot_reader(&self) -> SlotReader {
         SlotReader::new(&self.folder, self.format.store, self.format.layout.slot_bytes)
     }

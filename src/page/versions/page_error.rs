@@ -13,7 +13,6 @@ use std::io;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotName {
     pub page: PageId,
-    /// Place of the slot.
     pub place: Place,
     /// First generation that may name the version.
     pub generation: u64,
@@ -50,12 +49,7 @@ pub enum PageError {
     NoSpace(SlotName, #[source] io::Error),
     /// No space for another segment, or it cannot be created. Nothing is lost, and the attempt may be repeated.
     #[error("{} ({bytes} bytes) cannot be created: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
-    Grow {
-        /// Number of the segment.
-        segment: u32,
-        bytes: u64,
-        source: io::Error,
-    },
+    Grow { segment: u32, bytes: u64, source: io::Error },
     /// The drive failed to make writes durable. The store accepts no more writes.
     #[error(
         "the drive could not make writes durable: {0}\n  remedy: check the drive; committed generations are intact"

@@ -32,7 +32,6 @@ use std::io;
 /// Writes that are encoded and checksummed as one batch, so that all threads have work.
 const WRITE_BATCH: usize = 16;
 
-/// Configuration of a store.
 #[derive(Debug, Clone, Copy)]
 pub struct PagedStoreConfig {
     /// Identity of the store, in every slot.
@@ -66,7 +65,6 @@ pub struct PagedStore {
 }
 
 impl PagedStore {
-    /// A store without pages.
     pub fn new(engine: Box<dyn PageEngine>, config: PagedStoreConfig) -> PagedStore {
         PagedStore::with_slots(engine, config, Slots::new(config.layout))
     }
@@ -513,7 +511,6 @@ pub struct PageDone {
 pub struct PageTraffic {
     pub bytes_read: u64,
     pub bytes_written: u64,
-    /// Payload bytes of the pages written.
     pub payload_bytes_written: u64,
     pub reads_repeated: u64,
 }

@@ -11,7 +11,6 @@ use crate::page::engine::page_engine::Place;
 pub use crate::page::format::spill_format::SlotLayout;
 use std::collections::BTreeSet;
 
-/// State of a slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SlotState {
     /// May be handed out.
@@ -30,7 +29,6 @@ struct Retired {
     retired: u64,
 }
 
-/// The slots of a store.
 #[derive(Debug)]
 pub struct Slots {
     layout: SlotLayout,
@@ -79,12 +77,10 @@ impl Slots {
         self.states.len() as u64
     }
 
-    /// Number of free slots.
     pub fn free(&self) -> u64 {
         self.free.len() as u64
     }
 
-    /// Number of retired slots.
     pub fn retired(&self) -> u64 {
         self.retired.len() as u64
     }

@@ -32,7 +32,6 @@ fn gain(sightings: u32, least: f64) -> f64 {
     (2.0 / (f64::from(sightings) + 2.0)).max(least)
 }
 
-/// The values of a photo.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ImageState {
     /// Exposure and homography, fixed-point, with the mean in them.
@@ -63,7 +62,6 @@ pub struct AppearanceState {
     /// By group of views with the same intrinsics.
     pub cameras: Vec<CameraState>,
     sums: [i64; IMAGE_VALUES],
-    /// Photos seen.
     seen: u32,
 }
 

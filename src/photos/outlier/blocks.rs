@@ -155,52 +155,15 @@ pub fn mask(states: &[BlockState], picture: Option<&[f32]>, photo: &Target, mask
     }
 }
 
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct BlockOutliers {
-    /// By view; empty for a view that was not looked at yet.
-    views: Vec<Vec<BlockState>>,
-}
-
-impl BlockOutliers {
-    /// The state of `views` views before the first look.
-    pub fn new(views: usize) -> BlockOutliers {
-        BlockOutliers { views: vec![Vec::new(); views] }
-    }
-
-    /// Bytes that the blocks of a photo of this size take.
-    pub fn bytes_of_view(width: u32, height: u32) -> u64 {
-        (size_of::<Vec<BlockState>>() + size_of::<BlockState>() * BlockGrid::of(width, height).blocks()) as u64
-    }
-
-    /// The blocks of a view; empty before the first look.
-    pub fn of_view(&self, view: usize) -> &[BlockState] {
-        self.views.get(view).map_or(&[], Vec::as_slice)
-    }
-
-    /// Stores the blocks of a view after a look.
-    pub fn learn(&mut self, view: usize, states: Vec<BlockState>) {
-        if let Some(of_view) = self.views.get_mut(view) {
-            *of_view = states;
-        }
-    }
-
-    /// Share of the blocks of all views looked at that are masked; `None` before the first look.
-    pub fn masked_share(&self) -> Option<f64> {
-        let blocks = self.views.iter().flatten().count();
-        let masked = self.views.iter().flatten().filter(|state| state.is_masked()).count();
-        (blocks > 0).then(|| masked as f64 / blocks as f64)
-    }
-
-    /// Checks values from a file. Errors: names what no run can have written.
-    pub fn check(&self) -> Result<(), &'static str> {
-        let is_possible = |view: &Vec<BlockState>| {
-            let masked = || view.iter().filter(|state| state.is_masked());
-            view.len() <= BlockGrid::BLOCKS_MOST
-                && masked().count() <= view.len() / MASKED_MOST
-                && masked().all(|state| state.mean() != NO_PIXELS)
-        };
-        if self.views.iter().all(is_possible) { Ok(()) } else { Err("the blocks of a photo are invalid") }
-    }
+/// Checks the blocks of all views from a file. Errors: names what no run can have written.
+fn check_views(views: &[Vec<BlockState>]) -> Result<(), &'static str> {
+    let is_possible = |view: &Vec<BlockState>| {
+        let masked = || view.iter().filter(|state| state.is_masked());
+        view.len() <= BlockGrid::BLOCKS_MOST
+            && masked().count() <= view.len() / MASKED_MOST
+            && masked().all(|state| state.mean() != NO_PIXELS)
+    };
+    if views.iter().all(is_possible) { Ok(()) } else { Err("the blocks of a photo are invalid") }
 }
 
 /// In summary.json, the share of the blocks of training photos that are masked; absent in runs that masked none.
@@ -221,7 +184,8 @@ struct Now {
 
 struct MaskedBlocks {
     is_on: bool,
-    state: BlockOutliers,
+    /// By view, as a commit holds them; empty for a view that was not looked at yet.
+    views: Vec<Vec<BlockState>>,
     steps: u32,
     train_views: usize,
     /// `None` in a step that masks nothing.
@@ -234,7 +198,7 @@ struct MaskedBlocks {
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
     Some(Box::new(MaskedBlocks {
         is_on: options.robust_pixels,
-        state: BlockOutliers::new(dataset.views.len()),
+        views: vec![Vec::new(); dataset.views.len()],
         steps: options.steps,
         train_views: dataset.train_views().len(),
         now: None,
@@ -244,7 +208,7 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
 }
 
 fn check(saved: &Encoded) -> Result<(), ValuesError> {
-    saved.decoded(BlockOutliers::check).map(drop)
+    saved.decoded(|views: &Vec<_>| check_views(views)).map(drop)
 }
 
 impl PhotoParameter for MaskedBlocks {
@@ -253,11 +217,11 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn save(&self) -> Result<Encoded, EncodingError> {
-        Encoded::of(&self.state)
+        Encoded::of(&self.views)
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, BlockOutliers::check, |a, b| a.views.len() == b.views.len())
+        saved.restore(&mut self.views, |views| check_views(views), |a, b| a.len() == b.len())
     }
 
     fn needs_host(&self) -> bool {
@@ -273,7 +237,8 @@ impl PhotoParameter for MaskedBlocks {
             self.now = Some(Now { view: None, are_kept: false, all_count: false });
             return;
         }
-        let is_begun = !self.state.of_view(at.view).is_empty() || at.step >= first_look_at_blocks(self.steps);
+        let is_begun = self.views.get(at.view).is_some_and(|states| !states.is_empty())
+            || at.step >= first_look_at_blocks(self.steps);
         let are_kept = at.follows_reset();
         let all_count = counts_masked_blocks(at.step, self.steps, self.train_views);
         self.now = is_begun.then_some(Now { view: Some(at.view), are_kept, all_count });
@@ -285,7 +250,7 @@ impl PhotoParameter for MaskedBlocks {
 
     fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
         let Some(Now { view, are_kept, all_count }) = self.now else { return photo };
-        let states = view.map_or(&[][..], |view| self.state.of_view(view));
+        let states = view.and_then(|view| self.views.get(view)).map_or(&[][..], Vec::as_slice);
         self.found = picture.filter(|_| !are_kept).and_then(|picture| look(states, picture, photo));
         if all_count {
             return photo;
@@ -299,8 +264,9 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        if let (Some(found), true) = (self.found.take(), outcome.has_trained()) {
-            self.state.learn(outcome.view, found);
+        let found = self.found.take().filter(|_| outcome.has_trained());
+        if let (Some(found), Some(states)) = (found, self.views.get_mut(outcome.view)) {
+            *states = found;
         }
         Vec::new()
     }
@@ -317,13 +283,16 @@ impl PhotoParameter for MaskedBlocks {
     fn value_bytes(&self, dataset: &Dataset) -> u64 {
         let of_view = |view: usize| {
             let Camera { width, height, .. } = dataset.views[view].camera;
-            BlockOutliers::bytes_of_view(width, height)
+            (size_of::<Vec<BlockState>>() + size_of::<BlockState>() * BlockGrid::of(width, height).blocks()) as u64
         };
         if self.is_on { 3 * dataset.train_views().into_iter().map(of_view).sum::<u64>() } else { 0 }
     }
 
     fn figures(&self, _: &Dataset) -> Vec<(&'static str, Value)> {
-        self.state.masked_share().map(|share| (FIGURE, share.into())).into_iter().collect()
+        let blocks = self.views.iter().flatten().count();
+        let masked = self.views.iter().flatten().filter(|state| state.is_masked()).count();
+        let share = (blocks > 0).then(|| (FIGURE, (masked as f64 / blocks as f64).into()));
+        share.into_iter().collect()
     }
 }
 
@@ -450,8 +419,7 @@ mod tests {
             let blocks = BlockGrid::of(width, height).blocks();
             assert!((1..=BlockGrid::BLOCKS_MOST).contains(&blocks), "{width}x{height}: {blocks}");
         }
-        assert_eq!(BlockOutliers::bytes_of_view(160, 112), 24 + 2 * 40 * 28);
-        let of = |states: Vec<BlockState>| BlockOutliers { views: vec![Vec::new(), states] }.check();
+        let of = |states: Vec<BlockState>| check_views(&[Vec::new(), states]);
         let (free, masked) = (BlockState::new(5, false), BlockState::new(9, true));
         assert_eq!(of(vec![free, free, masked, free]), Ok(()));
         assert!(of(vec![free, masked, masked, free]).is_err());

@@ -24,7 +24,7 @@ use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::stats::PagerStats;
 use gsscale::photos::exposure::state::AppearanceState;
-use gsscale::photos::outlier::blocks::BlockOutliers;
+use gsscale::photos::outlier::blocks::BlockState;
 use gsscale::photos::outlier::views::ViewOutliers;
 use gsscale::photos::parameter::Encoded;
 use gsscale::photos::pose::PoseState;
@@ -214,7 +214,7 @@ fn sample() -> RunState {
     let values = [
         ("appearance", Encoded::of(&(AppearanceState::new(&[0, 0]), 2u32))),
         ("outliers", Encoded::of(&ViewOutliers::new(2))),
-        ("blocks", Encoded::of(&BlockOutliers::new(2))),
+        ("blocks", Encoded::of(&vec![Vec::<BlockState>::new(); 2])),
         ("poses", Encoded::of(&PoseState::new(2))),
     ];
     RunState {
