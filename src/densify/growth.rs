@@ -135,11 +135,6 @@ impl GrowthState {
         }
         Err("the checks of its growth are invalid")
     }
-
-    /// Gaussians that were allowed before the last check.
-    fn allowed_before(&self) -> u64 {
-        self.checks.iter().rev().nth(1).map_or(self.first, |check| check.allowed)
-    }
 }
 
 impl GrowthCheck {
@@ -211,7 +206,8 @@ impl GrowthRule {
         } else if is_trial {
             before.allowed().saturating_mul(2)
         } else if trial.is_some() && !may_pay {
-            before.allowed_before()
+            // What was allowed before the trial.
+            before.checks.iter().rev().nth(1).map_or(before.first, |check| check.allowed)
         } else {
             before.allowed()
         };

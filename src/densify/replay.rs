@@ -137,9 +137,13 @@ impl<'a> PendingEvents<'a> {
         let mut extremes = None;
         for index in from..self.events.len() {
             match effect_of(&self.events[index].kind) {
-                Effect::RaiseShDegree { degree } => rows.raise_sh_degree(degree),
+                Effect::RaiseShDegree { degree } if degree > rows.view().columns.sh_degree => {
+                    rows.table().raise_sh_degree(degree);
+                }
+                Effect::RaiseShDegree { .. } => {}
                 Effect::ResetOpacity { max_opacity } => {
-                    let reset_rows = rows.reset_opacities(self.at(index), max_opacity);
+                    let at = self.at(index);
+                    let reset_rows = rows.in_place(|rows| ops::reset_opacity_rows(at, rows, max_opacity));
                     replay.reset_rows += reset_rows;
                     if reset_rows > 0 {
                         replay.edit = PageEdit::InPlace;
@@ -152,7 +156,7 @@ impl<'a> PendingEvents<'a> {
                     if let Some(edits) = edits {
                         ops::apply_edits(rows.table(), &edits);
                         extremes = None;
-                    } else if rows.clear_statistics() && replay.edit == PageEdit::Unchanged {
+                    } else if rows.in_place(clear_statistics) && replay.edit == PageEdit::Unchanged {
                         replay.edit = PageEdit::Cleared;
                     }
                 }
@@ -224,25 +228,10 @@ impl EditedRows<'_, '_> {
         self.table.get_or_insert_with(|| read_page(&self.page.as_ref()))
     }
 
-    fn raise_sh_degree(&mut self, degree: u8) {
-        if degree > self.view().columns.sh_degree {
-            self.table().raise_sh_degree(degree);
-        }
-    }
-
-    /// Returns the number of rewritten rows.
-    fn reset_opacities(&mut self, values: &AdamNow<'_>, max_opacity: f32) -> usize {
+    fn in_place<T>(&mut self, edit: impl FnOnce(&mut RowsMut<'_>) -> T) -> T {
         match &mut self.table {
-            Some(state) => ops::reset_opacity_rows(values, &mut state.view_mut(), max_opacity),
-            None => ops::reset_opacity_rows(values, self.page, max_opacity),
-        }
-    }
-
-    /// Returns whether a row had statistics.
-    fn clear_statistics(&mut self) -> bool {
-        match &mut self.table {
-            Some(state) => clear_statistics(&mut state.view_mut()),
-            None => clear_statistics(self.page),
+            Some(state) => edit(&mut state.view_mut()),
+            None => edit(self.page),
         }
     }
 }

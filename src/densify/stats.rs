@@ -56,27 +56,15 @@ impl GradHistogram {
     }
 
     fn add_row(&mut self, grad2d: f32, count: u32) {
-        if count > 0 {
-            self.add(mean_grad2d(grad2d, count));
-        }
-        if let Some(bin) = weight_bin(count) {
-            self.bins[BINS + bin as usize] += 1;
-        }
+        bins_of(grad2d, count).for_each(|bin| self.bins[bin] += 1);
     }
 
     fn remove_row(&mut self, grad2d: f32, count: u32) {
-        if count > 0 {
-            self.take_from(bin(mean_grad2d(grad2d, count)));
-        }
-        if let Some(bin) = weight_bin(count) {
-            self.take_from(BINS + bin as usize);
-        }
-    }
-
-    fn take_from(&mut self, bin: usize) {
-        match self.bins[bin].checked_sub(1) {
-            Some(left) => self.bins[bin] = left,
-            None => self.uncounted += 1,
+        for bin in bins_of(grad2d, count) {
+            match self.bins[bin].checked_sub(1) {
+                Some(left) => self.bins[bin] = left,
+                None => self.uncounted += 1,
+            }
         }
     }
 
@@ -177,6 +165,13 @@ pub fn reaches_bin(grad2d: f32, count: u32, bin: u32) -> bool {
 pub fn weight_bin(count: u32) -> Option<u32> {
     let mean = mean_weight(count).filter(|_| views(count) >= WEIGHED_VIEWS)?;
     Some(bin(mean) as u32)
+}
+
+/// The bins that count a row with these statistics: of its score if a view drew it, and of its weight if enough views weighed it.
+#[inline(always)]
+fn bins_of(grad2d: f32, count: u32) -> impl Iterator<Item = usize> {
+    let of_score = (count > 0).then(|| bin(mean_grad2d(grad2d, count)));
+    of_score.into_iter().chain(weight_bin(count).map(|bin| BINS + bin as usize))
 }
 
 #[inline(always)]

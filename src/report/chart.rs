@@ -214,8 +214,9 @@ impl Chart {
         let lines = self.series.iter().filter(|s| s.mark != Mark::Dots && s.mark != Mark::Faint);
         let lines = lines.flat_map(|s| s.points.windows(2)).map(|ends| [pixel(&ends[0]), pixel(&ends[1])]);
         let lines: Vec<[Pixel; 2]> = lines.chain(self.bars().map(|ends| ends.map(|end| pixel(&end)))).collect();
+        let width_most = |text: &str| (LABEL_CHAR * text.chars().count() as f64).ceil() as i32;
         let labels: Vec<(Pixel, i32)> =
-            self.labels.iter().map(|(x, y, text)| (pixel(&(*x, *y)), width_of(text))).collect();
+            self.labels.iter().map(|(x, y, text)| (pixel(&(*x, *y)), width_most(text))).collect();
         let places = label_places(&labels, &dots.map(pixel).collect::<Vec<_>>(), &lines, [left, top, right, bottom]);
         let (base_x, base_y) = root.get_base_pixel();
         let here = |(x, y): Pixel| (x - base_x, y - base_y);
@@ -282,11 +283,6 @@ fn text<E: std::fmt::Display>(e: E) -> String {
 }
 
 type Pixel = (i32, i32);
-
-/// Most pixels that a label takes from left to right.
-fn width_of(label: &str) -> i32 {
-    (LABEL_CHAR * label.chars().count() as f64).ceil() as i32
-}
 
 /// A place for each label, a point and a width: its left, top, right and lower edge, and whether it is far from its point. It is the
 /// first one within `plot` that covers no dot, no earlier label and no line; where there is none, the first that covers no dot and no

@@ -86,12 +86,6 @@ impl Compared {
         }
         remarks
     }
-
-    /// Whether the held-out photos of both runs have the same size, as far as known.
-    fn has_same_photo_size(&self, other: &Compared) -> bool {
-        let mut pairs = self.judged_on.into_iter().zip(other.judged_on);
-        pairs.all(|(own, other)| own.zip(other).is_none_or(|(own, other)| own == other))
-    }
 }
 
 /// Values of [`PHOTO_KEYS`] in a config file; `None` for a missing file or key.
@@ -222,10 +216,11 @@ fn evenly(count: usize, max: usize) -> Vec<usize> {
 
 fn add_table(page: &mut Page, runs: &[Compared]) {
     let first = &runs[0];
-    // PSNR on other photos is a different measure.
     let against = |run: &Compared| {
-        let both =
-            run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && run.has_same_photo_size(first));
+        // PSNR on photos of another size, as far as known, is a different measure.
+        let mut sizes = run.judged_on.into_iter().zip(first.judged_on);
+        let is_same_size = sizes.all(|(own, first)| own.zip(first).is_none_or(|(own, first)| own == first));
+        let both = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && is_same_size);
         both.map(|(own, first)| own - first)
     };
     let row = |run: &Compared| {

@@ -59,7 +59,10 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
         }
         for file in files_with(&metadata, "pt")? {
             let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-            let Some(path) = photo_of(&folder.join(part).join("rgbs"), &stem) else {
+            // Mill-19 has .jpg, Sci-Art .JPG, others .png.
+            let named = ["jpg", "JPG", "jpeg", "png", "PNG"]
+                .map(|extension| folder.join(part).join("rgbs").join(format!("{stem}.{extension}")));
+            let Some(path) = named.into_iter().find(|path| path.is_file()) else {
                 gathered.missing.push(format!("{part}/rgbs/{stem}.*"));
                 continue;
             };
@@ -105,10 +108,4 @@ fn files_with(folder: &Path, extension: &str) -> InputResult<Vec<PathBuf>> {
     }
     files.sort();
     Ok(files)
-}
-
-/// The photo of a stem: Mill-19 has .jpg, Sci-Art .JPG, others .png.
-fn photo_of(folder: &Path, stem: &str) -> Option<PathBuf> {
-    let names = ["jpg", "JPG", "jpeg", "png", "PNG"].map(|extension| folder.join(format!("{stem}.{extension}")));
-    names.into_iter().find(|path| path.is_file())
 }

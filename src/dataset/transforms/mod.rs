@@ -99,6 +99,9 @@ fn read_files(
     Ok(())
 }
 
+/// The names of the photos of each set.
+type PrescribedNames<'j> = [(Split, Option<&'j BTreeSet<String>>); 2];
+
 struct Reading<'a> {
     gathered: Gathered<'a>,
     /// Frames that none of the used lists of file names contains.
@@ -119,8 +122,8 @@ impl Reading<'_> {
         if !json.has_frames()? && split != Some(Split::Test) {
             return Err(top.error("frames", "no frames", "write the file again with its frames"));
         }
-        let prescribed = Prescribed::of(json)?;
-        json.for_each_frame(&mut |frame| self.add_frame(folder, &Levels { frame, top }, split, prescribed.as_ref()))?;
+        let prescribed = prescribed(json)?;
+        json.for_each_frame(&mut |frame| self.add_frame(folder, &Levels { frame, top }, split, prescribed))?;
         if scene.points_path.is_none() {
             scene.points_path = points_path(&top, folder, &mut scene.warnings)?;
         }
@@ -132,20 +135,22 @@ impl Reading<'_> {
         folder: &Path,
         levels: &Levels<'_>,
         split: Option<Split>,
-        prescribed: Option<&Prescribed<'_>>,
+        prescribed: Option<PrescribedNames<'_>>,
     ) -> InputResult<()> {
         let frame = &levels.frame;
         let (key, stated) = stated_path(frame)?;
         let refused = |problem: String| frame.error(key, problem, STAY_INSIDE);
         let split = match prescribed {
             None => split,
-            Some(lists) => match lists.split_of(&read_name("", &stated).map_err(refused)?.name) {
-                None => {
+            Some(lists) => {
+                let name = read_name("", &stated).map_err(refused)?.name;
+                let found = lists.iter().find(|(_, names)| names.is_some_and(|names| names.contains(&name)));
+                let Some((split, _)) = found else {
                     self.unlisted.push(stated.into_owned());
                     return Ok(());
-                }
-                found => found,
-            },
+                };
+                Some(*split)
+            }
         };
         let mut matrix = pose::read_matrix(frame)?;
         let photos = &self.gathered.photos;
@@ -196,37 +201,24 @@ fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::
     Err(frame.error("file_path", "the key is missing", FIX_KEY))
 }
 
-/// nerfstudio's lists of file names, as far as used.
-struct Prescribed<'j> {
-    train: &'j BTreeSet<String>,
-    held_out: Option<&'j BTreeSet<String>>,
-}
-
-impl<'j> Prescribed<'j> {
-    /// The lists of a file, if any; of the held-out lists `test_filenames` is preferred.
-    fn of(json: &'j JsonFile) -> InputResult<Option<Prescribed<'j>>> {
-        let names = |list: usize| match json.names(list) {
-            Names::Absent => Ok(None),
-            Names::Listed(names) => Ok(Some(names)),
-            Names::Bad(problem, remedy) => Err(json.top().error(LISTS[list], problem, remedy)),
-        };
-        let Some(train) = names(0)? else { return Ok(None) };
-        let held_out = match names(2)? {
-            Some(test) => Some(test),
-            None => names(1)?,
-        };
-        if let Some(name) = held_out.and_then(|names| train.intersection(names).next()) {
-            let problem = format!("'{name}' is in the train and in the held-out list");
-            return Err(json.top().error(LISTS[0], problem, "a photo belongs to one of them"));
-        }
-        Ok(Some(Prescribed { train, held_out }))
+/// The names that nerfstudio's lists of a file put into each set, if there are any; of the held-out lists `test_filenames` is
+/// preferred.
+fn prescribed(json: &JsonFile) -> InputResult<Option<PrescribedNames<'_>>> {
+    let names = |list: usize| match json.names(list) {
+        Names::Absent => Ok(None),
+        Names::Listed(names) => Ok(Some(names)),
+        Names::Bad(problem, remedy) => Err(json.top().error(LISTS[list], problem, remedy)),
+    };
+    let Some(train) = names(0)? else { return Ok(None) };
+    let held_out = match names(2)? {
+        Some(test) => Some(test),
+        None => names(1)?,
+    };
+    if let Some(name) = held_out.and_then(|names| train.intersection(names).next()) {
+        let problem = format!("'{name}' is in the train and in the held-out list");
+        return Err(json.top().error(LISTS[0], problem, "a photo belongs to one of them"));
     }
-
-    fn split_of(&self, name: &str) -> Option<Split> {
-        let is_held_out = self.held_out.is_some_and(|names| names.contains(name));
-        let is_train = self.train.contains(name);
-        (is_held_out || is_train).then_some(if is_train { Split::Train } else { Split::Test })
-    }
+    Ok(Some([(Split::Train, Some(train)), (Split::Test, held_out)]))
 }
 
 /// The PLY that the file names, if it exists.

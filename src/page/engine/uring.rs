@@ -6,7 +6,7 @@
 //! Long-lived buffers are registered as far as the limit on locked memory allows. Files are not registered: there are
 //! few, and looking one up costs little next to moving a mebibyte.
 //!
-//! Safety: the kernel reads and writes page buffers while this process runs. The bytes of a [`PageBuffer`] stay in
+//! Safety: the kernel reads and writes page buffers while this process runs. The bytes of a `PageBuffer` stay in
 //! place when the buffer is moved. A transfer is moved into its flight on submission; nothing touches its bytes there,
 //! and it leaves only after the kernel has completed every request that names it. Dropping the engine waits for all
 //! completions; leaking the engine leaks the buffers.
@@ -17,7 +17,6 @@
 #![allow(unsafe_code)] // the ring takes addresses of buffers that it owns
 
 use crate::base::error::is_too_many_files;
-use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::engine::registered::RegisteredBuffers;
 use crate::page::engine::segment_files::{SegmentFiles, WriteBehind, drop_cached};
@@ -276,7 +275,7 @@ impl PageEngine for UringEngine {
             self.done.push(Completion { transfer, result });
             return;
         }
-        let (address, total) = (address_of(&mut transfer.buffer), transfer.bytes);
+        let (address, total) = (transfer.buffer.as_mut_slice().as_mut_ptr().expose_provenance(), transfer.bytes);
         let registered = self.registered.number_of(&self.ring.submitter(), &mut transfer.buffer, total);
         let requests_left = total.div_ceil(REQUEST_BYTES);
         let flight = Flight { transfer, address, registered, file: None, requests_left, error: None };
@@ -327,10 +326,6 @@ impl Drop for UringEngine {
             self.complete(true, &mut done);
         }
     }
-}
-
-fn address_of(buffer: &mut PageBuffer) -> usize {
-    buffer.as_mut_slice().as_mut_ptr().expose_provenance()
 }
 
 /// A ring that has completed a request. Where rings are forbidden, creating one may fail, or using it.

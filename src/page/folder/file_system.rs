@@ -18,6 +18,7 @@ pub enum FileSystem {
     Remote(&'static str),
 }
 
+#[cfg(target_os = "linux")]
 const KINDS: &[(u32, FileSystem)] = &[
     (0x0102_1994, FileSystem::Memory), // tmpfs
     (0x8584_58f6, FileSystem::Memory), // ramfs
@@ -43,17 +44,13 @@ const KINDS: &[(u32, FileSystem)] = &[
 ];
 
 impl FileSystem {
-    /// The kind for a magic number of `statfs` on Linux.
-    pub fn from_magic(magic: u32) -> FileSystem {
-        KINDS.iter().find(|(number, _)| *number == magic).map_or(FileSystem::Local, |(_, kind)| *kind)
-    }
-
     /// The kind of a folder's file system.
     /// Errors: the system does not tell.
     #[cfg(target_os = "linux")]
     pub fn of(folder: &Path) -> io::Result<FileSystem> {
-        // The number has 32 bits; the field is wider and signed on some machines.
-        Ok(FileSystem::from_magic(rustix::fs::statfs(folder)?.f_type as u32))
+        // The magic number has 32 bits; the field is wider and signed on some machines.
+        let magic = rustix::fs::statfs(folder)?.f_type as u32;
+        Ok(KINDS.iter().find(|(number, _)| *number == magic).map_or(FileSystem::Local, |(_, kind)| *kind))
     }
 
     /// The kind of a folder's file system.

@@ -148,11 +148,14 @@ impl Commits {
         }
         self.ensure_open()?;
         let generation = generation.unwrap_or_else(|| store.cut());
-        let put = cut.changes.iter().map(|c| (c.page, c.version.as_ref().map(|(slot, label)| value_of(slot, label))));
+        // The map's value for a version of a page: the slot reference, then the label.
+        let value = |(slot, label): &(SlotRef, Vec<u8>)| [&slot.to_bytes()[..], label].concat();
+        let put = cut.changes.iter().map(|c| (c.page, c.version.as_ref().map(value)));
         let texts = (cut.note.to_vec(), cut.run_state.to_vec());
         let batch = self.generations.plan_commit(generation, put.collect(), texts, cut.pin);
         if active(Mutant::SlotsFreedBeforeAcknowledgement) {
-            self.free_slots_without(store, &batch);
+            let kept = self.generations.kept().filter(|g| !batch.drop_generations.contains(g));
+            store.commit_done(batch.latest, &kept.collect::<Vec<u64>>());
         }
         self.acknowledge(&batch)?;
         if active(Mutant::SegmentsSyncedAfterMap) {
@@ -296,12 +299,6 @@ impl Commits {
         store.commit_done(self.generations.latest(), &kept);
     }
 
-    /// Frees slots as though `batch` were acknowledged: a deliberate bug for the crash tests.
-    fn free_slots_without(&self, store: &mut PagedStore, batch: &MapBatch) {
-        let kept: Vec<u64> = self.generations.kept().filter(|g| !batch.drop_generations.contains(g)).collect();
-        store.commit_done(batch.latest, &kept);
-    }
-
     fn refuse_if_poisoned(&self) -> Result<(), CommitError> {
         match &self.poison {
             Some(cause) if !active(Mutant::PoisonIgnored) => Err(CommitError::Poisoned(cause.clone())),
@@ -314,13 +311,6 @@ impl std::fmt::Debug for Commits {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         write!(f, "Commits({:?}, {:?}, poison: {:?})", self.manifest, self.witness, self.poison)
     }
-}
-
-/// The map's value for a version of a page: the slot reference, then the label.
-fn value_of(slot: &SlotRef, label: &[u8]) -> Vec<u8> {
-    let mut value = slot.to_bytes().to_vec();
-    value.extend_from_slice(label);
-    value
 }
 
 /// Writes every byte, because some drives and file systems do not keep space that was only allocated. The rename comes

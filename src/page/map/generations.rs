@@ -95,10 +95,6 @@ impl Generations {
         };
     }
 
-    fn last_entry(&self, page: PageId) -> Option<u64> {
-        self.last.get(&page).or_else(|| self.gone.get(&page)).copied()
-    }
-
     /// Plans the transaction that makes `generation` the latest. `put` holds the pages changed since the last
     /// generation, in any order, each once.
     pub fn plan_commit(
@@ -209,10 +205,10 @@ impl Generations {
         batch.drop_generations.iter().for_each(|g| {
             kept.remove(g);
         });
-        let newly = batch
-            .put_versions
-            .iter()
-            .filter_map(|v| self.last_entry(v.page).map(|from| Superseded { page: v.page, from, until: v.generation }));
+        let newly = batch.put_versions.iter().filter_map(|&MapVersion { page, generation: until, .. }| {
+            let from = *self.last.get(&page).or_else(|| self.gone.get(&page))?;
+            Some(Superseded { page, from, until })
+        });
         let (seen, needless): (Vec<_>, Vec<_>) =
             self.superseded.iter().copied().chain(newly).partition(|s| s.is_seen(&kept));
         batch.drop_versions.extend(needless.iter().map(|s| (s.page, s.from)));

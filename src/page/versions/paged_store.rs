@@ -16,7 +16,7 @@
 use crate::base::error::is_out_of_space;
 use crate::base::ids::PageId;
 use crate::page::engine::buffer::PageBuffer;
-use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place, Transfer};
+use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Transfer};
 use crate::page::format::codec::{self, Codec};
 use crate::page::format::slot_header::{
     HEADER_BYTES, LABEL_BYTES_MAX, SlotHeader, SlotRef, StoredAs, checksum, transfer_bytes,
@@ -296,7 +296,11 @@ impl PagedStore {
         }
         let place = match self.slots.allocate() {
             Some(place) => place,
-            None => self.grow()?,
+            None => {
+                self.add_segment()?;
+                // A new segment has at least one slot.
+                self.slots.allocate().ok_or(PageError::Poisoned("a segment without slots".to_string()))?
+            }
         };
         Ok(SlotRef {
             place,
@@ -306,12 +310,6 @@ impl PagedStore {
             checksum: 0,
             codec: StoredAs::Raw,
         })
-    }
-
-    fn grow(&mut self) -> Result<Place, PageError> {
-        self.add_segment()?;
-        // A new segment has at least one slot.
-        self.slots.allocate().ok_or(PageError::Poisoned("a segment without slots".to_string()))
     }
 
     fn add_segment(&mut self) -> Result<(), PageError> {

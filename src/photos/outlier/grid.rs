@@ -148,26 +148,29 @@ pub fn contrasts(photo: &Target, grid: &BlockGrid) -> Vec<f64> {
 /// picture.
 const OBJECT_MOST: f32 = 0.2;
 
-/// Red, green and blue in 0..1.
-type Rgb = [f32; 3];
-
 /// Clears `mask` (one byte per pixel) where a pixel of a block beside those in `is_masked` belongs to their object. `picture` is
 /// `[3][height][width]`.
 pub fn mask_rims(is_masked: &[bool], picture: &[f32], photo: &Target, mask: &mut [u8]) {
     let grid = BlockGrid::of(photo.width, photo.height);
     let blocks = (0..grid.blocks()).into_par_iter().with_min_len(64);
-    let objects: Vec<Option<Rgb>> =
+    let objects: Vec<Option<[f32; 3]>> =
         blocks.map(|block| is_masked[block].then(|| mean_rgb(&grid, block, photo)).flatten()).collect();
     let lines = mask.par_chunks_mut(grid.side * photo.width as usize).enumerate();
     lines.for_each(|(line, mask)| {
         let first = line * grid.side * photo.width as usize;
         for block in grid.line(line).filter(|&block| !is_masked[block]) {
-            let beside: Vec<Rgb> = grid.around(block).filter_map(|block| objects[block]).collect();
+            let beside: Vec<[f32; 3]> = grid.around(block).filter_map(|block| objects[block]).collect();
             if beside.is_empty() {
                 continue;
             }
             for pixel in grid.pixel_numbers(block) {
-                if is_of_object(photo_rgb(photo, pixel), picture_rgb(picture, photo, pixel), &beside) {
+                let of_photo = photo_rgb(photo, pixel);
+                let shown = std::array::from_fn(|c| picture[c * photo.pixels() + pixel].clamp(0.0, 1.0));
+                let residual = distance(of_photo, shown);
+                // Whether one of the colours of objects explains the pixel far better than the picture does.
+                if f64::from(residual) >= RESIDUAL_LEAST
+                    && beside.iter().any(|&object| distance(of_photo, object) <= OBJECT_MOST * residual)
+                {
                     mask[pixel - first] = 0;
                 }
             }
@@ -175,15 +178,8 @@ pub fn mask_rims(is_masked: &[bool], picture: &[f32], photo: &Target, mask: &mut
     });
 }
 
-/// Whether one of the colours of objects explains a pixel of the photo far better than the picture does.
-fn is_of_object(pixel: Rgb, shown: Rgb, objects: &[Rgb]) -> bool {
-    let residual = distance(pixel, shown);
-    f64::from(residual) >= RESIDUAL_LEAST
-        && objects.iter().any(|&object| distance(pixel, object) <= OBJECT_MOST * residual)
-}
-
 /// The mean colour of the used pixels of a block; `None` without one.
-fn mean_rgb(grid: &BlockGrid, block: usize, photo: &Target) -> Option<Rgb> {
+fn mean_rgb(grid: &BlockGrid, block: usize, photo: &Target) -> Option<[f32; 3]> {
     let (mut sums, mut count) = ([0f32; 3], 0u32);
     for pixel in grid.pixel_numbers(block).filter(|&pixel| is_used(photo, pixel)) {
         sums.iter_mut().zip(photo_rgb(photo, pixel)).for_each(|(sum, value)| *sum += value);
@@ -192,16 +188,13 @@ fn mean_rgb(grid: &BlockGrid, block: usize, photo: &Target) -> Option<Rgb> {
     (count > 0).then(|| sums.map(|sum| sum / count as f32))
 }
 
-fn photo_rgb(photo: &Target, pixel: usize) -> Rgb {
+/// Red, green and blue in 0..1, as all colours here.
+fn photo_rgb(photo: &Target, pixel: usize) -> [f32; 3] {
     std::array::from_fn(|c| f32::from(photo.rgb[3 * pixel + c]) / 255.0)
 }
 
-fn picture_rgb(picture: &[f32], photo: &Target, pixel: usize) -> Rgb {
-    std::array::from_fn(|c| picture[c * photo.pixels() + pixel].clamp(0.0, 1.0))
-}
-
 /// Absolute difference of two colours, mean over channels, in 0..1.
-fn distance(a: Rgb, b: Rgb) -> f32 {
+fn distance(a: [f32; 3], b: [f32; 3]) -> f32 {
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).sum::<f32>() / 3.0
 }
 

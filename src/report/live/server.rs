@@ -23,7 +23,7 @@ use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use serde::Deserialize;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::net::{IpAddr, SocketAddr, TcpListener};
+use std::net::{IpAddr, TcpListener};
 use std::path::Path;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -119,17 +119,14 @@ async fn serve(listener: TcpListener, app: Router) -> io::Result<()> {
 /// answer by resolving its own name to the loopback address (DNS rebinding).
 async fn check_host(State(live): State<Live>, request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
-    match is_own_host(live.address(), host) {
+    // Without its port; an IPv6 address stands in brackets.
+    let name = host.rsplit_once(':').filter(|_| !host.ends_with(']')).map_or(host, |(name, _)| name);
+    let is_own = name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+    // Any name if the network sees the page.
+    match is_own || !live.address().ip().is_loopback() {
         true => next.run(request).await,
         false => (StatusCode::FORBIDDEN, "this page answers only requests to its own address").into_response(),
     }
-}
-
-/// Whether `host`, with or without a port, may name a page at `address`: any name if the network sees the page.
-fn is_own_host(address: SocketAddr, host: &str) -> bool {
-    // An IPv6 address stands in brackets.
-    let name = host.rsplit_once(':').filter(|_| !host.ends_with(']')).map_or(host, |(name, _)| name);
-    !address.ip().is_loopback() || name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok()
 }
 
 /// An answer that no cache keeps.
@@ -276,7 +273,7 @@ impl AsyncWrite for Patient {
 mod tests {
     use super::*;
     use std::io::Write;
-    use std::net::TcpStream;
+    use std::net::{SocketAddr, TcpStream};
 
     fn request(live: &Live, path: &str) -> TcpStream {
         let mut stream = TcpStream::connect(live.address()).unwrap();
