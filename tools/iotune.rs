@@ -7,7 +7,7 @@ use gsscale::base::units::{format_bytes, parse_bytes};
 use gsscale::page::engine::open::IoEngine;
 use gsscale::page::folder::file_system::FileSystem;
 use gsscale::page::folder::measure::codec_for;
-use gsscale::page::folder::measure::{Case, Limits, Measured, Sweep, sweep};
+use gsscale::page::folder::measure::{Case, Limits, MeasuredCase, Sweep, sweep};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;
@@ -126,7 +126,7 @@ fn cases() -> Vec<Case> {
     shapes.iter().flat_map(|&(bytes, depth)| ENGINES.map(|engine| Case { engine, bytes, depth })).collect()
 }
 
-fn find(sweep: &Sweep, engine: IoEngine, bytes: usize, depth: usize) -> Option<&Measured> {
+fn find(sweep: &Sweep, engine: IoEngine, bytes: usize, depth: usize) -> Option<&MeasuredCase> {
     sweep.measured.iter().find(|m| m.case == Case { engine, bytes, depth })
 }
 
@@ -168,7 +168,7 @@ struct Advice {
 /// The first engine that equals the best one, then its smallest page that equals its best page (smaller pages waste
 /// fewer rows on views that see only part of them).
 fn advise(sweep: &Sweep) -> Option<Advice> {
-    let both = |engine, rows| find(sweep, engine, page_bytes(rows), USUAL_DEPTH).and_then(Measured::both);
+    let both = |engine, rows| find(sweep, engine, page_bytes(rows), USUAL_DEPTH).and_then(MeasuredCase::both);
     let best = ENGINES.iter().filter_map(|&e| both(e, USUAL_ROWS)).fold(0.0, f64::max);
     let engine = ENGINES.into_iter().find(|&e| both(e, USUAL_ROWS).is_some_and(|r| r >= AS_GOOD * best))?;
     let best = PAGE_ROWS.iter().filter_map(|&rows| both(engine, rows)).fold(0.0, f64::max);
@@ -203,7 +203,7 @@ mod tests {
         let measured = cases().into_iter().map(|case| {
             let bytes = case.bytes as f64;
             let rate = Some(bytes / (bytes / rate_of(case.engine) + seconds_per_request));
-            Measured { case, read: rate, write: rate }
+            MeasuredCase { case, read: rate, write: rate }
         });
         Sweep { measured: measured.collect(), notes: Vec::new(), rounds: 1, written_bytes: 0 }
     }

@@ -18,7 +18,7 @@ use std::path::Path;
 const PINHOLE: i32 = 1;
 
 #[derive(Debug, Clone)]
-pub struct Model {
+pub struct ColmapModel {
     /// Pinholes.
     pub cameras: Vec<Intrinsics>,
     pub images: Vec<ModelImage>,
@@ -56,7 +56,7 @@ pub struct Observation {
 }
 
 /// Writes `<sparse>/0/*.bin`; `sparse` must not exist and its parent must.
-pub fn write_model(sparse: &Path, model: &Model) -> InputResult<()> {
+pub fn write_model(sparse: &Path, model: &ColmapModel) -> InputResult<()> {
     debug_assert!(model.cameras.iter().all(|k| k.lens == Lens::Pinhole) && !model.tiles.is_empty());
     let partial = sparse.with_extension("partial");
     let folder = partial.join("0");
@@ -87,11 +87,11 @@ fn floats(out: &mut dyn Write, values: &[f64]) -> std::io::Result<()> {
     values.iter().try_for_each(|v| out.write_all(&v.to_le_bytes()))
 }
 
-fn tile_of(model: &Model, image: u32) -> usize {
+fn tile_of(model: &ColmapModel, image: u32) -> usize {
     image as usize % model.tiles.len()
 }
 
-fn images_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
+fn images_bin(out: &mut dyn Write, model: &ColmapModel) -> std::io::Result<()> {
     // For each image its observations, in the order of the points of its tile.
     let mut order = vec![Vec::new(); model.images.len()];
     for (k, point) in (1u64..).zip(&model.points) {
@@ -116,7 +116,7 @@ fn images_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
     Ok(())
 }
 
-fn points_bin(out: &mut dyn Write, model: &Model) -> std::io::Result<()> {
+fn points_bin(out: &mut dyn Write, model: &ColmapModel) -> std::io::Result<()> {
     // The index of an observation in its image's list: lists are in the order of the points.
     let mut written = vec![0u32; model.images.len()];
     let (points, tiles) = (model.points.len() as u64, model.tiles.len() as u64);

@@ -1,14 +1,14 @@
 //! Disturbed scenes: what real captures suffer from, written as ordinary COLMAP scenes, to measure what it costs.
 //!
 //! Photos are written as training sees them (undistorted, at training size, with their masks), training photos before
-//! held-out ones by name: `--test-after` with [`Plan::test_after`] gives the same split. Only what training sees is
+//! held-out ones by name: `--test-after` with [`DisturbedPlan::test_after`] gives the same split. Only what training sees is
 //! disturbed (photos, poses, points); held-out photos and their poses stay as they are.
 //!
 //! Invariants: 1. the same scene, disturbance and seed give the same bytes for any number of threads; 2. without a
 //! disturbance, pixels are those of the scene; 3. `sparse/` appears last, so that the folder of an interrupted call cannot be
 //! read as a scene.
 
-use super::colmap_write::{Model, ModelImage, Point, make_folder, write_model};
+use super::colmap_write::{ColmapModel, ModelImage, Point, make_folder, write_model};
 use super::loader::{Dataset, View};
 use super::model::{Intrinsics, Lens, Pose, Split};
 use super::photo::decode;
@@ -75,7 +75,7 @@ pub enum Disturbance {
 
 /// A disturbed scene that is not written yet.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Plan {
+pub struct DisturbedPlan {
     /// Views with a greater index, by name, are held out: the value of `--test-after`.
     pub test_after: u32,
     /// Names of the training photos that are wrong: swapped or blurred.
@@ -100,7 +100,7 @@ const HELD_OUT: char = 'b';
 
 /// Kinds of draws, part of their keys.
 #[derive(Debug, Clone, Copy)]
-enum Draw {
+enum DrawKind {
     Photo = 1,
     Pose = 2,
     Swaps = 3,
@@ -109,13 +109,13 @@ enum Draw {
 }
 
 /// The draws of one photo or point.
-fn stream(seed: u64, draw: Draw, number: usize) -> Stream {
+fn stream(seed: u64, draw: DrawKind, number: usize) -> Stream {
     Stream::new(seed, Purpose::Disturb, draw as u64, number as u64)
 }
 
 /// Whether this photo or point is one in `one_in`. Draws, so that no pattern of a flight decides.
 fn is_chosen(seed: u64, number: usize, one_in: u32) -> bool {
-    stream(seed, Draw::Chosen, number).below(u64::from(one_in.max(1))) == 0
+    stream(seed, DrawKind::Chosen, number).below(u64::from(one_in.max(1))) == 0
 }
 
 struct TrainView<'a> {
@@ -130,7 +130,7 @@ struct TrainView<'a> {
 
 /// The training photos of a disturbed scene.
 /// Errors: nothing is left to train on.
-pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<Plan> {
+pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<DisturbedPlan> {
     let train = train_views(dataset, disturbance, seed);
     if train.is_empty() || dataset.points.is_empty() {
         let problem = "the disturbance leaves no photo to train on, or the scene has no points";
@@ -145,7 +145,7 @@ pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputRes
         is_blurred || !std::ptr::eq(t.view, t.shown)
     };
     let wrong = train.iter().filter(is_wrong).map(|t| photo_name(TRAIN, t.number, disturbance)).collect();
-    Ok(Plan { test_after: train.len() as u32 - 1, wrong })
+    Ok(DisturbedPlan { test_after: train.len() as u32 - 1, wrong })
 }
 
 /// Writes the scene of `dataset` to `folder`, which must be new, with a disturbance.
@@ -173,7 +173,7 @@ pub fn write_disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturban
     let image = |((name, pose), camera)| ModelImage { name, pose, camera };
     let images = named.into_iter().zip(groups).map(image).collect();
     let points = points(dataset, disturbance, seed);
-    write_model(&folder.join("sparse"), &Model { cameras, images, points, tiles: vec![[0.0; 3]] })
+    write_model(&folder.join("sparse"), &ColmapModel { cameras, images, points, tiles: vec![[0.0; 3]] })
 }
 
 /// Name of a photo; those of a set are in the order of their numbers.
@@ -203,7 +203,7 @@ fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -
         shown: views[shown[number]],
         pose: {
             let pose = pose_of(&views[number].camera);
-            let mut draws = stream(seed, Draw::Pose, number);
+            let mut draws = stream(seed, DrawKind::Pose, number);
             let by = DVec3::from(std::array::from_fn::<f64, 3, _>(|_| noise * draws.normal()));
             Pose { translation: pose.translation - pose.rotation * by, ..pose }
         },
@@ -225,7 +225,7 @@ fn swapped(dataset: &Dataset, views: &[&View], share: f64, seed: u64) -> Vec<usi
         both < SHARED_MOST * count(&|i| seen[a][i]).min(count(&|i| seen[b][i]))
     };
     let mut order: Vec<usize> = (0..views.len()).collect();
-    stream(seed, Draw::Swaps, 0).shuffle(&mut order);
+    stream(seed, DrawKind::Swaps, 0).shuffle(&mut order);
     let mut shown: Vec<usize> = (0..views.len()).collect();
     let mut pairs = (share * views.len() as f64 / 2.0).ceil() as usize;
     for &a in &order {
@@ -275,7 +275,7 @@ fn cameras<'a>(views: impl Iterator<Item = &'a View>) -> (Vec<Intrinsics>, Vec<u
 }
 
 /// Writes a photo and its mask.
-fn write_photo(folder: &Path, name: &str, photo: &Encoded) -> InputResult<()> {
+fn write_photo(folder: &Path, name: &str, photo: &EncodedPhoto) -> InputResult<()> {
     write_whole(&folder.join("images").join(name), &photo.bytes)?;
     let Some(mask) = &photo.mask else { return Ok(()) };
     make_folder(&folder.join("masks"))?;
@@ -299,7 +299,7 @@ fn points(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> Vec<Point>
             let low: [f32; 3] = std::array::from_fn(|i| quantile(dataset, i, 0.01));
             let high: [f32; 3] = std::array::from_fn(|i| quantile(dataset, i, 0.99));
             let drawn = |number: usize| {
-                let mut draws = stream(seed, Draw::Point, number);
+                let mut draws = stream(seed, DrawKind::Point, number);
                 let position = std::array::from_fn(|i| draws.range(low[i].into(), high[i].into()) as f32);
                 of(position, std::array::from_fn(|_| draws.below(256) as u8))
             };
@@ -317,15 +317,15 @@ fn quantile(dataset: &Dataset, axis: usize, share: f64) -> f32 {
 }
 
 /// A photo as the bytes of its file.
-struct Encoded {
+struct EncodedPhoto {
     pub bytes: Vec<u8>,
     /// The mask as a PNG.
     pub mask: Option<Vec<u8>>,
 }
 
 /// The photo of training view `number`, disturbed.
-fn disturbed(mut photo: Target, disturbance: &Disturbance, seed: u64, number: usize) -> InputResult<Encoded> {
-    let mut draws = stream(seed, Draw::Photo, number);
+fn disturbed(mut photo: Target, disturbance: &Disturbance, seed: u64, number: usize) -> InputResult<EncodedPhoto> {
+    let mut draws = stream(seed, DrawKind::Photo, number);
     match *disturbance {
         Disturbance::Exposure { stops } => {
             let gain = libm::exp2(draws.range(-stops, stops));
@@ -353,7 +353,7 @@ fn disturbed(mut photo: Target, disturbance: &Disturbance, seed: u64, number: us
     };
     let mask =
         photo.mask.as_ref().map(|mask| png(mask, photo.width, photo.height, ExtendedColorType::L8)).transpose()?;
-    Ok(Encoded { bytes, mask })
+    Ok(EncodedPhoto { bytes, mask })
 }
 
 /// Multiplies the channels, and clamps.
@@ -410,7 +410,7 @@ mod tests {
         Target { width: 40, height: 30, rgb, mask: None }
     }
 
-    fn read(encoded: &Encoded) -> Vec<u8> {
+    fn read(encoded: &EncodedPhoto) -> Vec<u8> {
         image::load_from_memory(&encoded.bytes).unwrap().to_rgb8().into_raw()
     }
 

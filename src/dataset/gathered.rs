@@ -85,7 +85,7 @@ pub(super) fn listed(names: &[String]) -> String {
 }
 
 /// What errors about left-out views say: places in the file, and remedies.
-pub(super) struct Words {
+pub(super) struct RefusalWords {
     /// Place of the names of photos; empty for the whole file.
     pub photos: &'static str,
     /// Place of the list of views.
@@ -125,7 +125,12 @@ impl<'a> Gathered<'a> {
 
     /// The views, sorted by name; warns about those that `file` names and that are left out.
     /// Errors: a photo is missing, and missing photos are not allowed; no view is left; two views have one name or photo.
-    pub fn finish(mut self, file: &Path, words: &Words, warnings: &mut Vec<String>) -> InputResult<Vec<RawView>> {
+    pub fn finish(
+        mut self,
+        file: &Path,
+        words: &RefusalWords,
+        warnings: &mut Vec<String>,
+    ) -> InputResult<Vec<RawView>> {
         self.photos.finish(&mut self.views, warnings);
         if !self.missing.is_empty() && !self.options.allow_missing {
             let near = self.photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());

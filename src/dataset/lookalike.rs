@@ -6,7 +6,7 @@
 //!
 //! Invariant: nothing is overwritten: the folder must be new or empty.
 
-use super::colmap_write::{Model, ModelImage, Point, make_folder, write_model};
+use super::colmap_write::{ColmapModel, ModelImage, Point, make_folder, write_model};
 use super::layout::Layout;
 use super::mega_nerf::write::write_mega_nerf;
 use super::model::{RawScene, RawView};
@@ -66,11 +66,11 @@ fn remove(folder: &Path) -> InputResult<()> {
 }
 
 /// A model of some views under other names, with the city's points.
-fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawView)>) -> Model {
+fn model_of<'a>(city: &RawScene, views: impl Iterator<Item = (String, &'a RawView)>) -> ColmapModel {
     let colored = city.points.positions.iter().zip(&city.points.colors);
     let point =
         |(&position, &rgb): (&[f64; 3], &[u8; 3])| Point { position, rgb, error: 0.5, observations: Vec::new() };
-    Model {
+    ColmapModel {
         cameras: vec![city.views[0].intrinsics],
         images: views.map(|(name, view)| ModelImage { name, pose: view.pose, camera: 0 }).collect(),
         points: colored.map(point).collect(),

@@ -11,7 +11,7 @@
 //! photo's, its shape may not; 3. nothing is listed outside of the scene, except through links in it; 4. a picture is the mask of
 //! one photo at most, unless it has the plain name for several.
 
-use super::name_index::{Entry, NameIndex, folded, split_ending, split_folder};
+use super::name_index::{NameIndex, PictureFile, folded, split_ending, split_folder};
 use super::photo_header::PhotoHeader;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -173,9 +173,11 @@ impl MaskIndex {
 
     fn warn_of_unused(&self, masks: &[Option<FoundMask>], warnings: &mut Vec<String>) {
         let used: BTreeSet<&Path> = masks.iter().flatten().map(|mask| mask.path.as_path()).collect();
-        let unused = |entry: &&Entry| !used.contains(entry.path.as_path());
-        let all: Vec<&Entry> = self.in_folders.entries().chain(self.beside_photos.entries()).filter(unused).collect();
-        let (unread, others): (Vec<&Entry>, Vec<&Entry>) = all.into_iter().partition(|entry| !entry.is_readable());
+        let unused = |entry: &&PictureFile| !used.contains(entry.path.as_path());
+        let all: Vec<&PictureFile> =
+            self.in_folders.entries().chain(self.beside_photos.entries()).filter(unused).collect();
+        let (unread, others): (Vec<&PictureFile>, Vec<&PictureFile>) =
+            all.into_iter().partition(|entry| !entry.is_readable());
         let [unread, others] = [unread, others].map(|entries| entries.into_iter().map(|entry| &*entry.path).collect());
         let links =
             [&self.in_folders, &self.beside_photos].into_iter().flat_map(|i| &i.dangling).map(|p| &**p).collect();
@@ -214,7 +216,7 @@ fn mask_folders(place: &Path) -> Vec<PathBuf> {
 }
 
 /// The form of a mask's name, in words.
-fn form(entry: &Entry, before: &str, ending: &str, after: &str, inverted: bool) -> String {
+fn form(entry: &PictureFile, before: &str, ending: &str, after: &str, inverted: bool) -> String {
     let own = entry.path.extension().unwrap_or_default().to_string_lossy();
     let form = format!("{before}X{ending}{after}.{own}");
     let how = match (before, after, inverted) {

@@ -51,7 +51,7 @@ pub(super) fn split_folder(name: &str) -> (&str, &str) {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) struct Entry {
+pub(super) struct PictureFile {
     /// Folders below the one that was added, folded.
     folder: String,
     /// Folded.
@@ -62,7 +62,7 @@ pub(super) struct Entry {
 /// Files of folders by their folded names without ending.
 #[derive(Debug, Default)]
 pub(super) struct NameIndex {
-    files: BTreeMap<String, Vec<Entry>>,
+    files: BTreeMap<String, Vec<PictureFile>>,
     /// Listed folders, with links resolved.
     seen: BTreeSet<PathBuf>,
     count: usize,
@@ -94,7 +94,7 @@ impl NameIndex {
             if ending.is_some() && path.is_file() {
                 if self.count < FILES_MAX {
                     let (stem, folder) = (stem.to_string(), prefix.trim_end_matches('/').to_string());
-                    self.files.entry(stem).or_default().push(Entry { folder, base, path });
+                    self.files.entry(stem).or_default().push(PictureFile { folder, base, path });
                 }
                 self.count += 1;
             } else if depth < DEEPEST && path.is_dir() {
@@ -111,7 +111,7 @@ impl NameIndex {
 
     /// The files that fit a name equally well: with the same ending, otherwise with any ending that can be read. The folders of one
     /// must be the last folders of the other; those with the fewest other folders in front are taken.
-    pub fn find(&self, name: &str) -> Vec<&Entry> {
+    pub fn find(&self, name: &str) -> Vec<&PictureFile> {
         let name = folded(name);
         let (folder, base) = split_folder(&name);
         let stem = split_ending(base).0;
@@ -120,32 +120,32 @@ impl NameIndex {
     }
 
     /// As [`NameIndex::find`], for a folded stem and its folded folder.
-    pub fn find_stem(&self, folder: &str, stem: &str) -> Vec<&Entry> {
+    pub fn find_stem(&self, folder: &str, stem: &str) -> Vec<&PictureFile> {
         best(self.with_stem(stem), folder)
     }
 
     /// Readable files with this folded name without ending, in any folder.
-    pub fn with_stem(&self, stem: &str) -> impl Iterator<Item = &Entry> {
+    pub fn with_stem(&self, stem: &str) -> impl Iterator<Item = &PictureFile> {
         self.all(stem).filter(|entry| entry.is_readable())
     }
 
-    fn all(&self, stem: &str) -> impl Iterator<Item = &Entry> {
+    fn all(&self, stem: &str) -> impl Iterator<Item = &PictureFile> {
         self.files.get(stem).into_iter().flatten()
     }
 
-    pub fn entries(&self) -> impl Iterator<Item = &Entry> {
+    pub fn entries(&self) -> impl Iterator<Item = &PictureFile> {
         self.files.values().flatten()
     }
 }
 
-impl Entry {
+impl PictureFile {
     pub fn is_readable(&self) -> bool {
         is_photo(&self.path)
     }
 }
 
-fn best<'a>(entries: impl Iterator<Item = &'a Entry>, folder: &str) -> Vec<&'a Entry> {
-    let mut nearest: Vec<(usize, &Entry)> =
+fn best<'a>(entries: impl Iterator<Item = &'a PictureFile>, folder: &str) -> Vec<&'a PictureFile> {
+    let mut nearest: Vec<(usize, &PictureFile)> =
         entries.filter_map(|entry| Some((folders_apart(&entry.folder, folder)?, entry))).collect();
     nearest.sort();
     let least = nearest.first().map_or(0, |(apart, _)| *apart);
@@ -169,7 +169,7 @@ mod tests {
         for name in names {
             let name_folded = folded(name);
             let (folder, base) = split_folder(&name_folded);
-            let entry = Entry { folder: folder.into(), base: base.into(), path: PathBuf::from(name) };
+            let entry = PictureFile { folder: folder.into(), base: base.into(), path: PathBuf::from(name) };
             index.files.entry(split_ending(base).0.to_string()).or_default().push(entry);
         }
         index

@@ -94,8 +94,8 @@ pub fn intrinsics_at(intrinsics: &Intrinsics, size: Size) -> Intrinsics {
 /// Errors: the photo or its mask cannot be read or decoded, or changed its size since load.
 pub fn decode(source: &PhotoSource) -> InputResult<Target> {
     let (rgb, mut mask) = match read_colors(&source.image_path, &source.header, source.alpha)? {
-        Colors::Rgb(rgb) => at_target_size::<3>(rgb, source),
-        Colors::RgbOverBlack(rgba) => {
+        DecodedColors::Rgb(rgb) => at_target_size::<3>(rgb, source),
+        DecodedColors::RgbOverBlack(rgba) => {
             let (rgba, valid) = at_target_size::<4>(rgba, source);
             let pixels = rgba.as_chunks::<4>().0;
             // Colours of the opaque parts of pixels over black, and which pixels are at least half opaque.
@@ -168,17 +168,17 @@ fn thresholded(mut share: Vec<u8>) -> Vec<u8> {
 }
 
 /// An 8-bit picture, interleaved.
-enum Colors {
+enum DecodedColors {
     Rgb(Vec<u8>),
     /// Colours over black, and alpha.
     RgbOverBlack(Vec<u8>),
 }
 
 /// Decodes a picture to 8 bits; where alpha is no mask, over its background.
-fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<Colors> {
+fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<DecodedColors> {
     let picture = read_picture(path, header)?;
     if !picture.color().has_alpha() {
-        return Ok(Colors::Rgb(picture.into_rgb8().into_raw()));
+        return Ok(DecodedColors::Rgb(picture.into_rgb8().into_raw()));
     }
     let mut rgba = picture.into_rgba8().into_raw();
     match alpha {
@@ -187,7 +187,7 @@ fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<C
                 let [r, g, b, a] = *pixel;
                 *pixel = [over_black(r, a), over_black(g, a), over_black(b, a), a];
             }
-            Ok(Colors::RgbOverBlack(rgba))
+            Ok(DecodedColors::RgbOverBlack(rgba))
         }
         Alpha::Over(background) => {
             let mut rgb = Vec::with_capacity(rgba.len() / 4 * 3);
@@ -195,7 +195,7 @@ fn read_colors(path: &Path, header: &PhotoHeader, alpha: Alpha) -> InputResult<C
                 let under = background.map(|c| over_black(c, 255 - a));
                 rgb.extend([over_black(r, a) + under[0], over_black(g, a) + under[1], over_black(b, a) + under[2]]);
             }
-            Ok(Colors::Rgb(rgb))
+            Ok(DecodedColors::Rgb(rgb))
         }
     }
 }

@@ -22,10 +22,10 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     Ok(if is_above { scene } else { RawScene { root: root.to_path_buf(), ..scene } })
 }
 
-type Reader = (fn(&Path) -> bool, fn(&Path, &ReadOptions) -> InputResult<RawScene>);
+type SceneReader = (fn(&Path) -> bool, fn(&Path, &ReadOptions) -> InputResult<RawScene>);
 
 /// Whether a reader would find something in a folder, and the reader; the first one applies.
-const READERS: [Reader; 7] = [
+const READERS: [SceneReader; 7] = [
     (colmap::looks_like_colmap, colmap::read_colmap),
     (colmap::parts::looks_like_parts, colmap::parts::read_parts),
     (transforms::looks_like_transforms, transforms::read_transforms),

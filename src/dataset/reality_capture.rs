@@ -14,7 +14,7 @@
 //!
 //! Invariant: for any content of the file the result is a scene or an [`InputError`] that names file and line.
 
-use super::gathered::{Gathered, PUT_THEM_THERE, Words, checked_intrinsics};
+use super::gathered::{Gathered, PUT_THEM_THERE, RefusalWords, checked_intrinsics};
 use super::model::{Lens, RawScene, ReadOptions};
 use super::photo_files::PhotoFiles;
 use super::photo_header::read_size;
@@ -56,7 +56,7 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
     let folder = file.parent().unwrap_or(Path::new(""));
     let text = read_text(&file, MAX_BYTES, EXPORT)?;
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let header = lines.find_map(|(_, line)| Header::of(line));
+    let header = lines.find_map(|(_, line)| CsvHeader::of(line));
     let header = header.ok_or_else(|| InputError::new(&file, "no line of column names '#name,x,y,alt,...'", EXPORT))?;
     if let Some(missing) = REQUIRED.iter().find(|name| header.place(name).is_none()) {
         return Err(InputError::new(&file, format!("there is no column '{missing}'"), EXPORT));
@@ -68,7 +68,7 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
         line.add_view(&mut gathered)?;
     }
     let mut scene = RawScene::default();
-    let words = Words { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT };
+    let words = RefusalWords { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT };
     scene.views = gathered.finish(&file, &words, &mut scene.warnings)?;
     scene.points_path = Some(folder.join("points.ply")).filter(|path| path.is_file());
     Ok(scene)
@@ -76,7 +76,7 @@ pub fn read_reality_capture(path: &Path, options: &ReadOptions) -> InputResult<R
 
 /// The CSV files of a folder that have the header of this format.
 fn files_in(folder: &Path) -> Vec<PathBuf> {
-    let has_header = |path: &PathBuf| head_of(path, HEAD_BYTES).lines().any(|line| Header::of(line).is_some());
+    let has_header = |path: &PathBuf| head_of(path, HEAD_BYTES).lines().any(|line| CsvHeader::of(line).is_some());
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
     let is_csv = |path: &PathBuf| path.extension().is_some_and(|e| e.eq_ignore_ascii_case("csv")) && path.is_file();
     let mut files: Vec<PathBuf> = entries.filter(is_csv).filter(has_header).collect();
@@ -100,15 +100,15 @@ fn cells_of(line: &str, separator: char) -> Vec<String> {
     cells.iter().map(|cell| cell.trim().to_string()).collect()
 }
 
-struct Header {
+struct CsvHeader {
     names: Vec<String>,
     separator: char,
 }
 
-impl Header {
+impl CsvHeader {
     /// The header in this line, if it is one: it begins with the name and has the place. With `z` instead of `alt` it must have
     /// an angle too, since lists of ground control points begin in the same way.
-    fn of(line: &str) -> Option<Header> {
+    fn of(line: &str) -> Option<CsvHeader> {
         SEPARATORS.into_iter().find_map(|separator| {
             let names = cells_of(line, separator);
             let names = names.iter().map(|name| name.trim_matches(['#', ' ']).to_ascii_lowercase());
@@ -119,7 +119,7 @@ impl Header {
             }
             let has = |name: &str| names.iter().any(|other| other == name);
             let is_header = names.first().is_some_and(|name| name == "name") && has("x") && has("alt");
-            is_header.then_some(Header { names, separator })
+            is_header.then_some(CsvHeader { names, separator })
         })
     }
 
@@ -131,7 +131,7 @@ impl Header {
 struct Line<'a> {
     file: &'a Path,
     number: usize,
-    header: &'a Header,
+    header: &'a CsvHeader,
     cells: Vec<String>,
 }
 

@@ -32,7 +32,7 @@ pub fn same_shape(size: Size, stated: Size) -> bool {
 
 /// The range of a source row that one target pixel covers.
 #[derive(Debug, Clone, Copy)]
-struct Span {
+struct SourceSpan {
     start: u32,
     end: u32,
     first_weight: u32,
@@ -46,7 +46,7 @@ pub struct AreaResizer {
     source: Size,
     target: Size,
     unit: u32,
-    spans: Vec<Span>,
+    spans: Vec<SourceSpan>,
     reduced: Vec<u32>,
     sums: Vec<u64>,
     rows_taken: u32,
@@ -143,7 +143,7 @@ impl AreaResizer {
 }
 
 /// Target pixel `j` covers [j source, (j + 1) source), in units in which a source pixel is `target` wide.
-fn span(j: u32, source: u32, target: u32) -> Span {
+fn span(j: u32, source: u32, target: u32) -> SourceSpan {
     let (source, target, j) = (u64::from(source), u64::from(target), u64::from(j));
     let (left, right) = (j * source, (j + 1) * source);
     let start = left / target;
@@ -151,7 +151,12 @@ fn span(j: u32, source: u32, target: u32) -> Span {
     // All weights of a span add up to `source`; a span within a single pixel has its whole weight in the first.
     let first_weight = right.min((start + 1) * target) - left;
     let last_weight = if end - start > 1 { right - (end - 1) * target } else { 0 };
-    Span { start: start as u32, end: end as u32, first_weight: first_weight as u32, last_weight: last_weight as u32 }
+    SourceSpan {
+        start: start as u32,
+        end: end as u32,
+        first_weight: first_weight as u32,
+        last_weight: last_weight as u32,
+    }
 }
 
 /// Area average of a whole interleaved 8-bit picture with 1, 3 or 4 channels.

@@ -22,7 +22,7 @@ use std::thread::JoinHandle;
 /// in flight.
 #[derive(Debug)]
 pub struct TargetCache {
-    shared: Arc<Shared>,
+    shared: Arc<SharedCache>,
     workers: Vec<JoinHandle<()>>,
 }
 
@@ -40,10 +40,10 @@ pub struct CacheStats {
 }
 
 #[derive(Debug)]
-struct Shared {
+struct SharedCache {
     photos: Vec<PhotoSource>,
     budget: u64,
-    state: Mutex<State>,
+    state: Mutex<CacheState>,
     /// Notified when there may be work for a worker.
     work: Condvar,
     /// Notified when a decode has ended.
@@ -51,7 +51,7 @@ struct Shared {
 }
 
 #[derive(Debug, Default)]
-struct State {
+struct CacheState {
     slots: Vec<Slot>,
     /// Coming views: (position, view), positions ascending.
     plan: VecDeque<(u64, usize)>,
@@ -91,8 +91,8 @@ impl TargetCache {
     /// Errors: the system refuses to start a thread.
     pub fn new(views: &[View], budget_bytes: u64, threads: usize) -> InputResult<Self> {
         let photos: Vec<PhotoSource> = views.iter().map(|v| v.photo.clone()).collect();
-        let state = State { slots: photos.iter().map(|_| Slot::default()).collect(), ..State::default() };
-        let shared = Arc::new(Shared {
+        let state = CacheState { slots: photos.iter().map(|_| Slot::default()).collect(), ..CacheState::default() };
+        let shared = Arc::new(SharedCache {
             photos,
             budget: budget_bytes,
             state: Mutex::new(state),
@@ -196,14 +196,14 @@ impl Drop for TargetCache {
     }
 }
 
-impl Shared {
-    fn lock(&self) -> MutexGuard<'_, State> {
+impl SharedCache {
+    fn lock(&self) -> MutexGuard<'_, CacheState> {
         // No panic can leave the state half-changed: decoding happens outside the lock.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Decodes a view that [`Shared::start_next`] chose, without holding the lock.
-    fn decode_unlocked<'a>(&'a self, state: MutexGuard<'a, State>, view: usize) -> MutexGuard<'a, State> {
+    /// Decodes a view that [`SharedCache::start_next`] chose, without holding the lock.
+    fn decode_unlocked<'a>(&'a self, state: MutexGuard<'a, CacheState>, view: usize) -> MutexGuard<'a, CacheState> {
         drop(state);
         let photo = &self.photos[view];
         let result = catch_unwind(AssertUnwindSafe(|| decode(photo))).unwrap_or_else(|_| {
@@ -218,7 +218,7 @@ impl Shared {
     }
 
     /// Chooses the next view to decode, makes room and reserves its bytes; `None` if there is nothing to do now.
-    fn start_next(&self, state: &mut State) -> Option<usize> {
+    fn start_next(&self, state: &mut CacheState) -> Option<usize> {
         while let Some(&view) = state.wanted.front() {
             match state.slots[view].content {
                 Content::Absent => {
@@ -237,7 +237,7 @@ impl Shared {
         self.make_room(state, view, Some(position)).then(|| self.start(state, view))
     }
 
-    fn start(&self, state: &mut State, view: usize) -> usize {
+    fn start(&self, state: &mut CacheState, view: usize) -> usize {
         state.slots[view].content = Content::Decoding;
         state.in_flight += 1;
         state.stats.bytes += self.photos[view].decode_bytes();
@@ -245,7 +245,7 @@ impl Shared {
         view
     }
 
-    fn finish(&self, state: &mut State, view: usize, result: InputResult<Target>) {
+    fn finish(&self, state: &mut CacheState, view: usize, result: InputResult<Target>) {
         state.in_flight -= 1;
         state.stats.bytes -= self.photos[view].decode_bytes();
         state.stats.decodes += 1;
@@ -263,7 +263,7 @@ impl Shared {
     /// Evicts targets until the decode of `view` fits the budget: only targets that nobody holds or waits for and, for
     /// a prefetch at position `needed_at`, only those needed later. If it would still not fit, nothing is evicted,
     /// except for a view that is waited for while no other decode is in flight.
-    fn make_room(&self, state: &mut State, view: usize, needed_at: Option<u64>) -> bool {
+    fn make_room(&self, state: &mut CacheState, view: usize, needed_at: Option<u64>) -> bool {
         let needed = self.photos[view].decode_bytes();
         let mut victims: Vec<(u64, u64, usize, u64)> = Vec::new();
         for (i, slot) in state.slots.iter().enumerate() {
@@ -292,7 +292,7 @@ impl Shared {
     }
 }
 
-impl State {
+impl CacheState {
     /// Drops the plan up to and including the first position of `view`, if it is in the plan.
     fn pass(&mut self, view: usize) {
         let Some(&until) = self.slots[view].uses.front() else { return };

@@ -47,7 +47,7 @@ pub enum PageEdit {
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub struct Replay {
+pub struct PageReplay {
     pub edit: PageEdit,
     /// The rounds among the events, in order.
     pub rounds: Vec<PageRound>,
@@ -91,8 +91,8 @@ impl<'a> PendingEvents<'a> {
 
     /// Applies the pending events of page `id` to its rows, which have applied the first `applied` events.
     /// Errors: the page outgrew its capacity and cannot be split.
-    pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<Replay, SplitTooDeep> {
-        let mut replay = Replay::default();
+    pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<PageReplay, SplitTooDeep> {
+        let mut replay = PageReplay::default();
         let mut edited = EditedRows { page: rows, table: None };
         self.replay(applied, &mut edited, &mut replay);
         if let Some(state) = edited.table {
@@ -127,12 +127,12 @@ impl<'a> PendingEvents<'a> {
     pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
         let mut no_page = SceneState::default();
         let mut edited = EditedRows { page: &mut no_page.view_mut(), table: Some(std::mem::take(state)) };
-        self.replay(applied, &mut edited, &mut Replay::default());
+        self.replay(applied, &mut edited, &mut PageReplay::default());
         *state = edited.table.unwrap_or_default();
     }
 
     /// Applies the events from number `from` on.
-    fn replay(&self, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut Replay) {
+    fn replay(&self, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut PageReplay) {
         // Valid until rows are rewritten.
         let mut extremes = None;
         for index in from..self.events.len() {
@@ -205,9 +205,9 @@ impl<'a> PendingEvents<'a> {
     }
 }
 
-impl Default for Replay {
+impl Default for PageReplay {
     fn default() -> Self {
-        Replay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 }
+        PageReplay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 }
     }
 }
 

@@ -12,6 +12,7 @@ use super::stats::SlotSpace;
 use super::stored::{label, layout_of};
 use crate::base::ids::PageNo;
 use crate::page::engine::buffer::PageBuffer;
+use crate::page::engine::page_engine::Direction;
 use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::versions::page_error::PageError;
 use crate::page::versions::paged_store::{PageDone, PageMoved, PageTraffic, PagedStore};
@@ -26,13 +27,6 @@ const STAGED_LEAST: usize = 4;
 const AHEAD: u64 = 1 << 32;
 /// Set in the token of a read.
 const READ: u64 = 1 << 33;
-
-/// What a transfer does.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Direction {
-    Read,
-    Write,
-}
 
 /// A transfer that ended.
 #[derive(Debug)]

@@ -331,8 +331,8 @@ impl PhotoParameter for Poses {
         let seen = || images.iter().filter(|image| image.sightings > 0);
         let file = PosesFile {
             refined: seen().count(),
-            shift: Spread::of(seen().map(|image| image.shift)),
-            turn_degrees: Spread::of(seen().map(|image| image.turn_degrees)),
+            shift: MotionSpread::of(seen().map(|image| image.shift)),
+            turn_degrees: MotionSpread::of(seen().map(|image| image.turn_degrees)),
             scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
             images,
         };
@@ -362,9 +362,9 @@ struct PosesFile {
     /// Training photos whose pose was refined.
     refined: usize,
     /// How far their cameras stand from where the dataset says.
-    shift: Spread,
+    shift: MotionSpread,
     /// By how much they look elsewhere, degrees.
-    turn_degrees: Spread,
+    turn_degrees: MotionSpread,
     /// Scale of the scene, of which a shift may be 2 %.
     scene_scale: f64,
     /// The training photos, in the order of their names.
@@ -372,7 +372,7 @@ struct PosesFile {
 }
 
 #[derive(Debug, Default, Serialize)]
-struct Spread {
+struct MotionSpread {
     median: f64,
     largest: f64,
 }
@@ -392,12 +392,12 @@ struct RefinedPose {
     sightings: u32,
 }
 
-impl Spread {
-    fn of(values: impl Iterator<Item = f64>) -> Spread {
+impl MotionSpread {
+    fn of(values: impl Iterator<Item = f64>) -> MotionSpread {
         let mut values: Vec<f64> = values.collect();
         values.sort_unstable_by(f64::total_cmp);
         let at = |i: usize| values.get(i).copied().unwrap_or_default();
-        Spread { median: at(values.len() / 2), largest: at(values.len().saturating_sub(1)) }
+        MotionSpread { median: at(values.len() / 2), largest: at(values.len().saturating_sub(1)) }
     }
 }
 

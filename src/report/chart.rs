@@ -206,7 +206,7 @@ impl Chart {
     }
 
     /// Draws each label beside its point, where it covers nothing.
-    fn draw_labels(&self, root: &Canvas<'_>, chart: &Plot<'_, '_>) -> Result<(), String> {
+    fn draw_labels(&self, root: &Canvas<'_>, chart: &PlotArea<'_, '_>) -> Result<(), String> {
         let pixel = |&(x, y): &(f64, f64)| chart.backend_coord(&(x, y));
         let ([x0, x1], [y0, y1]) = self.ranges();
         let ((left, bottom), (right, top)) = (pixel(&(x0, y0)), pixel(&(x1, y1)));
@@ -261,7 +261,7 @@ impl Chart {
     }
 }
 
-type Plot<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+type PlotArea<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// The SVG of a drawing, or a paragraph with the error.
@@ -371,7 +371,7 @@ fn shortened(name: &str) -> String {
     name.chars().take(before).chain(['…']).chain(name.chars().skip(length - after)).collect()
 }
 
-fn draw_series(chart: &mut Plot<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
+fn draw_series(chart: &mut PlotArea<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
     let color = color(series.color);
     let is_named = in_legend && !series.name.is_empty();
     if series.mark.is_line() || series.mark == Mark::LineAndDots {

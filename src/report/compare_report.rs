@@ -126,9 +126,9 @@ fn names(folders: &[PathBuf]) -> Vec<String> {
 }
 
 /// A curve of the comparison: title, unit, and value of a line of metrics.
-type Curve = (&'static str, &'static str, fn(&Value) -> Option<f64>);
+type RunCurve = (&'static str, &'static str, fn(&Value) -> Option<f64>);
 
-const CURVES: [Curve; 4] = [
+const CURVES: [RunCurve; 4] = [
     ("PSNR of held-out views", "dB", |m| m["test"]["psnr"].as_f64()),
     ("PSNR of training views", "dB", |m| m["psnr"].as_f64()),
     ("Gaussians", "", |m| m["gaussians"].as_f64()),

@@ -22,22 +22,22 @@ const POINT_MIN: u64 = 8 + 3 * 8 + 3 + 8 + 8;
 const OBSERVATION: u64 = 24;
 const TRACK_ELEMENT: u64 = 8;
 
-struct Source {
+struct BinaryFile {
     path: PathBuf,
     reader: BufReader<File>,
     size: u64,
     offset: u64,
 }
 
-impl Source {
-    fn open(path: &Path) -> InputResult<Source> {
+impl BinaryFile {
+    fn open(path: &Path) -> InputResult<BinaryFile> {
         let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
         let facts = file.metadata().map_err(|e| InputError::io(path, "reading the size", &e))?;
         if !facts.is_file() {
             return Err(InputError::new(path, "not a regular file", DAMAGED));
         }
         let reader = BufReader::with_capacity(1 << 18, file);
-        Ok(Source { path: path.to_path_buf(), reader, size: facts.len(), offset: 0 })
+        Ok(BinaryFile { path: path.to_path_buf(), reader, size: facts.len(), offset: 0 })
     }
 
     fn left(&self) -> u64 {
@@ -127,7 +127,7 @@ impl Source {
 }
 
 pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResult<Cameras> {
-    let mut source = Source::open(path)?;
+    let mut source = BinaryFile::open(path)?;
     let count = source.count("cameras", CAMERA_MIN)?;
     let mut cameras = Cameras::new();
     for _ in 0..count {
@@ -155,12 +155,12 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
 
 /// The number of images that `images.bin` states, if the file is long enough for them.
 pub(super) fn count_images(path: &Path) -> InputResult<u64> {
-    Source::open(path)?.count("images", IMAGE_MIN)
+    BinaryFile::open(path)?.count("images", IMAGE_MIN)
 }
 
 /// Reads `images.bin`; skips 2D points.
 pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<ImageRecord>> {
-    let mut source = Source::open(path)?;
+    let mut source = BinaryFile::open(path)?;
     let count = source.count("images", IMAGE_MIN)?;
     let mut images = Vec::with_capacity(count as usize);
     for _ in 0..count {
@@ -179,7 +179,7 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
 
 /// Reads `points3D.bin`; skips tracks.
 pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {
-    let mut source = Source::open(path)?;
+    let mut source = BinaryFile::open(path)?;
     let count = source.count("points", POINT_MIN)?;
     let mut tally = PointTally::default();
     for _ in 0..count {

@@ -13,7 +13,7 @@ pub mod parts;
 mod text;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, Words};
+use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, RefusalWords};
 pub use crate::dataset::model::ReadOptions;
 use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
 use crate::dataset::photo_files::PhotoFiles;
@@ -26,7 +26,7 @@ pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or 
 /// Remedy for a file that COLMAP cannot have written.
 const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
 const STAY_INSIDE: &str = "image names must be relative to the image folder and stay inside it";
-const WORDS: Words = Words {
+const WORDS: RefusalWords = RefusalWords {
     photos: "",
     views: "",
     photo_is_missing: PUT_THEM_THERE,
@@ -90,12 +90,12 @@ pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene>
     let mut said = Vec::new();
     let folders = parts::image_folders(scene, options, &mut said)?;
     let model = read_model((scene, options), folders, Some(options.points_later))?;
-    let Model { views, points, points_path, warnings } = model;
+    let ReadModel { views, points, points_path, warnings } = model;
     said.extend(warnings);
     Ok(RawScene { views, points, points_path, warnings: said, ..RawScene::default() })
 }
 
-struct Model {
+struct ReadModel {
     views: Vec<RawView>,
     points: PointCloud,
     points_path: Option<PathBuf>,
@@ -108,7 +108,7 @@ fn read_model(
     (folder, options): (&Path, &ReadOptions),
     image_folders: Vec<PathBuf>,
     points_later: Option<bool>,
-) -> InputResult<Model> {
+) -> InputResult<ReadModel> {
     let mut warnings = Vec::new();
     let model = choose_model(folder, &mut warnings)?;
     let cameras_path = model.file("cameras");
@@ -142,7 +142,7 @@ fn read_model(
         None => (PointCloud::default(), None),
         Some(later) => read_points(&model, later, &mut warnings)?,
     };
-    Ok(Model { views, points, points_path, warnings })
+    Ok(ReadModel { views, points, points_path, warnings })
 }
 
 fn find_models(scene: &Path) -> Vec<ModelFolder> {

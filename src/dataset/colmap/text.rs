@@ -102,14 +102,14 @@ fn stated_count(comment: &[u8]) -> Option<u64> {
     rest.split(',').next()?.trim().parse().ok()
 }
 
-struct Words<'a> {
+struct LineWords<'a> {
     lines: &'a Lines,
     rest: &'a str,
 }
 
-impl<'a> Words<'a> {
-    fn of(lines: &'a Lines) -> InputResult<Words<'a>> {
-        Ok(Words { lines, rest: lines.text()? })
+impl<'a> LineWords<'a> {
+    fn of(lines: &'a Lines) -> InputResult<LineWords<'a>> {
+        Ok(LineWords { lines, rest: lines.text()? })
     }
 
     fn next(&mut self, what: &str) -> InputResult<&'a str> {
@@ -137,7 +137,7 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
     let mut lines = Lines::open(path)?;
     let mut cameras = Cameras::new();
     while lines.next_record()? {
-        let mut words = Words::of(&lines)?;
+        let mut words = LineWords::of(&lines)?;
         let id: u32 = words.number("the camera's number")?;
         let name = words.next("the camera model")?;
         let model = models::model_of(&format!("{name:?}"), |m| m.name == name)
@@ -175,7 +175,7 @@ pub(super) fn read_images(path: &Path, warnings: &mut Vec<String>) -> InputResul
         if lines.cut {
             return Err(lines.error(format!("an image entry longer than {LINE_BYTES} bytes")));
         }
-        let mut words = Words::of(&lines)?;
+        let mut words = LineWords::of(&lines)?;
         let _: u32 = words.number("the image's number")?;
         let quat = words.numbers("the quaternion")?;
         let translation = words.numbers("the translation")?;
@@ -205,7 +205,7 @@ pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut Ta
     let mut lines = Lines::open(path)?;
     let mut tally = PointTally::default();
     while lines.next_record()? {
-        let mut words = Words::of(&lines)?;
+        let mut words = LineWords::of(&lines)?;
         let _: u64 = words.number("the point's number")?;
         let position = words.numbers("a coordinate")?;
         let color = [words.number("red")?, words.number("green")?, words.number("blue")?];

@@ -37,12 +37,12 @@ struct Answer {
 }
 
 /// The cloud in spatial order, and for each point the root mean square distance to its neighbours.
-pub(super) struct Measured {
+pub(super) struct MeasuredPoints {
     pub points: Spool<CloudPoint>,
     pub distances: Spool<f64>,
 }
 
-pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<Measured> {
+pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<MeasuredPoints> {
     let pages = Pages::of(points.len(), budget.records(SEARCH_BYTES));
     let blocks: Vec<Range<usize>> = (0..pages.pages).map(|b| pages.start(b)..pages.start(b + 1)).collect();
     let space = budget.space();
@@ -110,5 +110,5 @@ pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputRe
         })?;
         dist2.iter().try_for_each(|d| distances.push(rms_distance(d)))?;
     }
-    Ok(Measured { points, distances: distances.finish()? })
+    Ok(MeasuredPoints { points, distances: distances.finish()? })
 }

@@ -210,8 +210,8 @@ fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputRe
     Ok(search.key())
 }
 
-fn size_points(measured: distances::Measured, options: &ImportOptions<'_>) -> InputResult<Spool<SizedPoint>> {
-    let distances::Measured { points, distances } = measured;
+fn size_points(measured: distances::MeasuredPoints, options: &ImportOptions<'_>) -> InputResult<Spool<SizedPoint>> {
+    let distances::MeasuredPoints { points, distances } = measured;
     let mut positive = 0;
     distances.for_each(|&d| {
         positive += usize::from(d > 0.0);

@@ -19,7 +19,7 @@ mod torch_file;
 pub mod write;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::gathered::{Gathered, Words, checked_intrinsics};
+use crate::dataset::gathered::{Gathered, RefusalWords, checked_intrinsics};
 use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions, Split};
 use crate::dataset::photo_files::{Photo, PhotoFiles};
 use crate::dataset::transforms::pose::make_pose;
@@ -43,7 +43,7 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
         let problem = format!("origin_drb {origin:?} or pose_scale_factor {scale} is impossible");
         return Err(InputError::new(folder.join("coordinates.pt"), problem, REMEDY));
     }
-    let words = Words {
+    let words = RefusalWords {
         photos: "",
         views: "train/metadata and val/metadata",
         photo_is_missing: "UrbanScene3D's photos are published apart from the poses: copy them into the rgbs folders; or leave \

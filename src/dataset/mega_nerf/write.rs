@@ -14,7 +14,7 @@ use std::path::Path;
 use zip::CompressionMethod;
 use zip::write::{SimpleFileOptions, ZipWriter};
 
-pub(super) enum Entry {
+pub(super) enum TorchValue {
     Int(i32),
     Float(f64),
     /// The type of the storage, the bytes of row-major numbers, and their shape.
@@ -36,8 +36,11 @@ pub fn write_mega_nerf(folder: &Path, scene: &RawScene, test_every: usize) -> In
     write_torch(
         &folder.join("coordinates.pt"),
         &[
-            ("origin_drb", Entry::Tensor("DoubleStorage", origin.to_array().map(f64::to_le_bytes).concat(), vec![3])),
-            ("pose_scale_factor", Entry::Float(scale)),
+            (
+                "origin_drb",
+                TorchValue::Tensor("DoubleStorage", origin.to_array().map(f64::to_le_bytes).concat(), vec![3]),
+            ),
+            ("pose_scale_factor", TorchValue::Float(scale)),
         ],
     )?;
     for (i, view) in scene.views.iter().enumerate() {
@@ -69,15 +72,15 @@ fn write_metadata(path: &Path, view: &RawView, drb: DMat3, origin: glam::DVec3, 
     write_torch(
         path,
         &[
-            ("W", Entry::Int(k.width as i32)),
-            ("H", Entry::Int(k.height as i32)),
-            ("intrinsics", Entry::Tensor("FloatStorage", intrinsics, vec![4])),
-            ("c2w", Entry::Tensor("FloatStorage", c2w.concat(), vec![3, 4])),
+            ("W", TorchValue::Int(k.width as i32)),
+            ("H", TorchValue::Int(k.height as i32)),
+            ("intrinsics", TorchValue::Tensor("FloatStorage", intrinsics, vec![4])),
+            ("c2w", TorchValue::Tensor("FloatStorage", c2w.concat(), vec![3, 4])),
         ],
     )
 }
 
-pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult<()> {
+pub(super) fn write_torch(path: &Path, entries: &[(&str, TorchValue)]) -> InputResult<()> {
     let io = |e: std::io::Error| InputError::io(path, "writing", &e);
     let zipped = |e: zip::result::ZipError| io(std::io::Error::other(e));
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
@@ -88,15 +91,15 @@ pub(super) fn write_torch(path: &Path, entries: &[(&str, Entry)]) -> InputResult
     for (key, entry) in entries {
         text(&mut pickle, key);
         match entry {
-            Entry::Int(n) => {
+            TorchValue::Int(n) => {
                 pickle.push(b'J');
                 pickle.extend_from_slice(&n.to_le_bytes());
             }
-            Entry::Float(x) => {
+            TorchValue::Float(x) => {
                 pickle.push(b'G');
                 pickle.extend_from_slice(&x.to_be_bytes());
             }
-            Entry::Tensor(storage, bytes, shape) => {
+            TorchValue::Tensor(storage, bytes, shape) => {
                 tensor(&mut pickle, storage, data.len(), shape);
                 data.push(bytes);
             }

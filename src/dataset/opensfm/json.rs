@@ -23,7 +23,7 @@ const MAX_BYTES: u64 = 4 << 30;
 /// A camera; a number that is not in the file is 0.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(default)]
-pub(super) struct Camera {
+pub(super) struct LensCamera {
     /// The name of the lens model; empty stands for `perspective`.
     pub projection_type: String,
     pub width: f64,
@@ -49,7 +49,7 @@ pub(super) struct Camera {
 
 /// A photo with its pose.
 #[derive(Debug, Clone, Deserialize)]
-pub(super) struct Shot {
+pub(super) struct PosedShot {
     /// Axis times angle in radians, world to camera.
     pub rotation: [Number; 3],
     /// World to camera.
@@ -61,9 +61,9 @@ pub(super) struct Shot {
 #[derive(Debug, Default, Deserialize)]
 pub(super) struct Reconstruction {
     #[serde(deserialize_with = "cameras")]
-    pub cameras: BTreeMap<String, Camera>,
+    pub cameras: BTreeMap<String, LensCamera>,
     #[serde(deserialize_with = "shots")]
-    pub shots: Vec<(String, Shot)>,
+    pub shots: Vec<(String, PosedShot)>,
     #[serde(default, deserialize_with = "points")]
     pub points: Points,
 }
@@ -98,13 +98,13 @@ pub(super) fn load(path: &Path) -> InputResult<Vec<Reconstruction>> {
 }
 
 /// Passes the entries of an object to `take`, by name.
-struct Entries<V, F: FnMut(String, V)> {
+struct NamedEntries<V, F: FnMut(String, V)> {
     what: &'static str,
     take: F,
     values: std::marker::PhantomData<V>,
 }
 
-impl<'de, V: Deserialize<'de>, F: FnMut(String, V)> Visitor<'de> for Entries<V, F> {
+impl<'de, V: Deserialize<'de>, F: FnMut(String, V)> Visitor<'de> for NamedEntries<V, F> {
     type Value = ();
     fn expecting(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         write!(f, "an object of {}s", self.what)
@@ -119,30 +119,30 @@ impl<'de, V: Deserialize<'de>, F: FnMut(String, V)> Visitor<'de> for Entries<V, 
     }
 }
 
-fn cameras<'de, D: Deserializer<'de>>(source: D) -> Result<BTreeMap<String, Camera>, D::Error> {
+fn cameras<'de, D: Deserializer<'de>>(source: D) -> Result<BTreeMap<String, LensCamera>, D::Error> {
     let mut cameras = BTreeMap::new();
     let take = |name, camera| _ = cameras.insert(name, camera);
-    source.deserialize_map(Entries { what: "camera", take, values: std::marker::PhantomData })?;
+    source.deserialize_map(NamedEntries { what: "camera", take, values: std::marker::PhantomData })?;
     Ok(cameras)
 }
 
-fn shots<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<(String, Shot)>, D::Error> {
+fn shots<'de, D: Deserializer<'de>>(source: D) -> Result<Vec<(String, PosedShot)>, D::Error> {
     let mut shots = Vec::new();
     let take = |name, shot| shots.push((name, shot));
-    source.deserialize_map(Entries { what: "shot", take, values: std::marker::PhantomData })?;
+    source.deserialize_map(NamedEntries { what: "shot", take, values: std::marker::PhantomData })?;
     Ok(shots)
 }
 
 fn points<'de, D: Deserializer<'de>>(source: D) -> Result<Points, D::Error> {
     #[derive(Deserialize)]
-    struct Point {
+    struct PointEntry {
         coordinates: [Number; 3],
         color: Option<[Number; 3]>,
         #[serde(rename = "observations")]
         _observations: Option<IgnoredAny>,
     }
     let mut points = Points::default();
-    let take = |_, point: Point| {
+    let take = |_, point: PointEntry| {
         let position = point.coordinates.map(|x| x.0);
         if !position.iter().all(|x| x.abs() <= MAX_COORDINATE) {
             points.dropped += 1;
@@ -152,6 +152,6 @@ fn points<'de, D: Deserializer<'de>>(source: D) -> Result<Points, D::Error> {
         // Without a colour: grey.
         points.cloud.colors.push(point.color.map_or([128; 3], |color| color.map(|c| c.0.round() as u8)));
     };
-    source.deserialize_map(Entries { what: "point", take, values: std::marker::PhantomData })?;
+    source.deserialize_map(NamedEntries { what: "point", take, values: std::marker::PhantomData })?;
     Ok(points)
 }

@@ -14,12 +14,12 @@
 mod json;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, Words, checked_intrinsics};
+use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, RefusalWords, checked_intrinsics};
 use crate::dataset::model::{Intrinsics, Lens, Pose, RawScene, ReadOptions};
 use crate::dataset::photo_files::PhotoFiles;
 use crate::dataset::photo_header::read_size;
 use glam::{DMat3, DVec3};
-use json::{Camera, Reconstruction, Shot};
+use json::{LensCamera, PosedShot, Reconstruction};
 use std::path::{Path, PathBuf};
 
 const FILE: &str = "reconstruction.json";
@@ -71,7 +71,7 @@ pub fn read_opensfm(path: &Path, options: &ReadOptions) -> InputResult<RawScene>
         let intrinsics = intrinsics_of(camera, size).map_err(refused)?;
         gathered.add(photo, intrinsics, pose_of(shot), None);
     }
-    let words = Words { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT_AGAIN };
+    let words = RefusalWords { photos: "", views: "", photo_is_missing: PUT_THEM_THERE, no_view: EXPORT_AGAIN };
     scene.views = gathered.finish(&file, &words, &mut scene.warnings)?;
     let dropped = reconstruction.points.dropped;
     if dropped > 0 {
@@ -107,7 +107,7 @@ fn pixels(number: f64) -> u64 {
 }
 
 /// Intrinsics in pixels, or the problem with its remedy.
-fn intrinsics_of(camera: &Camera, size: (u64, u64)) -> Result<Intrinsics, (String, &'static str)> {
+fn intrinsics_of(camera: &LensCamera, size: (u64, u64)) -> Result<Intrinsics, (String, &'static str)> {
     let c = camera;
     let (of_x, centre) = ([c.focal_x, c.focal_y], [c.c_x, c.c_y]);
     let beyond_fisheye = [c.k5, c.k6, c.p1, c.p2, c.s0, c.s1, c.s2, c.s3];
@@ -130,7 +130,7 @@ fn intrinsics_of(camera: &Camera, size: (u64, u64)) -> Result<Intrinsics, (Strin
 }
 
 /// The pose of a shot; `None` if it is impossible.
-fn pose_of(shot: &Shot) -> Option<Pose> {
+fn pose_of(shot: &PosedShot) -> Option<Pose> {
     let [axis, translation] = [shot.rotation, shot.translation].map(|v| v.map(|x| x.0));
     if !axis.iter().chain(&translation).all(|x| x.abs() <= MAX_COORDINATE) {
         return None;

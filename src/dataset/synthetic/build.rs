@@ -4,8 +4,8 @@
 //! depend on the order of construction.
 
 use super::parts::{Parts, grass, skin};
-use super::texture::{Kind, Noise, Skin, paint};
-use super::world::{HALF_ROAD, HALF_STREET, MARGIN, PITCH, Patch, Plot, World};
+use super::texture::{Material, Noise, Skin, paint};
+use super::world::{CityPlot, HALF_ROAD, HALF_STREET, MARGIN, PITCH, Patch, World};
 use crate::base::rng::{Purpose, Stream};
 use glam::DVec3;
 
@@ -52,8 +52,8 @@ fn rectangle(centre: [f64; 2], half: [f64; 2], skin: Skin) -> Patch {
 }
 
 /// Six houses with gardens.
-fn houses(parts: &mut Parts, centre: [f64; 2]) -> Plot {
-    let mut plot = Plot { base: grass(parts), patches: Vec::new() };
+fn houses(parts: &mut Parts, centre: [f64; 2]) -> CityPlot {
+    let mut plot = CityPlot { base: grass(parts), patches: Vec::new() };
     let lot = 2.0 * HALF_PLOT / 3.0;
     let hedge = parts.leaf_skin();
     for row in [-1.0, 1.0] {
@@ -71,7 +71,7 @@ fn houses(parts: &mut Parts, centre: [f64; 2]) -> Plot {
 }
 
 /// One house with its garden. `row` is -1 if the street is south of the house, 1 if it is north.
-fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: f64) {
+fn house_lot(parts: &mut Parts, plot: &mut CityPlot, x: f64, y: f64, row: f64, lot: f64) {
     let d = &mut parts.draws;
     let (half_x, half_y) = (d.range(3.6, 4.8), d.range(4.0, 5.2));
     let turn = if d.uniform() < 0.6 { 0.0 } else { d.range(-0.09, 0.09) };
@@ -80,7 +80,7 @@ fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: 
     let house_x = x - side * d.range(0.9, 1.6);
     let drive_x = x + side * (0.5 * lot - 1.9);
     let (pool, beds) = (d.uniform() < 0.3, d.uniform() < 0.4);
-    let drive = skin(parts, Kind::Paving, paint(0.56, 0.53, 0.5), paint(0.5, 0.46, 0.42));
+    let drive = skin(parts, Material::Paving, paint(0.56, 0.53, 0.5), paint(0.5, 0.46, 0.42));
     plot.patches.push(rectangle([drive_x, y + row * 0.27 * HALF_PLOT], [1.5, 0.23 * HALF_PLOT], drive));
     plot.patches.push(rectangle([house_x, front - row * (half_y + 1.5)], [half_x, 1.6], drive));
     plot.patches.push(rectangle([house_x, y + row * (0.5 * HALF_PLOT - 1.5)], [0.7, 1.6], drive));
@@ -90,12 +90,12 @@ fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: 
     }
     let garden = y - row * 0.28 * HALF_PLOT;
     if pool {
-        let rim = skin(parts, Kind::Paving, paint(0.74, 0.71, 0.65), paint(0.68, 0.65, 0.6));
-        let water = skin(parts, Kind::Pool, paint(0.3, 0.62, 0.72), paint(0.3, 0.6, 0.7));
+        let rim = skin(parts, Material::Paving, paint(0.74, 0.71, 0.65), paint(0.68, 0.65, 0.6));
+        let water = skin(parts, Material::Pool, paint(0.3, 0.62, 0.72), paint(0.3, 0.6, 0.7));
         plot.patches.push(rectangle([x + side, garden], [3.4, 2.4], rim));
         plot.patches.push(rectangle([x + side, garden], [2.6, 1.6], water));
     } else if beds {
-        let bed = skin(parts, Kind::Crop, paint(0.36, 0.45, 0.22), paint(0.42, 0.33, 0.25));
+        let bed = skin(parts, Material::Crop, paint(0.36, 0.45, 0.22), paint(0.42, 0.33, 0.25));
         plot.patches.push(rectangle([x - side * 2.0, garden], [3.0, 1.8], bed));
     }
     if parts.draws.uniform() < 0.5 {
@@ -109,14 +109,15 @@ fn house_lot(parts: &mut Parts, plot: &mut Plot, x: f64, y: f64, row: f64, lot: 
     }
 }
 
-fn terraces(parts: &mut Parts, centre: [f64; 2]) -> Plot {
-    let court = skin(parts, Kind::Paving, paint(0.6, 0.56, 0.5), paint(0.54, 0.5, 0.45));
+fn terraces(parts: &mut Parts, centre: [f64; 2]) -> CityPlot {
+    let court = skin(parts, Material::Paving, paint(0.6, 0.56, 0.5), paint(0.54, 0.5, 0.45));
     let lawn = grass(parts);
-    let mut plot = Plot { base: court, patches: vec![rectangle(centre, [HALF_PLOT - 14.5, HALF_PLOT - 14.5], lawn)] };
-    let path = skin(parts, Kind::Earth, paint(0.68, 0.62, 0.5), paint(0.6, 0.55, 0.45));
+    let mut plot =
+        CityPlot { base: court, patches: vec![rectangle(centre, [HALF_PLOT - 14.5, HALF_PLOT - 14.5], lawn)] };
+    let path = skin(parts, Material::Earth, paint(0.68, 0.62, 0.5), paint(0.6, 0.55, 0.45));
     plot.patches.push(rectangle(centre, [1.1, HALF_PLOT - 14.5], path));
     if parts.draws.uniform() < 0.6 {
-        let sand = skin(parts, Kind::Earth, paint(0.78, 0.7, 0.54), paint(0.7, 0.6, 0.5));
+        let sand = skin(parts, Material::Earth, paint(0.78, 0.7, 0.54), paint(0.7, 0.6, 0.5));
         plot.patches.push(rectangle([centre[0] + 4.5, centre[1] - 3.0], [2.8, 2.4], sand));
     }
     let depth = 5.6;
@@ -141,9 +142,9 @@ fn terraces(parts: &mut Parts, centre: [f64; 2]) -> Plot {
 }
 
 /// Office buildings; one quarter of the plot is a car park.
-fn offices(parts: &mut Parts, centre: [f64; 2]) -> Plot {
-    let base = skin(parts, Kind::Paving, paint(0.66, 0.64, 0.6), paint(0.58, 0.55, 0.52));
-    let mut plot = Plot { base, patches: Vec::new() };
+fn offices(parts: &mut Parts, centre: [f64; 2]) -> CityPlot {
+    let base = skin(parts, Material::Paving, paint(0.66, 0.64, 0.6), paint(0.58, 0.55, 0.52));
+    let mut plot = CityPlot { base, patches: Vec::new() };
     let parking = parts.draws.below(4);
     let quarter = 0.5 * HALF_PLOT;
     for k in 0..4u64 {
@@ -175,8 +176,8 @@ fn offices(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     plot
 }
 
-fn car_park(parts: &mut Parts, plot: &mut Plot, at: DVec3, half: f64) {
-    let surface = skin(parts, Kind::Asphalt, paint(0.4, 0.4, 0.4), paint(0.8, 0.8, 0.78));
+fn car_park(parts: &mut Parts, plot: &mut CityPlot, at: DVec3, half: f64) {
+    let surface = skin(parts, Material::Asphalt, paint(0.4, 0.4, 0.4), paint(0.8, 0.8, 0.78));
     plot.patches.push(rectangle([at.x, at.y], [half, half], surface));
     let bays = (2.0 * half / 2.6) as u32;
     for (row, y) in [(0u32, 2.8), (1, 13.8), (2, 18.8)] {
@@ -192,13 +193,13 @@ fn car_park(parts: &mut Parts, plot: &mut Plot, at: DVec3, half: f64) {
 }
 
 /// A park: lawn, paths, flower beds, a sports court, trees, a pavilion.
-fn park(parts: &mut Parts, centre: [f64; 2]) -> Plot {
-    let mut plot = Plot { base: grass(parts), patches: Vec::new() };
-    let path = skin(parts, Kind::Earth, paint(0.72, 0.66, 0.54), paint(0.6, 0.55, 0.45));
+fn park(parts: &mut Parts, centre: [f64; 2]) -> CityPlot {
+    let mut plot = CityPlot { base: grass(parts), patches: Vec::new() };
+    let path = skin(parts, Material::Earth, paint(0.72, 0.66, 0.54), paint(0.6, 0.55, 0.45));
     plot.patches.push(rectangle(centre, [1.4, HALF_PLOT], path));
     plot.patches.push(rectangle([centre[0], centre[1] + 3.0], [HALF_PLOT, 1.4], path));
     plot.patches.push(rectangle([centre[0], centre[1] + 3.0], [6.0, 6.0], path));
-    let beds = skin(parts, Kind::Crop, paint(0.72, 0.4, 0.42), paint(0.4, 0.46, 0.24));
+    let beds = skin(parts, Material::Crop, paint(0.72, 0.4, 0.42), paint(0.4, 0.46, 0.24));
     for (dx, dy) in [(-3.2, 6.2), (3.2, 6.2), (-3.2, -0.2), (3.2, -0.2)] {
         plot.patches.push(rectangle([centre[0] + dx, centre[1] + dy], [1.5, 1.5], beds));
     }
@@ -209,7 +210,7 @@ fn park(parts: &mut Parts, centre: [f64; 2]) -> Plot {
     } else {
         (paint(0.3, 0.45, 0.6), paint(0.36, 0.5, 0.38))
     };
-    let court = skin(parts, Kind::Court, ground, line);
+    let court = skin(parts, Material::Court, ground, line);
     let (court_x, court_y) = (centre[0] + side * 13.0, centre[1] - 11.0);
     plot.patches.push(rectangle([court_x, court_y], [7.5, 9.5], court));
     parts.shed(DVec3::new(centre[0] - side * 6.5, centre[1] - 6.5, 0.0));

@@ -59,7 +59,7 @@ impl Copies {
 }
 
 /// The flight: one camera, one pose per photo.
-pub(super) struct Flight {
+pub(super) struct CityFlight {
     pub(super) intrinsics: Intrinsics,
     pub(super) shots: Vec<Shot>,
     pub(super) blocks: u32,
@@ -88,7 +88,7 @@ impl Shot {
     }
 }
 
-pub(super) fn plan(options: &CityOptions) -> Flight {
+pub(super) fn plan(options: &CityOptions) -> CityFlight {
     let (width, height) = (f64::from(options.width), f64::from(options.height));
     let focal = FOCAL * width;
     let intrinsics = Intrinsics {
@@ -117,7 +117,7 @@ pub(super) fn plan(options: &CityOptions) -> Flight {
         fly_pass(options, pass, views, side, tilt, step / spacing, &mut shots);
     }
     (0..options.overviews).for_each(|_| shots.push(overview(options, side, shots.len() as u64)));
-    Flight { intrinsics, shots, blocks }
+    CityFlight { intrinsics, shots, blocks }
 }
 
 /// A photo straight down on the middle of all copies that shows [`OVERVIEW_AREA`] of them; `side` is that of one copy.

@@ -20,12 +20,12 @@ mod world;
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
-use crate::dataset::colmap_write::{Model, ModelImage, make_folder, write_model};
+use crate::dataset::colmap_write::{ColmapModel, ModelImage, make_folder, write_model};
 use build::build_city;
-use flight::Flight;
+use flight::CityFlight;
 use glam::DVec3;
 use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
-use photo::Photo;
+use photo::ShotPhoto;
 use shade::Scene;
 use std::path::{Path, PathBuf};
 
@@ -149,7 +149,7 @@ pub fn write_city(
     let pose = |k: usize| flight.shots[k].pose(offset + DVec3::from(tile(k)));
     let name = |k: usize| photo_name(k, options.photos());
     let images = (0..flight.shots.len()).map(|k| ModelImage { name: name(k), pose: pose(k), camera: 0 });
-    let model = Model { cameras: vec![flight.intrinsics], images: images.collect(), points, tiles };
+    let model = ColmapModel { cameras: vec![flight.intrinsics], images: images.collect(), points, tiles };
     write_model(&folder.join("sparse"), &model)?;
     Ok(CitySummary {
         folder: folder.to_path_buf(),
@@ -223,12 +223,12 @@ fn is_photo_name(name: &str) -> bool {
 fn write_photos(
     folder: &Path,
     options: &CityOptions,
-    flight: &Flight,
+    flight: &CityFlight,
     scene: &Scene,
     progress: &(dyn Fn(u32, u32) + Sync),
 ) -> InputResult<u64> {
     let mut rays = 0;
-    let mut waiting: Option<(usize, Photo)> = None;
+    let mut waiting: Option<(usize, ShotPhoto)> = None;
     // A photo is compressed and written while the next one is taken.
     for k in 0..=flight.shots.len() {
         let done = waiting.take();
@@ -252,7 +252,7 @@ fn write_photos(
     Ok(rays)
 }
 
-fn write_photo(folder: &Path, options: &CityOptions, k: usize, photo: &Photo) -> InputResult<()> {
+fn write_photo(folder: &Path, options: &CityOptions, k: usize, photo: &ShotPhoto) -> InputResult<()> {
     let path = folder.join("images").join(photo_name(k, options.photos()));
     let mut bytes = Vec::with_capacity(photo.rgb.len() / 4);
     JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY)

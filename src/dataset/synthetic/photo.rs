@@ -16,7 +16,7 @@ use rayon::prelude::*;
 const CONTRAST: f32 = 0.35;
 
 /// A photo: interleaved 8-bit RGB, and the number of rays.
-pub(super) struct Photo {
+pub(super) struct ShotPhoto {
     pub(super) rgb: Vec<u8>,
     pub(super) rays: u64,
 }
@@ -37,7 +37,7 @@ pub(super) fn gain(options: &CityOptions, view: u32) -> f32 {
     (1.0 + options.exposure * draws.normal_within(3.0)).max(0.2) as f32
 }
 
-pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, options: &CityOptions) -> Photo {
+pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, options: &CityOptions) -> ShotPhoto {
     let (width, height) = (k.width as usize, k.height as usize);
     let spread = 1.0 / k.fx;
     let mut first = vec![Sample { light: Vec3::ZERO, surface: 0 }; width * height];
@@ -72,7 +72,7 @@ pub(super) fn take(scene: &Scene, k: &Intrinsics, shot: &Shot, view: u32, option
             extra
         })
         .sum();
-    Photo { rgb, rays: (width * height) as u64 + extra }
+    ShotPhoto { rgb, rays: (width * height) as u64 + extra }
 }
 
 /// Whether the 3x3 pixels around (x, y) show more than one surface or differ much in brightness.

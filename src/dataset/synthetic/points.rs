@@ -5,7 +5,7 @@
 //! ascending order; 3. overview photos see no points; 4. every observation is the projection of the true place plus noise, and inside its photo.
 
 use super::CityOptions;
-use super::flight::{Flight, Shot};
+use super::flight::{CityFlight, Shot};
 use super::photo::{to_byte, tone};
 use super::shade::{Hit, Scene};
 use crate::base::rng::{Purpose, Stream};
@@ -21,7 +21,7 @@ const MATCH_NOISE: f64 = 0.5;
 const TRIES: u32 = 6;
 
 /// Samples the points. A point whose draws all see the sky is left out.
-pub(super) fn sample(scene: &Scene, flight: &Flight, options: &CityOptions) -> Vec<Point> {
+pub(super) fn sample(scene: &Scene, flight: &CityFlight, options: &CityOptions) -> Vec<Point> {
     let neighbours = neighbours(&flight.shots[..options.views as usize]);
     (0..options.points).into_par_iter().filter_map(|k| one_point(scene, flight, options, &neighbours, k)).collect()
 }
@@ -48,7 +48,7 @@ fn neighbours(shots: &[Shot]) -> Vec<Vec<u32>> {
 
 fn one_point(
     scene: &Scene,
-    flight: &Flight,
+    flight: &CityFlight,
     options: &CityOptions,
     neighbours: &[Vec<u32>],
     number: u32,

@@ -3,8 +3,8 @@
 //!
 //! Invariant: light depends on (world, place, viewing direction, footprint) alone.
 
-use super::texture::{Look, Place};
-use super::trace::{Entry, Face, Grid, Ray, Shape, Solid};
+use super::texture::{FacePlace, SurfaceLook};
+use super::trace::{Face, Ray, Shape, Solid, SolidGrid, SurfaceHit};
 use super::world::World;
 use glam::{DVec3, Vec3};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -28,7 +28,7 @@ fn sun() -> DVec3 {
 /// A world with its grid and its sky map.
 pub(super) struct Scene {
     pub(super) world: World,
-    grid: Grid,
+    grid: SolidGrid,
     sun: DVec3,
     sky: SkyMap,
 }
@@ -68,7 +68,7 @@ const SKY: Sample = Sample { light: Vec3::new(0.55, 0.68, 0.85), surface: u32::M
 impl Scene {
     /// Builds the grid, and a sky map of which nothing is known.
     pub(super) fn new(world: World) -> Scene {
-        let grid = Grid::new(&world.solids);
+        let grid = SolidGrid::new(&world.solids);
         let sky = SkyMap::new(&world);
         Scene { world, grid, sun: sun(), sky }
     }
@@ -76,7 +76,7 @@ impl Scene {
     /// The first place on a ray; `None` is the sky.
     pub(super) fn hit(&self, ray: &Ray) -> Option<Hit> {
         let ground = if ray.along.z < 0.0 { -ray.from.z * ray.inverse.z } else { f64::INFINITY };
-        if let Some((k, Entry { t, normal, face })) = self.grid.nearest(&self.world.solids, ray, ground.min(1e5)) {
+        if let Some((k, SurfaceHit { t, normal, face })) = self.grid.nearest(&self.world.solids, ray, ground.min(1e5)) {
             let normal = self.world.solids[k as usize].rotate_to_world(normal);
             return Some(Hit { t, point: ray.at(t), normal, solid: Some((k, face)) });
         }
@@ -119,7 +119,7 @@ impl Scene {
         Sample { light, surface: surface * 2 + u32::from(in_sun) }
     }
 
-    fn light(&self, ray: &Ray, hit: &Hit, look: &Look, w: f64) -> (Vec3, bool) {
+    fn light(&self, ray: &Ray, hit: &Hit, look: &SurfaceLook, w: f64) -> (Vec3, bool) {
         let mut n = hit.normal;
         if look.rough > 0.0 {
             let p = hit.point;
@@ -171,7 +171,7 @@ impl Scene {
     }
 }
 
-fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> Look {
+fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) -> SurfaceLook {
     let p = solid.rotate_to_local(point - solid.origin);
     let (half_x, half_y, height) = match solid.shape {
         Shape::Block { half_x, half_y, height } | Shape::Roof { half_x, half_y, height, .. } => {
@@ -199,7 +199,7 @@ fn solid_look(world: &World, solid: &Solid, face: Face, point: DVec3, w: f64) ->
         Face::SideX | Face::SideY | Face::Round | Face::Bottom => &solid.side,
         Face::Top | Face::SlopeX | Face::SlopeY => &solid.top,
     };
-    skin.look(&world.noise, Place { u, v, width, height, w })
+    skin.look(&world.noise, FacePlace { u, v, width, height, w })
 }
 
 impl SkyMap {

@@ -103,7 +103,7 @@ fn mix(a: Vec3, b: Vec3, t: f32) -> Vec3 {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
+pub(super) enum Material {
     /// Wall with a grid of windows.
     Facade,
     /// A facade with shops on the ground floor.
@@ -140,7 +140,7 @@ pub(super) enum Kind {
 /// A surface: its material, its colours, and the seed of its random details.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Skin {
-    pub(super) kind: Kind,
+    pub(super) kind: Material,
     pub(super) color: Vec3,
     pub(super) accent: Vec3,
     pub(super) seed: u32,
@@ -148,7 +148,7 @@ pub(super) struct Skin {
 
 /// The optical properties of a surface at one place.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Look {
+pub(super) struct SurfaceLook {
     /// Linear reflectance.
     pub(super) albedo: Vec3,
     /// Share of mirror-like reflection at grazing view, 0 to 1.
@@ -159,7 +159,7 @@ pub(super) struct Look {
 
 /// A place on a face: metres along it, metres up it, the size of the face, and the footprint.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Place {
+pub(super) struct FacePlace {
     pub(super) u: f64,
     pub(super) v: f64,
     pub(super) width: f64,
@@ -167,42 +167,42 @@ pub(super) struct Place {
     pub(super) w: f64,
 }
 
-fn matt(albedo: Vec3) -> Look {
-    Look { albedo, gloss: 0.0, rough: 0.0 }
+fn matt(albedo: Vec3) -> SurfaceLook {
+    SurfaceLook { albedo, gloss: 0.0, rough: 0.0 }
 }
 
 impl Skin {
-    pub(super) fn look(&self, noise: &Noise, place: Place) -> Look {
+    pub(super) fn look(&self, noise: &Noise, place: FacePlace) -> SurfaceLook {
         // Each surface shifts the noise, so that walls have different stains.
         let shift = f64::from(self.seed & 0xffff) * 0.37;
         let (u, v, w) = (place.u + shift, place.v, place.w);
         let speckled = |layers: &[(f64, f32)]| matt(self.color * (1.0 + noise.layers(u, v, w, layers)));
         match self.kind {
-            Kind::Facade | Kind::ShopFacade => self.facade(noise, place, shift),
-            Kind::Curtain => self.curtain(noise, place, shift),
-            Kind::Plain => matt(self.color * (1.0 + wall_stains(noise, u, v, w))),
-            Kind::Tiles => self.tiles(noise, place, shift),
-            Kind::Bitumen => self.bitumen(noise, u, v, w),
-            Kind::Gravel => speckled(&[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]),
-            Kind::Metal => self.metal(noise, u, v, w),
-            Kind::Solar => solar(u, v, w),
-            Kind::Leaves => {
+            Material::Facade | Material::ShopFacade => self.facade(noise, place, shift),
+            Material::Curtain => self.curtain(noise, place, shift),
+            Material::Plain => matt(self.color * (1.0 + wall_stains(noise, u, v, w))),
+            Material::Tiles => self.tiles(noise, place, shift),
+            Material::Bitumen => self.bitumen(noise, u, v, w),
+            Material::Gravel => speckled(&[(0.3, 0.22), (0.8, 0.12), (4.0, 0.14), (0.12, 0.2)]),
+            Material::Metal => self.metal(noise, u, v, w),
+            Material::Solar => solar(u, v, w),
+            Material::Leaves => {
                 let n = noise.layers(u, v, w, &[(1.6, 0.22), (0.7, 0.30), (0.3, 0.30), (0.12, 0.25)]);
-                Look { albedo: mix(self.color, self.accent, 0.5 + n) * (0.95 + 0.9 * n), gloss: 0.0, rough: 0.7 }
+                SurfaceLook { albedo: mix(self.color, self.accent, 0.5 + n) * (0.95 + 0.9 * n), gloss: 0.0, rough: 0.7 }
             }
-            Kind::Wood => matt(self.color * (1.0 + noise.layers(u * 4.0, v, w, &[(0.8, 0.2), (0.3, 0.2)]))),
-            Kind::CarPaint => Look { albedo: self.color, gloss: 0.35, rough: 0.0 },
-            Kind::CarGlass => Look { albedo: self.color, gloss: 0.6, rough: 0.0 },
-            Kind::Asphalt => matt(asphalt(noise, self, u, v, w)),
-            Kind::Paving => matt(self.paving(noise, place.u, v, w)),
-            Kind::Grass => matt(self.grass(noise, u, v, w)),
-            Kind::Earth => speckled(&[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]),
-            Kind::Crop => matt(self.crop(noise, u, v, w)),
-            Kind::Court => matt(self.court(noise, place)),
-            Kind::Pool => {
+            Material::Wood => matt(self.color * (1.0 + noise.layers(u * 4.0, v, w, &[(0.8, 0.2), (0.3, 0.2)]))),
+            Material::CarPaint => SurfaceLook { albedo: self.color, gloss: 0.35, rough: 0.0 },
+            Material::CarGlass => SurfaceLook { albedo: self.color, gloss: 0.6, rough: 0.0 },
+            Material::Asphalt => matt(asphalt(noise, self, u, v, w)),
+            Material::Paving => matt(self.paving(noise, place.u, v, w)),
+            Material::Grass => matt(self.grass(noise, u, v, w)),
+            Material::Earth => speckled(&[(5.0, 0.12), (1.3, 0.12), (0.4, 0.14), (0.15, 0.14)]),
+            Material::Crop => matt(self.crop(noise, u, v, w)),
+            Material::Court => matt(self.court(noise, place)),
+            Material::Pool => {
                 let n = noise.layers(u, v, w, &[(1.4, 0.10), (0.5, 0.10)]);
                 let lane = lines(place.u, 2.0, 0.18, w) * 0.25;
-                Look { albedo: self.color * (1.0 + n - lane), gloss: 0.25, rough: 0.0 }
+                SurfaceLook { albedo: self.color * (1.0 + n - lane), gloss: 0.25, rough: 0.0 }
             }
         }
     }
@@ -211,7 +211,7 @@ impl Skin {
         cell_draw(i64::from(k), 77, self.seed)
     }
 
-    fn facade(&self, noise: &Noise, p: Place, shift: f64) -> Look {
+    fn facade(&self, noise: &Noise, p: FacePlace, shift: f64) -> SurfaceLook {
         let w = p.w;
         let mut albedo = self.color * (1.0 + wall_stains(noise, p.u + shift, p.v, w));
         if self.seed & 3 == 0 {
@@ -228,7 +228,7 @@ impl Skin {
         let bay = p.width / bays as f64;
         let (i, j) = (floor_i(p.u / bay), floor_i(p.v / floor_height));
         let (cu, cv) = (p.u - (i as f64 + 0.5) * bay, p.v - j as f64 * floor_height);
-        let shop = self.kind == Kind::ShopFacade && j == 0;
+        let shop = self.kind == Material::ShopFacade && j == 0;
         let wide = if shop { 0.86 } else { 0.36 + 0.3 * f64::from(self.draw(2)) };
         let half = 0.5 * bay * wide;
         let (sill, head) = if shop { (0.12, 0.74) } else { (0.26, 0.26 + 0.4 + 0.12 * f64::from(self.draw(3))) };
@@ -251,10 +251,10 @@ impl Skin {
         // A blind covers the upper part of a dark pane.
         let blind = cover(cv, head - f64::from(cell_draw(j, i, self.seed)) * (head - sill) * 0.8, head, w);
         let pane = mix(pane, paint(0.66, 0.64, 0.6), if lit < 0.35 { blind } else { 0.0 });
-        Look { albedo: mix(albedo, pane, glass), gloss: 0.55 * glass, rough: 0.0 }
+        SurfaceLook { albedo: mix(albedo, pane, glass), gloss: 0.55 * glass, rough: 0.0 }
     }
 
-    fn curtain(&self, noise: &Noise, p: Place, shift: f64) -> Look {
+    fn curtain(&self, noise: &Noise, p: FacePlace, shift: f64) -> SurfaceLook {
         let w = p.w;
         let floors = (p.height / 3.5 + 0.5).max(1.0) as i64;
         let (floor_height, bays) = (p.height / floors as f64, (p.width / 1.6 + 0.5).max(1.0));
@@ -270,10 +270,10 @@ impl Skin {
         let spandrel = cover(cv, 0.0, 0.9, w);
         let albedo = mix(pane, self.accent * 0.55, spandrel);
         let grid = lines(p.u, bay, 0.16, w).max(lines(p.v, floor_height, 0.2, w));
-        Look { albedo: mix(albedo, self.accent, grid), gloss: 0.8 * (1.0 - spandrel) * (1.0 - grid), rough: 0.0 }
+        SurfaceLook { albedo: mix(albedo, self.accent, grid), gloss: 0.8 * (1.0 - spandrel) * (1.0 - grid), rough: 0.0 }
     }
 
-    fn tiles(&self, noise: &Noise, p: Place, shift: f64) -> Look {
+    fn tiles(&self, noise: &Noise, p: FacePlace, shift: f64) -> SurfaceLook {
         let (u, v, w) = (p.u + shift, p.v, p.w);
         let row = floor_i(v / 0.42);
         let tile = floor_i(u / 0.5);
@@ -290,27 +290,27 @@ impl Skin {
             let (low, high) = (p.width * 0.2, p.width * 0.2 + 1.0 * (p.width * 0.55).max(2.0));
             let on = cover(p.u, low, high, w) * cover(v, p.height * 0.25, p.height * 0.8, w);
             let panel = solar(p.u - low, v - p.height * 0.25, w);
-            return Look { albedo: mix(albedo, panel.albedo, on), gloss: panel.gloss * on, rough: 0.0 };
+            return SurfaceLook { albedo: mix(albedo, panel.albedo, on), gloss: panel.gloss * on, rough: 0.0 };
         }
-        Look { albedo, gloss: 0.04, rough: 0.0 }
+        SurfaceLook { albedo, gloss: 0.04, rough: 0.0 }
     }
 
-    fn bitumen(&self, noise: &Noise, u: f64, v: f64, w: f64) -> Look {
+    fn bitumen(&self, noise: &Noise, u: f64, v: f64, w: f64) -> SurfaceLook {
         let sheet = floor_i(u / 2.2);
         let mut albedo = self.color * (1.0 + 0.24 * (cell_draw(sheet, floor_i(v / 7.0), self.seed) - 0.5));
         albedo *= 1.0 + noise.layers(u, v, w, &[(6.0, 0.22), (2.0, 0.16), (0.6, 0.12), (0.2, 0.12)]);
         albedo *= 1.0 - 0.35 * lines(u, 2.2, 0.12, w) - 0.3 * lines(v, 7.0, 0.12, w);
         let puddle = (noise.layers(u + 40.0, v, w, &[(7.0, 1.0), (1.8, 0.35)]) * 3.0 - 1.6).clamp(0.0, 1.0);
-        Look { albedo: albedo * (1.0 - 0.4 * puddle), gloss: 0.03 + 0.2 * puddle, rough: 0.0 }
+        SurfaceLook { albedo: albedo * (1.0 - 0.4 * puddle), gloss: 0.03 + 0.2 * puddle, rough: 0.0 }
     }
 
-    fn metal(&self, noise: &Noise, u: f64, v: f64, w: f64) -> Look {
+    fn metal(&self, noise: &Noise, u: f64, v: f64, w: f64) -> SurfaceLook {
         let sheet = floor_i(u / 0.9);
         let mut albedo = self.color * (1.0 + 0.16 * (cell_draw(sheet, 0, self.seed) - 0.5) * fade(0.9, w));
         albedo *= 1.0 - 0.3 * lines(u, 0.9, 0.12, w);
         albedo *= 1.0 + noise.layers(u, v * 0.3, w, &[(4.0, 0.12), (1.0, 0.1), (0.3, 0.08)]);
         let rust = (noise.layers(u, v * 0.2, w, &[(2.5, 0.8), (0.7, 0.4)]) - 0.55).clamp(0.0, 0.5);
-        Look { albedo: mix(albedo, paint(0.45, 0.3, 0.2), rust), gloss: 0.22, rough: 0.0 }
+        SurfaceLook { albedo: mix(albedo, paint(0.45, 0.3, 0.2), rust), gloss: 0.22, rough: 0.0 }
     }
 
     fn paving(&self, noise: &Noise, u: f64, v: f64, w: f64) -> Vec3 {
@@ -344,7 +344,7 @@ impl Skin {
         albedo * (1.0 + noise.layers(u, v, w, &[(18.0, 0.2), (5.0, 0.16), (1.5, 0.16), (0.5, 0.14), (0.2, 0.12)]))
     }
 
-    fn court(&self, noise: &Noise, p: Place) -> Vec3 {
+    fn court(&self, noise: &Noise, p: FacePlace) -> Vec3 {
         let w = p.w;
         let border = 1.0 - cover(p.u, 0.9, p.width - 0.9, w) * cover(p.v, 0.9, p.height - 0.9, w);
         let inner = cover(p.u, 1.02, p.width - 1.02, w) * cover(p.v, 1.02, p.height - 1.02, w);
@@ -370,11 +370,11 @@ const SHOP_SIGNS: [Vec3; 5] = [
     paint(0.82, 0.8, 0.76),
 ];
 
-fn solar(u: f64, v: f64, w: f64) -> Look {
+fn solar(u: f64, v: f64, w: f64) -> SurfaceLook {
     let frame = lines(u, 1.05, 0.09, w).max(lines(v, 1.7, 0.09, w));
     let cells = 0.4 * lines(u, 0.35, 0.04, w).max(lines(v, 0.34, 0.04, w));
     let albedo = mix(paint(0.09, 0.12, 0.24), paint(0.6, 0.62, 0.65), frame.max(cells * 0.6));
-    Look { albedo, gloss: 0.5, rough: 0.0 }
+    SurfaceLook { albedo, gloss: 0.5, rough: 0.0 }
 }
 
 /// Asphalt with patches, cracks and stains. The ground plan adds road markings.

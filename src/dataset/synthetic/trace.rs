@@ -67,7 +67,7 @@ pub(super) enum Face {
 
 /// The place where a ray enters a solid; the normal is in the solid's frame.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Entry {
+pub(super) struct SurfaceHit {
     pub(super) t: f64,
     pub(super) normal: DVec3,
     pub(super) face: Face,
@@ -117,7 +117,7 @@ impl Solid {
 
     /// The place where `ray` enters, if its distance is in (0, limit).
     #[inline]
-    pub(super) fn enter(&self, ray: &Ray, limit: f64) -> Option<Entry> {
+    pub(super) fn enter(&self, ray: &Ray, limit: f64) -> Option<SurfaceHit> {
         let from = self.rotate_to_local(ray.from - self.origin);
         let along = self.rotate_to_local(ray.along);
         let entry = match self.shape {
@@ -165,8 +165,8 @@ impl Clip {
         }
     }
 
-    fn entry(self) -> Option<Entry> {
-        (self.t0 <= self.t1 && self.t0 > 0.0).then(|| Entry {
+    fn entry(self) -> Option<SurfaceHit> {
+        (self.t0 <= self.t1 && self.t0 > 0.0).then(|| SurfaceHit {
             t: self.t0,
             normal: self.normal / self.normal.length(),
             face: self.face,
@@ -177,7 +177,15 @@ impl Clip {
 const OPEN: Clip = Clip { t0: f64::NEG_INFINITY, t1: f64::INFINITY, normal: DVec3::Z, face: Face::Top };
 
 #[inline(always)]
-fn enter_roof(from: DVec3, along: DVec3, half_x: f64, half_y: f64, height: f64, run: f64, cap: f64) -> Option<Entry> {
+fn enter_roof(
+    from: DVec3,
+    along: DVec3,
+    half_x: f64,
+    half_y: f64,
+    height: f64,
+    run: f64,
+    cap: f64,
+) -> Option<SurfaceHit> {
     let mut clip = OPEN;
     clip.half_space(from, along, DVec3::new(0.0, height, half_y), height * half_y, Face::SlopeY);
     clip.half_space(from, along, DVec3::new(0.0, -height, half_y), height * half_y, Face::SlopeY);
@@ -194,7 +202,7 @@ fn enter_roof(from: DVec3, along: DVec3, half_x: f64, half_y: f64, height: f64, 
 }
 
 #[inline(always)]
-fn enter_ellipsoid(from: DVec3, along: DVec3, radii: DVec3) -> Option<Entry> {
+fn enter_ellipsoid(from: DVec3, along: DVec3, radii: DVec3) -> Option<SurfaceHit> {
     let (o, d) = (from / radii, along / radii);
     let (a, b, c) = (d.dot(d), o.dot(d), o.dot(o) - 1.0);
     let under = b * b - a * c;
@@ -206,13 +214,13 @@ fn enter_ellipsoid(from: DVec3, along: DVec3, radii: DVec3) -> Option<Entry> {
         return None;
     }
     let normal = (o + d * t) / radii;
-    Some(Entry { t, normal: normal / normal.length(), face: Face::Round })
+    Some(SurfaceHit { t, normal: normal / normal.length(), face: Face::Round })
 }
 
 /// Side of a cell, metres.
 const CELL: f64 = 4.0;
 
-pub(super) struct Grid {
+pub(super) struct SolidGrid {
     low: [f64; 2],
     cells: [usize; 2],
     /// Highest point of the solids of each cell.
@@ -260,8 +268,8 @@ fn single(ray: &Ray) -> ([f32; 3], [f32; 3]) {
     (ray.from.as_vec3().into(), ray.inverse.as_vec3().into())
 }
 
-impl Grid {
-    pub(super) fn new(solids: &[Solid]) -> Grid {
+impl SolidGrid {
+    pub(super) fn new(solids: &[Solid]) -> SolidGrid {
         let mut low = [0.0f64; 2];
         let mut high = [0.0f64; 2];
         let mut highest = 0.0f64;
@@ -273,7 +281,7 @@ impl Grid {
         let cells = [0, 1].map(|k| ((high[k] - low[k]) / CELL) as usize + 1);
         let count = cells[0] * cells[1];
         let (top, starts) = (vec![0.0; count], vec![0; count + 1]);
-        let mut grid = Grid { low, cells, top, starts, items: Vec::new(), highest };
+        let mut grid = SolidGrid { low, cells, top, starts, items: Vec::new(), highest };
         let mut listed = Vec::new();
         for (k, s) in solids.iter().enumerate() {
             let at = |v: f64, k: usize| (((v - low[k]) / CELL) as usize).min(cells[k] - 1);
@@ -344,8 +352,8 @@ impl Grid {
     }
 
     /// The nearest solid that the ray enters in (0, limit).
-    pub(super) fn nearest(&self, solids: &[Solid], ray: &Ray, limit: f64) -> Option<(u32, Entry)> {
-        let mut best: Option<(u32, Entry)> = None;
+    pub(super) fn nearest(&self, solids: &[Solid], ray: &Ray, limit: f64) -> Option<(u32, SurfaceHit)> {
+        let mut best: Option<(u32, SurfaceHit)> = None;
         let mut reach = limit;
         let (from, inverse) = single(ray);
         self.visit(ray, limit, |items, out| {
@@ -394,14 +402,14 @@ mod tests {
     #[test]
     fn the_grid_finds_what_a_search_of_all_solids_finds() {
         let world = build_city(3, 2);
-        let grid = Grid::new(&world.solids);
+        let grid = SolidGrid::new(&world.solids);
         let mut draws = Stream::new(1, Purpose::Test, 0, 0);
         let mut hits = 0;
         for _ in 0..3000 {
             let from = DVec3::new(draws.range(-90.0, 90.0), draws.range(-90.0, 90.0), draws.range(0.5, 80.0));
             let along = DVec3::new(draws.normal(), draws.normal(), draws.normal() - 0.5).normalize();
             let ray = Ray::new(from, along);
-            let mut all: Option<(u32, Entry)> = None;
+            let mut all: Option<(u32, SurfaceHit)> = None;
             for (k, s) in world.solids.iter().enumerate() {
                 if let Some(e) = s.enter(&ray, all.map_or(300.0, |(_, e)| e.t)) {
                     all = Some((k as u32, e));

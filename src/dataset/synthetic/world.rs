@@ -4,7 +4,7 @@
 //! [-half, half]^2 with a road around it, surrounded by fields; 3. coordinates are metres, z up, without the dataset's
 //! offset.
 
-use super::texture::{Kind, Look, Noise, Place, Skin, asphalt, cell_draw, cover, lines, paint};
+use super::texture::{FacePlace, Material, Noise, Skin, SurfaceLook, asphalt, cell_draw, cover, lines, paint};
 use super::trace::Solid;
 use glam::{DVec3, Vec3};
 
@@ -27,7 +27,7 @@ pub(super) struct Patch {
 
 /// The ground between four streets.
 #[derive(Debug, Clone)]
-pub(super) struct Plot {
+pub(super) struct CityPlot {
     pub(super) base: Skin,
     /// Later patches cover earlier ones.
     pub(super) patches: Vec<Patch>,
@@ -39,14 +39,15 @@ pub(super) struct World {
     pub(super) noise: Noise,
     pub(super) solids: Vec<Solid>,
     /// `[blocks][blocks]`, rows along x.
-    pub(super) plots: Vec<Plot>,
+    pub(super) plots: Vec<CityPlot>,
 }
 
 const ROAD: Skin =
-    Skin { kind: Kind::Asphalt, color: paint(0.34, 0.34, 0.35), accent: paint(0.84, 0.84, 0.8), seed: 3 };
+    Skin { kind: Material::Asphalt, color: paint(0.34, 0.34, 0.35), accent: paint(0.84, 0.84, 0.8), seed: 3 };
 const PAVEMENT: Skin =
-    Skin { kind: Kind::Paving, color: paint(0.62, 0.6, 0.57), accent: paint(0.55, 0.52, 0.49), seed: 4 };
-const VERGE: Skin = Skin { kind: Kind::Grass, color: paint(0.4, 0.47, 0.24), accent: paint(0.52, 0.52, 0.3), seed: 5 };
+    Skin { kind: Material::Paving, color: paint(0.62, 0.6, 0.57), accent: paint(0.55, 0.52, 0.49), seed: 4 };
+const VERGE: Skin =
+    Skin { kind: Material::Grass, color: paint(0.4, 0.47, 0.24), accent: paint(0.52, 0.52, 0.3), seed: 5 };
 
 /// Side of a field outside the city, metres.
 const FIELD: f64 = 74.0;
@@ -57,7 +58,7 @@ impl World {
     }
 
     /// The ground at (x, y), and a number that changes at the borders of the plan.
-    pub(super) fn ground(&self, x: f64, y: f64, w: f64) -> (Look, u32) {
+    pub(super) fn ground(&self, x: f64, y: f64, w: f64) -> (SurfaceLook, u32) {
         let half = self.half();
         let last = f64::from(self.blocks);
         let (gx, gy) = ((x + half) / PITCH, (y + half) / PITCH);
@@ -82,9 +83,9 @@ impl World {
     }
 
     /// A street; `dx`, `dy` are the distances to the centre lines of the streets along y and along x.
-    fn street(&self, x: f64, y: f64, dx: f64, dy: f64, in_town: bool, w: f64) -> (Look, u32) {
+    fn street(&self, x: f64, y: f64, dx: f64, dy: f64, in_town: bool, w: f64) -> (SurfaceLook, u32) {
         let on_road = dx.abs() < HALF_ROAD || dy.abs() < HALF_ROAD;
-        let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
+        let place = FacePlace { u: x, v: y, width: 0.0, height: 0.0, w };
         if !on_road && !in_town {
             return (VERGE.look(&self.noise, place), 2);
         }
@@ -109,18 +110,18 @@ impl World {
             let track = cover(lane.abs(), 0.55, 1.05, w.max(0.4));
             albedo *= 1.0 - 0.16 * track;
         }
-        (Look { albedo, gloss: 0.02, rough: 0.0 }, 3)
+        (SurfaceLook { albedo, gloss: 0.02, rough: 0.0 }, 3)
     }
 
-    fn plot_ground(&self, x: f64, y: f64, gx: f64, gy: f64, w: f64) -> (Look, u32) {
+    fn plot_ground(&self, x: f64, y: f64, gx: f64, gy: f64, w: f64) -> (SurfaceLook, u32) {
         let last = self.blocks as usize - 1;
         let (i, j) = ((gx as usize).min(last), (gy as usize).min(last));
         let plot = &self.plots[j * self.blocks as usize + i];
-        let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
+        let place = FacePlace { u: x, v: y, width: 0.0, height: 0.0, w };
         for (k, patch) in plot.patches.iter().enumerate().rev() {
             if x >= patch.low[0] && x < patch.high[0] && y >= patch.low[1] && y < patch.high[1] {
                 // The patterns of courts and car parks start at the patch's corner.
-                let own = Place {
+                let own = FacePlace {
                     u: x - patch.low[0],
                     v: y - patch.low[1],
                     width: patch.high[0] - patch.low[0],
@@ -128,7 +129,7 @@ impl World {
                     w,
                 };
                 let mut look = patch.skin.look(&self.noise, own);
-                if patch.skin.kind == Kind::Asphalt && own.width > 12.0 {
+                if patch.skin.kind == Material::Asphalt && own.width > 12.0 {
                     look.albedo += (patch.skin.accent - look.albedo) * (0.75 * parking_lines(own));
                 }
                 return (look, 16 + k as u32);
@@ -137,7 +138,7 @@ impl World {
         (plot.base.look(&self.noise, place), 4)
     }
 
-    fn countryside(&self, x: f64, y: f64, w: f64) -> (Look, u32) {
+    fn countryside(&self, x: f64, y: f64, w: f64) -> (SurfaceLook, u32) {
         // Every row of fields is shifted, so that their corners do not align.
         let j = (y / FIELD).floor();
         let shift = f64::from(cell_draw(j as i64, 9, self.seed as u32)) * FIELD;
@@ -147,7 +148,7 @@ impl World {
         let (kind, color, accent) = FIELDS[((pick * 6.0) as usize).min(5)];
         let skin = Skin { kind, color, accent, seed: (pick * 65_536.0) as u32 };
         let edge = u.min(FIELD - u).min(v).min(FIELD - v);
-        let place = Place { u: x, v: y, width: 0.0, height: 0.0, w };
+        let place = FacePlace { u: x, v: y, width: 0.0, height: 0.0, w };
         let mut look = skin.look(&self.noise, place);
         let margin = cover(edge, -1.0, 1.4 + 0.7 * f64::from(self.noise.value(x / 4.0, y / 4.0)), w);
         look.albedo += (VERGE.look(&self.noise, place).albedo - look.albedo) * margin;
@@ -179,18 +180,18 @@ fn markings(across: f64, along: f64, to_crossing: f64, in_town: bool, w: f64) ->
 }
 
 /// Lines of parking bays on both sides of aisles, which repeat every 16 m.
-fn parking_lines(p: Place) -> f32 {
+fn parking_lines(p: FacePlace) -> f32 {
     let v = p.v - 16.0 * (p.v / 16.0).floor();
     let row = cover(v, 0.3, 5.3, p.w).max(cover(v, 11.3, 16.0, p.w));
     let inside = cover(p.u, 0.5, p.width - 0.5, p.w);
     row * inside * lines(p.u, 2.6, 0.14, p.w)
 }
 
-const FIELDS: [(Kind, Vec3, Vec3); 6] = [
-    (Kind::Crop, paint(0.42, 0.5, 0.24), paint(0.44, 0.4, 0.27)),
-    (Kind::Crop, paint(0.66, 0.6, 0.36), paint(0.56, 0.49, 0.32)),
-    (Kind::Crop, paint(0.52, 0.43, 0.33), paint(0.45, 0.36, 0.27)),
-    (Kind::Grass, paint(0.42, 0.5, 0.26), paint(0.56, 0.56, 0.32)),
-    (Kind::Crop, paint(0.34, 0.43, 0.2), paint(0.4, 0.4, 0.24)),
-    (Kind::Grass, paint(0.47, 0.52, 0.29), paint(0.6, 0.57, 0.36)),
+const FIELDS: [(Material, Vec3, Vec3); 6] = [
+    (Material::Crop, paint(0.42, 0.5, 0.24), paint(0.44, 0.4, 0.27)),
+    (Material::Crop, paint(0.66, 0.6, 0.36), paint(0.56, 0.49, 0.32)),
+    (Material::Crop, paint(0.52, 0.43, 0.33), paint(0.45, 0.36, 0.27)),
+    (Material::Grass, paint(0.42, 0.5, 0.26), paint(0.56, 0.56, 0.32)),
+    (Material::Crop, paint(0.34, 0.43, 0.2), paint(0.4, 0.4, 0.24)),
+    (Material::Grass, paint(0.47, 0.52, 0.29), paint(0.6, 0.57, 0.36)),
 ];

@@ -3,7 +3,7 @@
 //! Focal lengths come from `fl_x, fl_y` or `camera_angle_x, camera_angle_y` (f = side / 2 / tan(angle / 2)); one axis
 //! alone serves both. The principal point is the centre of the image unless `cx, cy` say otherwise.
 
-use super::json::{FIX_KEY, Node};
+use super::json::{FIX_KEY, JsonNode};
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::gathered::checked_intrinsics;
 use crate::dataset::model::{Intrinsics, Lens};
@@ -12,8 +12,8 @@ const UNDISTORT: &str = "undistort the photos first, or export a PINHOLE, OPENCV
 
 #[derive(Clone, Copy)]
 pub(super) struct Levels<'a> {
-    pub frame: Node<'a>,
-    pub top: Node<'a>,
+    pub frame: JsonNode<'a>,
+    pub top: JsonNode<'a>,
 }
 
 impl<'a> Levels<'a> {
@@ -42,7 +42,7 @@ impl<'a> Levels<'a> {
         Ok(side("w")?.zip(side("h")?))
     }
 
-    fn focal_at(&self, node: &Node<'_>, focal: &str, angle: &str, side: u64) -> InputResult<Option<f64>> {
+    fn focal_at(&self, node: &JsonNode<'_>, focal: &str, angle: &str, side: u64) -> InputResult<Option<f64>> {
         if let Some(f) = node.number(focal)? {
             return Ok(Some(f));
         }

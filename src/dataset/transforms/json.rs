@@ -55,12 +55,12 @@ pub(super) struct JsonFile {
     path: PathBuf,
     bytes: Vec<u8>,
     top: Map<String, Value>,
-    lists: Lists,
+    lists: TopLists,
 }
 
 /// The keys of the top level whose values are lists without a limit.
 #[derive(Debug, Default)]
-struct Lists {
+struct TopLists {
     /// The value of `frames`, an array cut after its first element.
     frames: Value,
     /// How often the key `frames` appears.
@@ -81,9 +81,9 @@ pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
         let problem = format!("the file is larger than {} MiB", MAX_BYTES >> 20);
         return Err(InputError::new(path, problem, "split the scene into several, or use a COLMAP model"));
     }
-    let mut lists = Lists::default();
+    let mut lists = TopLists::default();
     let mut source = serde_json::Deserializer::from_slice(&bytes);
-    let value = Part::Top(&mut lists).deserialize(&mut source);
+    let value = JsonPart::Top(&mut lists).deserialize(&mut source);
     let value = value.and_then(|value| source.end().map(|()| value)).map_err(|e| invalid(path, &e))?;
     let Value::Object(top) = value else {
         return Err(InputError::new(path, "the top level is not an object", "give a transforms.json with 'frames'"));
@@ -101,8 +101,8 @@ fn invalid(path: &Path, e: &serde_json::Error) -> InputError {
 }
 
 impl JsonFile {
-    pub fn top(&self) -> Node<'_> {
-        Node { file: &self.path, map: &self.top, frame: None }
+    pub fn top(&self) -> JsonNode<'_> {
+        JsonNode { file: &self.path, map: &self.top, frame: None }
     }
 
     pub fn names(&self, list: usize) -> &Names {
@@ -119,19 +119,19 @@ impl JsonFile {
     }
 
     /// Passes the frames to `take` one by one, each with its index.
-    pub fn for_each_frame(&self, take: &mut dyn FnMut(Node<'_>) -> InputResult<()>) -> InputResult<()> {
+    pub fn for_each_frame(&self, take: &mut dyn FnMut(JsonNode<'_>) -> InputResult<()>) -> InputResult<()> {
         let mut refused = None;
         let mut index = 0;
         let mut one = |frame: Value| {
             let taken = match &frame {
-                Value::Object(map) => take(Node { file: &self.path, map, frame: Some(index) }),
+                Value::Object(map) => take(JsonNode { file: &self.path, map, frame: Some(index) }),
                 _ => Err(self.top().error(&format!("frames[{index}]"), "not an object", FIX_KEY)),
             };
             index += 1;
             taken.map_err(|error| refused = Some(error)).is_ok()
         };
         let mut source = serde_json::Deserializer::from_slice(&self.bytes);
-        let done = Part::TopOfFrames(&mut one).deserialize(&mut source);
+        let done = JsonPart::TopOfFrames(&mut one).deserialize(&mut source);
         match refused {
             Some(error) => Err(error),
             None => done.map(|_| ()).map_err(|e| invalid(&self.path, &e)),
@@ -141,11 +141,11 @@ impl JsonFile {
 
 /// A part of the file, and what is kept of it. serde's ignored value is of no use for the rest: serde_json checks
 /// neither the range of its numbers nor its depth.
-enum Part<'t> {
+enum JsonPart<'t> {
     /// A value: up to this number of values of an array; of an object only the fact that it is one.
     Value(&'t mut usize),
     /// The top level: its known keys.
-    Top(&'t mut Lists),
+    Top(&'t mut TopLists),
     Names(&'t mut Names),
     /// The top level, to pass on its frames until one is refused.
     TopOfFrames(&'t mut dyn FnMut(Value) -> bool),
@@ -154,14 +154,14 @@ enum Part<'t> {
     Frame,
 }
 
-impl<'de> DeserializeSeed<'de> for Part<'_> {
+impl<'de> DeserializeSeed<'de> for JsonPart<'_> {
     type Value = Value;
     fn deserialize<D: Deserializer<'de>>(self, source: D) -> Result<Value, D::Error> {
         source.deserialize_any(self)
     }
 }
 
-impl<'de> Visitor<'de> for Part<'_> {
+impl<'de> Visitor<'de> for JsonPart<'_> {
     type Value = Value;
     fn expecting(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
         f.write_str("a value")
@@ -187,16 +187,16 @@ impl<'de> Visitor<'de> for Part<'_> {
     fn visit_seq<A: SeqAccess<'de>>(self, mut of: A) -> Result<Value, A::Error> {
         let mut values = Vec::new();
         match self {
-            Part::Value(left) => {
+            JsonPart::Value(left) => {
                 while *left > 0 {
                     *left -= 1;
-                    let Some(value) = of.next_element_seed(Part::Value(&mut *left))? else { break };
+                    let Some(value) = of.next_element_seed(JsonPart::Value(&mut *left))? else { break };
                     values.push(value);
                 }
             }
-            Part::Names(names) => *names = read_names(&mut of)?,
-            Part::Frames(take) => {
-                while let Some(frame) = of.next_element_seed(Part::Frame)? {
+            JsonPart::Names(names) => *names = read_names(&mut of)?,
+            JsonPart::Frames(take) => {
+                while let Some(frame) = of.next_element_seed(JsonPart::Frame)? {
                     if !take(frame) {
                         return Err(A::Error::custom("a frame was refused"));
                     }
@@ -204,31 +204,33 @@ impl<'de> Visitor<'de> for Part<'_> {
             }
             _ => {}
         }
-        while of.next_element_seed(Part::Value(&mut 0))?.is_some() {}
+        while of.next_element_seed(JsonPart::Value(&mut 0))?.is_some() {}
         Ok(values.into())
     }
     fn visit_map<A: MapAccess<'de>>(mut self, mut of: A) -> Result<Value, A::Error> {
         let mut map = Map::new();
         while let Some(key) = of.next_key::<String>()? {
             match &mut self {
-                Part::Top(lists) if key == "frames" => {
+                JsonPart::Top(lists) if key == "frames" => {
                     lists.frame_keys += 1;
-                    lists.frames = of.next_value_seed(Part::Value(&mut 1))?;
+                    lists.frames = of.next_value_seed(JsonPart::Value(&mut 1))?;
                 }
-                Part::Top(lists) if LISTS.contains(&key.as_str()) => {
+                JsonPart::Top(lists) if LISTS.contains(&key.as_str()) => {
                     let mut names = Names::Bad("not an array".to_string(), FIX_KEY);
-                    if of.next_value_seed(Part::Names(&mut names))?.is_null() {
+                    if of.next_value_seed(JsonPart::Names(&mut names))?.is_null() {
                         names = Names::Absent;
                     }
                     let list = LISTS.iter().position(|name| *name == key).unwrap_or(0);
                     lists.names[list] = names;
                 }
-                Part::TopOfFrames(take) if key == "frames" => _ = of.next_value_seed(Part::Frames(&mut **take))?,
-                Part::Top(_) | Part::Frame if is_known(&key) => {
-                    let value = of.next_value_seed(Part::Value(&mut { MOST_VALUES }))?;
+                JsonPart::TopOfFrames(take) if key == "frames" => {
+                    _ = of.next_value_seed(JsonPart::Frames(&mut **take))?
+                }
+                JsonPart::Top(_) | JsonPart::Frame if is_known(&key) => {
+                    let value = of.next_value_seed(JsonPart::Value(&mut { MOST_VALUES }))?;
                     map.insert(key, value);
                 }
-                _ => _ = of.next_value_seed(Part::Value(&mut 0))?,
+                _ => _ = of.next_value_seed(JsonPart::Value(&mut 0))?,
             }
         }
         Ok(map.into())
@@ -238,7 +240,7 @@ impl<'de> Visitor<'de> for Part<'_> {
 /// Reads names up to the first bad one.
 fn read_names<'de, A: SeqAccess<'de>>(of: &mut A) -> Result<Names, A::Error> {
     let mut names = BTreeSet::new();
-    while let Some(name) = of.next_element_seed(Part::Value(&mut 1))? {
+    while let Some(name) = of.next_element_seed(JsonPart::Value(&mut 1))? {
         let Some(name) = name.as_str() else {
             return Ok(Names::Bad("not a list of strings".to_string(), FIX_KEY));
         };
@@ -252,14 +254,14 @@ fn read_names<'de, A: SeqAccess<'de>>(of: &mut A) -> Result<Names, A::Error> {
 
 /// An object of the file: the top level or one frame.
 #[derive(Clone, Copy)]
-pub(super) struct Node<'a> {
+pub(super) struct JsonNode<'a> {
     pub file: &'a Path,
     pub map: &'a Map<String, Value>,
     /// Index of the frame; `None` for the top level.
     pub frame: Option<usize>,
 }
 
-impl<'a> Node<'a> {
+impl<'a> JsonNode<'a> {
     pub fn error(&self, key: &str, problem: impl Into<String>, remedy: &str) -> InputError {
         let place = match self.frame {
             Some(i) => format!("frames[{i}].{key}"),

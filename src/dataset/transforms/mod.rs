@@ -21,13 +21,13 @@ mod matrix_city;
 pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
-use crate::dataset::gathered::{Gathered, Words, left_out};
+use crate::dataset::gathered::{Gathered, RefusalWords, left_out};
 use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::read_name;
 use crate::dataset::photo_files::{Photo, PhotoFiles, file_inside};
 use crate::dataset::photo_header::read_size;
 use intrinsics::Levels;
-use json::{FIX_KEY, JsonFile, LISTS, Names, Node, STAY_INSIDE};
+use json::{FIX_KEY, JsonFile, JsonNode, LISTS, Names, STAY_INSIDE};
 pub use matrix_city::{looks_like_matrix_city, read_matrix_city};
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -74,7 +74,7 @@ fn choose_files(path: &Path, warnings: &mut Vec<String>) -> InputResult<Vec<(Pat
     Ok([Some((train, Some(Split::Train))), held_out].into_iter().flatten().collect())
 }
 
-const WORDS: Words = Words {
+const WORDS: RefusalWords = RefusalWords {
     photos: "file_path",
     views: "frames",
     photo_is_missing: "put them there, name their folder with --images, or leave them out with --allow-missing",
@@ -189,7 +189,7 @@ impl Reading<'_> {
 }
 
 /// The photo's path in a frame and its key; MatrixCity's own files number the photos instead.
-fn stated_path<'a>(frame: &Node<'a>) -> InputResult<(&'static str, std::borrow::Cow<'a, str>)> {
+fn stated_path<'a>(frame: &JsonNode<'a>) -> InputResult<(&'static str, std::borrow::Cow<'a, str>)> {
     if let Some(path) = frame.text("file_path")? {
         return Ok(("file_path", path.into()));
     }
@@ -222,7 +222,7 @@ fn prescribed(json: &JsonFile) -> InputResult<Option<PrescribedNames<'_>>> {
 }
 
 /// The PLY that the file names, if it exists.
-fn points_path(top: &Node<'_>, folder: &Path, warnings: &mut Vec<String>) -> InputResult<Option<PathBuf>> {
+fn points_path(top: &JsonNode<'_>, folder: &Path, warnings: &mut Vec<String>) -> InputResult<Option<PathBuf>> {
     let Some(stated) = top.text("ply_file_path")? else { return Ok(None) };
     let (name, path) = file_inside(folder, stated).map_err(|p| top.error("ply_file_path", p, STAY_INSIDE))?;
     if path.is_file() {

@@ -1,6 +1,6 @@
 //! Converts camera-to-world matrices in OpenGL axes (x right, y up, z backward) to poses.
 
-use super::json::{FIX_KEY, Node};
+use super::json::{FIX_KEY, JsonNode};
 use crate::base::error::InputResult;
 use crate::dataset::gathered::MAX_COORDINATE;
 use crate::dataset::loose_json::is_no_number;
@@ -16,7 +16,7 @@ const MIN_SCALE: f64 = 1e-9;
 
 /// Reads the matrix of `transform_matrix`, or MatrixCity's `rot_mat`: 3 or 4 rows of 4 numbers, row-major; `null`,
 /// which some writers use for NaN, becomes NaN, and so does a word such as Infinity.
-pub(super) fn read_matrix(frame: &Node<'_>) -> InputResult<[[f64; 4]; 4]> {
+pub(super) fn read_matrix(frame: &JsonNode<'_>) -> InputResult<[[f64; 4]; 4]> {
     let key = if frame.get("transform_matrix").is_none() && frame.get("rot_mat").is_some() {
         "rot_mat"
     } else {

@@ -15,7 +15,7 @@ pub const MAX_HEADER_BYTES: u64 = 64 * 1024;
 const REMEDY: &str = "check that this is a complete PLY file";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Format {
+pub enum PlyFormat {
     Ascii,
     /// Packed, least significant byte first.
     LittleEndian,
@@ -81,7 +81,7 @@ impl Scalar {
 
 /// Kind of a property: a number or a list of numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum PropertyKind {
     Scalar(Scalar),
     /// A count, then that many values.
     List {
@@ -93,7 +93,7 @@ pub enum Kind {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Property {
     pub name: String,
-    pub kind: Kind,
+    pub kind: PropertyKind,
 }
 
 /// An element: a table of the file.
@@ -115,8 +115,8 @@ impl Element {
         let mut bytes = 0;
         for property in &self.properties {
             bytes += match property.kind {
-                Kind::Scalar(s) => s.size() as u64,
-                Kind::List { count, .. } => {
+                PropertyKind::Scalar(s) => s.size() as u64,
+                PropertyKind::List { count, .. } => {
                     exact = false;
                     count.size() as u64
                 }
@@ -128,7 +128,7 @@ impl Element {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Header {
-    pub format: Format,
+    pub format: PlyFormat,
     pub elements: Vec<Element>,
     /// Comments without the word `comment`, trimmed.
     pub comments: Vec<String>,
@@ -139,7 +139,8 @@ pub struct Header {
 /// Reads the header up to and including `end_header`. Errors name the line.
 pub fn parse_header(reader: &mut impl BufRead, path: &Path) -> InputResult<Header> {
     let mut limited = reader.by_ref().take(MAX_HEADER_BYTES);
-    let mut header = Header { format: Format::Ascii, elements: Vec::new(), comments: Vec::new(), bytes: 0, lines: 0 };
+    let mut header =
+        Header { format: PlyFormat::Ascii, elements: Vec::new(), comments: Vec::new(), bytes: 0, lines: 0 };
     let mut format = None;
     let mut raw = Vec::new();
     loop {
@@ -171,9 +172,9 @@ pub fn parse_header(reader: &mut impl BufRead, path: &Path) -> InputResult<Heade
         match word {
             "format" => {
                 format = match rest.split_whitespace().collect::<Vec<_>>()[..] {
-                    ["ascii", "1.0"] => Some(Format::Ascii),
-                    ["binary_little_endian", "1.0"] => Some(Format::LittleEndian),
-                    ["binary_big_endian", "1.0"] => Some(Format::BigEndian),
+                    ["ascii", "1.0"] => Some(PlyFormat::Ascii),
+                    ["binary_little_endian", "1.0"] => Some(PlyFormat::LittleEndian),
+                    ["binary_big_endian", "1.0"] => Some(PlyFormat::BigEndian),
                     _ => return Err(bad(format!("unknown format '{}'", shorten(rest)))),
                 }
             }
@@ -217,9 +218,9 @@ fn parse_property(rest: &str, element: &Element) -> Result<Property, String> {
             if count.is_float() {
                 return Err(format!("the count of list '{}' is a floating-point type", shorten(name)));
             }
-            (Kind::List { count, item }, name)
+            (PropertyKind::List { count, item }, name)
         }
-        [kind, name] => (Kind::Scalar(scalar(kind)?), name),
+        [kind, name] => (PropertyKind::Scalar(scalar(kind)?), name),
         _ => return Err("a property line needs a type and a name".into()),
     };
     if element.find(name).is_some() {

@@ -8,7 +8,7 @@
 //! successful result has at least one row.
 
 use super::PlyContent;
-use super::header::{Element, Header, Kind, Scalar, parse_header, shorten};
+use super::header::{Element, Header, PropertyKind, Scalar, parse_header, shorten};
 use super::rows::{Body, read_rows};
 use crate::base::error::{InputError, InputResult};
 use crate::exchange::foreign::foreign;
@@ -161,8 +161,8 @@ fn vertex_of<'h>(header: &'h Header, path: &Path) -> InputResult<(usize, &'h Ele
 fn scalar_at(path: &Path, vertex: &Element, name: &str) -> InputResult<(usize, Scalar)> {
     let index = vertex.find(name);
     match index.map(|i| (i, vertex.properties[i].kind)) {
-        Some((i, Kind::Scalar(s))) => Ok((i, s)),
-        Some((_, Kind::List { .. })) => Err((format!("property '{name}' is a list"), "write it as a number")),
+        Some((i, PropertyKind::Scalar(s))) => Ok((i, s)),
+        Some((_, PropertyKind::List { .. })) => Err((format!("property '{name}' is a list"), "write it as a number")),
         None if name == "scale_2" => {
             Err(("these are 2D Gaussians (no scale_2)".to_string(), "give a PLY of 3D Gaussians"))
         }
@@ -343,7 +343,7 @@ fn stream_body<R: BufRead + Seek>(
     (total_bytes, path): (u64, &Path),
     take: &mut dyn FnMut([f64; 3], [u8; 3]) -> InputResult<()>,
 ) -> InputResult<u64> {
-    let colors = Colors::of(path, vertex_of(header, path)?.1)?;
+    let colors = ColorFields::of(path, vertex_of(header, path)?.1)?;
     let full = match colors.full {
         Some(full) => full,
         // A pass that only finds the range of floating-point colours. Fractions may exceed 1 a little; a file of bytes in which
@@ -369,17 +369,17 @@ fn stream_body<R: BufRead + Seek>(
     })
 }
 
-struct Colors {
+struct ColorFields {
     slots: Vec<usize>,
     /// The value of full brightness; `None` for floating-point numbers, whose range is not stated.
     full: Option<f64>,
 }
 
-impl Colors {
-    fn of(path: &Path, vertex: &Element) -> InputResult<Colors> {
+impl ColorFields {
+    fn of(path: &Path, vertex: &Element) -> InputResult<ColorFields> {
         let known = [["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"], ["r", "g", "b"]];
         let Some(names) = known.into_iter().find(|n| n.iter().all(|name| vertex.find(name).is_some())) else {
-            return Ok(Colors { slots: Vec::new(), full: Some(255.0) });
+            return Ok(ColorFields { slots: Vec::new(), full: Some(255.0) });
         };
         let found = names.iter().map(|name| scalar_at(path, vertex, name)).collect::<InputResult<Vec<_>>>()?;
         let full = match found[0].1 {
@@ -387,7 +387,7 @@ impl Colors {
             kind if kind.size() == 2 => Some(65_535.0),
             _ => Some(255.0),
         };
-        Ok(Colors { slots: found.into_iter().map(|(slot, _)| slot).collect(), full })
+        Ok(ColorFields { slots: found.into_iter().map(|(slot, _)| slot).collect(), full })
     }
 }
 
@@ -395,7 +395,7 @@ impl Colors {
 fn stream_rows<R: BufRead>(
     body: &mut Body<'_, R>,
     vertex: &Element,
-    colors: &Colors,
+    colors: &ColorFields,
     take: &mut dyn FnMut([f64; 3], [f64; 3]) -> InputResult<()>,
 ) -> InputResult<u64> {
     let path = body.path;

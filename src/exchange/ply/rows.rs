@@ -5,7 +5,7 @@
 //! Invariants: 1. buffers are bounded by a constant ([`MAX_LINE_BYTES`]) or by the longest header; 2. no
 //! loop runs longer than the file has bytes; 3. errors name the byte offset (binary) or the line (ascii).
 
-use super::header::{Element, Format, Header, Kind, Scalar, shorten};
+use super::header::{Element, Header, PlyFormat, PropertyKind, Scalar, shorten};
 use crate::base::error::{InputError, InputResult};
 use std::io::{BufRead, ErrorKind, Read};
 use std::path::Path;
@@ -17,7 +17,7 @@ const CUT_SHORT: &str = "the file is cut short or its header is wrong: copy or e
 pub struct Body<'a, R> {
     pub path: &'a Path,
     reader: R,
-    format: Format,
+    format: PlyFormat,
     position: u64,
     total_bytes: u64,
     line: u64,
@@ -40,7 +40,7 @@ impl<'a, R: BufRead> Body<'a, R> {
 
     fn error(&self, problem: impl Into<String>, remedy: &str) -> InputError {
         let place = match self.format {
-            Format::Ascii => format!("line {}", self.line),
+            PlyFormat::Ascii => format!("line {}", self.line),
             _ => format!("byte {}", self.position),
         };
         InputError::new(self.path, problem, remedy).at(place)
@@ -53,7 +53,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         let left = self.total_bytes.saturating_sub(self.position);
         let (row, exact) = element.row_bytes();
         let (row, slack) = match self.format {
-            Format::Ascii => (2 * element.properties.len() as u64, 1),
+            PlyFormat::Ascii => (2 * element.properties.len() as u64, 1),
             _ => (row, 0),
         };
         let need = u128::from(element.count) * u128::from(row);
@@ -63,7 +63,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         if need <= u128::from(left) + slack {
             return Ok(());
         }
-        let least = if exact && self.format != Format::Ascii { "" } else { "at least " };
+        let least = if exact && self.format != PlyFormat::Ascii { "" } else { "at least " };
         let problem = format!(
             "{} rows of '{}' need {least}{need} bytes, but {left} are left in the file",
             element.count,
@@ -78,7 +78,7 @@ impl<'a, R: BufRead> Body<'a, R> {
         }
         self.check_room(element)?;
         match (self.format, element.row_bytes()) {
-            (Format::Ascii, _) => (0..element.count).try_for_each(|_| self.next_line()),
+            (PlyFormat::Ascii, _) => (0..element.count).try_for_each(|_| self.next_line()),
             // No overflow: the product was compared with the bytes left above.
             (_, (row_bytes, true)) => self.skip_bytes(element.count * row_bytes),
             _ => (0..element.count).try_for_each(|_| self.walk_row(element, |_, _| {})),
@@ -109,15 +109,15 @@ impl<'a, R: BufRead> Body<'a, R> {
     /// Reads one binary row property by property; `number` receives index and value of each property that is not a
     /// list.
     fn walk_row(&mut self, element: &Element, mut number: impl FnMut(usize, f64)) -> InputResult<()> {
-        let big_endian = self.format == Format::BigEndian;
+        let big_endian = self.format == PlyFormat::BigEndian;
         let mut raw = [0u8; 8];
         for (index, property) in element.properties.iter().enumerate() {
             match property.kind {
-                Kind::Scalar(scalar) => {
+                PropertyKind::Scalar(scalar) => {
                     self.fill(&mut raw[..scalar.size()])?;
                     number(index, scalar.decode(&raw, big_endian));
                 }
-                Kind::List { count, item } => {
+                PropertyKind::List { count, item } => {
                     self.fill(&mut raw[..count.size()])?;
                     let length = count.decode(&raw, big_endian);
                     if length < 0.0 {
@@ -166,14 +166,14 @@ impl<'a, R: BufRead> Body<'a, R> {
                 return Err(self.error(problem, CUT_SHORT));
             };
             match property.kind {
-                Kind::Scalar(_) => match word.parse::<f64>() {
+                PropertyKind::Scalar(_) => match word.parse::<f64>() {
                     Ok(value) => number(index, value),
                     Err(_) => {
                         let problem = format!("'{}' is not a number for property '{}'", shorten(word), name(index));
                         return Err(self.error(problem, "repair the line or export the file again"));
                     }
                 },
-                Kind::List { .. } => {
+                PropertyKind::List { .. } => {
                     // A count larger than the words of the line fails below or at the next property.
                     let length = word.parse::<u32>().ok();
                     let complete = length.is_some_and(|n| n == 0 || words.nth(n as usize - 1).is_some());
@@ -203,7 +203,7 @@ pub fn read_rows<R: BufRead>(
     mut each: impl FnMut(u64, &[f64]) -> InputResult<()>,
 ) -> InputResult<()> {
     let (row_bytes, exact) = element.row_bytes();
-    if body.format != Format::Ascii && exact {
+    if body.format != PlyFormat::Ascii && exact {
         return read_packed(body, element, row_bytes as usize, slots, each);
     }
     let mut slot_from_property = vec![None; element.properties.len()];
@@ -217,7 +217,7 @@ pub fn read_rows<R: BufRead>(
                 values[slot] = value;
             }
         };
-        if body.format == Format::Ascii {
+        if body.format == PlyFormat::Ascii {
             body.next_line()?;
             body.parse_line(element, store)?;
         } else {
@@ -239,12 +239,12 @@ fn read_packed<R: BufRead>(
     let mut offsets = Vec::with_capacity(element.properties.len());
     let mut offset = 0;
     for property in &element.properties {
-        let scalar = if let Kind::Scalar(s) = property.kind { s } else { Scalar::U8 };
+        let scalar = if let PropertyKind::Scalar(s) = property.kind { s } else { Scalar::U8 };
         offsets.push((offset, scalar));
         offset += scalar.size();
     }
     let fields: Vec<(usize, Scalar)> = slots.iter().map(|&property| offsets[property]).collect();
-    let big_endian = body.format == Format::BigEndian;
+    let big_endian = body.format == PlyFormat::BigEndian;
     let (mut bytes, mut values) = (vec![0u8; row_bytes], vec![0.0; slots.len()]);
     for row in 0..element.count {
         body.fill(&mut bytes)?;

@@ -41,15 +41,15 @@ pub fn write_chunk(folder: &mut PartFolder, inside: &Path, rows: &[ExportRow], s
     let coefficients = (bands + 1) * (bands + 1) - 1;
     let reach = reach(rows);
     let mut pictures = means(rows, &reach);
-    pictures.push(Picture::of(rows, |row| quaternion(row.quat)));
+    pictures.push(PackedPicture::of(rows, |row| quaternion(row.quat)));
     let scales = codebook(rows, |row| row.log_scales);
-    pictures.push(Picture::of(rows, |row| opaque(row.log_scales.map(|v| scales.code(v)))));
+    pictures.push(PackedPicture::of(rows, |row| opaque(row.log_scales.map(|v| scales.code(v)))));
     let colours = codebook(rows, |row| row.sh0);
     let coded = |row: &ExportRow| {
         let [r, g, b] = row.sh0.map(|v| colours.code(v));
         [r, g, b, libm::rintf(255.0 * sigmoid(row.opacity)) as u8]
     };
-    pictures.push(Picture::of(rows, coded));
+    pictures.push(PackedPicture::of(rows, coded));
     let mut meta = json!({
         "version": 2,
         "asset": { "generator": concat!("gsscale ", env!("CARGO_PKG_VERSION")) },
@@ -70,21 +70,21 @@ pub fn write_chunk(folder: &mut PartFolder, inside: &Path, rows: &[ExportRow], s
     folder.write(&inside.join(META_FILE), meta.to_string().as_bytes())
 }
 
-struct Picture {
+struct PackedPicture {
     width: usize,
     pixels: Vec<[u8; 4]>,
 }
 
-impl Picture {
+impl PackedPicture {
     /// One pixel a row, in a picture that is nearly square; sides are multiples of four, as viewers write them.
-    fn of<T>(rows: &[T], pixel: impl Fn(&T) -> [u8; 4]) -> Picture {
+    fn of<T>(rows: &[T], pixel: impl Fn(&T) -> [u8; 4]) -> PackedPicture {
         let up4 = |n: usize| n.div_ceil(4) * 4;
         let width = up4(libm::ceil(libm::sqrt(rows.len() as f64)) as usize).max(4);
         let height = up4(rows.len().div_ceil(width)).max(4);
         let mut pixels: Vec<[u8; 4]> = rows.iter().map(pixel).collect();
         // Of the last pixel's values, so that the rest compresses.
         pixels.resize(width * height, pixels.last().copied().unwrap_or([0, 0, 0, 255]));
-        Picture { width, pixels }
+        PackedPicture { width, pixels }
     }
 
     /// The shorter one of two lossless encodings.
@@ -128,7 +128,7 @@ fn reach(rows: &[ExportRow]) -> [[f64; 2]; 3] {
     })
 }
 
-fn means(rows: &[ExportRow], reach: &[[f64; 2]; 3]) -> Vec<Picture> {
+fn means(rows: &[ExportRow], reach: &[[f64; 2]; 3]) -> Vec<PackedPicture> {
     let fixed = |row: &ExportRow| {
         [0, 1, 2].map(|i| {
             let [least, most] = reach[i];
@@ -136,7 +136,7 @@ fn means(rows: &[ExportRow], reach: &[[f64; 2]; 3]) -> Vec<Picture> {
             (libm::rint(65535.0 * share) as u16).to_le_bytes()
         })
     };
-    [0, 1].map(|byte| Picture::of(rows, |row| opaque(fixed(row).map(|bytes| bytes[byte])))).into()
+    [0, 1].map(|byte| PackedPicture::of(rows, |row| opaque(fixed(row).map(|bytes| bytes[byte])))).into()
 }
 
 /// The largest component becomes positive: a quaternion and its negative are one rotation.
@@ -158,7 +158,7 @@ fn codebook(rows: &[ExportRow], values: impl Fn(&ExportRow) -> [f32; 3]) -> Code
 }
 
 /// Adds palette and labels to the pictures; returns what describes them.
-fn harmonics(rows: &[ExportRow], bands: usize, coefficients: usize, pictures: &mut Vec<Picture>) -> Value {
+fn harmonics(rows: &[ExportRow], bands: usize, coefficients: usize, pictures: &mut Vec<PackedPicture>) -> Value {
     let width = 3 * coefficients;
     let values: Vec<f32> = rows.iter().flat_map(|row| &row.sh_n[..width]).copied().collect();
     let wanted = rows.len().div_ceil(ROWS_PER_ENTRY).next_multiple_of(ENTRIES_PER_LINE).min(1 << 16);
@@ -168,8 +168,8 @@ fn harmonics(rows: &[ExportRow], bands: usize, coefficients: usize, pictures: &m
         palette.centres.chunks_exact(3).map(|rgb| opaque([0, 1, 2].map(|i| codes.code(rgb[i])))).collect();
     let line = ENTRIES_PER_LINE * coefficients;
     pixels.resize(pixels.len().next_multiple_of(line).max(line), [0, 0, 0, 255]);
-    pictures.push(Picture { width: line, pixels });
-    pictures.push(Picture::of(&palette.labels, |label| {
+    pictures.push(PackedPicture { width: line, pixels });
+    pictures.push(PackedPicture::of(&palette.labels, |label| {
         let [low, high] = label.to_le_bytes();
         [low, high, 0, 255]
     }));

@@ -5,8 +5,8 @@
 //! Invariants: 1. a level has each row of a file at most once, so its memory follows from files that exist, not from numbers in
 //! `lod-meta.json`; 2. no name leaves the folder.
 
-use super::read_chunk::{Chunk, malformed, path_in_folder, read_json, unsupported};
-use super::tree::Part;
+use super::read_chunk::{SogChunk, malformed, path_in_folder, read_json, unsupported};
+use super::tree::FilePart;
 use crate::base::error::InputResult;
 use crate::base::room;
 use crate::base::whole_file::folder_of;
@@ -52,14 +52,14 @@ struct PartText {
 #[derive(Debug)]
 struct Level {
     number: u32,
-    parts: Vec<Part>,
+    parts: Vec<FilePart>,
 }
 
 /// A folder that is open for reading.
 #[derive(Debug)]
 pub struct SogReader {
-    files: Vec<Chunk>,
-    always_shown: Option<Chunk>,
+    files: Vec<SogChunk>,
+    always_shown: Option<SogChunk>,
     levels: Vec<Level>,
     meta: SceneMeta,
 }
@@ -78,15 +78,15 @@ impl SogReader {
         let mut open = |name: &String| {
             let file = path_in_folder(path, name)?;
             match named.insert(file.clone()) {
-                true => Chunk::open(&file),
+                true => SogChunk::open(&file),
                 false => Err(malformed(path, format!("names the file '{name}' twice"))),
             }
         };
-        let files: Vec<Chunk> = text.filenames.iter().map(&mut open).collect::<InputResult<_>>()?;
+        let files: Vec<SogChunk> = text.filenames.iter().map(&mut open).collect::<InputResult<_>>()?;
         let always_shown = text.environment.as_ref().map(&mut open).transpose()?;
         let levels = levels_of(path, text.tree, &files)?;
         let is_ours = text.asset.and_then(|asset| asset.generator).is_some_and(|name| name.starts_with("gsscale"));
-        let antialiased = files.iter().chain(&always_shown).any(Chunk::is_antialiased);
+        let antialiased = files.iter().chain(&always_shown).any(SogChunk::is_antialiased);
         // A folder of gsscale has a transform.
         let transform = folder_of(path).join(TRANSFORM_ENDING);
         let meta = match read_json::<Transform>(&transform) {
@@ -128,8 +128,8 @@ impl SogReader {
     }
 }
 
-fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>> {
-    let mut by_level: BTreeMap<u32, Vec<Part>> = BTreeMap::new();
+fn levels_of(path: &Path, tree: Node, files: &[SogChunk]) -> InputResult<Vec<Level>> {
+    let mut by_level: BTreeMap<u32, Vec<FilePart>> = BTreeMap::new();
     let mut open = vec![tree];
     while let Some(node) = open.pop() {
         for (level, PartText { file, offset, count }) in node.lods {
@@ -139,7 +139,7 @@ fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>
                     format!("a leaf has rows {offset} to {offset} + {count} of file {file}, which do not exist");
                 return Err(malformed(path, problem).at(format!("level {level}")));
             }
-            by_level.entry(level).or_default().push(Part { file, first: offset, rows: count });
+            by_level.entry(level).or_default().push(FilePart { file, first: offset, rows: count });
         }
         open.extend(node.children);
     }
@@ -158,7 +158,7 @@ fn levels_of(path: &Path, tree: Node, files: &[Chunk]) -> InputResult<Vec<Level>
     Ok(levels)
 }
 
-fn append(rows: &mut Columns, chunk: &Columns, part: &Part) {
+fn append(rows: &mut Columns, chunk: &Columns, part: &FilePart) {
     let end = part.first + part.rows;
     for column in Column::ALL {
         let width = column.width(chunk.sh_degree);

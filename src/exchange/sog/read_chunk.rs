@@ -65,15 +65,15 @@ struct Harmonics {
 
 /// A SOG whose `meta.json` was read.
 #[derive(Debug)]
-pub struct Chunk {
+pub struct SogChunk {
     path: PathBuf,
     meta: Meta,
 }
 
-impl Chunk {
+impl SogChunk {
     /// Reads the `meta.json` at `path`.
-    /// Errors: the file cannot be read, or describes no SOG that [`Chunk::read`] could read.
-    pub fn open(path: &Path) -> InputResult<Chunk> {
+    /// Errors: the file cannot be read, or describes no SOG that [`SogChunk::read`] could read.
+    pub fn open(path: &Path) -> InputResult<SogChunk> {
         let meta: Meta = read_json(path)?;
         if meta.version != 2 {
             return Err(unsupported(path, format!("version {} of SOG; version 2 is read", meta.version)).at("version"));
@@ -89,7 +89,7 @@ impl Chunk {
         if !meta.means.mins.iter().chain(&meta.means.maxs).all(|log| log.abs() <= LOG_MAX) {
             return Err(malformed(path, "a position is beyond the range of numbers").at("means"));
         }
-        Ok(Chunk { path: path.to_path_buf(), meta })
+        Ok(SogChunk { path: path.to_path_buf(), meta })
     }
 
     pub fn rows(&self) -> usize {
@@ -105,14 +105,14 @@ impl Chunk {
     /// Errors: a picture cannot be read, or is not as `meta.json` says.
     pub fn read(&self) -> InputResult<Columns> {
         let Meta { count, means, quats, scales, sh0, sh_n, .. } = &self.meta;
-        let picture = |name: &str| Picture::read(&path_in_folder(&self.path, name)?, *count);
+        let picture = |name: &str| ChunkPicture::read(&path_in_folder(&self.path, name)?, *count);
         let (low, high) = (picture(&means.files[0])?, picture(&means.files[1])?);
         let (turns, sizes, colours) = (picture(&quats.files[0])?, picture(&scales.files[0])?, picture(&sh0.files[0])?);
         let harmonics = match sh_n.as_ref().filter(|sh| sh.bands > 0) {
             Some(sh) => {
                 let line = ENTRIES_PER_LINE * sh_n_width(sh.bands) / 3;
                 let path = path_in_folder(&self.path, &sh.files[0])?;
-                let palette = Picture::read(&path, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
+                let palette = ChunkPicture::read(&path, sh.count.div_ceil(ENTRIES_PER_LINE) * line)?;
                 if palette.width != line {
                     return Err(malformed(&path, format!("{} pixels wide; a palette has {line}", palette.width)));
                 }
@@ -197,16 +197,16 @@ fn coded(book: &[f32; CODES], pixel: [u8; 4]) -> [f32; 3] {
     [0, 1, 2].map(|i| book[usize::from(pixel[i])])
 }
 
-struct Picture {
+struct ChunkPicture {
     path: PathBuf,
     width: usize,
     /// RGBA.
     pixels: Vec<[u8; 4]>,
 }
 
-impl Picture {
+impl ChunkPicture {
     /// Reads a lossless picture of at least `least` pixels.
-    fn read(path: &Path, least: usize) -> InputResult<Picture> {
+    fn read(path: &Path, least: usize) -> InputResult<ChunkPicture> {
         let wrong = |e: image_webp::DecodingError| malformed(path, format!("cannot be decoded: {e}"));
         let mut decoder = WebPDecoder::new(Cursor::new(read_file(path)?)).map_err(wrong)?;
         let (width, height) = decoder.dimensions();
@@ -226,7 +226,7 @@ impl Picture {
             4 => bytes.as_chunks::<4>().0.to_vec(),
             _ => bytes.as_chunks::<3>().0.iter().map(|&[r, g, b]| [r, g, b, u8::MAX]).collect(),
         };
-        Ok(Picture { path: path.to_path_buf(), width: width as usize, pixels })
+        Ok(ChunkPicture { path: path.to_path_buf(), width: width as usize, pixels })
     }
 }
 

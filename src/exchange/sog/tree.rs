@@ -13,7 +13,7 @@ pub fn is_tree(path: &Path) -> bool {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Part {
+pub struct FilePart {
     pub file: usize,
     /// Its first row in the file.
     pub first: usize,
@@ -28,7 +28,7 @@ pub struct Leaf {
     /// Largest corner.
     pub high: [f64; 3],
     /// One part for each level, the finest first.
-    pub parts: Vec<Part>,
+    pub parts: Vec<FilePart>,
 }
 
 /// The text of the file. `files` are the paths of the `meta.json` files, `environment` that of rows that are always shown.
@@ -60,7 +60,7 @@ fn node(leaves: &mut [Leaf]) -> Value {
         }
     }
     if let [leaf] = leaves {
-        let part = |part: &Part| json!({ "file": part.file, "offset": part.first, "count": part.rows });
+        let part = |part: &FilePart| json!({ "file": part.file, "offset": part.first, "count": part.rows });
         let parts = leaf.parts.iter().enumerate();
         let lods: Map<String, Value> = parts.map(|(level, p)| (level.to_string(), part(p))).collect();
         return json!({ "bound": { "min": bound.0, "max": bound.1 }, "lods": lods });

@@ -13,7 +13,7 @@ use super::chunk::{META_FILE, PICTURES, write_chunk};
 use super::merge::{MERGE_ROW_BYTES, merged};
 use super::order::{leaves, order};
 use super::symmetric::Symmetric;
-use super::tree::{Leaf, Part, TREE_FILE, text};
+use super::tree::{FilePart, Leaf, TREE_FILE, text};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_folder::PartFolder;
 use crate::exchange::frames::{ExportRow, ExportRows};
@@ -82,7 +82,7 @@ pub fn is_of_sog(inside: &Path) -> bool {
 
 /// The file of a level that is being filled.
 #[derive(Default)]
-struct OpenFile {
+struct LevelFile {
     rows: Vec<ExportRow>,
     number: usize,
 }
@@ -95,7 +95,7 @@ pub struct SogWriter {
     giant_log_scale: f64,
     group: Vec<ExportRow>,
     giants: Vec<ExportRow>,
-    open: [OpenFile; LEVELS],
+    open: [LevelFile; LEVELS],
     /// Files of each level so far, for their names.
     files_of: [usize; LEVELS],
     files: Vec<String>,
@@ -118,7 +118,7 @@ impl SogWriter {
             sh_degree,
             group: Vec::new(),
             giants: Vec::new(),
-            open: std::array::from_fn(|_| OpenFile::default()),
+            open: std::array::from_fn(|_| LevelFile::default()),
             files_of: [0; LEVELS],
             files: Vec::new(),
             leaves: Vec::new(),
@@ -162,7 +162,7 @@ impl SogWriter {
         };
         let coarser: Vec<Vec<Vec<ExportRow>>> = ranges.par_iter().map(coarser_levels).collect();
         for (range, coarser) in ranges.into_iter().zip(coarser) {
-            let mut parts = vec![Part { file, first: range.start, rows: range.len() }];
+            let mut parts = vec![FilePart { file, first: range.start, rows: range.len() }];
             for (level, rows) in (1..).zip(coarser) {
                 parts.push(self.add(level, rows)?);
             }
@@ -173,13 +173,13 @@ impl SogWriter {
         self.write_file(file, &mut ordered)
     }
 
-    fn add(&mut self, level: usize, rows: Vec<ExportRow>) -> InputResult<Part> {
+    fn add(&mut self, level: usize, rows: Vec<ExportRow>) -> InputResult<FilePart> {
         if self.open[level].rows.is_empty() {
             self.open[level].number = self.new_file(level);
         }
         let open = &mut self.open[level];
         open.rows.reserve_exact((FULL_ROWS + LEAF_ROWS).saturating_sub(open.rows.len()));
-        let part = Part { file: open.number, first: open.rows.len(), rows: rows.len() };
+        let part = FilePart { file: open.number, first: open.rows.len(), rows: rows.len() };
         open.rows.extend(rows);
         if open.rows.len() >= FULL_ROWS {
             self.close_file(level)?;

@@ -21,11 +21,11 @@ use std::thread::JoinHandle;
 
 /// Segments as files; worker threads make blocking calls.
 pub struct ThreadedEngine {
-    shared: Arc<Shared>,
+    shared: Arc<SharedSegments>,
     pool: TransferPool,
 }
 
-struct Shared {
+struct SharedSegments {
     segments: Mutex<SegmentFiles>,
     /// Reads go through these maps, if any.
     maps: Option<SegmentMaps>,
@@ -55,7 +55,8 @@ impl ThreadedEngine {
 
     fn over(segments: SegmentFiles, maps: Option<SegmentMaps>, threads: usize) -> io::Result<ThreadedEngine> {
         let (direct, name) = (segments.is_direct(), if maps.is_some() { "mmap" } else { "pread" });
-        let shared = Arc::new(Shared { segments: Mutex::new(segments), maps, behind: Mutex::default(), direct });
+        let shared =
+            Arc::new(SharedSegments { segments: Mutex::new(segments), maps, behind: Mutex::default(), direct });
         let worker = Arc::clone(&shared);
         let pool = TransferPool::new(name, threads, move |transfer| worker.execute(transfer))?;
         Ok(ThreadedEngine { shared, pool })
@@ -67,7 +68,7 @@ impl ThreadedEngine {
     }
 }
 
-impl Shared {
+impl SharedSegments {
     fn execute(&self, transfer: &mut Transfer) -> io::Result<()> {
         let file = lock(&self.segments).file_of(transfer)?;
         match (&self.maps, transfer.direction) {

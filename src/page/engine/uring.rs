@@ -44,8 +44,8 @@ pub struct UringEngine {
     registered: RegisteredBuffers,
     segments: SegmentFiles,
     behind: WriteBehind,
-    flights: Slab<Flight>,
-    requests: Slab<Request>,
+    flights: Slab<RingTransfer>,
+    requests: Slab<RingRequest>,
     /// Requests not yet in the submission queue, oldest first.
     waiting: VecDeque<usize>,
     /// Requests in the submission queue that the kernel has not taken, oldest first.
@@ -57,7 +57,7 @@ pub struct UringEngine {
     broken: Option<i32>,
 }
 
-struct Flight {
+struct RingTransfer {
     transfer: Transfer,
     /// Address of the buffer's first byte, as a number: only the kernel dereferences it.
     address: usize,
@@ -69,7 +69,7 @@ struct Flight {
 }
 
 /// One piece of a transfer.
-struct Request {
+struct RingRequest {
     flight: usize,
     start: usize,
     bytes: usize,
@@ -278,11 +278,11 @@ impl PageEngine for UringEngine {
         let (address, total) = (transfer.buffer.as_mut_slice().as_mut_ptr().expose_provenance(), transfer.bytes);
         let registered = self.registered.number_of(&self.ring.submitter(), &mut transfer.buffer, total);
         let requests_left = total.div_ceil(REQUEST_BYTES);
-        let flight = Flight { transfer, address, registered, file: None, requests_left, error: None };
+        let flight = RingTransfer { transfer, address, registered, file: None, requests_left, error: None };
         let flight = self.flights.insert(flight);
         for start in (0..total).step_by(REQUEST_BYTES) {
             let bytes = REQUEST_BYTES.min(total - start);
-            let id = self.requests.insert(Request { flight, start, bytes, resume: Resume::default() });
+            let id = self.requests.insert(RingRequest { flight, start, bytes, resume: Resume::default() });
             self.waiting.push_back(id);
         }
         // Collects completions to make room in the ring, before anyone polls.

@@ -51,7 +51,7 @@ pub struct Case {
 
 /// A case with its rates, bytes per second; `None` if time ran out before it was measured.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Measured {
+pub struct MeasuredCase {
     pub case: Case,
     /// Rate of random reads.
     pub read: Option<f64>,
@@ -59,7 +59,7 @@ pub struct Measured {
     pub write: Option<f64>,
 }
 
-impl Measured {
+impl MeasuredCase {
     /// Bytes per second of an equal mix of reads and writes, which is training's pattern: nearly every page read is
     /// changed.
     pub fn both(&self) -> Option<f64> {
@@ -70,7 +70,7 @@ impl Measured {
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sweep {
     /// One entry per case, in the order of the cases.
-    pub measured: Vec<Measured>,
+    pub measured: Vec<MeasuredCase>,
     /// Messages for the user: engines that do not work here, missing direct I/O.
     pub notes: Vec<String>,
     pub rounds: usize,
@@ -89,7 +89,7 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
             engines.push(c.engine);
         }
     });
-    let mut scratch = Scratch::new(folder, &engines, limits.file_bytes, depth_max)?;
+    let mut scratch = ScratchSegments::new(folder, &engines, limits.file_bytes, depth_max)?;
     let failed = |e: io::Error| InputError::io(folder, "measuring the drive", &e);
     scratch.fill(Duration::from_secs_f64(limits.seconds / 2.0)).map_err(failed)?;
     let slice = (limits.seconds - begin.elapsed().as_secs_f64()) / (2 * ROUNDS * cases.len().max(1)) as f64;
@@ -118,7 +118,7 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
         }
         rounds += 1;
     }
-    let measure = |(&case, [read, write]): (&Case, &mut [Vec<f64>; 2])| Measured {
+    let measure = |(&case, [read, write]): (&Case, &mut [Vec<f64>; 2])| MeasuredCase {
         case,
         read: median(read),
         write: median(write),
@@ -134,8 +134,8 @@ fn median(values: &mut [f64]) -> Option<f64> {
 }
 
 /// Unlinked segments, one per engine.
-struct Scratch {
-    engines: Vec<Opened>,
+struct ScratchSegments {
+    engines: Vec<MeasuredEngine>,
     segment_bytes: u64,
     buffers: Vec<PageBuffer>,
     draws: Stream,
@@ -144,7 +144,7 @@ struct Scratch {
 }
 
 /// An open engine with its segment.
-struct Opened {
+struct MeasuredEngine {
     engine: IoEngine,
     segment: u32,
     store: Box<dyn PageEngine>,
@@ -152,10 +152,10 @@ struct Opened {
     filled_bytes: u64,
 }
 
-impl Scratch {
+impl ScratchSegments {
     /// Makes the segments, of `file_bytes` bytes together, and opens each engine of `engines` that works here.
     /// Errors: too little space; the folder cannot be written; no engine works.
-    pub fn new(folder: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
+    pub fn new(folder: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<ScratchSegments> {
         let failed = |doing: &'static str| move |e: io::Error| InputError::io(folder, doing, &e);
         let free = free_bytes(folder).map_err(failed("reading the free space"))?;
         if let Some(free) = free.filter(|&free| free < file_bytes + file_bytes / 4) {
@@ -165,14 +165,14 @@ impl Scratch {
         }
         let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
         std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
-        let opened = Scratch::open_all(&own, engines, file_bytes, depth);
+        let opened = ScratchSegments::open_all(&own, engines, file_bytes, depth);
         // Unlinks the segments: the system frees their space when this process ends, at the latest.
         std::fs::remove_dir_all(&own).map_err(failed("removing the folder of the measurement"))?;
         opened
     }
 
-    fn open_all(own: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<Scratch> {
-        let mut scratch = Scratch {
+    fn open_all(own: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<ScratchSegments> {
+        let mut scratch = ScratchSegments {
             engines: Vec::new(),
             segment_bytes: file_bytes / engines.len().max(1) as u64 / FILL_BYTES as u64 * FILL_BYTES as u64,
             buffers: Vec::new(),
@@ -197,7 +197,7 @@ impl Scratch {
             let place = Place { segment, offset: 0 };
             opened.store.submit(Transfer { token: 0, direction: Direction::Read, place, bytes: 4096, buffer });
             finish(&mut *opened.store).map_err(failed)?;
-            scratch.engines.push(Opened { engine, segment, store: opened.store, filled_bytes: 0 });
+            scratch.engines.push(MeasuredEngine { engine, segment, store: opened.store, filled_bytes: 0 });
             scratch.notes.extend(opened.notes);
         }
         scratch.notes.dedup();
@@ -267,7 +267,7 @@ impl Scratch {
     }
 }
 
-impl Opened {
+impl MeasuredEngine {
     /// Moves bytes at `places` until all are moved or time is over. Returns the number of bytes moved.
     fn run(
         &mut self,
@@ -337,7 +337,7 @@ impl DriveRate {
     pub fn measure(folder: &Path) -> InputResult<DriveRate> {
         let failed = |e: io::Error| InputError::io(folder, "measuring the drive", &e);
         let engine = IoEngine::Auto;
-        let mut scratch = Scratch::new(folder, &[engine], MEASURED_BYTES, DEPTH)?;
+        let mut scratch = ScratchSegments::new(folder, &[engine], MEASURED_BYTES, DEPTH)?;
         // Writes to fresh space, as an import and the first spills do.
         let write = scratch.fill(TIME).map_err(failed)?;
         let case = Case { engine, bytes: TRANSFER_BYTES, depth: DEPTH / 2 };

@@ -68,7 +68,7 @@ impl std::fmt::Display for Codec {
 /// Scratch memory of one thread, reused by encoding and decoding.
 #[cfg(feature = "zstd")]
 #[derive(Default)]
-struct Scratch {
+struct CodecBuffers {
     shuffled: Vec<u8>,
     compressor: Option<zstd::bulk::Compressor<'static>>,
     decompressor: Option<zstd::bulk::Decompressor<'static>>,
@@ -76,7 +76,7 @@ struct Scratch {
 
 #[cfg(feature = "zstd")]
 thread_local! {
-    static SCRATCH: RefCell<Scratch> = RefCell::default();
+    static SCRATCH: RefCell<CodecBuffers> = RefCell::default();
 }
 
 /// Encodes `payload` into `stored`, which is at least as long; returns the length and the form. `None` for

@@ -37,7 +37,7 @@ impl<K: Key + 'static> Entries<K> {
         store: u128,
         key: &impl SealKey,
         sealed: &'a [u8],
-    ) -> Result<(&'a [u8], u64), Fault> {
+    ) -> Result<(&'a [u8], u64), MapFault> {
         match self.scope(store).unseal(bound(&key.bytes()), sealed) {
             Err(SealBroken) if active(Mutant::ValuesNotVerified) => {
                 let (checksum, body) = sealed.split_first_chunk().ok_or_else(|| damaged(self.what, "too short"))?;
@@ -100,24 +100,24 @@ impl From<redb::Error> for MapError {
 }
 
 /// An error inside calls of redb.
-pub(in crate::page) enum Fault {
+pub(in crate::page) enum MapFault {
     Library(Box<redb::Error>),
     Map(MapError),
 }
 
-impl<E: Into<redb::Error>> From<E> for Fault {
-    fn from(error: E) -> Fault {
-        Fault::Library(Box::new(error.into()))
+impl<E: Into<redb::Error>> From<E> for MapFault {
+    fn from(error: E) -> MapFault {
+        MapFault::Library(Box::new(error.into()))
     }
 }
 
-pub(in crate::page) fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> Fault {
-    Fault::Map(MapError::Damaged(format!("{place}: {problem}")))
+pub(in crate::page) fn damaged(place: impl std::fmt::Display, problem: impl std::fmt::Display) -> MapFault {
+    MapFault::Map(MapError::Damaged(format!("{place}: {problem}")))
 }
 
 /// Counters of the whole map, written with every transaction.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
-pub struct Counters {
+pub struct MapCounters {
     /// Number of transactions.
     pub sequence: u64,
     /// The latest generation; 0 before the first commit.
@@ -142,7 +142,7 @@ pub struct MapVersion {
 /// Content of a map, except the run states.
 #[derive(Debug, Default)]
 pub struct MapContent {
-    pub counters: Counters,
+    pub counters: MapCounters,
     /// All versions, ordered by page, then generation.
     pub versions: Vec<MapVersion>,
     /// The kept generations with their notes.
@@ -212,8 +212,8 @@ impl Reader<'_> {
     pub fn read<K>(
         &mut self,
         of: &Entries<K>,
-        mut take: impl FnMut(K::SelfType<'_>, &[u8]) -> Result<(), Fault>,
-    ) -> Result<(), Fault>
+        mut take: impl FnMut(K::SelfType<'_>, &[u8]) -> Result<(), MapFault>,
+    ) -> Result<(), MapFault>
     where
         K: Key + 'static,
         for<'k> K::SelfType<'k>: SealKey,
@@ -232,12 +232,12 @@ impl Reader<'_> {
 /// Writes one batch and keeps the counters.
 pub(in crate::page) struct Writer {
     pub store: u128,
-    pub counters: Counters,
+    pub counters: MapCounters,
 }
 
 impl Writer {
     /// Writes all of `batch` into the tables of `transaction`.
-    pub fn write(&mut self, transaction: &WriteTransaction, batch: &MapBatch) -> Result<(), Fault> {
+    pub fn write(&mut self, transaction: &WriteTransaction, batch: &MapBatch) -> Result<(), MapFault> {
         let mut pages = transaction.open_table(PAGES.table)?;
         for (page, generation) in &batch.drop_versions {
             self.remove(&PAGES, &mut pages, (page.to_bits(), *generation))?;
@@ -276,7 +276,7 @@ impl Writer {
         table: &mut Table<'_, K, &'static [u8]>,
         key: K::SelfType<'k>,
         body: &[u8],
-    ) -> Result<(), Fault>
+    ) -> Result<(), MapFault>
     where
         K: Key + 'static,
         K::SelfType<'k>: SealKey + Copy,
@@ -296,7 +296,7 @@ impl Writer {
         of: &Entries<K>,
         table: &mut Table<'_, K, &'static [u8]>,
         key: K::SelfType<'k>,
-    ) -> Result<(), Fault>
+    ) -> Result<(), MapFault>
     where
         K: Key + 'static,
         K::SelfType<'k>: SealKey + Copy,

@@ -13,7 +13,7 @@
 use crate::base::ids::PageId;
 use crate::page::format::encoding;
 use crate::page::map::entries::{
-    COUNTERS, Counters, Fault, GENERATIONS, HEADER, MapBatch, MapContent, MapError, MapVersion, PAGES, PINS,
+    COUNTERS, GENERATIONS, HEADER, MapBatch, MapContent, MapCounters, MapError, MapFault, MapVersion, PAGES, PINS,
     RUN_STATES, Reader, Writer, damaged,
 };
 use crate::page::map::map_file::MapFile;
@@ -28,11 +28,11 @@ const SEQUENCE_MAX: u64 = 1 << 31;
 const GENERATION_MAX: u64 = 1 << 31;
 
 /// Runs calls of redb; a panic becomes an error.
-fn guarded<T>(calls: impl FnOnce() -> Result<T, Fault>) -> Result<T, MapError> {
+fn guarded<T>(calls: impl FnOnce() -> Result<T, MapFault>) -> Result<T, MapError> {
     match catch_unwind(AssertUnwindSafe(calls)) {
         Ok(Ok(value)) => Ok(value),
-        Ok(Err(Fault::Library(error))) => Err((*error).into()),
-        Ok(Err(Fault::Map(error))) => Err(error),
+        Ok(Err(MapFault::Library(error))) => Err((*error).into()),
+        Ok(Err(MapFault::Map(error))) => Err(error),
         Err(panic) => {
             let text = panic.downcast_ref::<&str>().map(|s| (*s).to_string());
             let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
@@ -45,7 +45,7 @@ pub struct Manifest {
     database: Option<Database>,
     file: MapFile,
     store: u128,
-    counters: Counters,
+    counters: MapCounters,
     poisoned: bool,
 }
 
@@ -55,7 +55,7 @@ impl Manifest {
     pub fn create(file: Arc<dyn StorageBackend>, store: u128, cache_bytes: usize) -> Result<Manifest, MapError> {
         let file = MapFile::new(file);
         let database = guarded(|| Ok(builder(cache_bytes).create_with_backend(file.clone())?))?;
-        let counters = Counters { next: 1, ..Counters::default() };
+        let counters = MapCounters { next: 1, ..MapCounters::default() };
         let mut manifest = Manifest { database: Some(database), file, store, counters, poisoned: false };
         manifest.apply(&MapBatch { next: 1, ..MapBatch::default() })?;
         Ok(manifest)
@@ -89,7 +89,7 @@ impl Manifest {
             return Err(MapError::Damaged("the file is empty".to_string()));
         }
         let database = guarded(|| Ok(builder(cache_bytes).create_with_backend(file.clone())?));
-        let mut manifest = Manifest { database: None, file, store, counters: Counters::default(), poisoned: true };
+        let mut manifest = Manifest { database: None, file, store, counters: MapCounters::default(), poisoned: true };
         manifest.database = Some(database?);
         let content = manifest.read_all()?;
         manifest.counters = content.counters;
@@ -100,7 +100,7 @@ impl Manifest {
     }
 
     /// Counters after the last transaction.
-    pub fn counters(&self) -> Counters {
+    pub fn counters(&self) -> MapCounters {
         self.counters
     }
 
@@ -112,8 +112,12 @@ impl Manifest {
         }
         self.poisoned = true;
         let database = self.database.as_ref().ok_or(MapError::Poisoned)?;
-        let start =
-            Counters { sequence: self.counters.sequence + 1, latest: batch.latest, next: batch.next, ..self.counters };
+        let start = MapCounters {
+            sequence: self.counters.sequence + 1,
+            latest: batch.latest,
+            next: batch.next,
+            ..self.counters
+        };
         let mut writer = Writer { store: self.store, counters: start };
         let result = guarded(|| {
             let mut transaction = database.begin_write()?;
@@ -206,8 +210,8 @@ fn builder(cache_bytes: usize) -> Builder {
 }
 
 /// Checks that the generations in a map are consistent.
-fn check_generations(content: &MapContent) -> Result<(), Fault> {
-    let Counters { sequence, latest, next, .. } = content.counters;
+fn check_generations(content: &MapContent) -> Result<(), MapFault> {
+    let MapCounters { sequence, latest, next, .. } = content.counters;
     if sequence > SEQUENCE_MAX || next > GENERATION_MAX {
         return Err(damaged("counters", format!("transaction {sequence} or generation {next} is impossible")));
     }

@@ -31,7 +31,7 @@ struct HeldBack {
 }
 
 #[derive(Debug)]
-struct Shared {
+struct SharedMap {
     file: Arc<dyn StorageBackend>,
     held_back: Mutex<Option<HeldBack>>,
     shut: AtomicBool,
@@ -40,13 +40,13 @@ struct Shared {
 
 /// A handle on the file; clones are the same file.
 #[derive(Debug, Clone)]
-pub struct MapFile(Arc<Shared>);
+pub struct MapFile(Arc<SharedMap>);
 
 impl MapFile {
     /// A file that passes everything through.
     pub fn new(file: Arc<dyn StorageBackend>) -> MapFile {
         let (held_back, failure) = (Mutex::new(None), Mutex::new(None));
-        MapFile(Arc::new(Shared { file, held_back, shut: AtomicBool::new(false), failure }))
+        MapFile(Arc::new(SharedMap { file, held_back, shut: AtomicBool::new(false), failure }))
     }
 
     /// A file that holds writes back until [`MapFile::release_held`].

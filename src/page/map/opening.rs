@@ -41,7 +41,7 @@ pub struct StoredPage {
 
 /// A slot that only past generations name.
 #[derive(Debug, Clone, Copy)]
-struct Past {
+struct PastSlots {
     slot: SlotRef,
     until: u64,
 }
@@ -54,7 +54,7 @@ pub struct Opened {
     pub run_state: Vec<u8>,
     /// The whole content of the map, for tools; the current pages are in `pages`.
     pub content: MapContent,
-    past: Vec<Past>,
+    past: Vec<PastSlots>,
 }
 
 impl Opened {
@@ -136,7 +136,7 @@ impl Opened {
         if active(Mutant::FreeListMissesOneSlot) {
             used.pop();
         }
-        let past: &[Past] = if active(Mutant::FreeListFromLatestOnly) { &[] } else { &self.past };
+        let past: &[PastSlots] = if active(Mutant::FreeListFromLatestOnly) { &[] } else { &self.past };
         used.extend(past.iter().map(|p| &p.slot));
         let Segments { number, unusable } = check_segments(engine.as_ref(), layout, used.iter().copied())?;
         for segment in unusable {
@@ -208,9 +208,9 @@ pub(in crate::page) fn pages_at(versions: &[MapVersion], generation: u64) -> Res
 }
 
 /// Slots of versions that the last generation does not see, each once.
-fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<Past>, CommitError> {
+fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<PastSlots>, CommitError> {
     let present: BTreeMap<Place, PageId> = present.iter().map(|p| (p.slot.place, p.page)).collect();
-    let mut past: BTreeMap<Place, (PageId, Past)> = BTreeMap::new();
+    let mut past: BTreeMap<Place, (PageId, PastSlots)> = BTreeMap::new();
     for pair in versions.windows(2).filter(|pair| pair[0].page == pair[1].page) {
         let (page, until) = (pair[0].page, pair[1].generation);
         let Some((slot, _)) = slot_and_label(&pair[0])? else { continue };
@@ -225,7 +225,7 @@ fn past_slots(versions: &[MapVersion], present: &[StoredPage]) -> Result<Vec<Pas
             }
             (Some(_), _) => {}
             _ => {
-                past.insert(slot.place, (page, Past { slot, until }));
+                past.insert(slot.place, (page, PastSlots { slot, until }));
             }
         }
     }

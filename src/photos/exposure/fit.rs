@@ -46,7 +46,7 @@ pub fn bounded_channel(values: [f64; CHANNEL_VALUES]) -> Option<[f64; CHANNEL_VA
 
 /// A picture as it was drawn, and its photo.
 #[derive(Debug, Clone, Copy)]
-pub struct Pair<'a> {
+pub struct FittedPair<'a> {
     /// `[3][height][width]`.
     pub drawn: &'a [f32],
     pub photo: &'a Target,
@@ -117,7 +117,7 @@ fn differences(photo: &[u8], corrected: [f64; 3]) -> [(f64, f64); 3] {
     })
 }
 
-impl Pair<'_> {
+impl FittedPair<'_> {
     /// Sums over the sampled, unmasked pixels of some columns: `add` takes the position, the drawn colour and the photo.
     fn sum<S: Send>(
         &self,
@@ -224,7 +224,7 @@ impl Pair<'_> {
 mod tests {
     use super::*;
     use crate::base::rng::mix64;
-    use crate::photos::exposure::picture::Lens;
+    use crate::photos::exposure::picture::LensPlane;
 
     const WIDTH: u32 = 64;
     const HEIGHT: u32 = 48;
@@ -241,8 +241,8 @@ mod tests {
         Target { width: WIDTH, height: HEIGHT, rgb: image.to_rgb8(), mask: None }
     }
 
-    fn lens() -> Lens {
-        Lens { centre: [32.0, 24.0], scale: 1.0 / 40.0 }
+    fn lens() -> LensPlane {
+        LensPlane { centre: [32.0, 24.0], scale: 1.0 / 40.0 }
     }
 
     #[test]
@@ -252,7 +252,7 @@ mod tests {
             let image = [exposure, 0.05, 0.0, 0.02, 0.0, -0.05, -0.01, 0.0, 0.0];
             let look = Look { image, lens: lens(), ..Look::default() };
             let photo = photo_of(&drawn, &look);
-            let pair = Pair { drawn: &drawn, photo: &photo };
+            let pair = FittedPair { drawn: &drawn, photo: &photo };
             let start = Look { lens: lens(), ..Look::default() };
             let found = pair.image_values(&start, IMAGE_VALUES, 0..WIDTH as usize, 8).unwrap();
             // The weights take up to .06 stops from an exposure of a stop on a picture as dark as this one, and a tenth
@@ -270,7 +270,7 @@ mod tests {
         let look = Look { image: [0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], ..Look::default() };
         let mut photo = photo_of(&drawn, &look);
         let of = |drawn: &[f32], photo: &Target| {
-            Pair { drawn, photo }.image_values(&Look::default(), IMAGE_VALUES, 0..WIDTH as usize, 2)
+            FittedPair { drawn, photo }.image_values(&Look::default(), IMAGE_VALUES, 0..WIDTH as usize, 2)
         };
         let want = of(&drawn, &photo);
         let left = |i: usize| i % (WIDTH as usize) < 9;
@@ -293,7 +293,7 @@ mod tests {
         let photo = photo_of(&drawn, &Look { falloff, lens: lens(), ..Look::default() });
         let mut look = Look { lens: lens(), ..Look::default() };
         for _ in 0..4 {
-            look.falloff = Pair { drawn: &drawn, photo: &photo }.falloff(&look).unwrap();
+            look.falloff = FittedPair { drawn: &drawn, photo: &photo }.falloff(&look).unwrap();
         }
         // a1, a2, a3 trade places under the weights, so compare the falloff where the photo has pixels.
         for at in [[0.2, 0.1], [0.5, 0.5], [0.7, 0.4]] {

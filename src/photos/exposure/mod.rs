@@ -27,7 +27,7 @@ use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::image::Target;
-use fit::Pair;
+use fit::FittedPair;
 use model::CHANNEL_VALUES;
 use picture::Look;
 use rayon::prelude::*;
@@ -192,7 +192,7 @@ impl PhotoParameter for Appearance {
     fn correct(&mut self, picture: &mut [f32], photo: &Target) {
         self.drawn.clear();
         self.drawn.extend_from_slice(picture);
-        self.found = find(&Pair { drawn: &self.drawn, photo }, &self.look, self.mode);
+        self.found = find(&FittedPair { drawn: &self.drawn, photo }, &self.look, self.mode);
         self.look.correct(picture, photo.width as usize, Some(photo));
     }
 

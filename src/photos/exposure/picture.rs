@@ -13,18 +13,18 @@ use rayon::prelude::*;
 
 /// Position of pixels on a lens.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Lens {
+pub struct LensPlane {
     /// Principal point, pixels.
     pub centre: [f32; 2],
     /// One over half the diagonal of the picture, 1/pixels.
     pub scale: f32,
 }
 
-impl Lens {
-    pub fn of(camera: &Camera) -> Lens {
+impl LensPlane {
+    pub fn of(camera: &Camera) -> LensPlane {
         let (width, height) = (camera.width as f32, camera.height as f32);
         let diagonal = (width * width + height * height).sqrt().max(1.0);
-        Lens { centre: [camera.cx, camera.cy], scale: 2.0 / diagonal }
+        LensPlane { centre: [camera.cx, camera.cy], scale: 2.0 / diagonal }
     }
 
     /// The position of the centre of pixel (x, y).
@@ -41,7 +41,7 @@ pub struct Look {
     pub image: [f64; IMAGE_VALUES],
     /// Vignetting of the camera, by channel.
     pub falloff: [[f64; CHANNEL_VALUES]; 3],
-    pub lens: Lens,
+    pub lens: LensPlane,
 }
 
 /// Whether the photo is white and the value at least 1: the photo then says no more about the value.

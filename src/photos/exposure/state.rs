@@ -10,9 +10,9 @@
 //! [`super::fit::bounded`]; 3. a fit that found nothing changes nothing.
 
 use super::AppearanceMode;
-use super::fit::{Pair, bounded, bounded_channel};
+use super::fit::{FittedPair, bounded, bounded_channel};
 use super::model::{CHANNEL_VALUES, IMAGE_VALUES};
-use super::picture::{Lens, Look};
+use super::picture::{LensPlane, Look};
 use crate::scene::camera::Camera;
 use serde::{Deserialize, Serialize};
 
@@ -78,7 +78,7 @@ pub fn camera_groups<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec<usize
 }
 
 /// Finds the values of the photo of a view, under the `look` that its picture was corrected with.
-pub fn find(pair: &Pair<'_>, look: &Look, mode: AppearanceMode) -> Option<Found> {
+pub fn find(pair: &FittedPair<'_>, look: &Look, mode: AppearanceMode) -> Option<Found> {
     let width = pair.photo.width as usize;
     let image = pair.image_values(look, mode.image_values(), 0..width, ROUNDS)?;
     let falloff = match mode {
@@ -133,7 +133,7 @@ impl AppearanceState {
             AppearanceMode::Full => self.cameras.get(group).map(|camera| camera.falloff).unwrap_or_default(),
             _ => Default::default(),
         };
-        Look { image: self.acting(view, mode.image_values()), falloff, lens: Lens::of(camera) }
+        Look { image: self.acting(view, mode.image_values()), falloff, lens: LensPlane::of(camera) }
     }
 
     /// Moves the values of a view's photo and camera towards what a step has found.

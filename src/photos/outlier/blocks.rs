@@ -173,7 +173,7 @@ pub(in crate::photos) const KIND: Kind = Kind { name: "blocks", file: None, firs
 
 /// What a step does with the blocks of its photo.
 #[derive(Debug, Clone, Copy)]
-struct Now {
+struct BlocksNow {
     /// The view; `None` for blocks that were not looked at yet.
     view: Option<usize>,
     /// The masks stay as they are, because the picture is unusable for a judgement (for example after an opacity reset).
@@ -189,7 +189,7 @@ struct MaskedBlocks {
     steps: u32,
     train_views: usize,
     /// `None` in a step that masks nothing.
-    now: Option<Now>,
+    now: Option<BlocksNow>,
     /// The blocks of the photo after a look at the last picture; `None` without one.
     found: Option<Vec<BlockState>>,
     masked: Target,
@@ -234,14 +234,14 @@ impl PhotoParameter for MaskedBlocks {
             return;
         }
         if at.is_rehearsal {
-            self.now = Some(Now { view: None, are_kept: false, all_count: false });
+            self.now = Some(BlocksNow { view: None, are_kept: false, all_count: false });
             return;
         }
         let is_begun = self.views.get(at.view).is_some_and(|states| !states.is_empty())
             || at.step >= first_look_at_blocks(self.steps);
         let are_kept = at.follows_reset();
         let all_count = counts_masked_blocks(at.step, self.steps, self.train_views);
-        self.now = is_begun.then_some(Now { view: Some(at.view), are_kept, all_count });
+        self.now = is_begun.then_some(BlocksNow { view: Some(at.view), are_kept, all_count });
     }
 
     fn needs_picture(&self) -> bool {
@@ -249,7 +249,7 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
-        let Some(Now { view, are_kept, all_count }) = self.now else { return photo };
+        let Some(BlocksNow { view, are_kept, all_count }) = self.now else { return photo };
         let states = view.and_then(|view| self.views.get(view)).map_or(&[][..], Vec::as_slice);
         self.found = picture.filter(|_| !are_kept).and_then(|picture| look(states, picture, photo));
         if all_count {

@@ -41,13 +41,13 @@ const STRIKES_MOST: u8 = 4;
 /// A measure is an outlier if three conditions hold: it exceeds the median by this many standard deviations (estimated from the median
 /// absolute deviation), the error is at least this many times the median error, and the picture leaves at least this share of the
 /// variance unexplained. A photo of another place leaves more than all of the variance, until the scene adapts to show the photo.
-const USUAL: Limits = Limits { deviations: 3.0, ratio: 1.6, unexplained: 0.5 };
+const USUAL: OutlierLimits = OutlierLimits { deviations: 3.0, ratio: 1.6, unexplained: 0.5 };
 /// Epochs in which a step compares its picture with its photo before it trains; from then on only strikes decide.
 pub const FIRST_EPOCHS: u32 = 3;
 /// The last measures that a picture is compared with in these epochs, at most.
 const RECENT_MOST: usize = 16;
 /// A contradiction is clear if the same three conditions hold with these limits.
-const CLEAR: Limits = Limits { deviations: 4.0, ratio: 2.0, unexplained: 0.8 };
+const CLEAR: OutlierLimits = OutlierLimits { deviations: 4.0, ratio: 2.0, unexplained: 0.8 };
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct ViewState {
@@ -112,13 +112,13 @@ fn measure(mse: f64, variance: f64) -> f64 {
 }
 
 /// How far a measure may lie above the others, and how large it must be at least, to be an outlier.
-struct Limits {
+struct OutlierLimits {
     deviations: f64,
     ratio: f64,
     unexplained: f64,
 }
 
-impl Limits {
+impl OutlierLimits {
     /// The largest measure that is no outlier among `measures`; `None` if they are too few.
     fn most<'a>(&self, measures: impl Iterator<Item = &'a i32>) -> Option<f64> {
         let mut measures: Vec<f64> = measures.map(|&measure| f64::from(measure)).collect();

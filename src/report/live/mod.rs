@@ -75,18 +75,18 @@ pub type Picture = Result<Vec<u8>, String>;
 
 /// The number of a request for a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
-pub struct Ticket(u64);
+pub struct PictureTicket(u64);
 
 #[derive(Debug, Default)]
 struct State {
     /// The file of the metrics, once the run has one.
     metrics: Option<PathBuf>,
     status: Status,
-    last: Ticket,
+    last: PictureTicket,
     /// Requests without an answer, the oldest first.
-    waiting: Vec<(Ticket, Orbit)>,
+    waiting: Vec<(PictureTicket, Orbit)>,
     /// Answers that are not fetched yet.
-    answers: Vec<(Ticket, Arc<Picture>)>,
+    answers: Vec<(PictureTicket, Arc<Picture>)>,
 }
 
 #[derive(Debug)]
@@ -142,24 +142,24 @@ impl Live {
     }
 
     /// The oldest request that is not answered yet.
-    pub fn wanted(&self) -> Option<(Ticket, Orbit)> {
+    pub fn wanted(&self) -> Option<(PictureTicket, Orbit)> {
         self.state().waiting.first().copied()
     }
 
     /// Answers a request, and all others for the same camera.
-    pub fn show(&self, (ticket, orbit): (Ticket, Orbit), picture: Picture) {
+    pub fn show(&self, (ticket, orbit): (PictureTicket, Orbit), picture: Picture) {
         let mut state = self.state();
         let picture = Arc::new(picture);
-        let is_answered = |request: &(Ticket, Orbit)| request.0 == ticket || request.1 == orbit;
+        let is_answered = |request: &(PictureTicket, Orbit)| request.0 == ticket || request.1 == orbit;
         let (answered, waiting) = state.waiting.iter().partition(|request| is_answered(request));
-        let answered: Vec<(Ticket, Orbit)> = answered;
+        let answered: Vec<(PictureTicket, Orbit)> = answered;
         state.waiting = waiting;
         state.answers.extend(answered.into_iter().map(|(ticket, _)| (ticket, Arc::clone(&picture))));
     }
 
     pub fn ask(&self, orbit: Orbit) -> Request {
         let mut state = self.state();
-        state.last = Ticket(state.last.0 + 1);
+        state.last = PictureTicket(state.last.0 + 1);
         let ticket = state.last;
         state.waiting.push((ticket, orbit.bounded()));
         Request { live: self.clone(), ticket }
@@ -170,7 +170,7 @@ impl Live {
 #[derive(Debug)]
 pub struct Request {
     live: Live,
-    ticket: Ticket,
+    ticket: PictureTicket,
 }
 
 impl Request {

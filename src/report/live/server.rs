@@ -64,9 +64,9 @@ struct Served {
 }
 
 /// The bytes of an answer and its place, which is free again when the bytes are sent.
-struct Held(Vec<u8>, #[allow(dead_code)] Option<OwnedSemaphorePermit>); // the place is held by being there
+struct HeldAnswer(Vec<u8>, #[allow(dead_code)] Option<OwnedSemaphorePermit>); // the place is held by being there
 
-impl AsRef<[u8]> for Held {
+impl AsRef<[u8]> for HeldAnswer {
     fn as_ref(&self) -> &[u8] {
         &self.0
     }
@@ -157,10 +157,11 @@ async fn metrics(State(served): State<Served>, Query(From { from }): Query<From>
     let file = live.state().metrics.clone();
     let lines = file.map_or(Ok((Vec::new(), 0)), |file| lines_from(&file, from));
     match lines {
-        Ok((lines, length)) => {
-            ([(METRICS_LENGTH, length.to_string())], fresh("application/jsonl", Bytes::from_owner(Held(lines, place))))
-                .into_response()
-        }
+        Ok((lines, length)) => (
+            [(METRICS_LENGTH, length.to_string())],
+            fresh("application/jsonl", Bytes::from_owner(HeldAnswer(lines, place))),
+        )
+            .into_response(),
         Err(error) => (StatusCode::SERVICE_UNAVAILABLE, error.to_string()).into_response(),
     }
 }
@@ -185,7 +186,7 @@ async fn picture(State(served): State<Served>, Query(orbit): Query<Orbit>) -> Re
     let (request, asked) = (live.ask(orbit), Instant::now());
     while asked.elapsed() < PATIENCE {
         match request.answer().as_deref() {
-            Some(Ok(png)) => return fresh("image/png", Bytes::from_owner(Held(png.clone(), place))),
+            Some(Ok(png)) => return fresh("image/png", Bytes::from_owner(HeldAnswer(png.clone(), place))),
             Some(Err(why)) => return (StatusCode::SERVICE_UNAVAILABLE, why.clone()).into_response(),
             None => sleep(LOOK_EVERY).await,
         }

@@ -10,7 +10,7 @@ use crate::base::png_rows::write_rgb_rows;
 use crate::base::trace;
 use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
-use crate::report::live::{Live, Orbit, Status, Ticket};
+use crate::report::live::{Live, Orbit, PictureTicket, Status};
 use crate::scene::camera::Camera;
 use crate::scene::image::Image;
 use crate::train::error::TrainError;
@@ -44,7 +44,7 @@ impl LivePage {
     }
 
     /// The request that is to be drawn now, if there is one and the share of pictures allows it.
-    fn due(&self) -> Option<(Ticket, Orbit)> {
+    fn due(&self) -> Option<(PictureTicket, Orbit)> {
         self.live.wanted().filter(|_| self.may_draw())
     }
 

@@ -10,8 +10,8 @@ use crate::base::whole_file::{write_whole, write_whole_with};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::photos::exposure::AppearanceMode;
-use crate::photos::exposure::fit::Pair;
-use crate::photos::exposure::picture::{Lens, Look};
+use crate::photos::exposure::fit::FittedPair;
+use crate::photos::exposure::picture::{LensPlane, Look};
 use crate::render::RenderOptions;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::{InputRange, Lpips};
@@ -148,8 +148,8 @@ fn half_fitted(picture: &mut [f32], target: &Target, camera: &Camera, mode: Appe
     let width = target.width as usize;
     let right = width / 2..width;
     let as_it_is = psnr_of_columns(picture, target, right.clone());
-    let start = Look { lens: Lens::of(camera), ..Look::default() };
-    let pair = Pair { drawn: picture, photo: target };
+    let start = Look { lens: LensPlane::of(camera), ..Look::default() };
+    let pair = FittedPair { drawn: picture, photo: target };
     // NaN: no pixel of the right half counts, or the picture is not finite.
     let values =
         pair.image_values(&start, mode.image_values(), 0..width / 2, FIT_ROUNDS).filter(|_| !as_it_is.is_nan())?;

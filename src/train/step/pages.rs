@@ -11,7 +11,7 @@ use super::working_set::WorkingSet;
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
 use crate::config::limits::RunOptions;
-use crate::densify::replay::{PageEdit, PendingEvents, Replay};
+use crate::densify::replay::{PageEdit, PageReplay, PendingEvents};
 use crate::densify::stats::GradHistogram;
 use crate::densify::strategy::{Effect, Strategy, effect_of};
 use crate::optim::bounds::{SplitLimits, page_bounds};
@@ -220,7 +220,7 @@ impl PagedScene {
             let is_behind = |p: &&mut PinnedPage| self.rules.is_behind(&p.meta);
             let mut behind: Vec<&mut PinnedPage> = batch.iter_mut().filter(is_behind).collect();
             let pending = self.rules.pending();
-            let replays: Vec<Result<Replay, SplitTooDeep>> = behind
+            let replays: Vec<Result<PageReplay, SplitTooDeep>> = behind
                 .par_iter_mut()
                 .map(|p| pending.apply(p.meta.id, p.meta.events_applied as usize, &mut p.rows_mut(0)))
                 .collect();
@@ -241,10 +241,10 @@ impl PagedScene {
     fn store_replay(
         &mut self,
         page: &mut PinnedPage,
-        replay: Replay,
+        replay: PageReplay,
         added: &mut Vec<PinnedPage>,
     ) -> Result<(), TrainError> {
-        let Replay { edit, rounds, .. } = replay;
+        let PageReplay { edit, rounds, .. } = replay;
         if let PageEdit::Replaced(parts) = &edit {
             self.store_parts(page, parts, added)?;
         } else {
