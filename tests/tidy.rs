@@ -21,7 +21,7 @@ const LAYERS: &[(&str, &str)] = &[
     ("densify", "base scene optim"),
     ("render", "base scene gpu kernels"),
     ("exchange", "base scene"),
-    ("report", "base photos"),
+    ("report", "base dataset photos"),
     ("config", "base scene dataset schedule kernels optim densify photos gpu render exchange page paging checkpoint"),
     (
         "train",
