@@ -7,6 +7,7 @@
 
 pub mod color_correct;
 pub mod cpu;
+pub mod device_check;
 #[cfg(feature = "gpu")]
 pub mod device_needs;
 #[cfg(feature = "gpu")]

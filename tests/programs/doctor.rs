@@ -2,7 +2,7 @@
 
 use crate::support::a_device;
 use crate::support::scenes::stderr;
-use crate::support::workdir::{BENCH, Workdir};
+use crate::support::workdir::{BENCH, TRAIN, Workdir};
 use serde_json::Value;
 use std::process::{Command, Output};
 
@@ -50,7 +50,7 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
 #[test]
 fn a_wrong_constant_is_found_and_its_stage_is_named() {
     let Some(()) = a_device() else { return };
-    let work = Workdir::new();
+    let work = Workdir::city(6, 64, 48, 300);
     for (fault, stage) in [
         ("sh_fwd.wgsl:0.28209479=0.3", "sh_fwd"),
         ("sh_bwd.wgsl:0.28209479=0.3", "sh_bwd"),
@@ -62,4 +62,11 @@ fn a_wrong_constant_is_found_and_its_stage_is_named() {
         let said = stderr(&wrong);
         assert!(said.contains(stage) && said.contains("--device cpu"), "{fault}: {said}");
     }
+    // A run on such a device does not begin.
+    let mut run = work.command(TRAIN, "scene --out run --device gpu --steps 1");
+    run.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", "sh_fwd.wgsl:0.28209479=0.3");
+    let run = run.output().unwrap();
+    let said = stderr(&run);
+    assert!(!run.status.success() && said.contains("sh_fwd") && said.contains("--device cpu"), "{said}");
+    assert!(!work.path("run/point_cloud.ply").exists());
 }

@@ -1,9 +1,9 @@
 //! `gsscale-bench doctor`: whether a GPU computes what the CPU computes, and how fast, in some minutes.
 //!
 //! Every check stands for itself: one that fails says what is wrong in plain words, and the others go on. The verdict names the flags to
-//! use. Views are compared as a whole, and the first wrong output names the stage in which the fault lies.
+//! use.
 //!
-//! Not here: the stages one by one, which the tests compare (`tests/numerics/parity`), and timings against the floor of each stage
+//! Not here: the comparison with the CPU (`render/device_check`), and timings against the floor of each stage
 //! (`cargo bench --bench gpu`).
 //!
 //! Invariant: the doctor writes into its own folder only, and its scenes are generated.
@@ -11,7 +11,6 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
-use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
@@ -22,12 +21,11 @@ use gsscale::densify::strategy::StrategyName;
 use gsscale::gpu::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions};
 use gsscale::optim::method::OptimizerPlace;
 use gsscale::render::cpu::CpuRenderer;
+use gsscale::render::device_check::{self, View, scene, view};
 use gsscale::render::gpu::GpuRenderer;
-use gsscale::render::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
+use gsscale::render::{RenderOptions, Renderer};
 use gsscale::report::html::{Cell, Page};
-use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::image::{Image, Target};
 use gsscale::train::error::TrainError;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
@@ -62,18 +60,6 @@ pub struct Args {
     device_mem: gsscale::config::values::ByteSize,
 }
 
-/// Error of a value of a picture without a flipped decision: some hundred roundings of 6e-8.
-const PIXEL: f32 = 5e-5;
-/// A rounding that flips a decision (a tile more, a stop one Gaussian later) moves a value by less than this.
-const FLIPPED: f32 = 1.0 / 255.0;
-/// One value in so many may be such a one.
-const FLIPPED_ONE_OF: usize = 1000;
-/// Difference of a loss: the small variances of SSIM, and a few flipped decisions.
-const LOSS: f64 = 2e-5;
-/// Relative L2 of a column of gradients: a thousand roundings, for sums whose terms cancel.
-const GRADIENT: f64 = 2e-4;
-/// One half extent in so many may be another: it is rounded up.
-const RADIUS_ONE_OF: usize = 500;
 /// Difference of the PSNR after a short training, dB: roundings grow over the steps as seeds do.
 const TRAINED: f64 = 0.1;
 /// Steps of the short training.
@@ -172,13 +158,6 @@ fn advice(checks: &[Check], kind: DeviceKind) -> String {
     }
 }
 
-/// Outputs of a view.
-struct View {
-    image: Image,
-    loss: LossValue,
-    grads: Gradients,
-}
-
 struct Doctor<'a> {
     args: &'a Args,
     choice: DeviceChoice,
@@ -204,22 +183,8 @@ impl Doctor<'_> {
 
     /// Views of generated Gaussians, clean and with one in a hundred broken, in every SH degree, from one to several workgroups.
     fn parity(&self) -> Result<(String, Value), String> {
-        let (mut gpu, mut cpu) = (self.renderer(false)?, CpuRenderer::new());
-        let mut figures = Vec::new();
-        for (rows, [width, height], sh_degree) in
-            [(4000, [160, 112], 3), (3, [65, 47], 2), (20_000, [123, 77], 1), (900, [40, 9], 0)]
-        {
-            for broken in [false, true] {
-                let (columns, camera) = scene(rows, width, height, broken);
-                let options = RenderOptions { sh_degree, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
-                let what = format!("{rows} Gaussians at {width}x{height}, degree {sh_degree}{}", broken_text(broken));
-                let want = view(&mut cpu, &columns, &camera, &options).map_err(|e| format!("{what}: the CPU: {e}"))?;
-                let got = view(&mut gpu, &columns, &camera, &options).map_err(|e| format!("{what}: {e}"))?;
-                let differences = compare(&got, &want).map_err(|why| format!("{what}: {why}"))?;
-                figures.push(json!({ "view": what, "differences": differences }));
-            }
-        }
-        Ok((format!("{} views agree with the CPU", figures.len()), Value::from(figures)))
+        let views = device_check::check(&mut self.renderer(false)?)?;
+        Ok((format!("{views} views agree with the CPU"), Value::Null))
     }
 
     fn same_bytes(&self) -> Result<(String, Value), String> {
@@ -407,107 +372,6 @@ impl CityScene {
         let test = trainer.evaluate(dataset, &targets, None, &|_| {}).map_err(|e| e.to_string())?;
         test.map(|test| test.psnr).ok_or_else(|| "no photo is held out".to_string())
     }
-}
-
-/// Gaussians in front of a camera; some are large, opaque, behind it or off the picture, and if `broken` one in a hundred is not finite.
-fn scene(rows: usize, width: u32, height: u32, broken: bool) -> (Columns, Camera) {
-    let mut draws = Stream::new(41, Purpose::Test, rows as u64, u64::from(width));
-    let mut c = Columns::zeros(rows, 3);
-    let mut fill = |values: &mut [f32], draw: &mut dyn FnMut(&mut Stream) -> f64| {
-        values.iter_mut().for_each(|x| *x = draw(&mut draws) as f32);
-    };
-    fill(&mut c.means, &mut |d| d.range(-2.0, 2.0));
-    fill(&mut c.quats, &mut |d| d.normal());
-    fill(&mut c.scales, &mut |d| d.range(-5.0, -1.0));
-    fill(&mut c.opacities, &mut |d| d.range(-6.0, 7.0));
-    fill(&mut c.sh0, &mut |d| 0.5 * d.normal());
-    fill(&mut c.sh_n, &mut |d| 0.5 * d.normal());
-    if broken {
-        for row in (0..rows).step_by(100) {
-            let value = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38][row / 100 % 4];
-            match row / 400 % 4 {
-                0 => c.means[3 * row] = value,
-                1 => c.quats[4 * row + 1] = value,
-                2 => c.scales[3 * row + 2] = value,
-                _ => c.opacities[row] = value,
-            }
-        }
-    }
-    let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
-    let (fx, fy, cx, cy) = (60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
-}
-
-fn broken_text(broken: bool) -> &'static str {
-    if broken { ", one in a hundred broken" } else { "" }
-}
-
-/// Draws a view, compares it with a smooth photo that has a hole in its mask, and takes the loss back to the rows.
-fn view(
-    renderer: &mut dyn Renderer,
-    columns: &Columns,
-    camera: &Camera,
-    options: &RenderOptions,
-) -> Result<View, String> {
-    let (width, height) = (camera.width, camera.height);
-    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-    let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
-    let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
-    let target = Target { width, height, rgb, mask };
-    let mut grads = Gradients::default();
-    let drawn = renderer.draw(columns, camera, options).and_then(|()| renderer.loss(&target, &LossOptions::default()));
-    drawn.and_then(|()| renderer.backpropagate(columns, &mut grads)).map_err(|e| e.to_string())?;
-    let loss = renderer.loss_value().map_err(|e| e.to_string())?;
-    let image = renderer.image().map_err(|e| e.to_string())?.clone();
-    Ok(View { image, loss, grads })
-}
-
-/// The largest differences by output; the first output that is wrong names the stage.
-fn compare(got: &View, want: &View) -> Result<Value, String> {
-    let radii = got.grads.radii.iter().zip(&want.grads.radii).filter(|(g, w)| g != w).count();
-    if radii * RADIUS_ONE_OF > want.grads.radii.len() {
-        return Err(format!("{radii} footprints have another size: stage project_fwd, or the sort"));
-    }
-    let apart = got.image.rgb.iter().zip(&want.image.rgb).map(|(g, w)| (g - w).abs());
-    let worst = apart.clone().fold(0.0f32, |most, d| if d <= most { most } else { d });
-    let off = apart.filter(|d| exceeds(f64::from(*d), f64::from(PIXEL))).count();
-    if exceeds(f64::from(worst), f64::from(FLIPPED)) || off * FLIPPED_ONE_OF > want.image.rgb.len() {
-        return Err(format!(
-            "the picture is another (a value by {worst:.1e}; {off} of {} values): colours (sh_fwd), lists (isect_emit, radix_sort), or \
-             blending (rasterize_fwd)",
-            want.image.rgb.len()
-        ));
-    }
-    let loss = (got.loss.loss - want.loss.loss).abs();
-    if exceeds(loss, LOSS) {
-        return Err(format!("the loss is {}, but {} on the CPU: stage image_loss", got.loss.loss, want.loss.loss));
-    }
-    let means2d = l2(got.grads.means2d.as_flattened(), want.grads.means2d.as_flattened());
-    if exceeds(means2d, GRADIENT) {
-        return Err(format!("gradients of footprints are others ({means2d:.1e} relative): stage rasterize_bwd"));
-    }
-    let mut columns = serde_json::Map::new();
-    for column in Column::ALL {
-        let error = l2(got.grads.columns.column(column), want.grads.columns.column(column));
-        if exceeds(error, GRADIENT) {
-            let stage = if matches!(column, Column::Sh0 | Column::ShN) { "sh_bwd" } else { "project_bwd" };
-            return Err(format!("gradients of {column:?} are others ({error:.1e} relative): stage {stage}"));
-        }
-        columns.insert(format!("{column:?}"), error.into());
-    }
-    Ok(json!({ "pixel": worst, "loss": loss, "means2d": means2d, "gradients": columns }))
-}
-
-/// Whether a difference is above a limit; NaN is above any.
-fn exceeds(difference: f64, limit: f64) -> bool {
-    difference.is_nan() || difference > limit
-}
-
-/// Relative L2 distance.
-fn l2(got: &[f32], want: &[f32]) -> f64 {
-    let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
-    let error = norm(&mut got.iter().zip(want).map(|(g, w)| f64::from(*g) - f64::from(*w)));
-    error / norm(&mut want.iter().map(|w| f64::from(*w))).max(1e-30)
 }
 
 fn bits(view: &View) -> Vec<u32> {

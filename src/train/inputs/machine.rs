@@ -6,9 +6,11 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
 use crate::gpu::DeviceChoice;
 #[cfg(feature = "gpu")]
-use crate::gpu::{Gpu, GpuError, GpuOptions, GpuResult};
+use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions, GpuResult};
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
+#[cfg(feature = "gpu")]
+use crate::render::device_check;
 #[cfg(feature = "gpu")]
 use crate::render::gpu::GpuRenderer;
 
@@ -65,7 +67,18 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn R
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
     let opened = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
     match opened {
-        Ok(renderer) => Ok((renderer, None)),
+        Ok(renderer) => match wrong_stage(choice) {
+            None => Ok((renderer, None)),
+            Some(wrong) if *choice == DeviceChoice::Auto => Ok((
+                Box::new(CpuRenderer::new()),
+                Some(format!("the CPU renders, since the GPU computes wrongly: {wrong}")),
+            )),
+            Some(wrong) => {
+                let problem = format!("this GPU or its driver computes wrongly: {wrong}");
+                let remedy = "use --device cpu; an update of the driver may help, and gsscale-bench doctor tells more";
+                Err(InputError::new("--device", problem, remedy))
+            }
+        },
         Err(GpuError::NoHardwareGpu { .. }) => {
             let word = "there is no hardware GPU: the CPU renders (--list-devices shows what was found)";
             Ok((Box::new(CpuRenderer::new()), Some(word.to_string())))
@@ -80,6 +93,18 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn R
         }
         Err(error) => Err(InputError::new("--device", error.to_string(), "use --device cpu")),
     }
+}
+
+/// The first difference between the device and the CPU, found in about a second, on an opened device of its own: the check leaves nothing
+/// on that of the run. Drivers in software are those of the tests, which compare every stage, and are not checked unless
+/// `GSSCALE_CHECK_DEVICE` is set.
+#[cfg(feature = "gpu")]
+fn wrong_stage(choice: &DeviceChoice) -> Option<String> {
+    let gpu = Gpu::open_with(choice, &GpuOptions::default()).ok()?;
+    if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
+        return None;
+    }
+    device_check::check(&mut GpuRenderer::new(gpu).ok()?).err()
 }
 
 #[cfg(feature = "gpu")]
