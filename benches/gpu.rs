@@ -14,9 +14,9 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
-use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
+use gsscale::config::values::Chosen;
 use gsscale::gpu::{DeviceChoice, Gpu, GpuOptions, GpuResult};
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Renderer;
@@ -27,8 +27,8 @@ use gsscale::scene::image::Target;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
+use gsscale::train::step::pages::WorkingSet;
 use gsscale::train::step::train_step::{StepView, train_step};
-use gsscale::train::step::working_set::WorkingSet;
 use serde_json::{Map, json};
 use std::time::Instant;
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};

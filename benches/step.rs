@@ -21,9 +21,9 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
-use gsscale::config::choice::Chosen;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
+use gsscale::config::values::Chosen;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{
@@ -35,9 +35,9 @@ use gsscale::scene::image::{Image, Target};
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::catch_up::{gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
+use gsscale::train::step::pages::WorkingSet;
 use gsscale::train::step::pages::{PagedScene, row_tables};
 use gsscale::train::step::train_step::{StepView, train_step};
-use gsscale::train::step::working_set::WorkingSet;
 use serde_json::json;
 use std::time::{Duration, Instant};
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};

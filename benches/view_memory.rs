@@ -19,7 +19,7 @@ use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, RowBatche
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
-use gsscale::train::step::working_set::WorkingSet;
+use gsscale::train::step::pages::WorkingSet;
 use serde_json::json;
 use std::ops::Range;
 use support::{Args, Hash, checked, machine, terrain};

@@ -51,13 +51,13 @@
 //!
 //! **A config key**
 //! 1. `config/file.rs`: one line in the list gives field, flag, help, default and the effect of a change
-//!    ([`config::key::Class`]). `hidden` behind the class keeps it out of help: it is for work on the program, and `configs/README.md`
-//!    names it. `common` also shows it in `-h` ([`config::key::Shown`]).
-//! 2. `check` in `config/file.rs`: its range. An enumeration needs its words instead: one line in `config/choice.rs`.
+//!    ([`config::file::Class`]). `hidden` behind the class keeps it out of help: it is for work on the program, and `configs/README.md`
+//!    names it. `common` also shows it in `-h` ([`config::file::Shown`]).
+//! 2. `check` in `config/file.rs`: its range. An enumeration needs its words instead: one line in `config/values.rs`.
 //! 3. `config/limits.rs`: puts the value into the options of the module that uses it. No module but `train` sees the config.
 //! 4. `configs/default.toml`: `GSSCALE_WRITE_DEFAULT_CONFIG=1 cargo test --test inputs default_file` writes the
 //!    file again, also after a change of a help text. Tests read the words of enumerations from
-//!    [`config::choice::choices`]. The lists below lead here wherever they add a key or a word.
+//!    [`config::values::choices`]. The lists below lead here wherever they add a key or a word.
 //!
 //! **A setting that one backend lacks**
 //! 1. `render/mod.rs`: a method of [`render::Renderer`]. The backend that lacks the setting returns an error with its remedy.
@@ -67,7 +67,7 @@
 //! 1. `densify/` gets a file with the [`densify::strategy::Strategy`], which `densify/mod.rs` names. `densify/strategy.rs`: its name in
 //!    [`densify::strategy::StrategyName`]. A round that needs other values than today's is an event kind in `scene/events.rs` with a
 //!    [`densify::strategy::Round`], which [`densify::strategy::effect_of`] names.
-//! 2. `config/choice.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
+//! 2. `config/values.rs`: the word of `--strategy`. `config/file.rs`: the keys. `config/limits.rs`: builds the
 //!    strategy from the keys. `check` in `config/file.rs`: which keys it needs, and whether an optimizer on the device can do without it.
 //! 3. What acts on the rows of a view in every step: [`densify::strategy::Strategy::add_gradients`] and
 //!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
@@ -103,7 +103,7 @@
 //! 2. `exchange/format.rs`: the ending, the sink, the transform, the name in a run's folder, and how `--overwrite` removes it.
 //!    Runs and `gsscale-ckpt export` follow. The PLY remains: resumes, `gsscale-eval` and more steps read it.
 //!    `train/run/eval_file.rs` is where evaluation reads another format.
-//! 3. `config/choice.rs`: the word of `--export`. `config/file.rs`: the help of the key.
+//! 3. `config/values.rs`: the word of `--export`. `config/file.rs`: the help of the key.
 //!
 //! **A resumable value**
 //! 1. `checkpoint/run_state.rs`: a field of [`checkpoint::run_state::TrainerState`], a place in `encode` and `decode`, a new
@@ -116,7 +116,7 @@
 //! 1. `paging/frames/evict.rs`: a value of [`paging::frames::evict::EvictPolicy`], a place in `ALL`, its key of the order,
 //!    and whether the order ignores the plan. Runs, look-ahead and simulations share it.
 //!    `last_use` is the number of steps begun at the last pin, in runs and simulations; 0 for a page that was read ahead and not used yet.
-//! 2. `config/choice.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
+//! 2. `config/values.rs`: the word of `--evict`. `config/file.rs`: the help of the key.
 //! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 
 pub mod base;

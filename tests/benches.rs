@@ -40,7 +40,7 @@ mod tiers;
 mod view_memory;
 
 use clap::Parser;
-use gsscale::config::command_line::parse_arguments;
+use gsscale::config::file::parse_arguments;
 use gsscale::train::error::TrainError;
 use lines_of_a_bench::number;
 use scenes::{city, text};

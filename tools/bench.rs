@@ -31,12 +31,12 @@ mod sweep_page;
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::config::choice::Choice;
-use gsscale::config::command_line::parse_arguments;
+use gsscale::config::file::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
 use gsscale::config::new_run;
 use gsscale::config::published::BUILT_IN;
+use gsscale::config::values::Choice;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;

@@ -1,9 +1,9 @@
 //! Shared by the benchmarks that train a scene: command lines, config, turns, lines of JSON. Measures nothing itself.
 
 use gsscale::base::error::InputError;
-use gsscale::config::choice::Device;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
+use gsscale::config::values::Device;
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::gpu::DeviceChoice;

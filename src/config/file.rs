@@ -1,21 +1,21 @@
-//! The keys of a run: one list defines the TOML file, the command line, the defaults and the class of each key. Reading them, their
-//! ranges, and the relations between them.
+//! The keys of a run: one list defines the TOML file, the command line with its help and configs/default.toml, the defaults and the class of
+//! each key (the effect of a change). Reading them, their ranges, and the relations between them. The config.toml of a run holds every
+//! setting, and facts resolved at its start (`[resolved]`), which resume and evaluation read.
 //!
-//! Not here: help and configs/default.toml ([`super::command_line`]), words of enumerations
-//! ([`super::choice`]).
+//! Not here: words of enumerations ([`super::values`]).
 //!
 //! Invariants: 1. a key has the same kebab-case spelling in the file and as a flag; 2. flags override the file, the
-//! file overrides the defaults; 3. unknown keys are refused; 4. the config.toml of a run is a valid config file; its
+//! file overrides the defaults; 3. unknown keys are refused; 4. the config.toml of a run is a valid `--config`; its
 //! `[resolved]` table and the tables of [`super::published`] hold facts and are ignored when read.
 
-use super::choice::{Chosen, Device, LogFormat, Schedule};
-use super::key::{Class, Key, Shown};
-use super::values::{ByteSize, Residence, Rgb, Up};
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
+use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
+use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, Rgb, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
@@ -36,7 +36,7 @@ use crate::render::metrics::SsimVariant;
 use crate::schedule::order::Order;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Tables of a config file that hold facts instead of settings.
 pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
@@ -461,6 +461,202 @@ impl TrainConfig {
             (folder, _) => Residence::SpillDir(Path::new(folder)),
         }
     }
+}
+
+#[derive(Debug, Clone, Copy)]
+pub struct Key {
+    pub heading: &'static str,
+    /// Its field in [`super::file::TrainConfig`], also the id of the flag.
+    pub field: &'static str,
+    /// Its meaning, for help and for configs/default.toml.
+    pub meaning: &'static str,
+    pub class: Class,
+    pub shown: Shown,
+}
+
+impl Key {
+    /// Its name in files and on the command line, in kebab-case.
+    pub fn name(&self) -> String {
+        self.field.replace('_', "-")
+    }
+}
+
+/// Where help shows a key.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shown {
+    /// In `-h` and in `--help`: most runs give it.
+    First,
+    /// In `--help`.
+    InGroup,
+    /// In configs/README.md and configs/default.toml alone: it is for work on the program, and for comparisons.
+    Nowhere,
+}
+
+/// The effect of a changed key on a resumed run, and on the comparison with a published run.
+///
+/// | class | on `--resume` | compared with a published run |
+/// | --- | --- | --- |
+/// | `Numbers` | refused without `--accept-changes` | another run |
+/// | `Layout` | refused | another run |
+/// | `Derived` | its derived value is compared | another run |
+/// | `Instructions` | its derived value is compared | the same run |
+/// | `Place` | refused without `--accept-changes` | the same run |
+/// | `Free` | reported; valid until the next resume | the same run |
+/// | `Lasting` | reported; kept for later resumes | the same run |
+/// | `Reported` | reported; valid until the next resume | another figure |
+/// | `Length` | reported; kept for later resumes | another run |
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Class {
+    /// Changes the numbers of the steps.
+    Numbers,
+    /// Determines the layout of stored pages.
+    Layout,
+    /// Different values can have the same effect: for `schedule-steps` the resolved steps are compared, for `init-ply`
+    /// the digest of the first Gaussians.
+    Derived,
+    /// The instruction path: as [`Class::Derived`]; results differ at most in rounding.
+    Instructions,
+    /// Location of the dataset, and whether it may be incomplete.
+    Place,
+    /// Resources, speed and outputs of a run.
+    Free,
+    /// As [`Class::Free`], for the place and the keeping of the checkpoint.
+    Lasting,
+    /// Changes a reported figure but no Gaussian.
+    Reported,
+    /// Number of steps. The learning rates follow `schedule-steps` instead.
+    Length,
+}
+
+impl Class {
+    /// Whether a run may resume with another value without --accept-changes, because no step computes other numbers.
+    pub fn is_free(self) -> bool {
+        matches!(self, Class::Free | Class::Lasting | Class::Reported | Class::Length)
+    }
+
+    /// Whether another value is kept for later resumes.
+    pub fn lasts(self) -> bool {
+        !matches!(self, Class::Free | Class::Reported)
+    }
+
+    /// Whether the derived value is compared instead of the key.
+    pub fn is_derived(self) -> bool {
+        matches!(self, Class::Derived | Class::Instructions)
+    }
+
+    /// Whether another value makes a run or its figures differ from a published run.
+    pub fn makes_another_run(self) -> bool {
+        !matches!(self, Class::Free | Class::Lasting | Class::Place | Class::Instructions)
+    }
+}
+
+/// Parses the command line of a program with [`super::file::TrainOverrides`]; prints help and usage errors and exits.
+pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
+    parse_arguments(&std::env::args_os().collect::<Vec<_>>())
+}
+
+/// As [`parse_command_line`], for given arguments, starting with the program's name.
+pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
+    let is_short = arguments.iter().any(|argument| argument == "-h");
+    let matches = with_help_of_keys(T::command(), is_short).get_matches_from(arguments);
+    T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+}
+
+/// Gives each key its help with its default, and its place in help: the first ones alone stand in `-h`, in one group and in few
+/// words. Flags have no clap defaults, because an absent flag must keep the config file's value.
+fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Command {
+    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
+    for key in KEYS {
+        let value =
+            defaults.get(&key.name()).map(|value| value.as_str().map_or_else(|| value.to_string(), str::to_string));
+        let default =
+            value.filter(|value| !value.is_empty()).map_or(String::new(), |value| format!(" [default: {value}]"));
+        command = command.mut_arg(key.field, |arg| {
+            let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
+            let end = [". ", "; "].iter().filter_map(|mark| help.find(mark)).min().unwrap_or(help.len());
+            let arg = arg.help(format!("{}{default}", &help[..end])).long_help(format!("{help}{default}"));
+            let arg = arg.hide(key.shown == Shown::Nowhere).hide_short_help(key.shown != Shown::First);
+            let in_short =
+                |arg: clap::Arg| arg.help_heading(None::<&str>).value_name("VALUE").hide_possible_values(true);
+            if is_short { in_short(arg) } else { arg }
+        });
+    }
+    // Of fewer columns, clap would make each flag two lines.
+    if is_short {
+        command = command.term_width(100);
+    }
+    let hidden = KEYS.iter().filter(|key| key.shown == Shown::Nowhere).count();
+    let more = format!("{hidden} more keys, for work on the program and for comparisons, are in configs/README.md.");
+    let last = command.get_after_help().map_or(more.clone(), |text| format!("{text}\n\n{more}"));
+    command.after_long_help(last)
+}
+
+/// The text of configs/default.toml: every key with its meaning and default.
+pub fn default_file() -> String {
+    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
+    let mut text = String::from(
+        "# Every key with its meaning and default. A config file needs only the keys that it changes;\n\
+         # flags of the same name override it.\n",
+    );
+    let mut last_heading = "";
+    for key in KEYS {
+        if key.heading != last_heading {
+            text.push_str(&format!("\n## {}\n", key.heading));
+            last_heading = key.heading;
+        }
+        for line in key.meaning.lines() {
+            text.push_str(&format!("\n#{line}"));
+        }
+        let name = key.name();
+        let value = defaults.get(&name).map(ToString::to_string).unwrap_or_default();
+        text.push_str(&format!("\n{name} = {value}\n"));
+    }
+    text
+}
+
+/// Facts of a run that follow from its config, scene and machine.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Resolved {
+    pub version: String,
+    /// Identity of the run; its commits hold it too. Unknown if somebody removed the line.
+    #[serde(default)]
+    pub run: RunId,
+    pub scene: PathBuf,
+    pub simd: String,
+    pub threads: usize,
+    /// The renderer: "cpu", or the name of the GPU with its driver.
+    pub device: String,
+    pub train_views: usize,
+    pub test_views: usize,
+    /// Gaussians at the start.
+    pub gaussians: u64,
+    /// Origin removed from the dataset's coordinates.
+    pub origin: [f64; 3],
+    /// Scale removed from the dataset's coordinates.
+    pub scale: f64,
+    /// Scene scale, dataset units.
+    pub scene_scale: f64,
+    /// The run made the folder of its spill directory, and so removes it at its end; not if the line is missing.
+    #[serde(default)]
+    pub made_spill_dir: bool,
+}
+
+/// Writes config.toml: every key, then the facts. Errors: the folder cannot be written.
+pub fn write_config(path: &Path, config: &TrainConfig, resolved: &Resolved) -> InputResult<()> {
+    let fail = |e: toml::ser::Error| InputError::new(path, format!("writing failed: {e}"), "report this as a bug");
+    let mut text = toml::to_string(config).map_err(fail)?;
+    text.push_str("\n[resolved]\n");
+    text.push_str(&toml::to_string(resolved).map_err(fail)?);
+    write_whole(path, text.as_bytes())
+}
+
+/// Reads the facts back from a run's config.toml. Errors: the file has no `[resolved]` table of a run.
+pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
+    let text = read_text(path, FILE_BYTES_MAX, "name the output folder of a run")?;
+    let refuse = |problem: String| InputError::new(path, problem, "name the output folder of a run");
+    let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
+    let resolved = table.remove("resolved").ok_or_else(|| refuse("it has no table [resolved]".to_string()))?;
+    Resolved::deserialize(resolved).map_err(|e| refuse(e.to_string()))
 }
 
 #[cfg(test)]

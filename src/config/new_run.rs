@@ -25,9 +25,9 @@
 //! result is written to the config of the run as if every key had been given, so a resumed run keeps its values whatever its new
 //! length; 3. at 30,000 steps and more every value but `others-lr-final` is the default; 4. no value jumps between lengths.
 
-use super::choice::Schedule;
 use super::file::{TrainConfig, TrainOverrides};
 use crate::base::error::InputResult;
+use crate::config::values::Schedule;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
 use std::collections::BTreeSet;

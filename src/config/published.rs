@@ -8,10 +8,10 @@
 //! 2509.15645) and from the behaviour of its code; comments in each file name the pitfalls.
 
 use super::file::{FILE_BYTES_MAX, KEYS, TABLES, TrainConfig};
-use super::key::Key;
 use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
+use crate::config::file::Key;
 use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;

@@ -12,10 +12,10 @@
 //! Invariants: 1. the view of a step is a pure function of (seed, cameras, order, step), so the future is known and a run
 //! can continue anywhere; 2. every epoch visits every view once.
 
-use super::places::{Place, cut, mean, places};
 use super::tour::tour;
 use crate::base::rng::{Purpose, Stream};
 use crate::scene::camera::Camera;
+use crate::schedule::tour::{Place, cut, mean, places};
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;

@@ -1,8 +1,6 @@
 //! Every config file parses and passes its checks; default.toml equals the built-in defaults.
 
-use gsscale::config::command_line::default_file;
-use gsscale::config::file::{KEYS, TrainConfig};
-use gsscale::config::key::{Key, Shown};
+use gsscale::config::file::{KEYS, Key, Shown, TrainConfig, default_file};
 use std::path::PathBuf;
 
 fn configs() -> PathBuf {

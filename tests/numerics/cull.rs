@@ -23,9 +23,8 @@ use gsscale::scene::state::SceneState;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::catch_up::{evaluate_all, gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::PagedScene;
+use gsscale::train::step::pages::{PagedScene, WorkingSet};
 use gsscale::train::step::train_step::{StepView, train_step};
-use gsscale::train::step::working_set::WorkingSet;
 
 fn camera(draws: &mut Stream) -> Camera {
     let r = random_rotation(draws);

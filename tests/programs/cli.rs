@@ -3,9 +3,8 @@
 
 use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
-use gsscale::config::choice::choices;
-use gsscale::config::file::KEYS;
-use gsscale::config::key::Shown;
+use gsscale::config::file::{KEYS, Shown};
+use gsscale::config::values::choices;
 use std::path::Path;
 use std::process::{Command, Output};
 

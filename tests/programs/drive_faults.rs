@@ -8,8 +8,7 @@ use crate::support::workdir::{Workdir, says};
 use gsscale::base::identity::RunId;
 use gsscale::checkpoint::interval::CommitEvery;
 use gsscale::checkpoint::run_state::{Origin, RunIdentity};
-use gsscale::config::facts::{Resolved, write_config};
-use gsscale::config::file::TrainConfig;
+use gsscale::config::file::{Resolved, TrainConfig, write_config};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::dataset::loader::Dataset;
 use gsscale::dataset::target_cache::TargetCache;
@@ -25,14 +24,13 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::commits::checkpoint::Checkpoint;
-use gsscale::train::commits::save::save;
+use gsscale::train::commits::results::save;
 use gsscale::train::error::TrainError;
-use gsscale::train::inputs::signals::StopFlag;
+use gsscale::train::inputs::machine::StopFlag;
 use gsscale::train::log::progress::Progress;
 use gsscale::train::log::report::MetricsLog;
 use gsscale::train::run::training_loop::TrainingLoop;
-use gsscale::train::start::first_scene::Start;
-use gsscale::train::start::first_scene::dataset_print;
+use gsscale::train::start::first_scene::{Start, dataset_print};
 use gsscale::train::start::tiers::commit_options;
 use gsscale::train::state::trainer::Trainer;
 use std::io::ErrorKind;
@@ -179,7 +177,7 @@ impl World {
             stop: &stop,
             checkpoint: Some(&mut checkpoint),
             live: None,
-            costs: Default::default(),
+            forecast: None,
         }
         .run();
         if let Err(error) = looped {

@@ -23,9 +23,8 @@ use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::error::TrainError;
 use gsscale::train::step::batch::HostRows;
 use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::PagedScene;
+use gsscale::train::step::pages::{PagedScene, WorkingSet};
 use gsscale::train::step::train_step::{StepOutcome, StepView, train_step};
-use gsscale::train::step::working_set::WorkingSet;
 use std::io::ErrorKind;
 
 const STEPS: u32 = 5;

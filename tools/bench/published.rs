@@ -19,7 +19,7 @@ use gsscale::render::lpips::InputRange;
 use gsscale::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::report::Summary;
-use gsscale::train::memory::estimate::reset_host_bytes_peak;
+use gsscale::train::memory::reset_host_bytes_peak;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::eval_file::{EvalExtras, evaluate_file};
 use gsscale::train::run::out_folder::Existing;

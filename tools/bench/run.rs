@@ -4,14 +4,14 @@
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::{cpu_model, process_cpu_seconds};
-use gsscale::config::choice::Device;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
+use gsscale::config::values::Device;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::gpu::DeviceChoice;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::train::error::TrainError;
-use gsscale::train::memory::estimate::host_bytes_peak;
+use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::start::first_scene::prepare;
 use gsscale::train::state::trainer::Trainer;
 use serde_json::{Value, json};

@@ -9,27 +9,33 @@
 //! `--disk-full-wait` the run stops. A run in memory waits as well, because it would lose all steps since its last commit if
 //! it ended; but its steps need no drive, so after the wait it goes on without commits where there is room for its results.
 //!
-//! Not here: the results after the last step (`results_wait`).
+//! Not here: the results after the last step (`super::results`).
 //!
 //! Invariants: 1. commits happen between steps and do not change the run; 2. a commit holds all state on which later
 //! steps depend: a run resumed from it ends with the same bytes; 3. clocks decide only when to commit; 4. a run in
 //! memory creates its checkpoint at its first commit, so a short run writes none; 5. waiting for space changes nothing, and the last
 //! commit always stays intact.
 
-use super::first_commit::FirstCommit;
 use crate::base::trace;
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::{CommitCost, CommitEvery, CommitInterval, CommitReport};
 use crate::checkpoint::run_state::{Origin, RunState};
+use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
+use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::page::map::commit::{CommitError, Commits};
+use crate::page::format::codec::Codec;
+use crate::page::map::commit::{CommitConfig, CommitError, Commits};
+use crate::page::map::opening::Opened;
+use crate::page::tool::uncommitted::remove_uncommitted;
+use crate::page::versions::paged_store::PagedStore;
+use crate::page::versions::slots::SlotLayout;
+use crate::paging::pager::Pager;
 use crate::paging::stats::SlotSpace;
 use crate::photos;
 use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
-use crate::train::inputs::places::drive_of;
-use crate::train::inputs::signals::StopFlag;
+use crate::train::inputs::machine::{StopFlag, drive_of};
 use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
 use std::path::{Path, PathBuf};
@@ -575,6 +581,49 @@ pub fn restore(trainer: &mut Trainer, state: &RunState) -> Result<(), CommitErro
     trainer.state = state.trainer.clone();
     trainer.scene.pager.restore_stats(state.traffic);
     Ok(())
+}
+
+/// Memory for the cache of the page map, bytes.
+pub(crate) const MAP_CACHE_BYTES: usize = 8 << 20;
+
+/// Settings of the checkpoint to create.
+#[derive(Debug, Clone)]
+pub(crate) struct FirstCommit {
+    /// `checkpoint/` in the output folder of the run.
+    pub folder: PathBuf,
+    pub io: IoEngine,
+    pub codec: Codec,
+    /// Bytes of a full page.
+    pub capacity_bytes: usize,
+}
+
+impl FirstCommit {
+    /// Creates the store and attaches it to the pager.
+    pub fn make(&self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
+        let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
+        // An earlier process killed during its first commit leaves a store without commits.
+        remove_uncommitted(&self.folder, true)?;
+        // Allow a network file system: the user chose it for the results.
+        let spill = SpillDir::create(&self.folder, layout, true)?;
+        match self.make_in(&spill, layout) {
+            Ok((commits, store)) => {
+                pager.attach(store);
+                Ok((spill, commits))
+            }
+            Err(error) => {
+                spill.remove()?;
+                Err(error)
+            }
+        }
+    }
+
+    fn make_in(&self, spill: &SpillDir, layout: SlotLayout) -> Result<(Commits, PagedStore), TrainError> {
+        let engine = open_engine(self.io, &self.folder, DEPTH)?.store;
+        let config = CommitConfig { store: spill.format().store, cache_bytes: MAP_CACHE_BYTES, reserve_bytes: 0 };
+        let opened = Opened::create(Box::new(DriveFolder::new(&self.folder)), config)?;
+        let store = opened.paged_store(engine, layout, self.codec)?;
+        Ok((opened.commits, store))
+    }
 }
 
 #[cfg(test)]

@@ -2,8 +2,5 @@
 //! machine, signals.
 
 pub mod dataset_print;
-pub(crate) mod fit;
 pub(crate) mod gaussian_pages;
 pub mod machine;
-pub(crate) mod places;
-pub mod signals;

@@ -7,16 +7,15 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
-use crate::train::error::TrainError;
-use crate::train::memory::estimate::{INDEX_BYTES, MemoryEstimate};
-use crate::train::step::device_slots::{SLOTS_SHARE, slots_in};
-use crate::train::step::pages::PagedScene;
-
 use crate::gpu::{GpuError, budget_for_buffers, bytes_for_buffers};
 use crate::optim::method::OptimizerPlace;
 use crate::render::RenderError;
 use crate::render::device_needs::{DeviceNeeds, ViewSizes};
 use crate::scene::page_layout::capacity_bytes;
+use crate::train::error::TrainError;
+use crate::train::memory::{INDEX_BYTES, MemoryEstimate};
+use crate::train::step::device_slots::{SLOTS_SHARE, slots_in};
+use crate::train::step::pages::PagedScene;
 
 /// The needs of the largest view that was probed, grown to the cap on Gaussians; `None` without a device.
 fn needs(config: &TrainConfig, memory: &MemoryEstimate) -> Option<DeviceNeeds> {
@@ -54,7 +53,7 @@ fn whole_of(config: &TrainConfig, needs: &DeviceNeeds) -> u64 {
 
 /// Refuses a `--device-mem` below the least that the largest view takes, now or grown to the cap on Gaussians.
 /// Errors: the budget is too small.
-pub(crate) fn check(config: &TrainConfig, memory: &[MemoryEstimate; 3]) -> InputResult<()> {
+pub(crate) fn check_device_memory(config: &TrainConfig, memory: &[MemoryEstimate; 3]) -> InputResult<()> {
     let [Some(now), Some(grown)] = [&memory[0], &memory[1]].map(|memory| needs(config, memory)) else { return Ok(()) };
     let (budget, least) = (config.device_mem.0, least_of(config, &now).max(least_of(config, &grown)));
     if budget == 0 || bytes_for_buffers(budget) >= least {

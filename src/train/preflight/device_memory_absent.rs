@@ -4,11 +4,11 @@ use crate::base::error::InputResult;
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::train::error::TrainError;
-use crate::train::memory::estimate::MemoryEstimate;
+use crate::train::memory::MemoryEstimate;
 use crate::train::step::pages::PagedScene;
 
 /// Nothing to check.
-pub(crate) fn check(_: &TrainConfig, _: &[MemoryEstimate; 3]) -> InputResult<()> {
+pub(crate) fn check_device_memory(_: &TrainConfig, _: &[MemoryEstimate; 3]) -> InputResult<()> {
     Ok(())
 }
 

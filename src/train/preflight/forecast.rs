@@ -1,27 +1,50 @@
-//! What a run will take at the number of Gaussians that it will reach: memory, drive, bytes written, time.
+//! What a run will take at the number of Gaussians that it will reach: memory, drives, bytes written, time; and the refusal of drives that
+//! cannot hold its first pages, or a PLY of its first Gaussians. Drives that may not hold the growth are a warning.
 //!
 //! The dry run, `gsscale-plan` and the run itself make one forecast, here, from the same measurements: views rendered with
 //! the first Gaussians, and a simulation of the pages of some epochs.
 //!
-//! Not here: which budgets are refused ([`super::plan`]), and the words (`plan_text`).
+//! Not here: which budgets are refused ([`super::plan`]), the words (`plan_text`), a drive that is full during a run
+//! ([`crate::train::commits::checkpoint`]).
 //!
 //! Invariants: 1. the run does not depend on its forecast; 2. bytes of memory depend on no clock, and
 //! those of the drive only through the number of commits in the time of the run.
 
-use super::drive_space::{DriveUse, StepUse, VERSIONS};
-use super::plan::{LargestNeed, TierPlan, shrink_to_budget};
-use super::probe::rows_at_most;
+use super::device_memory;
+use super::plan::{
+    LargestNeed, Probe, TierPlan, allow_largest_view, estimate, plan_tiers, rows_at_most, shrink_to_budget,
+};
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::format_bytes;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::values::Residence;
+use crate::dataset::loader::Dataset;
 use crate::densify::growth::GrowthCheck;
 use crate::densify::strategy::StrategyName;
+use crate::exchange::format::ExportFormat;
+use crate::page::folder::file_system::{free_bytes, is_same_drive};
+use crate::page::folder::measure::DriveRate;
+use crate::page::format::slot_header::transfer_bytes;
 use crate::page::format::spill_format::SlotLayout;
+use crate::paging::pager::PagerConfig;
+use crate::paging::simulation::replay::{DriveModel, Replay, ReplayOptions, replay};
+use crate::scene::page_layout::PageLayout;
+use crate::scene::page_meta::PageMeta;
+use crate::scene::partition::first_fill;
 use crate::scene::state::row_bytes;
+use crate::schedule::visibility::ViewPages;
 use crate::train::commits::checkpoint::reserve_bytes;
+use crate::train::error::TrainError;
+use crate::train::inputs::machine::drive_of;
 use crate::train::log::report::Foreseen;
-use crate::train::memory::estimate::MemoryEstimate;
+use crate::train::memory::{MemoryEstimate, PLAN_BYTES, list_bytes, train_cameras};
+use crate::train::start::tiers::Tiers;
+use crate::train::state::trainer::Trainer;
+use crate::train::state::turns::keeps_first_count;
+use crate::train::step::soundness::no_view_sees;
+use std::path::Path;
 
 /// Gaussians that a round of densification adds without a cap, if rounds are [`ROUND_STEPS`] apart. Neither the size of the photos nor the
 /// first number of Gaussians changes it much, see "Gaussians without a cap" in `benches/RESULTS.md`.
@@ -138,26 +161,83 @@ pub struct Forecast {
 
 /// What was measured before the first step.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Measured {
+struct Measured {
     /// Gaussians.
-    pub rows: u64,
+    rows: u64,
     /// Gaussians at the end, and how that is known.
-    pub reach: (u64, Reach),
+    reach: (u64, Reach),
     /// Steps done by earlier processes.
-    pub steps_done: u32,
+    steps_done: u32,
     /// Median seconds to render a view forward and backward.
-    pub view_seconds: f64,
+    view_seconds: f64,
     /// Largest share of the Gaussians that a view draws.
-    pub visible_share: f64,
+    visible_share: f64,
     /// What steps do with the drive.
-    pub drive: DriveUse,
+    drive: DriveUse,
     /// Frames with the Gaussians of the end; `None` for a run in memory.
-    pub frames_at_end: Option<u64>,
+    frames_at_end: Option<u64>,
+}
+
+/// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
+/// Errors: a view cannot be rendered, or memory, device or drive are too small.
+pub(crate) fn plan_run(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    tiers: &Tiers,
+    trainer: &mut Trainer,
+    host_mem: Option<u64>,
+    driver: u64,
+    drive_rate: DriveRate,
+) -> Result<Forecast, TrainError> {
+    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
+    let largest = allow_largest_view(config, dataset, trainer, host_mem);
+    if largest.view.is_none() {
+        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
+    }
+    let probe = Probe::of_run(dataset, trainer, largest.view, driver);
+    let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
+    let views = dataset.train_views();
+    let pixels = views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
+    let (last, known) = match keeps_first_count(&trainer.options.strategy, views.len()) {
+        true => (rows, Reach::Kept),
+        false => reach(config, rows, pixels, steps_done, trainer.growth()),
+    };
+    let (mut memory, probed) = estimate(config, dataset, trainer, &probe, last)?;
+    device_memory::check_device_memory(config, &memory)?;
+    let plan = plan_tiers(config, dataset, trainer, tiers, largest, host_mem, &mut memory)?;
+    if let Some(free) = plan.free_bytes.filter(|_| plan.frames.is_some() && tiers.spills()) {
+        check_drive(config, free, plan.pages, plan.frame_bytes)?;
+    }
+    let growth = last as f64 / rows.max(1) as f64;
+    let step_seconds = probed.seconds * STEP_OVER_RENDERING;
+    let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
+    let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
+    let drive = plan.frames.zip(frames_at_end).map_or(DriveUse::default(), |(now, then)| {
+        drive_use(config, dataset, trainer, [now, then], growth, step_seconds, drive_rate)
+    });
+    let measured = Measured {
+        rows,
+        reach: (last, known),
+        steps_done,
+        view_seconds: probed.seconds,
+        visible_share: probed.visible as f64 / rows.max(1) as f64,
+        drive,
+        frames_at_end,
+    };
+    let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
+    if !(known == Reach::Decided && trainer.growth().is_empty()) {
+        return Ok(forecast);
+    }
+    let [first, most, _] = memory;
+    let drive = DriveUse { of_step: [drive.of_step[0]; 2], ..drive };
+    let kept = Measured { reach: (rows, known), drive, frames_at_end: plan.frames, ..measured };
+    let if_kept = Forecast::new(config, [first, most, first], plan, &kept, host_mem);
+    Ok(Forecast { if_kept: Some(Box::new(if_kept)), ..forecast })
 }
 
 impl Forecast {
     /// The forecast of a run with these pages and frames. `host_mem` limits the memory of the run.
-    pub(crate) fn new(
+    fn new(
         config: &TrainConfig,
         memory: [MemoryEstimate; 3],
         tiers: TierPlan,
@@ -222,6 +302,16 @@ impl Forecast {
         self.frames_at_end.is_some_and(|frames| frames.saturating_mul(self.tiers.frame_bytes) >= self.drive_bytes)
     }
 
+    /// What the run takes with `gaussians`, as a line; `None` unless the run decides its count and so has foreseen both ends. Rows make up
+    /// memory and drive, so both are interpolated in their number.
+    pub(crate) fn costs_text(&self, gaussians: u64) -> Option<String> {
+        let ends = [self.if_kept.as_deref()?, self];
+        let costs = |of: fn(&Forecast) -> u64| interpolated(ends.map(|end| [end.gaussians[1], of(end)]), gaussians);
+        let (memory, drive) = (costs(|end| end.memory_at_end().total())?, costs(|end| end.drive_bytes_peak)?);
+        let [memory, drive] = [memory, drive].map(format_bytes);
+        Some(format!("  which takes about {memory} of memory and {drive} of the drive"))
+    }
+
     /// The figures that the summary keeps.
     pub(crate) fn facts(&self) -> Foreseen {
         Foreseen {
@@ -241,7 +331,7 @@ impl Forecast {
 
 /// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
 /// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run in memory.
-pub(crate) fn limit_memory(
+fn limit_memory(
     config: &TrainConfig,
     tiers: &TierPlan,
     host_mem: Option<u64>,
@@ -261,11 +351,6 @@ pub(crate) fn limit_memory(
 }
 
 impl DriveUse {
-    /// That of a run whose scene stays as it is.
-    pub(crate) fn without_growth(self) -> DriveUse {
-        DriveUse { of_step: [self.of_step[0]; 2], ..self }
-    }
-
     /// The mean over the steps to do: from a step of now to one with the Gaussians of the end, as their number grows.
     fn mean_of_steps(&self, growing: &GrowingSteps, growth: f64) -> StepUse {
         let ramp = growing.mean(growth, 1.0);
@@ -274,6 +359,12 @@ impl DriveUse {
         let mean = |now: f64, at_end: f64| now + share * (at_end - now);
         StepUse { written: mean(now.written, at_end.written), waits: mean(now.waits, at_end.waits) }
     }
+}
+
+/// The value at `x`, also beyond the two points `[x, y]`, of the line through them; `None` if the second does not come after the first.
+fn interpolated([[x0, y0], [x1, y1]]: [[u64; 2]; 2], x: u64) -> Option<u64> {
+    let share = (x as f64 - x0 as f64) / x1.checked_sub(x0).filter(|wide| *wide > 0)? as f64;
+    Some((y0 as f64 + share * (y1 as f64 - y0 as f64)) as u64)
 }
 
 /// Bytes of the files of a store with that many slots in use: whole segments and the map.
@@ -293,7 +384,7 @@ fn versions(is_in_memory: bool, commits: u64) -> [u64; 2] {
 }
 
 /// Bytes of a PLY of `rows` Gaussians.
-pub(super) fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
+fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
     rows * (PLY_ROW_BYTES + 12 * (u64::from(config.sh_degree) + 1).pow(2))
 }
 
@@ -357,6 +448,202 @@ fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
     let state = state_bytes as f64;
     let commits = (seconds / every).min((limit * seconds / 3600.0 / state.max(1.0)).max(1.0));
     (commits as u64, state * commits.ceil())
+}
+
+/// Epochs that are simulated to estimate the traffic of a run.
+const PLAYED_EPOCHS: u32 = 3;
+/// Versions of a page on the drive: one per commit kept (two), and one being written.
+const VERSIONS: u64 = 3;
+/// Additional slots of writes in flight.
+const SLOTS_IN_FLIGHT: u64 = 64;
+
+/// Pages of `rows` first Gaussians, and the bytes of the frame of one.
+pub(super) fn first_pages(config: &TrainConfig, rows: u64) -> [u64; 2] {
+    let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
+    [rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64), frame_bytes]
+}
+
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
+/// free space passes.
+/// Errors: the drive has too little free space.
+pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
+    let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
+    let Some(free) = free_bytes(&drive_of(spill_dir)).ok().flatten() else { return Ok(()) };
+    let [pages, frame_bytes] = first_pages(config, rows);
+    refuse_small_drive(free, pages, frame_bytes)
+}
+
+/// Bytes of `pages` pages on the drive, with slots of writes in flight.
+fn drive_bytes(pages: u64, frame_bytes: u64) -> u64 {
+    pages.saturating_add(SLOTS_IN_FLIGHT).saturating_mul(frame_bytes)
+}
+
+fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()> {
+    let needed = drive_bytes(pages, frame_bytes);
+    if free >= needed {
+        return Ok(());
+    }
+    let problem = format!(
+        "the drive has {} free, but the run may need {}: {pages} pages of {}, and room for pages that are being written",
+        format_bytes(free),
+        format_bytes(needed),
+        format_bytes(frame_bytes)
+    );
+    let remedy = "free space on it, choose another drive, or lower --sh-degree";
+    Err(InputError::new("--spill-dir", problem, remedy))
+}
+
+/// Refuses a drive that cannot hold the `now` pages of a scene, and warns of one that may not hold the `most` pages of the
+/// grown scene with its last commits.
+fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2], frame_bytes: u64) -> InputResult<()> {
+    // Each named checkpoint of --save-every may hold a version of every page.
+    let kept = u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0));
+    refuse_small_drive(free, now, frame_bytes)?;
+    let with_past = drive_bytes(most, frame_bytes).saturating_mul(VERSIONS.saturating_add(kept));
+    if free < with_past {
+        let (named, fewer) = match kept {
+            0 => (String::new(), ""),
+            kept => (format!(" and {kept} named checkpoints"), ", keep fewer checkpoints with --save-every"),
+        };
+        crate::tell!(
+            "warning: the scene with its last two commits{named} may take {} on the drive, which has {} free: lower \
+             --max-gaussians{fewer}, or commit less often with --commit-every",
+            format_bytes(with_past),
+            format_bytes(free)
+        );
+    }
+    Ok(())
+}
+
+/// What a run does with its drive, without commits.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct DriveUse {
+    /// Bytes that the import writes.
+    import: f64,
+    /// A step with the Gaussians of now, and with those of the end.
+    of_step: [StepUse; 2],
+}
+
+/// What a step does with its drive, mean.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct StepUse {
+    /// Bytes written.
+    written: f64,
+    /// Seconds that the step waits for the drive.
+    waits: f64,
+}
+
+/// What the steps of a run do with its drive. Simulates a few epochs with the current pages. At the end the frames hold a smaller share of
+/// the pages, and a view that needs as large a share as now goes in batches where it needs more than the frames. `frames` (possibly more than
+/// pages) and `step_seconds` (of a step that waits for nothing) are those with the Gaussians of now and those of the end, which are `growth`
+/// times as many.
+fn drive_use(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &Trainer,
+    frames: [u64; 2],
+    growth: f64,
+    step_seconds: [f64; 2],
+    drive: DriveRate,
+) -> DriveUse {
+    let cameras = train_cameras(dataset);
+    let index = trainer.scene.pager.index();
+    let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
+    let sh_degree = config.sh_degree;
+    let bands = share_of_bands(trainer, config);
+    let payload = |page: &PageMeta| bands * PageLayout { rows: page.rows as usize, sh_degree }.bytes() as f64;
+    let page_bytes: Vec<u32> = index.iter().map(|page| transfer_bytes(payload(page) as usize) as u32).collect();
+    let views = ViewPages::new(index, &cameras);
+    let play = |frames: usize, reads_ahead: bool| -> Replay {
+        let options = ReplayOptions { frames, policy: config.evict, reads_ahead, steps, plan_bytes: PLAN_BYTES as u64 };
+        replay(&views, &page_bytes, trainer.view_order(), &options).unwrap_or_default()
+    };
+    // With more Gaussians a page stands for several: a drive that is slower by as much takes as long.
+    let of_step = |frames: usize, growth: f64, step_seconds: f64| {
+        let (_, written) = play(frames, false).totals();
+        let (read_rate, write_rate) = (drive.read / growth, drive.write / growth);
+        let played = play(frames, true);
+        let steady = played.steady();
+        let waits = played.stall(steady.clone(), &DriveModel { read_rate, write_rate, step_seconds }).seconds;
+        StepUse {
+            written: growth * written as f64 / f64::from(steps.max(1)),
+            waits: waits / steady.len().max(1) as f64,
+        }
+    };
+    // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
+    let growth = growth.max(1.0);
+    let [frames, then] =
+        [frames[0] as f64, frames[1] as f64 / growth].map(|n| (n as usize).clamp(1, index.len().max(1)));
+    let import = if trainer.steps_done() == 0 { page_bytes.iter().map(|&b| f64::from(b)).sum() } else { 0.0 };
+    let [step_seconds, step_seconds_then] = step_seconds;
+    let now = of_step(frames, 1.0, step_seconds);
+    let at_end = match then < frames || growth > 1.0 {
+        true => of_step(then.min(frames), growth, step_seconds_then),
+        false => now,
+    };
+    DriveUse { import, of_step: [now, at_end] }
+}
+
+/// Bytes of a Gaussian on the drive over those with all colour bands, mean over the steps to do: pages hold the bands that the run has
+/// reached.
+fn share_of_bands(trainer: &Trainer, config: &TrainConfig) -> f64 {
+    let steps = trainer.steps_done()..config.steps;
+    let bytes = |step: u32| row_bytes(trainer.options.sh_degree_at(step)) as f64;
+    let sum: f64 = steps.clone().map(bytes).sum();
+    if steps.is_empty() { 1.0 } else { sum / (steps.len() as f64 * row_bytes(config.sh_degree) as f64) }
+}
+
+/// The most bytes of the file for viewers while it is written, in percent of those of the PLY. SPZ: 8, and up to 34 for its temporary
+/// file. SOG: 12.
+fn export_percent(format: ExportFormat) -> u64 {
+    match format {
+        ExportFormat::Ply => 0,
+        ExportFormat::Spz => 42,
+        ExportFormat::Sog => 12,
+    }
+}
+
+/// Refuses a drive that cannot hold a PLY of the first Gaussians, unless the run is resumed. Warns if the drive may not hold the results of
+/// the end: the PLY, the files for viewers and, where they lie on the same drive, the pages of the store or the checkpoint beyond the
+/// `stored` bytes of now. A drive that does not report its free space passes.
+/// Errors: the drive has too little free space.
+pub(crate) fn check_drive_of_results(
+    config: &TrainConfig,
+    out: &Path,
+    forecast: &Forecast,
+    stored: u64,
+    is_resumed: bool,
+) -> InputResult<()> {
+    let drive = drive_of(out);
+    let Some(free) = free_bytes(&drive).ok().flatten() else { return Ok(()) };
+    let [now, last] = forecast.gaussians.map(|rows| ply_bytes(config, rows));
+    if free < now && !is_resumed {
+        let problem = format!(
+            "the drive has {} free, but the PLY of the first Gaussians alone takes {}",
+            format_bytes(free),
+            format_bytes(now)
+        );
+        return Err(InputError::new(out, problem, "free space on it, or choose another --out"));
+    }
+    let results = last + last / 100 * config.export.formats().map(export_percent).sum::<u64>();
+    let (pages, beside) = match config.residence() {
+        Residence::Memory => (forecast.drive_bytes_peak, " and the checkpoint"),
+        Residence::SpillDir(folder) if is_same_drive(&drive, &drive_of(folder)) => {
+            (forecast.drive_bytes_peak, " and the pages, which lie on the same drive,")
+        }
+        _ => (0, ""),
+    };
+    let needed = results.saturating_add(pages.saturating_sub(stored));
+    if free < needed {
+        crate::tell!(
+            "warning: the results{beside} may take {} more in {}, whose drive has {} free: free space, choose another --out, or \
+             lower --max-gaussians",
+            format_bytes(needed),
+            out.display(),
+            format_bytes(free)
+        );
+    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -482,5 +769,12 @@ mod tests {
         assert_eq!(commits(&every, GIB, hour), (6, 6.0 * GIB as f64));
         let never = TrainConfig { commit_every: CommitEvery::Seconds(0.0), ..config() };
         assert_eq!(commits(&never, GIB, hour), (0, 0.0));
+    }
+
+    #[test]
+    fn costs_grow_with_the_rows() {
+        let at = |gaussians| interpolated([[1000, 100], [8000, 800]], gaussians);
+        assert_eq!([1000, 4000, 16_000].map(at), [100, 400, 1600].map(Some), "also beyond what was foreseen");
+        assert_eq!(interpolated([[1000, 1], [1000, 2]], 1000), None);
     }
 }

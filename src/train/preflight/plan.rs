@@ -7,24 +7,26 @@
 //! Invariant: a run that cannot fit is refused here, with numbers and alternatives: a budget that holds no batch of the largest view is
 //! refused with the smallest one that suffices. Growth that may not fit is a warning.
 
-use super::drive_space::check_drive;
-use super::probe::{Probe, estimate, rows_at_most};
+use super::device_memory;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
 use crate::paging::simulation::replay::automatic_order;
+use crate::scene::columns::row_width;
 use crate::scene::partition::first_fill;
 use crate::schedule::order::Order;
 use crate::schedule::visibility::ViewPages;
 use crate::train::error::TrainError;
-use crate::train::memory::budget::{FRAMES_LEAST, HostBudget, frames_and_batch};
-use crate::train::memory::estimate::{MemoryEstimate, list_bytes, obtainable_bytes};
-use crate::train::memory::largest_view::{LargestView, cut_views, largest_view, train_cameras};
-use crate::train::memory::staging::{PLAN_BYTES, staging_bytes, with_staging};
+use crate::train::memory::{
+    BASE_BYTES, FRAMES_LEAST, HostBudget, INDEX_BYTES, LargestView, MemoryEstimate, PLAN_BYTES, bytes_of_copies,
+    cut_views, frames_and_batch, frames_in_memory, largest_decode, largest_view, list_bytes, obtainable_bytes,
+    staging_bytes, train_cameras, with_staging,
+};
 use crate::train::start::tiers::{Tiers, budget_in_memory, first_staging_bytes};
-use crate::train::state::trainer::Trainer;
-use crate::train::step::working_set::WorkingSet;
+use crate::train::state::trainer::{Probed, Trainer};
+use crate::train::step::pages::WorkingSet;
 
 /// Pages are numbered in 32 bits.
 const PAGES_MOST: u64 = u32::MAX as u64;
@@ -62,13 +64,14 @@ pub struct TierPlan {
     pub free_bytes: Option<u64>,
 }
 
-/// Chooses the number of frames and completes the estimates of [`super::probe::estimate`] with it.
+/// Chooses the number of frames and completes the estimates of [`estimate`] with it.
 /// Errors: the budget or the drive is too small.
-pub fn plan_tiers(
+pub(super) fn plan_tiers(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
     tiers: &Tiers,
+    largest_view: LargestView,
     host_mem: Option<u64>,
     memory: &mut [MemoryEstimate; 3],
 ) -> InputResult<TierPlan> {
@@ -79,7 +82,7 @@ pub fn plan_tiers(
         frames: None,
         frames_are_named: config.frames > 0,
         free_bytes: tiers.free_bytes()?,
-        largest_view: largest_view(dataset, trainer.scene.pager.index()),
+        largest_view,
         cut_views: (0, 1),
     };
     if trainer.scene.pager.frames_max() == usize::MAX {
@@ -95,9 +98,6 @@ pub fn plan_tiers(
         trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
     }
     warn_of_growth(config, &plan, host_mem, memory);
-    if let Some(free) = plan.free_bytes.filter(|_| tiers.spills()) {
-        check_drive(config, free, plan.pages, plan.frame_bytes)?;
-    }
     Ok(plan)
 }
 
@@ -321,16 +321,17 @@ fn page_working(config: &TrainConfig) -> u64 {
 
 /// Allows the frames that the largest training view of `dataset` needs, so that views can be measured; [`plan_tiers`]
 /// allows the rest afterwards. Where the budget may not hold them beside the rows of the view, the view is measured in batches.
-/// Returns the index of that view. Runs in memory or with --frames are left unchanged.
-pub fn allow_largest_view(
+/// Returns that view. Runs in memory or with --frames are left unchanged.
+pub(super) fn allow_largest_view(
     config: &TrainConfig,
     dataset: &Dataset,
     trainer: &mut Trainer,
     host_mem: Option<u64>,
-) -> Option<usize> {
-    let LargestView { view, pages: needed, .. } = largest_view(dataset, trainer.scene.pager.index());
+) -> LargestView {
+    let largest = largest_view(dataset, trainer.scene.pager.index());
+    let needed = largest.pages;
     if config.frames > 0 || trainer.scene.pager.frames_max() == usize::MAX {
-        return view;
+        return largest;
     }
     let frame_bytes = trainer.scene.pager.frame_bytes() as u64;
     // A default budget may rise once the memory of a view is known.
@@ -344,7 +345,7 @@ pub fn allow_largest_view(
         }
     }
     trainer.scene.pager.allow_frames(frames as usize);
-    view
+    largest
 }
 
 /// Resolves `--view-order auto`. For a scene that grows, the current pages stand for the grown scene, with the number
@@ -449,6 +450,98 @@ fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>
         );
     }
     Ok(())
+}
+
+/// Views to render, spread evenly over the dataset.
+const PROBE_VIEWS: usize = 6;
+
+/// Most bytes of a renderer for a row in view that are expected of any scene: splat, gradients and staging, and some twenty
+/// intersections with tiles.
+const RENDERER_ROW_BYTES_MOST: u64 = 2048;
+
+/// Known upper bound of a run's rows: the current rows, or the cap if that is more.
+pub(crate) fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
+    if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
+}
+
+/// Input of an estimate.
+#[derive(Debug, Clone)]
+pub(super) struct Probe {
+    pub views: Vec<usize>,
+    /// Gaussians of the scene.
+    pub rows: u64,
+    /// Pages of the scene.
+    pub pages: usize,
+    /// Bytes that the graphics driver allocated during the search for a device.
+    pub driver: u64,
+}
+
+impl Probe {
+    /// The probe of a run: `largest` (the view that needs most pages) and a few views spread over the dataset. The
+    /// largest comes first, so that buffers get their final size at once instead of growing with spare capacity.
+    pub fn of_run(dataset: &Dataset, trainer: &Trainer, largest: Option<usize>, driver: u64) -> Probe {
+        let every = dataset.views.len().div_ceil(PROBE_VIEWS).max(1);
+        let spread = (0..dataset.views.len()).step_by(every).filter(|view| largest != Some(*view));
+        let views = largest.into_iter().chain(spread).collect();
+        Probe { views, rows: trainer.scene.rows(), pages: trainer.scene.pager.index().len(), driver }
+    }
+}
+
+/// Estimates the memory of a run with all pages in memory: without growth, grown to its cap, and with `last` Gaussians. The trainer renders
+/// the views of the probe and keeps the allocations for its steps; allocating twice would fragment the heap and exceed
+/// the estimate. Also returns what rendering measured.
+/// Errors: a view cannot be rendered.
+pub(super) fn estimate(
+    config: &TrainConfig,
+    dataset: &Dataset,
+    trainer: &mut Trainer,
+    probe: &Probe,
+    last_rows: u64,
+) -> Result<([MemoryEstimate; 3], Probed), TrainError> {
+    let rows = probe.rows;
+    let probed = trainer
+        .probe_views(dataset, &probe.views)
+        .map_err(|error| device_memory::refusal(error, config, dataset, &trainer.scene, &probe.views))?;
+    let (pixels, visible) = (probed.pixels as u64, probed.visible);
+    let [working, rendering] = trainer.run_memory().view_bytes();
+    // Image, coverage, gradient, and per-tile copies of them.
+    let of_pixels = (pixels * 4 * (3 + 1 + 3 + 6)).min(rendering);
+    // The part of the rows grows with the number of Gaussians and with the SH degree; the part of the pixels is
+    // constant.
+    let (first, last) = trainer.sh_degrees();
+    let wider = row_width(last) as f64 / row_width(first) as f64;
+    // A view that was probed in batches had the working set of one of them.
+    let working = (working as f64 * wider).max((visible * WorkingSet::row_bytes(last)) as f64);
+    let of_rows = working + (rendering - of_pixels) as f64;
+    let decoders = rayon::current_num_threads();
+    // A photo that a step waits for is decoded even if it exceeds the cache.
+    let keep_all = TargetCache::bytes_to_keep_all(&dataset.views, decoders);
+    let targets = config.image_cache.0.min(keep_all).max(largest_decode(dataset).0);
+    let pages = probe.pages as f64;
+    let is_growing = config.strategy.grows();
+    let copies = if is_growing { bytes_of_copies(probe.pages, trainer.scene.pager.frame_bytes()) } else { 0 };
+    let base = BASE_BYTES + trainer.scene.rules.adam.bytes() as u64 + probe.driver;
+    let base = base + trainer.photos.iter().map(|parameter| parameter.value_bytes(dataset)).sum::<u64>();
+    let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
+        let growth = rows_then as f64 / rows.max(1) as f64;
+        // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.
+        let most = |bytes: f64, row_bytes: u64| bytes.max((bytes * growth).min((rows_then * row_bytes) as f64));
+        let page_rows = config.page_rows as usize;
+        let fills_up = growth * first_fill(page_rows, true) as f64 > page_rows as f64;
+        MemoryEstimate {
+            frames: frames_in_memory(rows_then, last, fills_up),
+            staging: 0,
+            view: of_pixels + most(of_rows, WorkingSet::row_bytes(last) as u64 + RENDERER_ROW_BYTES_MOST) as u64,
+            view_pixels: of_pixels,
+            working: most(working, WorkingSet::row_bytes(last) as u64) as u64,
+            targets,
+            index: (pages * growth) as u64 * INDEX_BYTES,
+            copies,
+            base: base + config.export.formats().map(|format| format.memory_bytes(rows_then)).max().unwrap_or(0),
+            device: probed.device.map(|view| view.grown(growth)),
+        }
+    });
+    Ok((memory, probed))
 }
 
 #[cfg(test)]

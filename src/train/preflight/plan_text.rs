@@ -1,14 +1,12 @@
 //! The plan of a run's tiers as text, as a run prints it at its start.
 
-use super::forecast::{Forecast, Reach};
+use super::forecast::{Forecast, Reach, first_pages};
 use crate::base::units::{format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::page::folder::file_system::free_bytes;
-use crate::paging::pager::PagerConfig;
-use crate::scene::partition::first_fill;
 use crate::train::commits::checkpoint::reserve_bytes;
-use crate::train::inputs::places::drive_of;
-use crate::train::memory::largest_view::LargestView;
+use crate::train::inputs::machine::drive_of;
+use crate::train::memory::LargestView;
 use crate::train::start::first_scene::Start;
 use crate::train::start::tiers::Tiers;
 
@@ -181,8 +179,7 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
 /// run writes no pages: it keeps the pages of the drive in memory, in at most half of the budget.
 pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Option<u64>) -> Option<String> {
     let (spill_dir, budget) = (config.residence().spill_dir()?, host_mem?);
-    let frame = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
-    let pages = start.rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64);
+    let [pages, frame] = first_pages(config, start.rows);
     if pages.saturating_mul(frame) <= budget / 2 {
         return None;
     }

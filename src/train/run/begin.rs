@@ -12,11 +12,10 @@ use super::run_folder::{Begun, train_into};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::DatasetPrint;
-use crate::config::choice::Device;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::new_run;
-use crate::config::values::{Residence, Up};
+use crate::config::values::{Device, Residence, Up};
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
@@ -26,24 +25,15 @@ use crate::report::run_files::CONFIG_FILE;
 use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
-use crate::train::inputs::signals::StopFlag;
-use crate::train::memory::estimate::list_bytes;
-use crate::train::memory::estimate::{host_budget, host_bytes_now};
-use crate::train::preflight::device_memory;
-use crate::train::preflight::drive_space::{DriveUse, SimulatedRun, check_first_drive, drive_use};
-use crate::train::preflight::forecast::{
-    Forecast, Measured, Reach, STEP_GROWTH, STEP_OVER_RENDERING, limit_memory, reach,
-};
-use crate::train::preflight::plan;
-use crate::train::preflight::plan_text;
-use crate::train::preflight::probe::{Probe, estimate, rows_at_most};
-use crate::train::preflight::results_space::check_drive_of_results;
-use crate::train::start::first_scene::Start;
-use crate::train::start::first_scene::dataset_print;
+use crate::train::inputs::machine::StopFlag;
+use crate::train::memory::{host_budget, host_bytes_now};
+use crate::train::preflight::forecast::{Forecast, check_drive_of_results, check_first_drive, plan_run};
+use crate::train::preflight::plan::rows_at_most;
+use crate::train::preflight::{device_memory, plan_text};
+use crate::train::start::first_scene::{Start, dataset_print};
 use crate::train::start::tiers::{self, Tiers};
-use crate::train::state::held_out::{are_too_few_to_decide, too_few_to_decide};
 use crate::train::state::trainer::Trainer;
-use crate::train::step::soundness::no_view_sees;
+use crate::train::state::turns::{keeps_first_count, too_few_to_decide};
 use std::path::{Path, PathBuf};
 
 /// Runs a request from beginning to end.
@@ -144,11 +134,6 @@ pub(super) fn first_trainer(
     Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
 }
 
-/// Whether a run that is to decide its count has too few training photos for it, and so keeps the count that it starts with.
-fn keeps_first_count(config: &TrainConfig, dataset: &Dataset) -> bool {
-    limits::growth_rule(config).is_some() && are_too_few_to_decide(dataset.train_views().len())
-}
-
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
 pub(crate) fn begin(
     quiet: bool,
@@ -158,11 +143,12 @@ pub(crate) fn begin(
     for warning in &start.dataset.warnings {
         crate::tell!("warning: {warning}");
     }
-    if keeps_first_count(config, &start.dataset) {
-        crate::tell!("warning: {}", too_few_to_decide(start.dataset.train_views().len()));
-    }
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    let views = start.dataset.train_views().len();
+    if keeps_first_count(&options.strategy, views) {
+        crate::tell!("warning: {}", too_few_to_decide(views));
+    }
     if config.up == Up::Auto {
         options.up = start.up()?;
     }
@@ -211,60 +197,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
         return Ok(None);
     }
     let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
-    plan(&request.config, &dataset, &tiers, &mut trainer, host_mem, driver, drive_rate).map(Some)
-}
-
-/// Chooses the frames of a run, refuses what cannot fit, and forecasts the rest. `driver`: bytes of the graphics driver.
-fn plan(
-    config: &TrainConfig,
-    dataset: &Dataset,
-    tiers: &Tiers,
-    trainer: &mut Trainer,
-    host_mem: Option<u64>,
-    driver: u64,
-    drive_rate: DriveRate,
-) -> Result<Forecast, TrainError> {
-    trainer.renderer.set_list_bytes(host_mem.map(list_bytes));
-    let largest = plan::allow_largest_view(config, dataset, trainer, host_mem);
-    if largest.is_none() {
-        return Err(no_view_sees(dataset, trainer.scene.rows()).into());
-    }
-    let probe = Probe::of_run(dataset, trainer, largest, driver);
-    let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
-    let pixels = dataset.train_views().iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
-    let (last, known) = match keeps_first_count(config, dataset) {
-        true => (rows, Reach::Kept),
-        false => reach(config, rows, pixels, steps_done, trainer.growth()),
-    };
-    let (mut memory, times) = estimate(config, dataset, trainer, &probe, last)?;
-    device_memory::check(config, &memory)?;
-    let plan = plan::plan_tiers(config, dataset, trainer, tiers, host_mem, &mut memory)?;
-    let growth = last as f64 / rows.max(1) as f64;
-    let step_seconds = times.seconds * STEP_OVER_RENDERING;
-    let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
-    let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
-    let drive = plan.frames.zip(frames_at_end).map_or(DriveUse::default(), |(now, then)| {
-        let frames = [now, then].map(|frames| frames as usize);
-        drive_use(config, dataset, trainer, &SimulatedRun { frames, growth, step_seconds, drive: drive_rate })
-    });
-    let measured = Measured {
-        rows,
-        reach: (last, known),
-        steps_done,
-        view_seconds: times.seconds,
-        visible_share: times.visible_share,
-        drive,
-        frames_at_end,
-    };
-    let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
-    if !(known == Reach::Decided && trainer.growth().is_empty()) {
-        return Ok(forecast);
-    }
-    let [first, most, _] = memory;
-    let drive = measured.drive.without_growth();
-    let kept = Measured { reach: (rows, known), drive, frames_at_end: plan.frames, ..measured };
-    let if_kept = Forecast::new(config, [first, most, first], plan, &kept, host_mem);
-    Ok(Forecast { if_kept: Some(Box::new(if_kept)), ..forecast })
+    plan_run(&request.config, &dataset, &tiers, &mut trainer, host_mem, driver, drive_rate).map(Some)
 }
 
 /// Plans a run, prints the plan, and trains to the end.
@@ -277,7 +210,7 @@ pub(super) fn plan_and_train(
 ) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     trainer.start_photos(dataset).iter().for_each(|warning| crate::tell!("warning: {warning}"));
-    let forecast = plan(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
+    let forecast = plan_run(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
     if !request.quiet {
         let of_device = device_memory::describe(config, forecast.memory_at_end());
         let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;

@@ -13,7 +13,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::report::run_files::{BEGUN_FILE, CONFIG_FILE};
-use crate::train::inputs::places::absolute;
+use crate::train::inputs::machine::absolute;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 

@@ -6,8 +6,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
-use crate::config::file::{KEYS, TrainConfig};
-use crate::config::key::{Class, Key};
+use crate::config::file::{Class, KEYS, Key, TrainConfig};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
 use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};

@@ -6,8 +6,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, part_path, sync_folder};
-use crate::config::facts::read_resolved;
-use crate::config::file::TrainConfig;
+use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;

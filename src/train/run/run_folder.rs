@@ -16,11 +16,9 @@ use super::training_loop::TrainingLoop;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
-use crate::config::choice::{Chosen, LogFormat};
-use crate::config::facts::{Resolved, write_config};
-use crate::config::file::TrainConfig;
+use crate::config::file::{Resolved, TrainConfig, write_config};
 use crate::config::limits;
-use crate::config::values::Up;
+use crate::config::values::{Chosen, LogFormat, Up};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
@@ -29,16 +27,13 @@ use crate::exchange::sink::Written;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::Checkpoint;
-use crate::train::commits::results_wait::Results;
-use crate::train::commits::save::{export, save, scene_meta};
+use crate::train::commits::results::{Results, export, save, scene_meta};
 use crate::train::error::TrainError;
-use crate::train::inputs::places::absolute;
-use crate::train::inputs::signals::StopFlag;
+use crate::train::inputs::machine::{StopFlag, absolute};
 use crate::train::log::progress::{Count, Progress};
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
-use crate::train::memory::estimate::host_bytes_peak;
+use crate::train::memory::host_bytes_peak;
 use crate::train::preflight::forecast::Forecast;
-use crate::train::preflight::growth_costs::GrowthCosts;
 use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
@@ -185,7 +180,6 @@ pub(super) fn train_into(
     let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     metrics.start_clock(trainer.train_seconds());
-    let costs = GrowthCosts::new(forecast);
     let looped = TrainingLoop {
         trainer: &mut trainer,
         dataset,
@@ -196,7 +190,7 @@ pub(super) fn train_into(
         stop,
         checkpoint,
         live,
-        costs,
+        forecast: Some(forecast),
     }
     .run();
     let step_costs =

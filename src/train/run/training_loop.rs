@@ -16,14 +16,13 @@ use crate::paging::error::PagingError;
 use crate::render::Traffic;
 use crate::report::run_files::saved_ply_name;
 use crate::train::commits::checkpoint::Checkpoint;
-use crate::train::commits::save::save;
+use crate::train::commits::results::save;
 use crate::train::error::TrainError;
-use crate::train::inputs::signals::StopFlag;
+use crate::train::inputs::machine::StopFlag;
 use crate::train::log::progress::{Progress, Shown};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
-use crate::train::memory::estimate::host_bytes_peak;
-use crate::train::memory::staging::PLAN_BYTES;
-use crate::train::preflight::growth_costs::GrowthCosts;
+use crate::train::memory::{PLAN_BYTES, host_bytes_peak};
+use crate::train::preflight::forecast::Forecast;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;
 use crate::train::step::train_step::StepOutcome;
@@ -45,8 +44,8 @@ pub struct TrainingLoop<'a> {
     pub checkpoint: Option<&'a mut Checkpoint>,
     /// The page that shows the run while it trains, if the user asked for it.
     pub live: Option<LivePage>,
-    /// What the run takes by its count.
-    pub costs: GrowthCosts,
+    /// What the run will take, to be named when a check of growth changes the count.
+    pub forecast: Option<&'a Forecast>,
 }
 
 impl TrainingLoop<'_> {
@@ -158,7 +157,8 @@ impl TrainingLoop<'_> {
         }
         if let Some(check) = self.trainer.growth().get(checks) {
             self.progress.say(&check.to_string());
-            let costs = self.costs.text(check.allowed).filter(|_| check.allowed != allowed);
+            let forecast = self.forecast.filter(|_| check.allowed != allowed);
+            let costs = forecast.and_then(|forecast| forecast.costs_text(check.allowed));
             costs.iter().for_each(|line| self.progress.say(line));
         }
         Ok(true)

@@ -27,17 +27,14 @@ use crate::scene::init::{InitOptions, gaussians_from_points, random_points_in_fr
 use crate::scene::log_scales::LogScaleRange;
 use crate::scene::partition::first_fill;
 use crate::scene::state::SceneState;
-use crate::train::error::TrainError;
-use crate::train::error::not_stored;
-use crate::train::inputs::dataset_print::view_print;
-use crate::train::inputs::dataset_print::{GaussiansPrint, points_print};
-use crate::train::inputs::fit::PositionSample;
+use crate::train::error::{TrainError, not_stored};
+use crate::train::inputs::dataset_print::{GaussiansPrint, points_print, view_print};
 use crate::train::inputs::gaussian_pages::{
-    GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead, file_warnings, giants_warning, remove_giants,
-    truncate_sh,
+    GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead, PositionSample, file_warnings, giants_warning,
+    remove_giants, truncate_sh,
 };
-use crate::train::inputs::places::folder_beside;
-use crate::train::memory::estimate::check_photos_fit;
+use crate::train::inputs::machine::folder_beside;
+use crate::train::memory::check_photos_fit;
 use crate::train::step::pages::{PagedScene, first_pages};
 use crate::train::stores::StoredStart;
 use rayon::prelude::*;

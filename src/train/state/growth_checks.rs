@@ -4,7 +4,7 @@
 //! The loss says how crowded the scene is. Where Gaussians are scarce, even the faintest carry detail; where they abound,
 //! neighbours hide what a removed one leaves.
 //!
-//! Not here: the decision ([`crate::densify::growth`]), which views (`held_out`).
+//! Not here: the decision ([`crate::densify::growth`]), which views (`turns`).
 //!
 //! Invariants: 1. nothing is stored; 2. the values are a function of the scene, the step and the views: rows are ordered by
 //! weight, then by their place in the view; 3. memory beside the renderer's is that of one batch of rows, and four bytes a
@@ -148,7 +148,7 @@ mod tests {
     use crate::render::cpu::CpuRenderer;
     use crate::scene::columns::Columns;
     use crate::train::step::pages::PagedScene;
-    use crate::train::step::working_set::WorkingSet;
+    use crate::train::step::pages::WorkingSet;
 
     /// More pages than a batch of any size below, in front of a camera that sees all of them.
     fn scene(options: &RunOptions) -> PagedScene {

@@ -3,7 +3,6 @@
 
 pub mod eval;
 mod growth_checks;
-pub(crate) mod held_out;
 pub(crate) mod run_memory;
 pub mod trainer;
-mod turns;
+pub(crate) mod turns;

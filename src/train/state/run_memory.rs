@@ -1,4 +1,4 @@
-//! The memory of a run between its steps: adjusts the number of frames and raises the budget, as [`crate::train::memory::budget`]
+//! The memory of a run between its steps: adjusts the number of frames and raises the budget, as [`crate::train::memory`]
 //! computes them.
 //!
 //! Invariant: no bit of the result depends on it.
@@ -10,10 +10,8 @@ use crate::photos::PhotoParameters;
 use crate::render::Renderer;
 use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
-use crate::train::memory::budget::{HostBudget, SPARE_SHARE, ViewMemory};
-use crate::train::memory::staging::PLAN_BYTES_LEAST;
-use crate::train::step::pages::PagedScene;
-use crate::train::step::working_set::WorkingSet;
+use crate::train::memory::{HostBudget, PLAN_BYTES_LEAST, SPARE_SHARE, ViewMemory};
+use crate::train::step::pages::{PagedScene, WorkingSet};
 
 /// The number of frames rises only by more than 1/16, to avoid small changes at every step.
 const FRAME_RISE_SHARE: usize = 16;

@@ -43,7 +43,7 @@
 
 use super::device_slots::{Leaves, SlotCache, device_of};
 use super::pages::PagedScene;
-use super::step_faults::{StepFault, StepFaults, steps_in_flight};
+use super::soundness::{StepFault, StepFaults, steps_in_flight};
 use super::train_step::{ROWS_PER_UNUSABLE, StepOutcome};
 use crate::base::error::InputError;
 use crate::base::ids::PageNo;

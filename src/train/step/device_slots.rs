@@ -33,7 +33,7 @@
 //! The list of the next view's pages is computed from the bounds before this step, so it may lack pages or have superfluous ones. The
 //! pages that a step touches follow from the bounds at that step: a missing page is copied then, and a superfluous page changes no bit.
 //!
-//! Not here: pages that events change (`device_events`); steps in flight (`device_flights`).
+//! Not here: pages that events change (`device_tier`); steps in flight (`device_flights`).
 //!
 //! Invariants: 1. a held page differs from its frame, a page that is leaving exists in its copy back alone, and every other page equals
 //! its frame; 2. slots, frames and the order of copies change no bit of a page; 3. the slot of a page of a batch stays until the

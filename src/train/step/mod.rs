@@ -6,15 +6,10 @@
 pub mod batch;
 pub mod catch_up;
 pub mod comparison;
-mod device_events;
 pub mod device_flights;
-pub mod device_rows;
 pub mod device_slots;
 pub mod device_tier;
 pub mod pages;
 pub(crate) mod soundness;
-mod step_faults;
 pub mod train_step;
-mod update;
 pub mod view;
-pub mod working_set;

@@ -1,8 +1,9 @@
 //! Checks that training has an effect: warns of skipped rows and steps, and stops a run that has diverged or whose photos
-//! are all masked. The error names the cause.
+//! are all masked. The error names the cause. Also injected faults of recorded steps, for tests: `GSSCALE_STEP_FAULT` names steps whose
+//! lists have no room, or whose gate closes as for a loss that is not finite; `GSSCALE_STEPS_IN_FLIGHT` limits the steps in flight.
 //!
-//! Invariants: 1. nothing here changes a number of the result: a run is stopped or goes on; 2. a run that stops here
-//! keeps its last commit and writes its last good step.
+//! Invariants: 1. nothing here changes a number of the result: a run is stopped or goes on, and no fault and no number of steps in flight
+//! changes a bit; 2. a run that stops here keeps its last commit and writes its last good step.
 
 use super::train_step::{Skipped, StepOutcome};
 use crate::base::error::InputError;
@@ -160,5 +161,72 @@ fn problem_of(outcome: &StepOutcome) -> String {
         Some(Skipped::Loss) => "the loss is not finite".to_string(),
         Some(Skipped::Gradients(rows)) => of_rows(rows),
         None => of_rows(outcome.rows_skipped),
+    }
+}
+
+/// Environment variable of the faults: `rows@12,isects@13,closed@20`, 0-based steps.
+const FAULTS: &str = "GSSCALE_STEP_FAULT";
+/// Environment variable of the steps in flight: 0 for steps that wait for each of their numbers, 1, or 2.
+const IN_FLIGHT: &str = "GSSCALE_STEPS_IN_FLIGHT";
+
+/// A fault of a recorded step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum StepFault {
+    /// Its list of rows has room for one row.
+    Rows,
+    /// Its lists of tiles have room for one intersection.
+    Isects,
+    /// Its gate closes whatever its numbers are.
+    Closed,
+}
+
+/// Faults of the steps of a run.
+#[derive(Debug, Clone, Default)]
+pub(super) struct StepFaults(Vec<(StepFault, u32)>);
+
+impl StepFaults {
+    /// Parses text such as `rows@12,closed@13`; ignores anything else.
+    fn parse(text: &str) -> StepFaults {
+        let fault = |part: &str| {
+            let (kind, step) = part.trim().split_once('@')?;
+            let kind = match kind {
+                "rows" => StepFault::Rows,
+                "isects" => StepFault::Isects,
+                "closed" => StepFault::Closed,
+                _ => return None,
+            };
+            Some((kind, step.parse().ok()?))
+        };
+        StepFaults(text.split(',').filter_map(fault).collect())
+    }
+
+    /// The faults that the environment requests.
+    pub fn from_environment() -> StepFaults {
+        std::env::var(FAULTS).map_or(StepFaults::default(), |text| StepFaults::parse(&text))
+    }
+
+    /// Whether a fault is injected at a step.
+    pub fn is_injected_at(&self, fault: StepFault, step: u32) -> bool {
+        self.0.contains(&(fault, step))
+    }
+}
+
+/// The most steps in flight, `most` unless the environment asks for fewer.
+pub(super) fn steps_in_flight(most: usize) -> usize {
+    let asked = std::env::var(IN_FLIGHT).ok().and_then(|text| text.trim().parse().ok());
+    asked.unwrap_or(most).min(most)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn faults_strike_the_steps_they_name() {
+        let faults = StepFaults::parse("rows@12, closed@13,fire@1,isects@,closed");
+        assert!(faults.is_injected_at(StepFault::Rows, 12) && faults.is_injected_at(StepFault::Closed, 13));
+        assert!(!faults.is_injected_at(StepFault::Rows, 13) && !faults.is_injected_at(StepFault::Isects, 12));
+        assert_eq!(faults.0.len(), 2);
+        assert!(StepFaults::parse("").0.is_empty());
     }
 }

@@ -12,8 +12,7 @@
 
 use super::batch::{AtStep, RowBackend, UpdateCounts};
 use super::comparison::Comparison;
-use super::pages::PagedScene;
-use super::working_set::WorkingSet;
+use super::pages::{PagedScene, WorkingSet};
 use crate::base::ids::PageNo;
 use crate::base::trace;
 use crate::densify::strategy::ViewGradients;

@@ -8,8 +8,7 @@
 //! the view has.
 
 use super::comparison::Comparison;
-use super::pages::PagedScene;
-use super::working_set::WorkingSet;
+use super::pages::{PagedScene, WorkingSet};
 use crate::base::ids::PageNo;
 use crate::render::{Gradients, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;

@@ -1,35 +1,29 @@
 //! The commands of gsscale-ckpt: list, inspect, verify, export, import, clone, salvage, rollback, prune.
 //!
-//! Each returns plain structs, which the tool prints as text or
-//! JSON.
+//! Each returns plain structs, which the tool prints as text or JSON.
 //!
 //! Invariants: 1. read-only commands write nothing ([`crate::page::tool::reading`]); 2. a command creates its store or
 //! file whole or not at all; 3. values of rows come from the trainer's code.
 
 mod change;
-mod copy;
 mod export;
 mod import;
 mod inspect;
 pub mod ownership;
 mod salvage;
-mod start;
-mod verify;
 
-pub use change::{PruneRequest, Pruned, RolledBack, prune, rollback};
-pub use copy::{Copied, clone_store};
-pub use export::{ExportRequest, Exported, export};
+pub use change::{Copied, PruneRequest, Pruned, RolledBack, clone_store, prune, rollback};
+pub use export::{ExportRequest, Exported, StoredStart, export};
 pub use import::{ImportRequest, Imported, import};
-pub use inspect::{GenerationLine, Inspected, Listed, PageInspected, Spread, inspect, inspect_page, list};
+pub use inspect::{
+    Fault, GenerationLine, Inspected, Listed, PageInspected, Spread, Verdict, inspect, inspect_page, list, verify,
+};
 pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
-pub use start::StoredStart;
-pub use verify::{Fault, Verdict, verify};
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::RunState;
-use crate::config::facts::read_resolved;
-use crate::config::file::TrainConfig;
+use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};

@@ -21,6 +21,7 @@
 //! In all cases, files inside a spill directory are deleted by the store's identity ([`SpillDir::remove`]); other files
 //! stay, and so does a store that cannot be opened.
 
+use super::run_state_of;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
@@ -31,11 +32,9 @@ use crate::page::map::commit::{CommitConfig, CommitError};
 use crate::page::map::opening::Opened;
 use crate::page::tool::reading::{Access, StoreReader, WitnessRule};
 use crate::page::tool::uncommitted::{holds_no_commit, is_uncommitted, remove_uncommitted};
-use crate::train::commits::checkpoint::reserve_bytes;
-use crate::train::commits::first_commit::MAP_CACHE_BYTES;
+use crate::train::commits::checkpoint::{MAP_CACHE_BYTES, reserve_bytes};
 use crate::train::error::TrainError;
-use crate::train::inputs::places::absolute;
-use crate::train::stores::run_state_of;
+use crate::train::inputs::machine::absolute;
 use std::path::Path;
 
 /// Refuses the checkpoint of another run.

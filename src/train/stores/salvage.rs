@@ -14,13 +14,12 @@
 //! statistics of a round that will never be applied, and these are cleared. If no page had applied the last round, all
 //! pages keep their statistics, and the next round covers more steps.
 
-use super::copy::{layout_for, usual_codec};
+use super::change::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
-use crate::config::facts::read_resolved;
-use crate::config::file::TrainConfig;
+use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::{self, RunOptions};
 use crate::densify::stats::GradHistogram;
 use crate::densify::strategy::{Effect, effect_of};
@@ -29,11 +28,9 @@ use crate::page::format::spill_format::SpillFormat;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
-use crate::page::tool::slot_reader::SlotReader;
-use crate::page::tool::slot_reader::{Scan, scan_slots};
+use crate::page::tool::slot_reader::{Scan, SlotReader, scan_slots};
 use crate::page::versions::slots::SlotLayout;
-use crate::paging::stored::{check_values, layout_of};
-use crate::paging::stored::{label, meta_from_label};
+use crate::paging::stored::{check_values, label, layout_of, meta_from_label};
 use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;

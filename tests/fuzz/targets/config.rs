@@ -2,8 +2,7 @@
 
 use crate::Target;
 use gsscale::base::units::parse_bytes;
-use gsscale::config::command_line::default_file;
-use gsscale::config::file::TrainConfig;
+use gsscale::config::file::{TrainConfig, default_file};
 use gsscale::page::format::codec::Codec;
 use gsscale::schedule::order::Order;
 
