@@ -24,7 +24,7 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
-use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::PagedScene;
 use gsscale::train::step::pages::WorkingSet;
@@ -129,7 +129,7 @@ fn steps<R: Renderer>(
     let (mut step, mut hash, mut counts, mut counted) = (0, Hash::default(), Counts::default(), false);
     let mut round = |counted: bool| {
         for (camera, target) in &views {
-            let (rows, comparison) = (&mut HostRows::new(renderer), &mut Comparison::new(target, options.loss));
+            let (rows, comparison) = (&mut RowsInHost::new(renderer), &mut Comparison::new(target, options.loss));
             let view = StepView { step, camera, render: &options.render, collects: false, pages_most: usize::MAX };
             let done = train_step(&mut scene, &mut working, rows, &view, comparison);
             let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };

@@ -32,7 +32,7 @@ use gsscale::render::{
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
-use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::catch_up::{gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::WorkingSet;
@@ -169,7 +169,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
             for (camera, target) in &views {
                 renderer.begin = Some(Instant::now());
                 let (rows, comparison) =
-                    (&mut HostRows::new(&mut renderer), &mut Comparison::new(target, options.loss));
+                    (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(target, options.loss));
                 let view = StepView { step, camera, render: &options.render, collects: true, pages_most: usize::MAX };
                 let done = train_step(&mut scene, &mut working, rows, &view, comparison);
                 let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };

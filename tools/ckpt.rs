@@ -13,9 +13,9 @@ use gsscale::page::map::commit::CommitError;
 use gsscale::page::map::entries::MapError;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::{
-    ExportRequest, Fault, GenerationLine, ImportRequest, Inspected, PageInspected, PruneRequest, Pruned, RolledBack,
-    SalvageRequest, Salvaged, Spread, Verdict, clone_store, export, find_store, import, inspect, inspect_page, list,
-    prune, rollback, salvage, verify,
+    ExportRequest, GenerationLine, ImportRequest, Inspected, PageInspected, PruneRequest, Pruned, RolledBack,
+    SalvageRequest, Salvaged, StoreFault, ValueSpread, Verdict, clone_store, export, find_store, import, inspect,
+    inspect_page, list, prune, rollback, salvage, verify,
 };
 use serde::Serialize;
 use std::path::PathBuf;
@@ -250,7 +250,7 @@ fn store_text(s: &Inspected) -> String {
 }
 
 fn page_text(p: &PageInspected) -> String {
-    let spread = |s: &Spread| format!("{:.4} to {:.4}, mean {:.4}", s.least, s.most, s.mean);
+    let spread = |s: &ValueSpread| format!("{:.4} to {:.4}, mean {:.4}", s.least, s.most, s.mean);
     let mut text = format!(
         "page        {}, since generation {}\n\
          slot        {} offset {}, write {}\n\
@@ -336,7 +336,7 @@ fn verify_text(verdict: &Verdict, args: &Verify) -> String {
     text
 }
 
-fn fault_line(fault: &Fault) -> String {
+fn fault_line(fault: &StoreFault) -> String {
     let mut words = vec![format!("FAULT {}", fault.kind)];
     words.extend(fault.page.as_ref().map(|page| format!("page {page}")));
     words.extend(fault.generation.map(|generation| format!("generation {generation}")));

@@ -100,8 +100,8 @@ macro_rules! config_keys {
         }
 
         /// Every key, in order.
-        pub const KEYS: &[Key] = &[$($(
-            Key { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class, shown: shown!($($shown)?) },
+        pub const KEYS: &[ConfigKey] = &[$($(
+            ConfigKey { heading: $heading, field: stringify!($name), meaning: concat!($($doc, "\n"),+), class: Class::$class, shown: shown!($($shown)?) },
         )+)+];
     };
 }
@@ -464,7 +464,7 @@ impl TrainConfig {
 }
 
 #[derive(Debug, Clone, Copy)]
-pub struct Key {
+pub struct ConfigKey {
     pub heading: &'static str,
     /// Its field in [`super::file::TrainConfig`], also the id of the flag.
     pub field: &'static str,
@@ -474,7 +474,7 @@ pub struct Key {
     pub shown: Shown,
 }
 
-impl Key {
+impl ConfigKey {
     /// Its name in files and on the command line, in kebab-case.
     pub fn name(&self) -> String {
         self.field.replace('_', "-")

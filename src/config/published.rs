@@ -11,7 +11,7 @@ use super::file::{FILE_BYTES_MAX, KEYS, TABLES, TrainConfig};
 use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
-use crate::config::file::Key;
+use crate::config::file::ConfigKey;
 use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -35,7 +35,7 @@ pub struct PublishedRun {
     /// Settings of the active tier.
     pub config: TrainConfig,
     pub facts: Published,
-    pub tiers: BTreeMap<String, Tier>,
+    pub tiers: BTreeMap<String, PublishedTier>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -99,7 +99,7 @@ pub struct MemorySaving {
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, rename_all = "kebab-case")]
-pub struct Tier {
+pub struct PublishedTier {
     /// Mean screen-space gradient above which Gaussians grow.
     pub grow_grad2d: f64,
     /// Size up to which growing Gaussians are cloned, times the scene scale.
@@ -113,7 +113,7 @@ pub struct Tier {
 struct Tables {
     published: Published,
     #[serde(default)]
-    tier: BTreeMap<String, Tier>,
+    tier: BTreeMap<String, PublishedTier>,
 }
 
 impl PublishedRun {
@@ -163,7 +163,7 @@ impl PublishedRun {
 
     /// Name of the tier with the config's settings.
     pub fn tier_of(&self, config: &TrainConfig) -> Option<&str> {
-        let of = |t: &Tier| (t.grow_grad2d, t.grow_scale3d, t.refine_stop);
+        let of = |t: &PublishedTier| (t.grow_grad2d, t.grow_scale3d, t.refine_stop);
         let used = (config.grow_grad2d, config.grow_scale3d, config.refine_stop);
         self.tiers.iter().find(|(_, tier)| of(tier) == used).map(|(name, _)| name.as_str())
     }
@@ -177,7 +177,7 @@ pub fn differences(published: &TrainConfig, used: &TrainConfig) -> Vec<String> {
     // A run writes the place that auto chose.
     let [theirs, ours] = [published, used].map(|config| config.optimizer_on.0.unwrap_or_default());
     let is_free = |name: &str| {
-        let same_run = |key: &Key| key.name() == name && !key.class.makes_another_run();
+        let same_run = |key: &ConfigKey| key.name() == name && !key.class.makes_another_run();
         KEYS.iter().any(same_run)
             || (name == "schedule-steps" && is_same_schedule)
             || (name == "optimizer-on" && theirs == ours)

@@ -1,6 +1,6 @@
 //! Every config file parses and passes its checks; default.toml equals the built-in defaults.
 
-use gsscale::config::file::{KEYS, Key, Shown, TrainConfig, default_file};
+use gsscale::config::file::{ConfigKey, KEYS, Shown, TrainConfig, default_file};
 use std::path::PathBuf;
 
 fn configs() -> PathBuf {
@@ -21,7 +21,7 @@ fn default_file_is_the_default() {
         "configs/default.toml is out of date ({other}): run the test once with GSSCALE_WRITE_DEFAULT_CONFIG=1"
     );
     assert_eq!(TrainConfig::read(&path).unwrap(), TrainConfig::default());
-    for name in KEYS.iter().map(Key::name) {
+    for name in KEYS.iter().map(ConfigKey::name) {
         assert!(written.contains(&format!("\n{name} = ")), "{name} is not in default.toml");
     }
 }

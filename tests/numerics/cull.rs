@@ -20,7 +20,7 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::state::SceneState;
-use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::catch_up::{evaluate_all, gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::{PagedScene, WorkingSet};
@@ -115,7 +115,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
-        let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
+        let (rows, comparison) = (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(&target, options.loss));
         let (camera, render) = (&camera, &options.render);
         let view = StepView { step, camera, render, collects: false, pages_most: usize::MAX };
         train_step(&mut pages, &mut working, rows, &view, comparison).unwrap();

@@ -27,7 +27,7 @@ use gsscale::train::commits::checkpoint::Checkpoint;
 use gsscale::train::commits::results::save;
 use gsscale::train::error::TrainError;
 use gsscale::train::inputs::machine::StopFlag;
-use gsscale::train::log::progress::Progress;
+use gsscale::train::log::progress::RunProgress;
 use gsscale::train::log::report::MetricsLog;
 use gsscale::train::run::training_loop::TrainingLoop;
 use gsscale::train::start::first_scene::{Start, dataset_print};
@@ -166,7 +166,7 @@ impl World {
         }
         checkpoint.commit(&mut trainer, &mut metrics)?;
         plan(faults);
-        let (mut progress, stop) = (Progress::new(config.steps, true), StopFlag::default());
+        let (mut progress, stop) = (RunProgress::new(config.steps, true), StopFlag::default());
         let looped = TrainingLoop {
             trainer: &mut trainer,
             dataset: &dataset,

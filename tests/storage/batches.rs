@@ -21,7 +21,7 @@ use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::image::Target;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::error::TrainError;
-use gsscale::train::step::batch::HostRows;
+use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::comparison::Comparison;
 use gsscale::train::step::pages::{PagedScene, WorkingSet};
 use gsscale::train::step::train_step::{StepOutcome, StepView, train_step};
@@ -82,7 +82,7 @@ fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
-    let (rows, comparison) = (&mut HostRows::new(&mut renderer), &mut Comparison::new(&target, options.loss));
+    let (rows, comparison) = (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(&target, options.loss));
     let view = StepView { step, camera: &camera, render: &render, collects: false, pages_most: usize::MAX };
     train_step(scene, &mut working, rows, &view, comparison)
 }

@@ -28,7 +28,7 @@ const PSNR_WEIGHT: f64 = 0.05;
 
 /// What a step shows.
 #[derive(Debug, Clone, Copy)]
-pub struct Shown {
+pub struct ShownStep {
     /// Gaussians in the scene.
     pub gaussians: u64,
     /// PSNR of the step's view, dB.
@@ -36,7 +36,7 @@ pub struct Shown {
 }
 
 /// Progress of a loop over steps.
-pub struct Progress {
+pub struct RunProgress {
     bar: Option<ProgressBar>,
     quiet: bool,
     /// Steps done before this process.
@@ -49,7 +49,7 @@ pub struct Progress {
     psnr: Option<f64>,
 }
 
-impl Progress {
+impl RunProgress {
     /// A display for `total` steps.
     pub fn new(total: u32, quiet: bool) -> Self {
         let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
@@ -58,7 +58,7 @@ impl Progress {
         });
         let now = Instant::now();
         let rate = RecentRate::default();
-        Progress { bar, quiet, first: 0, total, rate, started: now, last_shown: now, psnr: None }
+        RunProgress { bar, quiet, first: 0, total, rate, started: now, last_shown: now, psnr: None }
     }
 
     /// The display of a run resumed after `first` steps; these do not count in the rate.
@@ -66,11 +66,11 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.set_position(u64::from(first));
         }
-        Progress { first, ..self }
+        RunProgress { first, ..self }
     }
 
     /// Shows that `done` steps are done.
-    pub fn step(&mut self, done: u32, shown: Shown) {
+    pub fn step(&mut self, done: u32, shown: ShownStep) {
         let psnr = self.psnr.map_or(shown.psnr, |mean| mean + PSNR_WEIGHT * (shown.psnr - mean));
         self.psnr = Some(psnr);
         if self.quiet {
@@ -87,7 +87,7 @@ impl Progress {
             return;
         }
         self.last_shown = Instant::now();
-        let words = words(Shown { psnr, ..shown }, rate, self.total.saturating_sub(done));
+        let words = words(ShownStep { psnr, ..shown }, rate, self.total.saturating_sub(done));
         match &self.bar {
             Some(bar) => bar.set_message(words),
             None => crate::tell!("step {done}/{}  {words}", self.total),
@@ -122,7 +122,7 @@ fn digits(n: u32) -> usize {
 }
 
 /// `1.25M Gaussians  PSNR 24.31  103/s  12 min left`.
-fn words(shown: Shown, rate: f64, steps_left: u32) -> String {
+fn words(shown: ShownStep, rate: f64, steps_left: u32) -> String {
     let rate_text = if rate < 9.95 { format!("{rate:.1}") } else { format!("{rate:.0}") };
     let left = match steps_left {
         0 => "0 s".to_string(),
@@ -225,7 +225,7 @@ mod tests {
             for gaussians in [0, 999, 1_250_000, 4_294_967_294] {
                 for (rate, psnr) in [(0.0, 0.0), (0.01, 24.31), (103.4, 100.0), (99_999.0, 9.5)] {
                     for left in [0, 1, total] {
-                        let words = words(Shown { gaussians, psnr }, rate, left);
+                        let words = words(ShownStep { gaussians, psnr }, rate, left);
                         assert!(words.len() <= WORDS, "{words}");
                         let line = format!("step {total}/{total}  {words}");
                         assert!(line.len() <= COLUMNS, "{line}");
@@ -233,13 +233,13 @@ mod tests {
                 }
             }
         }
-        let words = words(Shown { gaussians: 1_250_000, psnr: 24.312 }, 41.7, 30_000);
+        let words = words(ShownStep { gaussians: 1_250_000, psnr: 24.312 }, 41.7, 30_000);
         assert_eq!(words, "1.25M Gaussians  PSNR 24.31  42/s  12 min left");
     }
 
     #[test]
     fn steps_of_earlier_lives_make_no_run_faster() {
-        let after = Progress::new(1200, true).after(900);
+        let after = RunProgress::new(1200, true).after(900);
         assert_eq!((after.first, after.total), (900, 1200));
     }
 }

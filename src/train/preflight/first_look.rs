@@ -21,7 +21,7 @@ use crate::train::inputs::machine;
 use crate::train::memory::{host_budget, largest_view};
 use crate::train::start::first_scene::Start;
 use crate::train::state::trainer::Trainer;
-use crate::train::step::pages::{PageRules, PagedScene};
+use crate::train::step::pages::{PagedScene, SceneRules};
 use std::path::Path;
 
 /// Views that are rendered for the time of a step.
@@ -73,7 +73,7 @@ pub fn first_look(
     let mut start = Start::look(scene, config, folder, host_mem)?;
     let options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
-    let rules = PageRules::new(&options);
+    let rules = SceneRules::new(&options);
     let mut index = Vec::new();
     start.for_each_page(&options, folder, host_mem, &mut |id, state| {
         index.push(rules.meta(id, &state));

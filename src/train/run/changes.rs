@@ -6,7 +6,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
-use crate::config::file::{Class, KEYS, Key, TrainConfig};
+use crate::config::file::{Class, ConfigKey, KEYS, TrainConfig};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
 use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};
@@ -20,7 +20,7 @@ pub(super) fn kept_config(file: &Path, of_file: &TrainConfig, config: &TrainConf
     let broken = |e: String| InputError::new(file, e, "report this as a bug");
     let table = |config: &TrainConfig| toml::Table::try_from(config).map_err(|e| broken(e.to_string()));
     let (of_file, mut kept) = (table(of_file)?, table(config)?);
-    for name in KEYS.iter().filter(|key| !key.class.lasts()).map(Key::name) {
+    for name in KEYS.iter().filter(|key| !key.class.lasts()).map(ConfigKey::name) {
         kept.extend(of_file.get(&name).map(|value| (name, value.clone())));
     }
     let kept = TrainConfig::deserialize(kept).map_err(|e| broken(e.to_string()))?;
@@ -59,7 +59,7 @@ impl Changes {
         let (there, here) = (table(&then)?, table(config)?);
         let mut changes = Changes::default();
         for (name, now) in &here {
-            let Some(&Key { class, .. }) = KEYS.iter().find(|key| key.name() == *name) else { continue };
+            let Some(&ConfigKey { class, .. }) = KEYS.iter().find(|key| key.name() == *name) else { continue };
             // A key that the commit lacks counts as a difference, so that the user sees its default.
             let then = there.get(name).filter(|_| written.contains_key(name));
             if class.is_derived() || then == Some(now) {

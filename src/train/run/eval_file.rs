@@ -25,7 +25,7 @@ use crate::train::log::report::TestMetrics;
 use crate::train::memory::{check_evaluation_fits, check_photos_fit, host_budget};
 use crate::train::state::eval::{EvalRequest, evaluate};
 use crate::train::step::pages::{PagedScene, WorkingSet};
-use crate::train::step::view::Now;
+use crate::train::step::view::SceneNow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -51,7 +51,7 @@ pub struct EvalReport {
 
 /// The figures of some Gaussians.
 #[derive(Debug, Clone, Copy, serde::Serialize, serde::Deserialize)]
-pub struct Figures {
+pub struct EvalFigures {
     /// Gaussians that were drawn.
     pub gaussians: u64,
     /// Means over the held-out views; `None` without held-out views.
@@ -64,7 +64,7 @@ pub struct LevelReport {
     /// Number of the level; the finest is 0.
     pub level: u32,
     #[serde(flatten)]
-    pub figures: Figures,
+    pub figures: EvalFigures,
 }
 
 /// Optional outputs of the evaluation of a file.
@@ -186,7 +186,7 @@ impl<'a> Evaluator<'a> {
         mut columns: Columns,
         meta: &SceneMeta,
         pictures: Option<&Path>,
-    ) -> Result<Figures, TrainError> {
+    ) -> Result<EvalFigures, TrainError> {
         let frame = &self.dataset.frame;
         let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
         let mut sample = PositionSample::default();
@@ -224,8 +224,8 @@ impl<'a> Evaluator<'a> {
             progress: &|done| shown.show(done),
         };
         let working = &mut WorkingSet::default();
-        let mut now = Now { scene: &mut pages, step: 0, working, renderer: &mut *self.renderer };
+        let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *self.renderer };
         let test = evaluate(&mut now, &self.dataset, &self.targets, &render, &request)?;
-        Ok(Figures { gaussians, test })
+        Ok(EvalFigures { gaussians, test })
     }
 }

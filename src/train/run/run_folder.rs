@@ -30,7 +30,7 @@ use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::{Results, export, save, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::{StopFlag, absolute};
-use crate::train::log::progress::{Count, Progress};
+use crate::train::log::progress::{Count, RunProgress};
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::memory::host_bytes_peak;
 use crate::train::preflight::forecast::Forecast;
@@ -177,7 +177,7 @@ pub(super) fn train_into(
         live.set_metrics(out.join(METRICS_FILE));
         LivePage::new(live)
     });
-    let mut progress = Progress::new(config.steps, request.quiet).after(trainer.steps_done());
+    let mut progress = RunProgress::new(config.steps, request.quiet).after(trainer.steps_done());
     let meter = Meter::start(&trainer);
     metrics.start_clock(trainer.train_seconds());
     let looped = TrainingLoop {

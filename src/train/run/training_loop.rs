@@ -19,7 +19,7 @@ use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::save;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::StopFlag;
-use crate::train::log::progress::{Progress, Shown};
+use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::{PLAN_BYTES, host_bytes_peak};
 use crate::train::preflight::forecast::Forecast;
@@ -37,7 +37,7 @@ pub struct TrainingLoop<'a> {
     /// Writer of metrics.jsonl.
     pub metrics: &'a mut MetricsLog,
     /// Progress bar or lines.
-    pub progress: &'a mut Progress,
+    pub progress: &'a mut RunProgress,
     /// Stop request (Ctrl-C).
     pub stop: &'a StopFlag,
     /// The run's checkpoint, if it has one.
@@ -90,7 +90,7 @@ impl TrainingLoop<'_> {
                 let written = self.metrics.write(line).map_err(TrainError::from);
                 written.or_else(|error| self.make_space(error))?;
             }
-            self.progress.step(done, Shown { gaussians: self.trainer.scene.rows(), psnr });
+            self.progress.step(done, ShownStep { gaussians: self.trainer.scene.rows(), psnr });
             if let Some(live) = &mut self.live {
                 live.show(self.trainer, self.dataset, psnr);
             }

@@ -21,7 +21,7 @@ use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
 use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
-use crate::train::step::view::{Now, draw};
+use crate::train::step::view::{SceneNow, draw};
 use std::path::{Path, PathBuf};
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
@@ -49,7 +49,7 @@ pub struct EvalRequest<'a> {
 /// figures of all others. `None` if no view has metrics, with a warning.
 /// Errors: pages could not be pinned, the renderer failed, or a picture cannot be written.
 pub fn evaluate(
-    now: &mut Now<'_>,
+    now: &mut SceneNow<'_>,
     dataset: &Dataset,
     targets: &TargetCache,
     options: &RenderOptions,

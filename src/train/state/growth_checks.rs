@@ -19,7 +19,7 @@ use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use crate::train::log::report::json_psnr;
-use crate::train::step::view::{Now, ViewPass};
+use crate::train::step::view::{SceneNow, ViewPass};
 
 /// One in this many drawn rows is left out.
 const LEFT_OUT_OF: usize = 4;
@@ -39,7 +39,7 @@ pub(super) struct Comparing<'a> {
 /// cameras; `None` if all of either are masked as a whole.
 /// Errors: a photo cannot be decoded, pages could not be had, or the renderer failed.
 pub(super) fn growth_values(
-    now: &mut Now<'_>,
+    now: &mut SceneNow<'_>,
     comparing: &Comparing<'_>,
     held_out: &[(usize, Camera)],
     trained: &[(usize, Camera)],
@@ -53,17 +53,17 @@ pub(super) fn growth_values(
 
 /// Means of values of these views, dB; `None` if none of them counts.
 fn mean_psnr<const N: usize>(
-    now: &mut Now<'_>,
+    now: &mut SceneNow<'_>,
     comparing: &Comparing<'_>,
     views: &[(usize, Camera)],
-    of_view: impl Fn(Draw<'_, '_>) -> Result<[f64; N], TrainError>,
+    of_view: impl Fn(ViewToDraw<'_, '_>) -> Result<[f64; N], TrainError>,
 ) -> Result<Option<[f64; N]>, TrainError> {
     let mut values: Vec<[f64; N]> = Vec::with_capacity(views.len());
     for (i, (view, camera)) in views.iter().enumerate() {
         comparing.targets.prefetch(&views[i..views.len().min(i + 2)].iter().map(|(view, _)| *view).collect::<Vec<_>>());
         let target = comparing.targets.get(*view)?;
         if target.counts() {
-            values.push(of_view(Draw::new(now, comparing, camera, &target))?);
+            values.push(of_view(ViewToDraw::new(now, comparing, camera, &target))?);
         }
     }
     let mean = |k: usize| values.iter().map(|of_view| of_view[k]).sum::<f64>() / values.len() as f64;
@@ -84,17 +84,22 @@ fn are_kept(weights: &[f32]) -> Vec<bool> {
 }
 
 /// A view whose pages are drawn in batches, as often as wanted.
-struct Draw<'a, 'n> {
-    now: &'a mut Now<'n>,
+struct ViewToDraw<'a, 'n> {
+    now: &'a mut SceneNow<'n>,
     comparing: &'a Comparing<'a>,
     target: &'a Target,
     pass: ViewPass<'a>,
 }
 
-impl<'a, 'n> Draw<'a, 'n> {
-    fn new(now: &'a mut Now<'n>, comparing: &'a Comparing<'a>, camera: &'a Camera, target: &'a Target) -> Draw<'a, 'n> {
+impl<'a, 'n> ViewToDraw<'a, 'n> {
+    fn new(
+        now: &'a mut SceneNow<'n>,
+        comparing: &'a Comparing<'a>,
+        camera: &'a Camera,
+        target: &'a Target,
+    ) -> ViewToDraw<'a, 'n> {
         let pass = ViewPass::new(now.scene, camera, comparing.render, comparing.pages_most);
-        Draw { now, comparing, target, pass }
+        ViewToDraw { now, comparing, target, pass }
     }
 
     /// PSNR with all rows, and without the faintest quarter of the rows drawn, dB.
@@ -183,8 +188,8 @@ mod tests {
                 Comparing { targets: &targets, render: &render, loss: &options.loss, pages_most, correct: None };
             let (working, renderer) = (&mut WorkingSet::default(), &mut CpuRenderer::new());
             renderer.weigh_rows(true).unwrap();
-            let mut now = Now { scene: &mut scene, step: 0, working, renderer };
-            Draw::new(&mut now, &comparing, &camera, &target).psnr_without_faint().unwrap()
+            let mut now = SceneNow { scene: &mut scene, step: 0, working, renderer };
+            ViewToDraw::new(&mut now, &comparing, &camera, &target).psnr_without_faint().unwrap()
         });
         assert!(whole == few && few == parts && parts == all, "{whole:?} {few:?} {parts:?} {all:?}");
         assert!(whole[0] != whole[1], "{whole:?}");

@@ -34,14 +34,14 @@ use crate::scene::image::Target;
 use crate::schedule::order::{Order, ViewOrder};
 use crate::train::error::TrainError;
 use crate::train::log::report::{TestMetrics, TierTraffic};
-use crate::train::step::batch::HostRows;
+use crate::train::step::batch::RowsInHost;
 use crate::train::step::comparison::Comparison;
 use crate::train::step::device_flights::StepToRecord;
 use crate::train::step::device_tier::{DeviceRows, DeviceTier};
 use crate::train::step::pages::{PagedScene, WorkingSet};
 use crate::train::step::soundness::{Idle, note_soundness};
 use crate::train::step::train_step::{StepOutcome, StepView, train_step};
-use crate::train::step::view::{Now, rehearse};
+use crate::train::step::view::{SceneNow, rehearse};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
@@ -163,9 +163,9 @@ impl Trainer {
     }
 
     /// The scene as it is now, to be drawn.
-    pub(crate) fn now(&mut self) -> Now<'_> {
+    pub(crate) fn now(&mut self) -> SceneNow<'_> {
         let Trainer { scene, working, renderer, state, .. } = self;
-        Now { scene, step: state.step, working, renderer: &mut **renderer }
+        SceneNow { scene, step: state.step, working, renderer: &mut **renderer }
     }
 
     /// The memory of the run, to be fitted.
@@ -205,7 +205,7 @@ impl Trainer {
             self.begin_step_of_photo(view, camera, false, true);
             let mut comparison = Comparison { photos: &mut self.photos, ..Comparison::new(&target, self.options.loss) };
             let (scene, working, renderer) = (&mut self.scene, &mut self.working, &mut *self.renderer);
-            let mut now = Now { scene, step: self.state.step, working, renderer };
+            let mut now = SceneNow { scene, step: self.state.step, working, renderer };
             let (pages_most, began) = (self.memory.pages_most, Instant::now());
             let rows = rehearse(&mut now, camera, &render, &mut comparison, pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
@@ -344,7 +344,7 @@ impl Trainer {
         let render = self.render_options();
         let mut comparison = Comparison { target, loss: self.options.loss, photos: &mut self.photos, is_left_out };
         let collects = self.options.strategy.collects(step);
-        let mut rows = HostRows::new(&mut *self.renderer);
+        let mut rows = RowsInHost::new(&mut *self.renderer);
         let (scene, working) = (&mut self.scene, &mut self.working);
         let view = StepView { step, camera, render: &render, collects, pages_most: self.memory.pages_most };
         train_step(scene, working, &mut rows, &view, &mut comparison)

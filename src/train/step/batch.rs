@@ -1,5 +1,5 @@
 //! Gather and update: how a step reads and writes the rows of a batch of pinned pages. [`RowBackend`] is the interface,
-//! [`HostRows`] the form for rows in host memory, whatever device draws them. The form for pages on a device is
+//! [`RowsInHost`] the form for rows in host memory, whatever device draws them. The form for pages on a device is
 //! [`super::device_tier`].
 //!
 //! Invariants: 1. between [`RowBackend::rows_in`] and [`RowBackend::update`] of a batch, the rows stay unchanged, because the
@@ -7,7 +7,7 @@
 //! threads; 3. an unchanged page stays clean; every changed page gets new bounds.
 
 use super::catch_up;
-use super::pages::{PageRules, PagedScene, WorkingSet, row_tables};
+use super::pages::{PagedScene, SceneRules, WorkingSet, row_tables};
 use crate::base::ids::PageNo;
 use crate::densify::strategy::DrawnRows;
 use crate::optim::row_kernels::{StepCounts, step_rows};
@@ -126,27 +126,27 @@ pub trait RowBackend {
 }
 
 /// Rows in host memory.
-pub struct HostRows<'a> {
+pub struct RowsInHost<'a> {
     renderer: &'a mut dyn Renderer,
 }
 
-impl<'a> HostRows<'a> {
+impl<'a> RowsInHost<'a> {
     /// Rows in host memory, drawn by `renderer`.
-    pub fn new(renderer: &'a mut dyn Renderer) -> HostRows<'a> {
-        HostRows { renderer }
+    pub fn new(renderer: &'a mut dyn Renderer) -> RowsInHost<'a> {
+        RowsInHost { renderer }
     }
 }
 
 /// Culls the rows of the pages for `camera` and evaluates the visible rows at 0-based `step`. The pages must have
 /// applied all events.
-pub fn gather(rules: &PageRules, pages: &[PinnedPage], step: u32, camera: &Camera, working: &mut WorkingSet) {
+pub fn gather(rules: &SceneRules, pages: &[PinnedPage], step: u32, camera: &Camera, working: &mut WorkingSet) {
     let tables = row_tables(pages);
     let WorkingSet { row_from_working, columns, .. } = working;
     catch_up::visible_rows(&tables, &rules.adam, step, camera, row_from_working);
     catch_up::gather(&tables, rules.sh_degree(), &rules.adam, step, row_from_working, columns);
 }
 
-impl RowBackend for HostRows<'_> {
+impl RowBackend for RowsInHost<'_> {
     fn renderer(&mut self) -> &mut dyn Renderer {
         self.renderer
     }

@@ -65,7 +65,7 @@ const ROWS_MORE: u64 = 256;
 
 /// What became of a step to record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Recorded {
+enum RecordedStep {
     /// It is in flight.
     Done,
     /// There is no memory for what must leave behind the step in flight: the step can be recorded when that one is finished.
@@ -240,14 +240,14 @@ impl Flights {
         self.pin_flight(cache, scene, renderer, step.step, &pages)?;
         scene.pager.prefetch(step.step);
         match self.record_pinned(cache, scene, renderer, &pages, step) {
-            Ok(Recorded::Done) => {
+            Ok(RecordedStep::Done) => {
                 self.steps.push_back(Flight { step: step.step, camera: *step.camera, pages });
                 scene.pager.prefetch(step.step);
                 Ok(true)
             }
             Ok(other) => {
                 self.release_flight(cache, scene, &pages);
-                if other == Recorded::Short {
+                if other == RecordedStep::Short {
                     self.not_before = step.step.saturating_add(STEPS_WITHOUT);
                 }
                 Ok(false)
@@ -287,14 +287,14 @@ impl Flights {
         renderer: &mut dyn Renderer,
         pages: &[PageNo],
         step: &StepToRecord<'_>,
-    ) -> Result<Recorded, TrainError> {
+    ) -> Result<RecordedStep, TrainError> {
         let (recorded, of_view) = (u64::from(step.step), pages.len() as u64);
         let _span = trace::span("record step").with("recorded", recorded).with("pages", of_view);
         let pinned: Vec<&PinnedPage> =
             pages.iter().filter_map(|page| self.pages.get(page)).map(|(page, _)| page).collect();
         let is_alone = self.in_flight() == 0;
         let in_slots = cache.load_after_queued_work(scene, renderer, (step.step, is_alone), &pinned)?;
-        let Some(in_slots) = in_slots else { return Ok(Recorded::TooEarly) };
+        let Some(in_slots) = in_slots else { return Ok(RecordedStep::TooEarly) };
         let rows_in_pages: u64 = in_slots.iter().map(|page| page.layout.rows as u64).sum();
         let is_injected = |fault: StepFault| self.faults.is_injected_at(fault, step.step);
         let (rows_room, closes) = (step.rows_room(rows_in_pages), is_injected(StepFault::Closed));
@@ -307,14 +307,14 @@ impl Flights {
             isects_most: if is_injected(StepFault::Isects) { 1 } else { u32::MAX },
         };
         if !device_of(renderer)?.record_picture(&job)? {
-            return Ok(Recorded::Short);
+            return Ok(RecordedStep::Short);
         }
         scene.pager.prefetch(step.step);
         let StepToRecord { target, loss, collects, .. } = *step;
         let rows_per_unusable = ROWS_PER_UNUSABLE as u32;
         let update = RecordedUpdate { target, loss, collects, rows_per_unusable, closes };
         if !device_of(renderer)?.record_update(&update)? {
-            return Ok(Recorded::Short);
+            return Ok(RecordedStep::Short);
         }
         if let Some((next, camera)) = step.next {
             let of_next = self.pages_behind(scene, camera, step.step);
@@ -322,7 +322,7 @@ impl Flights {
             let leaves = if self.is_sure { Leaves::Used } else { Leaves::Unused };
             cache.load_ahead(scene, renderer, (next, &of_next), leaves)?;
         }
-        Ok(Recorded::Done)
+        Ok(RecordedStep::Done)
     }
 
     /// Waits for the first step in flight and takes over its effect on its pages. `None` if the step was not taken: no step is in flight

@@ -115,7 +115,7 @@ struct Leaving {
 
 /// A payload that is to go up.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Coming<'a> {
+pub(super) struct ComingUse<'a> {
     pub page: PageNo,
     /// The step that needs the page.
     pub next_use: u32,
@@ -414,8 +414,8 @@ impl SlotCache {
         pinned: &[&PinnedPage],
     ) -> Result<Option<Vec<SlotPage>>, TrainError> {
         let missing = self.use_slots(pinned);
-        let coming: Vec<Coming<'_>> =
-            missing.iter().map(|page| Coming { page: page.page, next_use: step, payload: payload(page) }).collect();
+        let coming: Vec<ComingUse<'_>> =
+            missing.iter().map(|page| ComingUse { page: page.page, next_use: step, payload: payload(page) }).collect();
         let how = (step.saturating_sub(1), Leaves::Used, !is_alone);
         let kept: Vec<PageNo> = pinned.iter().map(|page| page.page).collect();
         let loaded = self.load_evicting(scene, renderer, how, &coming, &kept)?;
@@ -445,10 +445,10 @@ impl SlotCache {
             return Ok(());
         }
         let missing = of_view.iter().copied().filter(|page| self.slots.state(*page).is_none());
-        let coming: Vec<Coming<'_>> = missing
+        let coming: Vec<ComingUse<'_>> = missing
             .filter_map(|page| {
                 let payload = scene.pager.payload(page)?.get(..layout_ahead(scene, page)?.bytes())?;
-                Some(Coming { page, next_use: step, payload })
+                Some(ComingUse { page, next_use: step, payload })
             })
             .collect();
         self.load_evicting(scene, renderer, (step.saturating_sub(1), leaves, true), &coming, of_view).map(|_| ())
@@ -462,7 +462,7 @@ impl SlotCache {
         scene: &PagedScene,
         renderer: &mut dyn Renderer,
         (behind, leaves, is_ahead): (u32, Leaves, bool),
-        coming: &[Coming<'_>],
+        coming: &[ComingUse<'_>],
         kept: &[PageNo],
     ) -> Result<usize, TrainError> {
         let wanted = coming.len().saturating_sub(self.slots.free_frames());

@@ -11,7 +11,7 @@
 //!
 //! A survey is conservative; a page for which it is not sure goes to the host, which decides row by row. Both ways leave the same bytes,
 //! so the result does not depend on which pages have slots. That includes the bounds of the page: clearing statistics keeps them, on the
-//! host as well (`PageRules`).
+//! host as well (`SceneRules`).
 //!
 //! Not here: which page lies in which slot (`device_slots`), steps that are recorded without waiting (`device_flights`), which rounds edit
 //! what (`densify::replay`), the stages of the device (`render`).

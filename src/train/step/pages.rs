@@ -39,7 +39,7 @@ use std::sync::Arc;
 pub(crate) const PAGES_PER_BATCH: usize = 32;
 
 /// State shared by all pages.
-pub struct PageRules {
+pub struct SceneRules {
     /// The optimizer.
     pub adam: DeferredAdam,
     events: EventLog,
@@ -54,26 +54,26 @@ pub struct PageRules {
 }
 
 /// Receives the rows of some pages as tables with consecutive row numbers.
-pub(super) type Visitor<'v, E> = dyn FnMut(&PageRules, &[Rows<'_>]) -> Result<(), E> + 'v;
+pub(super) type Visitor<'v, E> = dyn FnMut(&SceneRules, &[Rows<'_>]) -> Result<(), E> + 'v;
 
 /// The pages of a run and their shared state.
 pub struct PagedScene {
     /// Cache and storage of the pages.
     pub pager: Pager,
     /// State shared by all pages.
-    pub rules: PageRules,
+    pub rules: SceneRules,
     /// Gradient statistics of rows since the last densification round.
     pub histogram: GradHistogram,
     rows: u64,
     rows_bound: u64,
 }
 
-impl PageRules {
-    pub(crate) fn new(options: &RunOptions) -> PageRules {
+impl SceneRules {
+    pub(crate) fn new(options: &RunOptions) -> SceneRules {
         let adam = DeferredAdam::new(options.rates, options.adam, options.render.simd)
             .with_moments(options.moments)
             .with_log_scales(LogScaleRange::of_scene(options.scene_scale));
-        PageRules {
+        SceneRules {
             adam: if options.optimizer == Method::Sparse { adam.without_catch_up() } else { adam },
             events: EventLog::default(),
             seed: options.seed,
@@ -138,7 +138,7 @@ impl PagedScene {
 
     /// A scene without pages.
     pub fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
-        let (rules, histogram) = (PageRules::new(options), GradHistogram::default());
+        let (rules, histogram) = (SceneRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
 
@@ -150,7 +150,7 @@ impl PagedScene {
         histogram: GradHistogram,
         [rows, rows_bound]: [u64; 2],
     ) -> PagedScene {
-        let mut rules = PageRules::new(options);
+        let mut rules = SceneRules::new(options);
         // Replay the logged raises: the configured schedule may have changed since.
         rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
         for event in events.events() {
@@ -298,7 +298,7 @@ impl PagedScene {
     /// whether the recount differs, as it does after a salvage that left statistics out.
     /// Errors: pages could not be pinned.
     pub(crate) fn change_rules(&mut self, options: &RunOptions, now: u32) -> Result<bool, TrainError> {
-        let mut rules = PageRules::new(options);
+        let mut rules = SceneRules::new(options);
         rules.events = self.rules.events.clone();
         rules.sh_degree = self.rules.sh_degree;
         let pages: Vec<PageNo> = (0..self.pager.index().len() as u32).map(PageNo).collect();
@@ -328,7 +328,7 @@ impl PagedScene {
         pages: &[PageNo],
         now: u32,
         acquire: fn(&mut Pager, &[PageNo]) -> Result<Vec<PinnedPage>, PagingError>,
-        rules: Option<&PageRules>,
+        rules: Option<&SceneRules>,
         see: &mut dyn FnMut(&PinnedPage),
     ) -> Result<(), TrainError> {
         // The other half of the frames is for pages that split.

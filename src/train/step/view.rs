@@ -21,7 +21,7 @@ use std::vec::IntoIter;
 const PAGES_PER_BATCH: usize = 64;
 
 /// The scene after `step` steps, the renderer that draws it, and room for the rows of a batch.
-pub struct Now<'a> {
+pub struct SceneNow<'a> {
     pub scene: &'a mut PagedScene,
     pub step: u32,
     pub working: &'a mut WorkingSet,
@@ -53,7 +53,7 @@ impl<'a> ViewPass<'a> {
     /// The pass in: hands the rows to the renderer, each batch as `edit` leaves it; [`Renderer::picture`] is next. Returns the rows of
     /// the view before they were edited.
     /// Errors: pages could not be had, or the renderer failed.
-    pub fn rows_in(&self, now: &mut Now<'_>, mut edit: impl FnMut(&mut Columns)) -> Result<usize, TrainError> {
+    pub fn rows_in(&self, now: &mut SceneNow<'_>, mut edit: impl FnMut(&mut Columns)) -> Result<usize, TrainError> {
         let batches = self.batches();
         let how = if batches.len() == 1 { RowBatches::One } else { RowBatches::Several };
         now.renderer.begin_view(self.camera, self.options, how)?;
@@ -70,7 +70,7 @@ impl<'a> ViewPass<'a> {
     /// The pass out, from the last batch to the first, after a pass in with the same working set that edited no row; `each` gets the
     /// gradients of a batch.
     /// Errors: as [`ViewPass::rows_in`].
-    pub fn rows_out(&self, now: &mut Now<'_>, mut each: impl FnMut(&Gradients)) -> Result<(), TrainError> {
+    pub fn rows_out(&self, now: &mut SceneNow<'_>, mut each: impl FnMut(&Gradients)) -> Result<(), TrainError> {
         let mut batches = self.batches();
         // The pass in has left the rows of the last batch in the working set.
         let mut gathered = batches.pop().map(|(number, _)| number);
@@ -94,7 +94,7 @@ impl<'a> ViewPass<'a> {
 
 impl Batches<'_> {
     /// Gathers the rows of the next batch; returns its number, `None` after the last.
-    fn gather_next(&mut self, now: &mut Now<'_>) -> Result<Option<usize>, TrainError> {
+    fn gather_next(&mut self, now: &mut SceneNow<'_>) -> Result<Option<usize>, TrainError> {
         let Some((number, pages)) = self.coming.next() else { return Ok(None) };
         let next = self.coming.peek().map_or(&[][..], |(_, pages)| *pages);
         now.scene.gather_pages(pages, next, self.camera, now.step, now.working)?;
@@ -104,7 +104,7 @@ impl Batches<'_> {
 
 /// Renders the picture that `camera` has; [`Renderer::image`] gives it.
 /// Errors: pages could not be had, or the renderer failed.
-pub fn draw(now: &mut Now<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
+pub fn draw(now: &mut SceneNow<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
     ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |_| {})?;
     Ok(now.renderer.picture()?)
 }
@@ -113,7 +113,7 @@ pub fn draw(now: &mut Now<'_>, camera: &Camera, options: &RenderOptions) -> Resu
 /// the step is allocated. Returns the rows of the view.
 /// Errors: as [`draw`].
 pub fn rehearse(
-    now: &mut Now<'_>,
+    now: &mut SceneNow<'_>,
     camera: &Camera,
     options: &RenderOptions,
     comparison: &mut Comparison<'_>,

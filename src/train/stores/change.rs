@@ -145,7 +145,7 @@ fn write_pins(place: &StorePlace, store: u128, dropped_names: &[String]) -> Resu
 
 /// Result of a copy.
 #[derive(Debug, Clone, Serialize)]
-pub struct Copied {
+pub struct ClonedStore {
     /// The new folder.
     pub to: PathBuf,
     /// Numbers of the generations.
@@ -159,7 +159,7 @@ pub struct Copied {
 /// Copies a store to the folder `to`, which does not exist.
 /// Errors: the store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at
 /// `to` then.
-pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> {
+pub fn clone_store(place: &StorePlace, to: &Path) -> Result<ClonedStore, TrainError> {
     refuse_existing(to)?;
     let store = place.open(Access::Pages)?;
     store.find(None)?;
@@ -189,7 +189,7 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<Copied, TrainError> 
         copy.commit(&store.run_state(generation)?, store.note(generation), &store.generations().names_of(generation))?;
     }
     copy.finish()?;
-    Ok(Copied { to: to.to_path_buf(), generations, versions, bytes_read })
+    Ok(ClonedStore { to: to.to_path_buf(), generations, versions, bytes_read })
 }
 
 /// The codec of most pages, for new pages.

@@ -97,7 +97,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let (_, options) = options_of(&place.folder, &state)?;
     let mut scene =
         scene_at(&store, generation, &state, &options, (request.host_mem, 1), format.memory_bytes(state.rows_bound))?;
-    let mut choice = Choice::new(&state, request);
+    let mut choice = RowChoice::new(&state, request);
     let pages = choice.pages(&scene);
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
     let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
@@ -181,7 +181,7 @@ pub(super) fn scene_at(
 }
 
 /// Selection of the rows for the file.
-struct Choice {
+struct RowChoice {
     /// Box in the local frame, rounded outwards for pages; rows are compared in dataset coordinates.
     crop: Option<[f64; 6]>,
     origin: [f64; 3],
@@ -193,10 +193,10 @@ struct Choice {
     next: u32,
 }
 
-impl Choice {
-    fn new(state: &RunState, request: &ExportRequest) -> Choice {
+impl RowChoice {
+    fn new(state: &RunState, request: &ExportRequest) -> RowChoice {
         let (origin, scale) = (state.origin.dataset.origin, state.origin.dataset.scale);
-        Choice { crop: request.crop, origin, scale, most: request.max_gaussians, cut: None, next: 0 }
+        RowChoice { crop: request.crop, origin, scale, most: request.max_gaussians, cut: None, next: 0 }
     }
 
     /// Pages that may hold a row inside the box, in the order of their ids.

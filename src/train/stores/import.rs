@@ -31,7 +31,7 @@ use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter, PositionSample, file_warnings};
 use crate::train::memory::host_bytes_peak;
-use crate::train::step::pages::PageRules;
+use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -92,7 +92,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
     let mut pages = PageWriter {
         store: NewStore::create(&request.out, layout, request.codec)?,
-        rules: PageRules::new(&options),
+        rules: SceneRules::new(&options),
         payload: vec![0; capacity_bytes(options.page_rows, sh_degree).div_ceil(8)],
         pages: 0,
         failed: None,
@@ -142,7 +142,7 @@ fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMe
 /// Encodes rows as pages and stores them.
 struct PageWriter {
     store: NewStore,
-    rules: PageRules,
+    rules: SceneRules,
     /// As u64, so that tables are aligned.
     payload: Vec<u64>,
     pages: u32,

@@ -142,7 +142,7 @@ fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
 
 /// Minimum, mean and maximum of a value.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Spread {
+pub struct ValueSpread {
     pub least: f64,
     pub mean: f64,
     pub most: f64,
@@ -175,15 +175,15 @@ pub struct PageInspected {
     /// Largest standard deviation, local units.
     pub sigma_max: f32,
     /// Step of the last update of its rows.
-    pub stamp: Spread,
+    pub stamp: ValueSpread,
     /// Rows whose moments are all zero.
     pub rows_without_moments: u64,
     /// Opacities as stored, after activation.
-    pub opacity: Spread,
+    pub opacity: ValueSpread,
     /// Largest standard deviation of each row as stored, local units.
-    pub sigma: Spread,
+    pub sigma: ValueSpread,
     /// Views that drew a row since the last round.
-    pub views: Spread,
+    pub views: ValueSpread,
     /// First invalid value, if any.
     pub fault: Option<String>,
 }
@@ -236,12 +236,12 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
     })
 }
 
-fn spread(values: impl Iterator<Item = f64>) -> Spread {
+fn spread(values: impl Iterator<Item = f64>) -> ValueSpread {
     let (mut least, mut sum, mut most, mut count) = (f64::INFINITY, 0.0, f64::NEG_INFINITY, 0.0);
     for value in values {
         (least, sum, most, count) = (least.min(value), sum + value, most.max(value), count + 1.0);
     }
-    Spread { least, mean: sum / count, most }
+    ValueSpread { least, mean: sum / count, most }
 }
 
 fn rows_without_moments(rows: &Rows<'_>) -> u64 {
@@ -331,7 +331,7 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
 
 /// One fault of a store.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
-pub struct Fault {
+pub struct StoreFault {
     /// The faulty part: map, state, segment, entry, header, payload, values.
     pub kind: &'static str,
     pub page: Option<String>,
@@ -357,7 +357,7 @@ pub struct Verdict {
     /// Bytes of slots read.
     pub bytes_read: u64,
     /// All faults, in the order map, states, segments, slots by place.
-    pub faults: Vec<Fault>,
+    pub faults: Vec<StoreFault>,
 }
 
 /// Verifies a store.
@@ -430,9 +430,12 @@ fn check_states(store: &StoreReader, verdict: &mut Verdict) -> Option<(PageLimit
         };
         match read() {
             Ok(limits) => last = Some(limits),
-            Err(what) => {
-                verdict.faults.push(Fault { kind: "state", generation: Some(generation), what, ..Fault::default() })
-            }
+            Err(what) => verdict.faults.push(StoreFault {
+                kind: "state",
+                generation: Some(generation),
+                what,
+                ..StoreFault::default()
+            }),
         }
     }
     last
@@ -453,23 +456,23 @@ fn check_segments(store: &StoreReader, slots: &[SlotRef], verdict: &mut Verdict)
             Some(_) => continue,
         };
         let file = Some(segment_file_name(segment));
-        verdict.faults.push(Fault { kind: "segment", file, what, ..Fault::default() });
+        verdict.faults.push(StoreFault { kind: "segment", file, what, ..StoreFault::default() });
     }
     Ok(())
 }
 
-fn fault_of_map(error: &CommitError) -> Fault {
+fn fault_of_map(error: &CommitError) -> StoreFault {
     let file = match error {
         CommitError::File { name, .. } => name,
         _ => crate::page::map::commit::MAP_NAME,
     };
     // Drop the remedy, which follows the first line.
     let what = error.to_string().lines().next().unwrap_or_default().to_string();
-    Fault { kind: "map", file: Some(file.to_string()), what, ..Fault::default() }
+    StoreFault { kind: "map", file: Some(file.to_string()), what, ..StoreFault::default() }
 }
 
-fn fault_of_slot(kind: &'static str, page: &str, slot: &SlotRef, what: String) -> Fault {
-    Fault {
+fn fault_of_slot(kind: &'static str, page: &str, slot: &SlotRef, what: String) -> StoreFault {
+    StoreFault {
         kind,
         page: Some(page.to_string()),
         generation: Some(slot.generation),

@@ -12,11 +12,12 @@ mod inspect;
 pub mod ownership;
 mod salvage;
 
-pub use change::{Copied, PruneRequest, Pruned, RolledBack, clone_store, prune, rollback};
+pub use change::{ClonedStore, PruneRequest, Pruned, RolledBack, clone_store, prune, rollback};
 pub use export::{ExportRequest, Exported, StoredStart, export};
 pub use import::{ImportRequest, Imported, import};
 pub use inspect::{
-    Fault, GenerationLine, Inspected, Listed, PageInspected, Spread, Verdict, inspect, inspect_page, list, verify,
+    GenerationLine, Inspected, Listed, PageInspected, StoreFault, ValueSpread, Verdict, inspect, inspect_page, list,
+    verify,
 };
 pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 

@@ -36,7 +36,7 @@ use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
-use crate::train::step::pages::PageRules;
+use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -341,7 +341,7 @@ fn without_state(place: &StorePlace, mut source: Source, request: &SalvageReques
     let layout = SlotLayout::new(capacity_bytes(options.page_rows, options.sh_degree), kept.len() as u64);
     let codec = usual_codec(kept.values().map(|whole| &whole.header.slot));
     let mut copy = NewStore::create(&request.to, layout, codec)?;
-    let rules = PageRules::new(&options);
+    let rules = SceneRules::new(&options);
     let mut words = vec![0u64; capacity_bytes(options.page_rows, options.sh_degree).div_ceil(8)];
     let mut histogram = GradHistogram::default();
     for (id, Whole { header, meta, .. }) in &kept {
