@@ -22,7 +22,7 @@ use gsscale::train::log::report::Summary;
 use gsscale::train::memory::reset_host_bytes_peak;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::eval_file::{EvalExtras, evaluate_file};
-use gsscale::train::run::out_folder::Existing;
+use gsscale::train::run::request::Existing;
 use gsscale::train::run::request::RunRequest;
 use gsscale::train::state::trainer::Trainer;
 use serde_json::Value;

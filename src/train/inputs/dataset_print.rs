@@ -7,9 +7,9 @@
 //! thousands. The digest of the points covers all of them, since a run reads all points at its start.
 
 use crate::base::error::{InputError, InputResult};
-use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
+use crate::checkpoint::run_state::ViewPrint;
 use crate::dataset::import::PointSource;
-use crate::dataset::loader::{Dataset, View};
+use crate::dataset::loader::View;
 use crate::dataset::model::Split;
 use crate::scene::columns::{Column, Columns};
 use std::fs::File;
@@ -21,8 +21,6 @@ use xxhash_rust::xxh3::Xxh3;
 const WHOLE_BYTES: u64 = 256 << 10;
 /// Length of one sample of a longer file.
 const SAMPLE_BYTES: u64 = 64 << 10;
-/// Differences to list; further ones are only counted.
-const LISTED: usize = 10;
 
 pub(crate) fn view_print(view: &View) -> InputResult<ViewPrint> {
     let camera = &view.camera;
@@ -93,53 +91,6 @@ impl GaussiansPrint {
     pub fn digest(&self) -> u64 {
         self.0.digest()
     }
-}
-
-/// Differences from the dataset with which a run began, one line each.
-#[derive(Debug, Default, PartialEq)]
-pub(crate) struct DatasetChanges {
-    /// Differences with which training can resume if the user accepts them.
-    pub lines: Vec<String>,
-    /// Differences with which training cannot resume.
-    pub fixed: Vec<String>,
-}
-
-/// Compares `dataset`, whose print is `here`, with `there`, the print with which a run began.
-pub(crate) fn dataset_changes(dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) -> DatasetChanges {
-    let mut changes = DatasetChanges::default();
-    let lines = &mut changes.lines;
-    if there.views.len() == here.views.len() {
-        let name = |v: usize| format!("view {} ({})", v + 1, dataset.views[v].name);
-        let pairs = || there.views.iter().zip(&here.views).enumerate();
-        let poses: Vec<usize> = pairs().filter(|(_, (a, b))| a.pose != b.pose).map(|(v, _)| v).collect();
-        let photos: Vec<usize> = pairs().filter(|(_, (a, b))| a.photo != b.photo).map(|(v, _)| v).collect();
-        for (views, what) in [(poses, "another name, set, size or pose"), (photos, "another photo or mask")] {
-            lines.extend(views.iter().take(LISTED).map(|&v| format!("{} has {what}", name(v))));
-            if views.len() > LISTED {
-                lines.push(format!("{} more views have {what}", views.len() - LISTED));
-            }
-        }
-    } else if there.views.is_empty() {
-        lines.push("the photos of the run are unknown: its state was lost, and its pages were salvaged".to_string());
-    } else {
-        lines.push(format!("the dataset had {} views and has {}", there.views.len(), here.views.len()));
-    }
-    if there.first_rows != here.first_rows {
-        lines.push(format!("the dataset gave {} first Gaussians and gives {}", there.first_rows, here.first_rows));
-    } else if there.points != here.points {
-        lines.push("the points that the first Gaussians are made from are others".to_string());
-    }
-    if there.scene_scale.to_bits() != here.scene_scale.to_bits() {
-        lines.push(format!("the scene scale was {} and is {}", there.scene_scale, here.scene_scale));
-    }
-    let bits = |p: &DatasetPrint| [p.origin[0], p.origin[1], p.origin[2], p.scale].map(f64::to_bits);
-    if bits(there) != bits(here) {
-        changes.fixed.push(format!(
-            "the local frame was at {:?} with scale {} and is at {:?} with scale {}",
-            there.origin, there.scale, here.origin, here.scale
-        ));
-    }
-    changes
 }
 
 #[cfg(test)]

@@ -2,16 +2,14 @@
 //!
 //! Not here: what happens in the output folder (`run_folder`).
 //!
-//! Invariant: bad input leaves no files. A run that is killed before it has a config.toml leaves its settings (`beginning`).
+//! Invariant: bad input leaves no files. A run that is killed before it has a config.toml leaves its settings (`out_folder`).
 
-use super::beginning::{self, Beginning};
 use super::changes::with_absolute_paths;
-use super::out_folder::{self, Existing};
-use super::request::{RunOutcome, RunRequest};
+use super::out_folder::{self, Beginning};
+use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, train_into};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
-use crate::checkpoint::run_state::DatasetPrint;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::new_run;
@@ -48,7 +46,6 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let start = Start::read(&request.scene, config, host_mem)?;
     let request = &adapt_schedule(request, &start);
     let config = &request.config;
-    let sh_degree_start = start.sh_degree_start;
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         check_first_drive(config, start.rows)?;
         if !request.quiet {
@@ -56,12 +53,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         }
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
-    if !request.dry_run {
-        clear_spill_dir(config)?;
-    }
-    let FirstTrainer { dataset, trainer, tiers, print, driver } = first_trainer(request, start, host_mem)?;
-    let run = RunId::draw();
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run };
+    let (dataset, trainer, tiers, begun) = first_trainer(request, start, host_mem)?;
     plan_and_train(request, &dataset, tiers, trainer, begun)
 }
 
@@ -87,7 +79,7 @@ fn check_folders(request: &RunRequest) -> Result<(), TrainError> {
 }
 
 /// Removes what a run that was cut off before its first commit left in the spill directory.
-pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
+fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
     if let Some(spill_dir) = config.residence().spill_dir()
         && remove_uncommitted(spill_dir, false)?
     {
@@ -96,42 +88,31 @@ pub(super) fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
     Ok(())
 }
 
-/// A trainer before its first step, with all that belongs to it. The trainer's pages may lie in the tiers, so drop them
-/// after it.
-pub(super) struct FirstTrainer {
-    /// Views and frame.
-    pub dataset: Dataset,
-    pub trainer: Trainer,
-    /// Where its pages live.
-    pub tiers: Tiers,
-    /// Digest of the dataset.
-    pub print: DatasetPrint,
-    /// Bytes allocated by the graphics driver.
-    pub driver: u64,
-}
-
-/// Makes the first pages of a scene, and their trainer.
+/// Makes the first pages of a scene, and their trainer before its first step. The trainer's pages may lie in the tiers, so drop them after it.
 /// Errors: the drive or the device cannot be used, or the source of the Gaussians cannot be read again.
 pub(super) fn first_trainer(
     request: &RunRequest,
     start: Start,
     host_mem: Option<u64>,
-) -> Result<FirstTrainer, TrainError> {
+) -> Result<(Dataset, Trainer, Tiers, Begun), TrainError> {
     let config = &request.config;
+    if !request.dry_run {
+        clear_spill_dir(config)?;
+    }
     check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let fill = first_fill(config.page_rows as usize, options.strategy.grows());
     let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
-    // Drop the tiers after the trainer, whose pages may lie there.
     let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
     }
-    let print = dataset_print(&start)?;
+    let (print, sh_degree_start) = (dataset_print(&start)?, start.sh_degree_start);
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw() };
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    Ok(FirstTrainer { dataset, trainer, tiers, print, driver })
+    Ok((dataset, trainer, tiers, begun))
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
@@ -196,8 +177,8 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }
-    let FirstTrainer { dataset, mut trainer, tiers, driver, .. } = first_trainer(&request, start, host_mem)?;
-    plan_run(&request.config, &dataset, &tiers, &mut trainer, host_mem, driver, drive_rate).map(Some)
+    let (dataset, mut trainer, tiers, begun) = first_trainer(&request, start, host_mem)?;
+    plan_run(&request.config, &dataset, &tiers, &mut trainer, host_mem, begun.driver, drive_rate).map(Some)
 }
 
 /// Plans a run, prints the plan, and trains to the end.
@@ -234,7 +215,7 @@ pub(super) fn plan_and_train(
     let _lock = out_folder::lock(&request.out)?;
     if begun.past.is_none() {
         if request.out.join(CONFIG_FILE).is_file() && request.existing == Existing::Overwrite {
-            beginning::write_mark(request)?;
+            out_folder::write_mark(request)?;
         }
         out_folder::make(&request.out, request.existing)?;
     }

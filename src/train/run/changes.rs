@@ -9,7 +9,6 @@ use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::{Class, ConfigKey, KEYS, TrainConfig};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
-use crate::train::inputs::dataset_print::{DatasetChanges, dataset_changes};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -34,6 +33,9 @@ pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
     };
     TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
 }
+
+/// Views to list of a difference; further ones are only counted.
+const LISTED: usize = 10;
 
 /// Differences, one line each.
 #[derive(Debug, Default, PartialEq)]
@@ -95,11 +97,41 @@ impl Changes {
         }
     }
 
-    /// Adds the differences of the dataset.
+    /// Adds the differences of `dataset`, whose print is `here`, from `there`, the print with which the run began.
     pub fn add_dataset(&mut self, dataset: &Dataset, there: &DatasetPrint, here: &DatasetPrint) {
-        let DatasetChanges { lines, fixed } = dataset_changes(dataset, there, here);
-        self.numbers.extend(lines);
-        self.fixed.extend(fixed);
+        let lines = &mut self.numbers;
+        if there.views.len() == here.views.len() {
+            let name = |v: usize| format!("view {} ({})", v + 1, dataset.views[v].name);
+            let pairs = || there.views.iter().zip(&here.views).enumerate();
+            let poses: Vec<usize> = pairs().filter(|(_, (a, b))| a.pose != b.pose).map(|(v, _)| v).collect();
+            let photos: Vec<usize> = pairs().filter(|(_, (a, b))| a.photo != b.photo).map(|(v, _)| v).collect();
+            for (views, what) in [(poses, "another name, set, size or pose"), (photos, "another photo or mask")] {
+                lines.extend(views.iter().take(LISTED).map(|&v| format!("{} has {what}", name(v))));
+                if views.len() > LISTED {
+                    lines.push(format!("{} more views have {what}", views.len() - LISTED));
+                }
+            }
+        } else if there.views.is_empty() {
+            lines
+                .push("the photos of the run are unknown: its state was lost, and its pages were salvaged".to_string());
+        } else {
+            lines.push(format!("the dataset had {} views and has {}", there.views.len(), here.views.len()));
+        }
+        if there.first_rows != here.first_rows {
+            lines.push(format!("the dataset gave {} first Gaussians and gives {}", there.first_rows, here.first_rows));
+        } else if there.points != here.points {
+            lines.push("the points that the first Gaussians are made from are others".to_string());
+        }
+        if there.scene_scale.to_bits() != here.scene_scale.to_bits() {
+            lines.push(format!("the scene scale was {} and is {}", there.scene_scale, here.scene_scale));
+        }
+        let bits = |p: &DatasetPrint| [p.origin[0], p.origin[1], p.origin[2], p.scale].map(f64::to_bits);
+        if bits(there) != bits(here) {
+            self.fixed.push(format!(
+                "the local frame was at {:?} with scale {} and is at {:?} with scale {}",
+                there.origin, there.scale, here.origin, here.scale
+            ));
+        }
     }
 
     /// Refuses differences that exclude a resume, and differences in numbers without `accept`.

@@ -3,16 +3,12 @@
 //! [`begin`] is the page to read first.
 
 pub mod begin;
-mod beginning;
 mod changes;
 pub mod eval_file;
 pub mod live;
 mod more_steps;
 pub mod out_folder;
-pub mod page_map;
 pub mod request;
-pub mod restart;
 pub mod resume;
-pub mod resume_plan;
 mod run_folder;
 pub mod training_loop;

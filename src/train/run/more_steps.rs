@@ -9,9 +9,8 @@
 //! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
 //! is renamed before the scene was found; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
 
-use super::begin::{clear_spill_dir, first_trainer, plan_and_train};
+use super::begin::{first_trainer, plan_and_train};
 use super::changes::with_absolute_paths;
-use super::out_folder::Existing;
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
@@ -20,11 +19,9 @@ use crate::base::units::format_grouped;
 use crate::base::whole_file::sync_folder;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
-use crate::report::live::Live;
 use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
-use crate::train::inputs::machine;
-use crate::train::inputs::machine::absolute;
+use crate::train::inputs::machine::{self, absolute};
 use crate::train::log::report::Summary;
 use crate::train::memory::host_budget;
 use crate::train::start::first_scene::Start;
@@ -43,66 +40,45 @@ pub(super) fn text_of_rates(config: &TrainConfig) -> Option<String> {
     })
 }
 
-/// A finished run, and the config with which it goes on.
-pub(super) struct Finished<'a> {
-    /// Its output folder.
-    pub out: &'a Path,
-    pub scene: &'a Path,
-    /// Config with more steps.
-    pub config: TrainConfig,
-    /// Content of its config.toml.
-    pub file: Option<(TrainConfig, Resolved)>,
-    /// Its identity.
-    pub run: RunId,
-    pub summary: &'a Summary,
-    /// Print only warnings and errors.
-    pub quiet: bool,
-    /// The page that shows the run while it trains.
-    pub live: Option<Live>,
-}
-
-impl Finished<'_> {
-    /// Trains from the PLY to the new number of steps.
-    /// Errors: the scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
-    pub fn go_on(self) -> Result<RunOutcome, TrainError> {
-        let Finished { out, scene, file, run, summary, quiet, live, .. } = self;
-        machine::set_up(&self.config)?;
-        if !scene.exists() {
-            let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
-            return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
-        }
-        let kept = keep_result(out, summary.steps)?;
-        crate::tell!(
-            "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
-             lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
-            out.display(),
-            kept.display()
-        );
-        if let Some(rates) = text_of_rates(&self.config) {
-            crate::tell!("{rates}");
-        }
-        let init_ply = absolute(&kept).to_string_lossy().into_owned();
-        let config = TrainConfig { init_ply, ..self.config };
-        let host_mem = host_budget(config.host_mem.0);
-        let start = Start::read(scene, &config, host_mem)?;
-        let (sh_degree_start, first_rows) = (start.sh_degree_start, start.rows);
-        let past = Past {
-            config: with_absolute_paths(config.clone()),
-            metrics_bytes: metrics_until(out, summary.steps),
-            step: summary.steps,
-            has_changed: false,
-            file,
-            first_rows,
-        };
-        let (scene, out) = (scene.to_path_buf(), out.to_path_buf());
-        let request = RunRequest { scene, out, config, dry_run: false, existing: Existing::BeginAgain, quiet, live };
-        clear_spill_dir(&request.config)?;
-        let mut first = first_trainer(&request, start, host_mem)?;
-        first.trainer.begin_after(summary.steps, summary.train_seconds);
-        let (print, driver) = (first.print, first.driver);
-        let begun = Begun { print, sh_degree_start, past: Some(past), host_mem, driver, run };
-        plan_and_train(&request, &first.dataset, first.tiers, first.trainer, begun)
+/// Trains the finished run in the output folder of `request` from the PLY of its `summary` to the steps of the config. `file` is the content of
+/// its config.toml.
+/// Errors: the scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
+pub(super) fn train_more_steps(
+    mut request: RunRequest,
+    file: Option<(TrainConfig, Resolved)>,
+    run: RunId,
+    summary: &Summary,
+) -> Result<RunOutcome, TrainError> {
+    let (scene, out) = (request.scene.clone(), request.out.clone());
+    machine::set_up(&request.config)?;
+    if !scene.exists() {
+        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
+        return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
+    let kept = keep_result(&out, summary.steps)?;
+    crate::tell!(
+        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
+         lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
+        out.display(),
+        kept.display()
+    );
+    if let Some(rates) = text_of_rates(&request.config) {
+        crate::tell!("{rates}");
+    }
+    request.config.init_ply = absolute(&kept).to_string_lossy().into_owned();
+    let host_mem = host_budget(request.config.host_mem.0);
+    let start = Start::read(&scene, &request.config, host_mem)?;
+    let past = Past {
+        config: with_absolute_paths(request.config.clone()),
+        metrics_bytes: metrics_until(&out, summary.steps),
+        step: summary.steps,
+        has_changed: false,
+        file,
+        first_rows: start.rows,
+    };
+    let (dataset, mut trainer, tiers, begun) = first_trainer(&request, start, host_mem)?;
+    trainer.begin_after(summary.steps, summary.train_seconds);
+    plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }
 
 /// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.

@@ -1,10 +1,20 @@
 //! The request for a run, and its outcome.
 
-use super::out_folder::Existing;
 use crate::config::file::TrainConfig;
 use crate::report::live::Live;
 use crate::train::log::report::Summary;
 use std::path::PathBuf;
+
+/// Treatment of an existing output folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Existing {
+    /// Refuse the folder unless it is empty.
+    Refuse,
+    /// Remove the earlier run's results and its checkpoint in the folder.
+    Overwrite,
+    /// Use the folder: this run was cut off there before its first commit.
+    BeginAgain,
+}
 
 /// The run to start.
 #[derive(Debug, Clone)]

@@ -1,21 +1,23 @@
-//! Resumes a run that stopped, or that ended and kept its checkpoint, from its output folder.
+//! Resumes a run that stopped, or that ended and kept its checkpoint, from its output folder; says what a resume would do; and restarts a run
+//! in the same process after its device was lost, so that a reset or update of the driver, or a device that was unplugged for a moment, costs
+//! the steps since the last commit only.
 //!
 //! Invariants: 1. a resumed run ends with the same bytes as an uninterrupted one; 2. a resume with changed numbers or
 //! another dataset is refused with the differences. If the user accepts them, every page is evaluated once at the step
-//! of the change by the old rules and continues by the new; 3. a refused resume changes nothing; 4. the checkpoint is
-//! sufficient: the output folder only names it, and missing files there are written again; 5. a checkpoint of another
-//! run is neither used nor removed (`ownership`).
+//! of the change by the old rules and continues by the new; 3. a refused resume changes nothing, and neither does a dry run, even while
+//! another process trains the run; 4. the checkpoint is sufficient: the output folder only names it, and missing files there are written
+//! again; 5. a checkpoint of another run is neither used nor removed (`ownership`); 6. errors other than a lost device end the run.
 
 use super::begin::{begin, plan_and_train, run};
-use super::beginning::settings_of_mark;
 use super::changes::{Changes, kept_config};
-use super::more_steps::{Finished, text_of_rates};
-use super::out_folder::{self, Existing, check_restart, has_results};
-use super::request::{RunOutcome, RunRequest};
+use super::more_steps::{text_of_rates, train_more_steps};
+use super::out_folder::{self, check_restart, has_results, settings_of_mark};
+use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
+use crate::base::units::{format_grouped, format_seconds};
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::limits::{self, RunOptions};
@@ -28,19 +30,18 @@ use crate::page::tool::uncommitted::is_uncommitted;
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::live::Live;
-use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::restore;
 use crate::train::error::TrainError;
-use crate::train::inputs::machine;
-use crate::train::inputs::machine::absolute;
-use crate::train::log::report::Summary;
+use crate::train::inputs::machine::{self, absolute};
+use crate::train::log::report::{StepLine, Summary};
 use crate::train::memory::host_budget;
 use crate::train::start::first_scene::{Start, dataset_print};
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::pages::PagedScene;
-use crate::train::stores::ownership::{Claim, Stored, last_state, open_own};
+use crate::train::stores::ownership::{Claim, Stored, last_state, open_own, read_own};
 use std::path::{Path, PathBuf};
 
 /// Remedy for an unusable config.toml.
@@ -64,6 +65,14 @@ pub struct ResumeRequest {
     pub live: Option<Live>,
 }
 
+impl ResumeRequest {
+    /// The request for the rest of the run.
+    fn to_run(&self, scene: &Path, config: TrainConfig, existing: Existing) -> RunRequest {
+        let (scene, out, live) = (scene.to_path_buf(), self.out.clone(), self.live.clone());
+        RunRequest { scene, out, config, dry_run: false, existing, quiet: self.quiet, live }
+    }
+}
+
 /// Resumes a run and trains to its end.
 /// Errors: no run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
@@ -72,24 +81,21 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     if let Some((config, scene)) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
         drop(lock);
         crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
-        return begin_again(request, config, scene, Existing::Overwrite);
+        return run(&request.to_run(&scene, config, Existing::Overwrite));
     }
     let earlier = Earlier::find(request)?;
-    let mut config = earlier.config.clone();
-    request.keys.clone().apply(&mut config);
-    config.check()?;
+    let mut config = earlier.config_now(request)?;
     if let Some(outcome) = finished_outcome(request, &config, &earlier)? {
         return Ok(outcome);
     }
     // What lies in the place of a result is refused here, and not after the last step.
     config.export.formats().try_for_each(|format| out_folder::check_results(&request.out, format))?;
-    let folder = stored_folder(&request.out, &config);
+    let folder = config.residence().checkpoint_folder(&request.out);
     if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
         drop(lock);
         keep_rates(&mut config, &request.keys, &earlier.config);
-        let (out, scene, quiet) = (request.out.as_path(), earlier.scene.as_path(), request.quiet);
-        let (file, run, live) = (earlier.file, earlier.run, request.live.clone());
-        return Finished { out, scene, config, file, run, summary: &summary, quiet, live }.go_on();
+        let goes_on = request.to_run(&earlier.scene, config, Existing::BeginAgain);
+        return train_more_steps(goes_on, earlier.file, earlier.run, &summary);
     }
     let is_in_output = config.residence().spill_dir().is_none();
     let found = open_own(&folder, earlier.claim(request), is_in_output);
@@ -107,16 +113,16 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
 }
 
 /// Facts of a run before its checkpoint is opened.
-pub(super) struct Earlier {
+struct Earlier {
     /// Path of config.toml, which may not exist.
-    pub path: PathBuf,
+    path: PathBuf,
     /// Its content; `None` if it is missing.
-    pub file: Option<(TrainConfig, Resolved)>,
+    file: Option<(TrainConfig, Resolved)>,
     /// Its config, from the file or from the checkpoint.
-    pub config: TrainConfig,
-    pub scene: PathBuf,
+    config: TrainConfig,
+    scene: PathBuf,
     /// Its identity; unknown if config.toml is missing and the user named the checkpoint.
-    pub run: RunId,
+    run: RunId,
 }
 
 impl Earlier {
@@ -158,6 +164,15 @@ impl Earlier {
         Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
     }
 
+    /// Its config with the flags of the request.
+    /// Errors: they do not fit together.
+    fn config_now(&self, request: &ResumeRequest) -> InputResult<TrainConfig> {
+        let mut config = self.config.clone();
+        request.keys.clone().apply(&mut config);
+        config.check()?;
+        Ok(config)
+    }
+
     /// `stored`, whose folder is removed at the end if the run made it.
     fn adopted(&self, mut stored: Stored) -> Stored {
         let is_own = |(config, facts): &(TrainConfig, Resolved)| {
@@ -178,7 +193,7 @@ impl Earlier {
 
 /// The summary of a run that did all of its steps, has no checkpoint any more, and is to do more steps. A run that was to
 /// keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
-pub(super) fn result_to_continue(
+fn result_to_continue(
     request: &ResumeRequest,
     earlier: &Earlier,
     config: &TrainConfig,
@@ -190,7 +205,7 @@ pub(super) fn result_to_continue(
     (is_gone && !earlier.config.keep_checkpoint && earlier.file.is_some()).then_some(summary)
 }
 
-pub(super) fn read_summary(out: &Path) -> Option<Summary> {
+fn read_summary(out: &Path) -> Option<Summary> {
     serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
 }
 
@@ -199,39 +214,35 @@ pub(super) fn read_summary(out: &Path) -> Option<Summary> {
 fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
     check_restart(&request.out)?;
     crate::tell!("{} was cut off before its first commit: it begins again", request.out.display());
-    begin_again(request, config, earlier.scene.clone(), Existing::BeginAgain)
-}
-
-fn begin_again(
-    request: &ResumeRequest,
-    config: TrainConfig,
-    scene: PathBuf,
-    existing: Existing,
-) -> Result<RunOutcome, TrainError> {
-    let (out, quiet) = (request.out.clone(), request.quiet);
-    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet, live: request.live.clone() })
+    run(&request.to_run(&earlier.scene, config, Existing::BeginAgain))
 }
 
 /// What a run resumes with.
-pub(super) struct Goal {
+struct Goal {
     /// Accepted differences.
-    pub changes: Changes,
-    pub start: Start,
+    changes: Changes,
+    start: Start,
     /// Digest of the dataset.
-    pub print: DatasetPrint,
+    print: DatasetPrint,
 }
 
 /// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Changes no file.
 /// Errors: the run has done more steps, its settings or its dataset changed, or its scene is not there.
-pub(super) fn goal(
+fn goal(
     request: &ResumeRequest,
     earlier: &Earlier,
     config: &mut TrainConfig,
     state: &RunState,
 ) -> Result<Goal, TrainError> {
     let (file, scene) = (&earlier.path, &earlier.scene);
-    keep_schedule(config, &request.keys, state);
-    check_steps(config, state)?;
+    if let Ok(then) = TrainConfig::parse(&state.origin.config) {
+        keep_rates(config, &request.keys, &then);
+    }
+    if config.steps < state.trainer.step {
+        let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.trainer.step);
+        let remedy = "give more, or roll the run back with gsscale-ckpt";
+        return Err(InputError::new("--steps", problem, remedy).into());
+    }
     let mut changes = Changes::of_config(file, state, config)?;
     changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
@@ -277,51 +288,18 @@ fn resume_from(
         file: earlier.file.clone(),
         first_rows: state.origin.dataset.first_rows,
     };
-    let run = identity_of(earlier.run, &state);
+    // Its own, that of its checkpoint, or a new one.
+    let run = [earlier.run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw);
     let begun = Begun { print, sh_degree_start: state.origin.sh_degree_start, past: Some(past), host_mem, driver, run };
-    let (scene, out, quiet) = (earlier.scene.clone(), request.out.clone(), request.quiet);
-    let request = RunRequest {
-        scene,
-        out,
-        config,
-        dry_run: false,
-        existing: Existing::BeginAgain,
-        quiet,
-        live: request.live.clone(),
-    };
+    let request = request.to_run(&earlier.scene, config, Existing::BeginAgain);
     plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
 
-/// The identity of a resumed run: its own, that of its checkpoint, or a new one.
-fn identity_of(run: RunId, state: &RunState) -> RunId {
-    [run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw)
-}
-
-/// Folder of a run's checkpoint.
-pub(super) fn stored_folder(out: &Path, config: &TrainConfig) -> PathBuf {
-    config.residence().checkpoint_folder(out)
-}
-
-/// Keeps the rate schedule of a run that is extended to more steps.
-fn keep_schedule(config: &mut TrainConfig, keys: &TrainOverrides, state: &RunState) {
-    if let Ok(then) = TrainConfig::parse(&state.origin.config) {
-        keep_rates(config, keys, &then);
-    }
-}
-
-/// Keeps the rate schedule of `then` unless a flag gives another.
+/// Keeps the rate schedule of `then` in a run that is extended to more steps, unless a flag gives another.
 fn keep_rates(config: &mut TrainConfig, keys: &TrainOverrides, then: &TrainConfig) {
     if keys.schedule_steps.is_none() && config.steps != then.steps {
         config.schedule_steps = limits::schedule_steps(then);
     }
-}
-
-fn check_steps(config: &TrainConfig, state: &RunState) -> InputResult<()> {
-    if config.steps >= state.trainer.step {
-        return Ok(());
-    }
-    let problem = format!("{} are fewer than the {} steps that the run has done", config.steps, state.trainer.step);
-    Err(InputError::new("--steps", problem, "give more, or roll the run back with gsscale-ckpt"))
 }
 
 /// Prints the resume and its differences.
@@ -366,8 +344,8 @@ fn finished_outcome(
 ) -> Result<Option<RunOutcome>, TrainError> {
     let summary = read_summary(&request.out).filter(|s| s.finished && s.steps >= config.steps);
     let Some(summary) = summary else { return Ok(None) };
-    let folder = stored_folder(&request.out, config);
-    let is_its_place = folder == stored_folder(&request.out, &earlier.config);
+    let folder = config.residence().checkpoint_folder(&request.out);
+    let is_its_place = folder == earlier.config.residence().checkpoint_folder(&request.out);
     let stored = if SpillDir::exists_in(&folder) {
         open_own(&folder, earlier.claim(request), config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
             crate::tell!("warning: {} is left alone: {error}", folder.display());
@@ -446,6 +424,113 @@ fn first_degree_change(start: &Start, state: &RunState, here: &DatasetPrint) -> 
     }
     let (there, here) = (state.origin.sh_degree_start, start.sh_degree_start);
     (there != here).then(|| format!("the SH degree of the first Gaussians was {there} and is {here}"))
+}
+
+/// Whether the run in an output folder has a commit, or can begin again because all of it was in memory.
+fn can_continue(out: &Path) -> bool {
+    TrainConfig::read(&out.join(CONFIG_FILE)).is_ok_and(|config| {
+        let residence = config.residence();
+        residence.spill_dir().is_none() || SpillDir::exists_in(&residence.checkpoint_folder(out))
+    })
+}
+
+/// Goes on with the run of `request` for as long as it ends with the loss of its device, at most `most` times. `ended` is how the run
+/// has ended so far.
+/// Errors: the error that ended the run last.
+pub fn go_on(
+    mut ended: Result<RunOutcome, TrainError>,
+    request: &ResumeRequest,
+    most: u32,
+) -> Result<RunOutcome, TrainError> {
+    for restart in 1..=most {
+        match ended {
+            Err(error) if error.is_device_lost() && can_continue(&request.out) => {
+                crate::tell!(
+                    "warning: {error}\n  the run goes on in this process (restart {restart} of at most {most})"
+                );
+                ended = resume(request);
+            }
+            ended => return ended,
+        }
+    }
+    ended
+}
+
+/// Says what a resume with this request would do.
+/// Errors: those of the resume before its first step, but for memory and drives.
+pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
+    out_folder::refuse_in_use(&request.out)?;
+    let out = request.out.display();
+    if settings_of_mark(&request.out, &request.keys, request.scene.as_deref())?.is_some() {
+        return Ok(format!("resume  {out} was cut off before its first step: it begins again"));
+    }
+    let earlier = Earlier::find(request)?;
+    let config = earlier.config_now(request)?;
+    machine::set_up(&config)?;
+    let folder = config.residence().checkpoint_folder(&request.out);
+    let state = match SpillDir::exists_in(&folder) {
+        true => read_own(&folder, earlier.claim(request))?,
+        false => None,
+    };
+    if let Some(summary) = read_summary(&request.out).filter(|s| s.finished && s.steps >= config.steps)
+        && state.as_ref().is_none_or(|state| state.trainer.step >= config.steps)
+    {
+        let steps = format_grouped(summary.steps.into());
+        return Ok(format!("resume  {out} is finished: all {steps} steps, with results; --steps N continues it"));
+    }
+    if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
+        let from = format!("{} Gaussians of {PLY_FILE}", format_grouped(summary.gaussians));
+        return Ok(steps_to_do(&request.out, &from, summary.steps, &config));
+    }
+    match state {
+        Some(state) => committed(request, &earlier, config, &state),
+        None => {
+            check_restart(&request.out)?;
+            Ok(format!("resume  {out} was cut off before its first commit: it begins again"))
+        }
+    }
+}
+
+/// What a resume from a commit would do.
+fn committed(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    mut config: TrainConfig,
+    state: &RunState,
+) -> Result<String, TrainError> {
+    let changes = goal(request, earlier, &mut config, state)?.changes;
+    let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
+    let mut text = steps_to_do(&request.out, &from, state.trainer.step, &config);
+    for change in changes.free.iter().chain(&changes.numbers) {
+        text.push_str(&format!("\nchange  {change}"));
+    }
+    Ok(text)
+}
+
+fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> String {
+    let left = config.steps.saturating_sub(done);
+    let [done, all, more] = [done, config.steps, left].map(|steps| format_grouped(steps.into()));
+    let time = match seconds_of_a_step(out) {
+        Some(seconds) => {
+            format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
+        }
+        None => String::new(),
+    };
+    let rates = text_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
+    format!(
+        "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",
+        out.display()
+    )
+}
+
+/// Seconds of a step by the metrics of the second half of the run.
+fn seconds_of_a_step(out: &Path) -> Option<f64> {
+    let text = std::fs::read_to_string(out.join(METRICS_FILE)).ok()?;
+    let lines: Vec<StepLine> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+    let last = lines.last().filter(|last| last.step > 0)?;
+    let half = lines.iter().rfind(|line| line.step <= last.step / 2);
+    let (steps, seconds) = half.map_or((0, 0.0), |line| (line.step, line.seconds));
+    Some((last.seconds - seconds).max(0.0) / f64::from(last.step - steps))
 }
 
 #[cfg(test)]

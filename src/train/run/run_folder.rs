@@ -6,15 +6,16 @@
 //! error that ended a run is the one that is returned; 3. a resumed run keeps the identity and the first facts of its past; 4. a file for
 //! viewers that cannot be written costs the run neither its evaluation nor its report, and leaves it to be resumed.
 
-use super::beginning::remove_mark;
 use super::changes::with_absolute_paths;
 use super::live::LivePage;
 use super::out_folder;
-use super::page_map::write_page_map;
+use super::out_folder::remove_mark;
 use super::request::{RunOutcome, RunRequest};
 use super::training_loop::TrainingLoop;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::ids::PageNo;
+use crate::base::whole_file::write_whole;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity};
 use crate::config::file::{Resolved, TrainConfig, write_config};
 use crate::config::limits;
@@ -24,8 +25,10 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
+use crate::report::page_map::PageTile;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
+use crate::scene::page_meta::PageBounds;
 use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::{Results, export, save, scene_meta};
 use crate::train::error::TrainError;
@@ -443,4 +446,45 @@ fn resolved(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, run: Run
         scene_scale: f64::from(dataset.scene_scale) * dataset.frame.scale,
         made_spill_dir: false,
     }
+}
+
+/// Writes the page map of a run as it is now.
+/// Errors: the folder cannot be written.
+pub fn write_page_map(path: &Path, dataset: &Dataset, trainer: &Trainer) -> InputResult<()> {
+    let text = serde_json::to_vec(&page_tiles(dataset, trainer))
+        .map_err(|e| InputError::new(path, format!("writing failed: {e}"), "report this as a bug"))?;
+    write_whole(path, &text)
+}
+
+/// One tile per page that has rows, with the number of training views that see it by its bounds.
+fn page_tiles(dataset: &Dataset, trainer: &Trainer) -> Vec<PageTile> {
+    let pager = &trainer.scene.pager;
+    let index = pager.index();
+    let mut views = vec![0u32; index.len()];
+    for view in dataset.train_views() {
+        for page in pager.pages_of_view(&dataset.views[view].camera) {
+            views[page.index()] += 1;
+        }
+    }
+    let seen: Vec<usize> = (0..index.len()).filter(|&i| is_finite(&index[i].bounds)).collect();
+    // The view from above is along the axis in which page centres differ least.
+    let centre = |i: usize, axis: usize| f64::from(index[i].bounds.lo[axis]) + f64::from(index[i].bounds.hi[axis]);
+    let spread = |axis: usize| {
+        let mean = seen.iter().map(|&i| centre(i, axis)).sum::<f64>() / seen.len() as f64;
+        seen.iter().map(|&i| (centre(i, axis) - mean).abs()).sum::<f64>()
+    };
+    let down = (0..3).min_by(|&a, &b| spread(a).total_cmp(&spread(b))).unwrap_or(2);
+    let [x, y] = [(down + 1) % 3, (down + 2) % 3];
+    let tile = |&i: &usize| PageTile {
+        lo: [index[i].bounds.lo[x], index[i].bounds.lo[y]],
+        hi: [index[i].bounds.hi[x], index[i].bounds.hi[y]],
+        rows: index[i].rows,
+        views: views[i],
+        resident: pager.is_in_memory(PageNo(i as u32)),
+    };
+    seen.iter().map(tile).collect()
+}
+
+fn is_finite(bounds: &PageBounds) -> bool {
+    bounds.lo.iter().chain(&bounds.hi).all(|x| x.is_finite())
 }
