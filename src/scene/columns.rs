@@ -109,7 +109,7 @@ impl<T> ColumnSet<T> {
 
     /// Something else for each column, in storage order.
     #[inline(always)]
-    pub fn map<U>(self, mut of: impl FnMut(Column, T) -> U) -> ColumnSet<U> {
+    pub fn map_columns<U>(self, mut of: impl FnMut(Column, T) -> U) -> ColumnSet<U> {
         ColumnSet {
             sh_degree: self.sh_degree,
             means: of(Column::Means, self.means),

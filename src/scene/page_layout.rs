@@ -87,14 +87,14 @@ pub fn write_page(state: &SceneState, payload: &mut [u8]) -> PageLayout {
     for (to, from) in
         [(rows.columns, &state.columns), (rows.exp_avg, &state.exp_avg), (rows.exp_avg_sq, &state.exp_avg_sq)]
     {
-        to.map(|column, values| values.copy_from_slice(from.column(column)));
+        to.map_columns(|column, values| values.copy_from_slice(from.column(column)));
     }
     layout
 }
 
 /// Copies the rows of a page into a table of their own.
 pub fn read_page(rows: &Rows<'_>) -> SceneState {
-    let table = |from: ColumnsRef<'_>| from.map(|_, values| values.to_vec());
+    let table = |from: ColumnsRef<'_>| from.map_columns(|_, values| values.to_vec());
     SceneState {
         columns: table(rows.columns),
         exp_avg: table(rows.exp_avg),

@@ -48,7 +48,7 @@ impl Columns {
     }
 
     pub fn view_mut(&mut self) -> ColumnsMut<'_> {
-        self.each_mut().map(|_, values| values.as_mut_slice())
+        self.each_mut().map_columns(|_, values| values.as_mut_slice())
     }
 }
 
@@ -60,7 +60,10 @@ impl<'a> ColumnsRef<'a> {
     /// The rows before `row`, and the rest.
     pub fn split_at(self, row: usize) -> (ColumnsRef<'a>, ColumnsRef<'a>) {
         let at = |column: Column| row * column.width(self.sh_degree);
-        (self.map(|column, values| &values[..at(column)]), self.map(|column, values| &values[at(column)..]))
+        (
+            self.map_columns(|column, values| &values[..at(column)]),
+            self.map_columns(|column, values| &values[at(column)..]),
+        )
     }
 
     /// Copies one row into the lanes of a block. `W` is the width of `sh_n`: constant, so that the copy takes a few
@@ -106,7 +109,7 @@ impl<'a> ColumnsMut<'a> {
     pub fn split_at(self, row: usize) -> (ColumnsMut<'a>, ColumnsMut<'a>) {
         let sh_degree = self.sh_degree;
         let mut rest = ColumnsMut { sh_degree, ..ColumnsMut::default() };
-        let front = self.map(|column, values| {
+        let front = self.map_columns(|column, values| {
             let (front, back) = values.split_at_mut(row * column.width(sh_degree));
             *rest.column_mut(column) = back;
             front

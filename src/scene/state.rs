@@ -92,7 +92,7 @@ impl SceneState {
         let SceneState { columns, exp_avg, exp_avg_sq, stamp, uid, grad2d, count } = self;
         let mut floats: Vec<(usize, &mut Vec<f32>)> = Vec::new();
         for table in [columns, exp_avg, exp_avg_sq] {
-            table.each_mut().map(|column, values| floats.push((column.width(sh_degree), values)));
+            table.each_mut().map_columns(|column, values| floats.push((column.width(sh_degree), values)));
         }
         floats.push((1, grad2d));
         floats.par_iter_mut().for_each(|(width, values)| remove_runs(values, *width, removed));
@@ -128,7 +128,7 @@ impl SceneState {
     #[must_use]
     pub fn select(&self, rows: &[u32]) -> SceneState {
         let of = |from: &Columns| {
-            from.view().map(|column, _| {
+            from.view().map_columns(|column, _| {
                 let mut values = Vec::with_capacity(rows.len() * column.width(from.sh_degree));
                 rows.iter().for_each(|&row| values.extend_from_slice(from.row(column, row as usize)));
                 values
