@@ -14,7 +14,7 @@ pub struct ViewSizes {
 
 impl ViewSizes {
     /// The larger of each size.
-    pub fn max(self, other: ViewSizes) -> ViewSizes {
+    pub fn widest(self, other: ViewSizes) -> ViewSizes {
         ViewSizes {
             rows: self.rows.max(other.rows),
             isects: self.isects.max(other.isects),

@@ -1,4 +1,4 @@
-//! Memory by part: the estimate of a run, staging, the largest view, an evaluation, and the budget of a growing scene: how many frames
+//! Memory by part: the estimate of a run, staging, an evaluation, and the budget of a growing scene: how many frames
 //! remain beside the other memory, and when a scene in memory no longer fits (the loop then starts paging).
 //!
 //! Parts that depend on views (rows, intersections, images) are measured by rendering a few views with the first Gaussians; the other parts
@@ -9,7 +9,7 @@
 //! the largest growth that its view may have had since the last step; frames that were removed for growth that did not happen are added
 //! again; 3. possible growth never stops a run: a step gets the frames that it needs while the run's current memory leaves room for them.
 //! For such frames, a run without --host-mem exceeds its first share, up to the available memory of the machine; 4. no bit of the result
-//! depends on the budget; 5. needs of views follow from the bounds of the pages alone; no page is read.
+//! depends on the budget.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::memory_available;
@@ -18,14 +18,10 @@ use crate::dataset::loader::{Dataset, View};
 use crate::dataset::target_cache::TargetCache;
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::HEADER_BYTES;
-use crate::paging::plan::batches;
 use crate::render::lpips::Network;
 use crate::render::view_sizes::ViewSizes;
-use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
-use crate::scene::page_meta::PageMeta;
 use crate::scene::state::row_bytes;
-use crate::schedule::visibility::visible_pages;
 use crate::train::step::pages::{PAGES_PER_BATCH, PagedScene};
 use std::path::Path;
 
@@ -188,48 +184,6 @@ pub(crate) fn with_staging(rest: u64, staging: u64, budget: u64) -> u64 {
     let share = ((staging - of_plan) as f64 / budget.max(1) as f64).min(0.5);
     let most = of_plan + (staging - of_plan).max(2 * PREFETCH_BYTES_MAX as u64);
     (((rest + of_plan) as f64 / (1.0 - share)) as u64).min(rest + most).max(rest + staging)
-}
-
-/// The training view that needs most pages, by page bounds. Held-out views do not count: evaluation visits their pages
-/// in batches.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub(crate) struct LargestView {
-    /// Its index in `dataset.views`; `None` if no view sees a page.
-    pub view: Option<usize>,
-    pub name: String,
-    /// Pages that it needs.
-    pub pages: u64,
-    /// Mean number of pages over the training views.
-    pub mean: f64,
-}
-
-/// The [`LargestView`] of a scene with these pages.
-pub(crate) fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> LargestView {
-    let (mut largest, mut sum, mut list) = (LargestView::default(), 0, Vec::new());
-    let views = dataset.train_views();
-    for &view in &views {
-        visible_pages(index, &dataset.views[view].camera, &mut list);
-        let pages = list.len() as u64;
-        sum += pages;
-        if pages > largest.pages {
-            largest = LargestView { view: Some(view), name: dataset.views[view].name.clone(), pages, mean: 0.0 };
-        }
-    }
-    LargestView { mean: sum as f64 / views.len().max(1) as f64, ..largest }
-}
-
-/// The training views that need more than one batch, and the most batches of one of them.
-pub(crate) fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usize) -> (usize, usize) {
-    let mut list = Vec::new();
-    let pages = dataset.train_views().into_iter().map(|view| {
-        visible_pages(index, &dataset.views[view].camera, &mut list);
-        list.len()
-    });
-    batches::cut_views(pages, frames as usize, pages_most)
-}
-
-pub(crate) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
-    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
 /// Bytes of a renderer for a Gaussian in view: splat, sort and intersections with tiles.

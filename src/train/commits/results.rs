@@ -51,7 +51,10 @@ impl Results<'_> {
                 Err(error) if error.is_out_of_space() && self.stop.exit_code().is_none() => {
                     let is_first = paused.is_none();
                     let began = *paused.get_or_insert_with(Instant::now);
-                    self.commit_last_step();
+                    if !self.has_last_step() {
+                        // A failure changes nothing: the result is tried again anyway.
+                        let _ = self.commit();
+                    }
                     if is_first && !self.wait.is_zero() {
                         self.tell_pause(&error);
                     }
@@ -80,13 +83,6 @@ impl Results<'_> {
     pub fn commit(&mut self) -> Result<(), TrainError> {
         let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
         checkpoint.commit(self.trainer, self.metrics)
-    }
-
-    /// Commits the last step if no commit holds it. A failure changes nothing: the result is tried again anyway.
-    fn commit_last_step(&mut self) {
-        if !self.has_last_step() {
-            let _ = self.commit();
-        }
     }
 
     fn has_last_step(&self) -> bool {

@@ -93,7 +93,7 @@ pub(crate) fn refusal(
         let rows = scene.pager.pages_of_view(camera).iter().map(|page| u64::from(index[page.index()].rows)).sum();
         ViewSizes { rows, isects: 0, pixels: camera.pixels() as u64 }
     };
-    let largest = views.iter().map(of_view).fold(ViewSizes::default(), ViewSizes::max);
+    let largest = views.iter().map(of_view).fold(ViewSizes::default(), ViewSizes::widest);
     let least = least_of(config, &DeviceNeeds::new(largest, config.sh_degree));
     if bytes_for_buffers(config.device_mem.0) >= least {
         return error;

@@ -6,7 +6,7 @@
 
 use super::forecast::STEP_OVER_RENDERING;
 use super::plan;
-use super::plan::Probe;
+use super::plan::{Probe, largest_view};
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
@@ -18,7 +18,7 @@ use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
-use crate::train::memory::{host_budget, largest_view};
+use crate::train::memory::host_budget;
 use crate::train::start::first_scene::Start;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::pages::{PagedScene, SceneRules};

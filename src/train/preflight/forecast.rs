@@ -13,6 +13,7 @@
 use super::device_memory;
 use super::plan::{
     LargestNeed, Probe, TierPlan, allow_largest_view, estimate, plan_tiers, rows_at_most, shrink_to_budget,
+    train_cameras,
 };
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -39,7 +40,7 @@ use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::drive_of;
 use crate::train::log::report::Foreseen;
-use crate::train::memory::{MemoryEstimate, PLAN_BYTES, list_bytes, train_cameras};
+use crate::train::memory::{MemoryEstimate, PLAN_BYTES, list_bytes};
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
 use crate::train::state::turns::keeps_first_count;
@@ -458,7 +459,7 @@ const VERSIONS: u64 = 3;
 const SLOTS_IN_FLIGHT: u64 = 64;
 
 /// Pages of `rows` first Gaussians, and the bytes of the frame of one.
-pub(super) fn first_pages(config: &TrainConfig, rows: u64) -> [u64; 2] {
+pub(crate) fn first_pages(config: &TrainConfig, rows: u64) -> [u64; 2] {
     let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes() as u64;
     [rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64), frame_bytes]
 }

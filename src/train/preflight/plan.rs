@@ -13,16 +13,19 @@ use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::paging::plan::batches;
 use crate::paging::simulation::replay::automatic_order;
+use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
+use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
 use crate::schedule::order::Order;
 use crate::schedule::visibility::ViewPages;
+use crate::schedule::visibility::visible_pages;
 use crate::train::error::TrainError;
 use crate::train::memory::{
-    BASE_BYTES, FRAMES_LEAST, HostBudget, INDEX_BYTES, LargestView, MemoryEstimate, PLAN_BYTES, bytes_of_copies,
-    cut_views, frames_and_batch, frames_in_memory, largest_decode, largest_view, list_bytes, obtainable_bytes,
-    staging_bytes, train_cameras, with_staging,
+    BASE_BYTES, FRAMES_LEAST, HostBudget, INDEX_BYTES, MemoryEstimate, PLAN_BYTES, bytes_of_copies, frames_and_batch,
+    frames_in_memory, largest_decode, list_bytes, obtainable_bytes, staging_bytes, with_staging,
 };
 use crate::train::start::tiers::{Tiers, budget_in_memory, first_staging_bytes};
 use crate::train::state::trainer::{Probed, Trainer};
@@ -42,6 +45,48 @@ const SPLAT_BYTES: u64 = 150;
 /// A view whose rows take more than this share of the budget, of 4, is measured in batches: program, photos and lists of
 /// intersections need the rest.
 const PROBE_WHOLE_OF_4: u64 = 3;
+
+/// The training view that needs most pages, by page bounds. Held-out views do not count: evaluation visits their pages
+/// in batches.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(crate) struct LargestView {
+    /// Its index in `dataset.views`; `None` if no view sees a page.
+    pub view: Option<usize>,
+    pub name: String,
+    /// Pages that it needs.
+    pub pages: u64,
+    /// Mean number of pages over the training views.
+    pub mean: f64,
+}
+
+/// The [`LargestView`] of a scene with these pages.
+pub(super) fn largest_view(dataset: &Dataset, index: &[PageMeta]) -> LargestView {
+    let (mut largest, mut sum, mut list) = (LargestView::default(), 0, Vec::new());
+    let views = dataset.train_views();
+    for &view in &views {
+        visible_pages(index, &dataset.views[view].camera, &mut list);
+        let pages = list.len() as u64;
+        sum += pages;
+        if pages > largest.pages {
+            largest = LargestView { view: Some(view), name: dataset.views[view].name.clone(), pages, mean: 0.0 };
+        }
+    }
+    LargestView { mean: sum as f64 / views.len().max(1) as f64, ..largest }
+}
+
+/// The training views that need more than one batch, and the most batches of one of them.
+fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usize) -> (usize, usize) {
+    let mut list = Vec::new();
+    let pages = dataset.train_views().into_iter().map(|view| {
+        visible_pages(index, &dataset.views[view].camera, &mut list);
+        list.len()
+    });
+    batches::cut_views(pages, frames as usize, pages_most)
+}
+
+pub(super) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
+    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
+}
 
 /// Pages, frames and drive space of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -185,7 +230,10 @@ fn first_frames(
     memory: &MemoryEstimate,
 ) -> InputResult<(FirstFrames, Option<u64>)> {
     if config.frames > 0 {
-        check_frames(u64::from(config.frames))?;
+        if (config.frames as usize) < FRAMES_LEAST {
+            let problem = format!("{} is too few: a step writes one page back while it reads another", config.frames);
+            return Err(InputError::new("--frames", problem, format!("give at least {FRAMES_LEAST}")));
+        }
         return Ok((FirstFrames::of_whole_views(u64::from(config.frames)), host_mem));
     }
     // By the estimate without growth: the cap may never be reached, and growth takes frames when it happens.
@@ -306,14 +354,6 @@ fn raise_to_minimum(config: &TrainConfig, host_mem: Option<u64>, least: u64) -> 
     Some(least)
 }
 
-fn check_frames(frames: u64) -> InputResult<()> {
-    if frames >= FRAMES_LEAST as u64 {
-        return Ok(());
-    }
-    let problem = format!("{frames} is too few: a step writes one page back while it reads another");
-    Err(InputError::new("--frames", problem, format!("give at least {FRAMES_LEAST}")))
-}
-
 /// Bytes of the working set for the rows of one full page.
 fn page_working(config: &TrainConfig) -> u64 {
     u64::from(config.page_rows) * WorkingSet::row_bytes(config.sh_degree) as u64
@@ -405,7 +445,10 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
             shrink_to_budget(config, &need, budget, &mut memory[1].clone()).min(frames)
         }
     };
-    let times = times_to_outgrow(plan, frames, memory[0].view - memory[0].view_pixels, config.frames > 0);
+    // With --frames the number of frames does not shrink as the rows of a view grow.
+    let of_rows = if config.frames > 0 { 0 } else { memory[0].view - memory[0].view_pixels };
+    // The growth at which the largest view needs all frames.
+    let times = (frames * plan.frame_bytes + of_rows) as f64 / (needed * plan.frame_bytes + of_rows).max(1) as f64;
     let until = match config.max_gaussians {
         0 if times >= GROWTH_UNLIKELY => return,
         0 => "growth has no cap (--max-gaussians)".to_string(),
@@ -417,14 +460,6 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
          grown about {times:.1} times, steps on such views take several batches and read more; more --frames or --host-mem \
          avoid it"
     );
-}
-
-/// Growth factor of the scene at which the largest view needs all frames.
-fn times_to_outgrow(plan: &TierPlan, frames: u64, of_rows: u64, are_fixed: bool) -> f64 {
-    // With --frames the number of frames does not shrink as the rows of a view grow.
-    let of_rows = if are_fixed { 0 } else { of_rows };
-    let needed = plan.largest_view.pages * plan.frame_bytes;
-    (frames * plan.frame_bytes + of_rows) as f64 / (needed + of_rows).max(1) as f64
 }
 
 fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>) -> InputResult<()> {

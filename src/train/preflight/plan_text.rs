@@ -1,14 +1,20 @@
-//! The plan of a run's tiers as text, as a run prints it at its start.
+//! The plan of a run as text, as a run prints it at its start.
 
+use super::device_memory;
 use super::forecast::{Forecast, Reach, first_pages};
+use super::plan::LargestView;
 use crate::base::units::{format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
+use crate::config::limits;
+use crate::config::values::Residence;
+use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
 use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::inputs::machine::drive_of;
-use crate::train::memory::LargestView;
 use crate::train::start::first_scene::Start;
 use crate::train::start::tiers::Tiers;
+use crate::train::state::trainer::Trainer;
+use std::path::Path;
 
 /// Rated endurance of a common drive of 500 GB, bytes written.
 const ENDURANCE_BYTES: f64 = 300e12;
@@ -21,7 +27,7 @@ const COLUMNS: usize = 80;
 const INDENT: &str = "        ";
 
 /// The growth of the number of Gaussians, as text of a plan.
-pub fn growth(forecast: &Forecast) -> String {
+fn growth(forecast: &Forecast) -> String {
     let last = format_grouped(forecast.gaussians[1]);
     match forecast.reach {
         Reach::Constant => String::from(" (no densification)"),
@@ -38,8 +44,53 @@ pub fn growth(forecast: &Forecast) -> String {
     }
 }
 
-/// The description of memory, drive and time that a run prints at its start.
-pub fn describe(forecast: &Forecast, tiers: &Tiers) -> String {
+/// The plan: dataset, start, tiers and device. `[scene, out]` are the scene and the output folder; without results the latter is empty.
+pub fn describe(
+    config: &TrainConfig,
+    [scene, out]: [&Path; 2],
+    dataset: &Dataset,
+    trainer: &Trainer,
+    forecast: &Forecast,
+    tiers: &Tiers,
+) -> String {
+    let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
+    let size = largest.map_or(String::new(), |c| format!("{}x{} pixels", c.width, c.height));
+    let results = match out.as_os_str().is_empty() {
+        true => String::new(),
+        false => format!(", results in {}", out.display()),
+    };
+    let commits = match config.residence() {
+        Residence::Memory => "to checkpoint/ in the results (see --commit-every)",
+        Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
+        Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
+    };
+    let of_photos = trainer.photos.iter().filter_map(|parameter| parameter.plan_text());
+    let photos: String = of_photos.map(|text| format!("photos  {text}\n")).collect();
+    let text = format!(
+        "scene   {}: {} views to train on, {} held out, at most {size}\n\
+         {photos}\
+         start   {} Gaussians, SH degree {}{}\n\
+         run     {} steps on {} threads ({}), rendered by {}{results}\n\
+         commit  {commits}\n\
+         {}{}",
+        scene.display(),
+        dataset.train_views().len(),
+        dataset.test_views().len(),
+        trainer.scene.rows(),
+        config.sh_degree,
+        growth(forecast),
+        config.steps,
+        rayon::current_num_threads(),
+        limits::simd_path(config).name(),
+        trainer.renderer.device(),
+        describe_tiers(forecast, tiers),
+        device_memory::describe(config, forecast.memory_at_end())
+    );
+    folded(text.trim_end())
+}
+
+/// The lines about pages, memory, drive and time.
+fn describe_tiers(forecast: &Forecast, tiers: &Tiers) -> String {
     let (plan, memory) = (&forecast.tiers, forecast.memory_at_end());
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let LargestView { pages: largest, mean, .. } = &plan.largest_view;
@@ -111,7 +162,7 @@ fn waits(forecast: &Forecast) -> String {
 
 /// Wraps the lines of a text at 80 columns, and indents the rest of each. Lines break only behind a comma, a semicolon or a colon, or
 /// before a bracket; a line without such a place stays long.
-pub fn folded(text: &str) -> String {
+fn folded(text: &str) -> String {
     let mut lines = Vec::new();
     for line in text.lines() {
         let mut rest = line.to_string();

@@ -11,23 +11,21 @@ use super::run_folder::{Begun, train_into};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;
-use crate::config::limits::{self, RunOptions};
+use crate::config::limits::RunOptions;
 use crate::config::new_run;
-use crate::config::values::{Device, Residence, Up};
+use crate::config::values::{Device, Up};
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
-use crate::scene::partition::first_fill;
 use crate::train::error::TrainError;
-use crate::train::inputs::machine;
-use crate::train::inputs::machine::StopFlag;
+use crate::train::inputs::machine::{self, StopFlag};
 use crate::train::memory::{host_budget, host_bytes_now};
-use crate::train::preflight::forecast::{Forecast, check_drive_of_results, check_first_drive, plan_run};
+use crate::train::preflight::forecast::{Forecast, check_drive_of_results, check_first_drive, first_pages, plan_run};
 use crate::train::preflight::plan::rows_at_most;
-use crate::train::preflight::{device_memory, plan_text};
+use crate::train::preflight::plan_text;
 use crate::train::start::first_scene::{Start, dataset_print};
 use crate::train::start::tiers::{self, Tiers};
 use crate::train::state::trainer::Trainer;
@@ -40,7 +38,9 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let config = &request.config;
     config.check()?;
     machine::set_up(config)?;
-    check_folders(request)?;
+    // Before anything else is read, and without a change: dry runs refuse what runs refuse.
+    out_folder::check_usable_out(&request.out, request.existing)?;
+    config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
     let _mark = Beginning::mark(request)?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
@@ -53,7 +53,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         }
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
-    let (dataset, trainer, tiers, begun) = first_trainer(request, start, host_mem)?;
+    let FirstTrainer { dataset, trainer, tiers, begun } = first_trainer(request, start, host_mem)?;
     plan_and_train(request, &dataset, tiers, trainer, begun)
 }
 
@@ -69,41 +69,32 @@ fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     request
 }
 
-/// Refuses folders in which the run may not begin, before anything else is read. Changes nothing, so dry runs refuse what runs refuse.
-fn check_folders(request: &RunRequest) -> Result<(), TrainError> {
-    out_folder::check(&request.out, request.existing)?;
-    match request.config.residence().spill_dir() {
-        Some(spill_dir) => Ok(check_usable(spill_dir, false)?),
-        None => Ok(()),
-    }
+/// A trainer before its first step, with all that belongs to it. Its pages may lie in the tiers, so drop them after it.
+pub(super) struct FirstTrainer {
+    pub dataset: Dataset,
+    pub trainer: Trainer,
+    pub tiers: Tiers,
+    pub begun: Begun,
 }
 
-/// Removes what a run that was cut off before its first commit left in the spill directory.
-fn clear_spill_dir(config: &TrainConfig) -> Result<(), TrainError> {
-    if let Some(spill_dir) = config.residence().spill_dir()
-        && remove_uncommitted(spill_dir, false)?
-    {
-        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
-    }
-    Ok(())
-}
-
-/// Makes the first pages of a scene, and their trainer before its first step. The trainer's pages may lie in the tiers, so drop them after it.
+/// Makes the first pages of a scene, and their trainer.
 /// Errors: the drive or the device cannot be used, or the source of the Gaussians cannot be read again.
 pub(super) fn first_trainer(
     request: &RunRequest,
     start: Start,
     host_mem: Option<u64>,
-) -> Result<(Dataset, Trainer, Tiers, Begun), TrainError> {
+) -> Result<FirstTrainer, TrainError> {
     let config = &request.config;
-    if !request.dry_run {
-        clear_spill_dir(config)?;
+    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
+        && remove_uncommitted(spill_dir, false)?
+    {
+        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
-    let fill = first_fill(config.page_rows as usize, options.strategy.grows());
-    let pages = rows_at_most(config, start.rows).div_ceil(fill as u64);
-    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    let [pages, _] = first_pages(config, rows_at_most(config, start.rows));
+    let (mut pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    pager.set_transfers(config.transfers);
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
@@ -112,7 +103,7 @@ pub(super) fn first_trainer(
     let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw() };
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    Ok((dataset, trainer, tiers, begun))
+    Ok(FirstTrainer { dataset, trainer, tiers, begun })
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.
@@ -177,7 +168,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }
-    let (dataset, mut trainer, tiers, begun) = first_trainer(&request, start, host_mem)?;
+    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
     plan_run(&request.config, &dataset, &tiers, &mut trainer, host_mem, begun.driver, drive_rate).map(Some)
 }
 
@@ -193,10 +184,7 @@ pub(super) fn plan_and_train(
     trainer.start_photos(dataset).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let forecast = plan_run(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
     if !request.quiet {
-        let of_device = device_memory::describe(config, forecast.memory_at_end());
-        let of_tiers = plan_text::describe(&forecast, &tiers) + &of_device;
-        let plan = describe(request, dataset, &trainer, &plan_text::growth(&forecast), &of_tiers);
-        let plan = plan_text::folded(&plan);
+        let plan = plan_text::describe(config, [&request.scene, &request.out], dataset, &trainer, &forecast, &tiers);
         match request.dry_run {
             // What was asked for goes to standard output.
             true => crate::say!("{plan}"),
@@ -240,40 +228,4 @@ fn spill_dir_flag(request: &RunRequest) -> String {
         Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
         _ => String::new(),
     }
-}
-
-/// Text of the plan: dataset, start and tiers.
-fn describe(request: &RunRequest, dataset: &Dataset, trainer: &Trainer, growth: &str, tiers: &str) -> String {
-    let (config, rows) = (&request.config, trainer.scene.rows());
-    let largest = dataset.views.iter().map(|v| &v.camera).max_by_key(|c| c.pixels());
-    let size = largest.map_or(String::new(), |c| format!("{}x{} pixels", c.width, c.height));
-    let results = match request.out.as_os_str().is_empty() {
-        true => String::new(),
-        false => format!(", results in {}", request.out.display()),
-    };
-    let commits = match config.residence() {
-        Residence::Memory => "to checkpoint/ in the results (see --commit-every)",
-        Residence::Frames => "nowhere: --frames without --spill-dir is for comparisons",
-        Residence::SpillDir(_) => "to the spill directory (see --commit-every)",
-    };
-    let of_photos = trainer.photos.iter().filter_map(|parameter| parameter.plan_text());
-    let photos: String = of_photos.map(|text| format!("photos  {text}\n")).collect();
-    let text = format!(
-        "scene   {}: {} views to train on, {} held out, at most {size}\n\
-         {photos}\
-         start   {} Gaussians, SH degree {}{growth}\n\
-         run     {} steps on {} threads ({}), rendered by {}{results}\n\
-         commit  {commits}\n\
-         {tiers}",
-        request.scene.display(),
-        dataset.train_views().len(),
-        dataset.test_views().len(),
-        rows,
-        config.sh_degree,
-        config.steps,
-        rayon::current_num_threads(),
-        limits::simd_path(config).name(),
-        trainer.renderer.device(),
-    );
-    text.trim_end().to_string()
 }

@@ -9,7 +9,7 @@
 //! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
 //! is renamed before the scene was found; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
 
-use super::begin::{first_trainer, plan_and_train};
+use super::begin::{FirstTrainer, first_trainer, plan_and_train};
 use super::changes::with_absolute_paths;
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, Past};
@@ -76,7 +76,7 @@ pub(super) fn train_more_steps(
         file,
         first_rows: start.rows,
     };
-    let (dataset, mut trainer, tiers, begun) = first_trainer(&request, start, host_mem)?;
+    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
     trainer.begin_after(summary.steps, summary.train_seconds);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }

@@ -91,40 +91,24 @@ pub fn default_out(scene: Option<&Path>) -> PathBuf {
 
 /// Refuses an output folder in which a run may not begin. Changes nothing, so a dry run asks the same.
 /// Errors: the folder cannot be made, is not empty and `existing` refuses it, is in use, or its checkpoint belongs to another run.
-pub(crate) fn check(out: &Path, existing: Existing) -> Result<(), TrainError> {
-    check_above(out)?;
+pub(crate) fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError> {
+    if let Some(above) = out.ancestors().find(|above| above.exists()).filter(|above| !above.is_dir()) {
+        let problem = format!("the folder cannot be made: {} is a file", above.display());
+        return Err(InputError::new(out, problem, "choose another --out").into());
+    }
     refuse_in_use(out)?;
     match existing {
-        Existing::Refuse => Ok(check_new(out)?),
+        Existing::Refuse if out.exists() && !is_empty(out) => {
+            Err(InputError::new(out, "exists already", remedy_of_existing(out)).into())
+        }
         Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
-        Existing::BeginAgain => Ok(()),
+        Existing::Refuse | Existing::BeginAgain => Ok(()),
     }
 }
 
 /// Identity of the run whose config lies in `out`.
 fn run_in(out: &Path) -> RunId {
     read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
-}
-
-/// Refuses an output folder where a file is, or in whose path one is.
-fn check_above(out: &Path) -> InputResult<()> {
-    match out.ancestors().find(|above| above.exists()) {
-        Some(above) if !above.is_dir() => {
-            let problem = format!("the folder cannot be made: {} is a file", above.display());
-            Err(InputError::new(out, problem, "choose another --out"))
-        }
-        _ => Ok(()),
-    }
-}
-
-fn check_new(out: &Path) -> InputResult<()> {
-    if !out.exists() {
-        return Ok(());
-    }
-    if is_empty(out) {
-        return Ok(());
-    }
-    Err(InputError::new(out, "exists already", remedy_of_existing(out)))
 }
 
 /// The remedy for an existing output folder: resume its run, or another folder. `--overwrite` is proposed only where there
@@ -154,23 +138,27 @@ pub fn remedy_of_existing(out: &Path) -> String {
     }
 }
 
+fn failed(path: &Path, doing: &str) -> impl FnOnce(std::io::Error) -> InputError {
+    move |e| InputError::io(path, doing, &e)
+}
+
 /// Creates the folder durably.
 /// Errors: the folder cannot be created.
 pub(super) fn make_folder(out: &Path) -> InputResult<()> {
-    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     let is_new = !out.exists();
-    std::fs::create_dir_all(out).map_err(io)?;
+    std::fs::create_dir_all(out).map_err(failed(out, "making the output folder"))?;
     // The names of new parent folders are not synced.
-    if is_new { sync_folder(folder_of(out)).map_err(io) } else { Ok(()) }
+    if is_new { sync_folder(folder_of(out)).map_err(failed(out, "making the output folder")) } else { Ok(()) }
 }
 
 /// Creates the folder, checks that it is writable, and removes an earlier run's files.
 /// Errors: the folder cannot be written, or its checkpoint belongs to another run.
 pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
-    let io = |e: std::io::Error| InputError::io(out, "making the output folder", &e);
     make_folder(out)?;
     let probe = out.join(PROBE);
-    std::fs::write(&probe, b"").and_then(|()| std::fs::remove_file(&probe)).map_err(io)?;
+    std::fs::write(&probe, b"")
+        .and_then(|()| std::fs::remove_file(&probe))
+        .map_err(failed(out, "making the output folder"))?;
     // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
     let is_runs = [CONFIG_FILE, BEGUN_FILE].iter().any(|file| out.join(file).is_file());
     if existing == Existing::Refuse || !is_runs {
@@ -223,7 +211,7 @@ fn exports(out: &Path) -> impl Iterator<Item = (ExportFormat, PathBuf)> {
 
 fn remove_file(path: &Path) -> InputResult<()> {
     match std::fs::remove_file(path) {
-        Err(e) if path.is_file() => Err(InputError::io(path, "removing the earlier run's file", &e)),
+        Err(e) if path.is_file() => Err(failed(path, "removing the earlier run's file")(e)),
         _ => Ok(()),
     }
 }
@@ -234,7 +222,7 @@ fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputR
     if !folder.is_dir() {
         return Ok(());
     }
-    let entries = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
+    let entries = std::fs::read_dir(folder).map_err(failed(folder, "listing the folder"))?;
     for entry in entries.flatten() {
         let path = entry.path();
         match entry.file_type() {
@@ -277,7 +265,7 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
 
 /// The PLY files that `--save-every` wrote.
 pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
-    let entries = std::fs::read_dir(out).map_err(|e| InputError::io(out, "listing the folder", &e))?;
+    let entries = std::fs::read_dir(out).map_err(failed(out, "listing the folder"))?;
     let is_saved = |path: &PathBuf| path.file_name().and_then(|name| name.to_str()).is_some_and(is_saved_ply);
     Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
@@ -362,7 +350,7 @@ pub(super) fn settings_of_mark(
     let path = out.join(BEGUN_FILE);
     let remedy = "remove the file, and start the run again with its first command";
     let refuse = |problem: String| InputError::new(&path, problem, remedy);
-    let text = std::fs::read_to_string(&path).map_err(|e| InputError::io(&path, "reading the settings", &e))?;
+    let text = std::fs::read_to_string(&path).map_err(failed(&path, "reading the settings"))?;
     let mut config = TrainConfig::parse(&text).map_err(refuse)?;
     let BegunMark { resolved } = toml::from_str(&text).map_err(|e| refuse(e.to_string()))?;
     keys.clone().apply(&mut config);
@@ -408,10 +396,10 @@ mod tests {
         let out = folder.path();
         for name in [LOCK, PROBE, BEGUN_FILE, "..gsscale-begun.toml.part", ".config.toml.part"] {
             std::fs::write(out.join(name), "").unwrap();
-            check(out, Existing::Refuse).unwrap();
+            check_usable_out(out, Existing::Refuse).unwrap();
         }
         std::fs::write(out.join("notes.txt.part"), "somebody's").unwrap();
-        assert!(check(out, Existing::Refuse).is_err());
+        assert!(check_usable_out(out, Existing::Refuse).is_err());
     }
 
     /// For every format, so that none can be left out.

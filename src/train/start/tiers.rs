@@ -76,14 +76,14 @@ fn codec(config: &TrainConfig) -> Codec {
     })
 }
 
+/// Pager sizes of a run that keeps all pages in memory.
+fn in_memory(config: &TrainConfig) -> PagerConfig {
+    PagerConfig { policy: config.evict, ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree) }
+}
+
 /// Pager sizes of a run within `host_mem` bytes.
 fn pager_config(config: &TrainConfig, host_mem: u64) -> PagerConfig {
-    let mut pager = PagerConfig {
-        frames: config.frames as usize,
-        policy: config.evict,
-        plan_bytes: PLAN_BYTES,
-        ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree)
-    };
+    let mut pager = PagerConfig { frames: config.frames as usize, plan_bytes: PLAN_BYTES, ..in_memory(config) };
     let affordable = (host_mem / pager.frame_bytes() as u64) as usize;
     if pager.frames == 0 {
         pager.frames = (affordable / PREFETCH_SHARE).max(FIRST_FRAMES);
@@ -105,16 +105,10 @@ fn prefetch_bytes(config: &TrainConfig, frames: usize, frame_bytes: usize) -> us
 
 /// The budget of a run that keeps all pages in memory while they fit.
 pub(crate) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &MemoryEstimate) -> HostBudget {
-    let frame_bytes = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree).frame_bytes();
+    let frame_bytes = in_memory(config).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
     let staging = staging_bytes(2 * ahead, codec(config));
     HostBudget::new(host_mem, memory, config.host_mem.0 > 0).in_memory(ahead, staging)
-}
-
-/// Sets the time of transfers by `--transfers`.
-fn with_transfers(mut pager: Pager, config: &TrainConfig) -> Pager {
-    pager.set_transfers(config.transfers);
-    pager
 }
 
 /// Staging of a run that has not begun, with this budget.
@@ -127,14 +121,12 @@ pub fn first_staging_bytes(config: &TrainConfig, host_mem: u64) -> u64 {
 /// memory and must fit there (`plan_text::too_large_for_a_dry_run`).
 /// Errors: the spill directory cannot be used, or the I/O engine does not work here.
 pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Result<(Pager, Tiers), TrainError> {
-    let (page_rows, sh_degree) = (config.page_rows as usize, config.sh_degree);
     let residence = config.residence();
     if residence == Residence::Memory {
-        let in_memory = PagerConfig { policy: config.evict, ..PagerConfig::in_memory(page_rows, sh_degree) };
-        return Ok((with_transfers(Pager::in_memory(in_memory), config), Tiers::default()));
+        return Ok((Pager::in_memory(in_memory(config)), Tiers::default()));
     }
     let pager = pager_config(config, host_mem);
-    let layout = SlotLayout::new(capacity_bytes(page_rows, sh_degree), pages as u64);
+    let layout = SlotLayout::new(capacity_bytes(config.page_rows as usize, config.sh_degree), pages as u64);
     let mut tiers = Tiers::default();
     tiers.keeps = config.keep_checkpoint;
     tiers.segment_bytes = layout.segment_bytes();
@@ -144,7 +136,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let codec = codec(config);
         (tiers.engine, tiers.codec) = (engine.name().to_string(), codec);
         let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
-        return Ok((with_transfers(Pager::new(pager, PagedStore::new(engine, of_store)), config), tiers));
+        return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     };
     let spill = SpillDir::create(spill_dir, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
@@ -155,7 +147,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, commit_options(config));
     checkpoint.fill_reserve()?;
     tiers.checkpoint = Some(checkpoint);
-    Ok((with_transfers(Pager::new(pager, store), config), tiers))
+    Ok((Pager::new(pager, store), tiers))
 }
 
 impl Tiers {
@@ -169,8 +161,7 @@ impl Tiers {
         // directory.
         let is_in_memory = config.residence() == Residence::Memory && bytes <= host_mem / 2;
         if is_in_memory {
-            let in_memory = PagerConfig::in_memory(config.page_rows as usize, config.sh_degree);
-            pager = PagerConfig { policy: config.evict, ..in_memory };
+            pager = in_memory(config);
         }
         let layout = spill.format().layout;
         if layout.slot_bytes != pager.frame_bytes() as u64 {
@@ -188,7 +179,7 @@ impl Tiers {
         checkpoint.set_optional(is_in_memory);
         checkpoint.fill_reserve()?;
         tiers.checkpoint = Some(checkpoint);
-        Ok((with_transfers(pager, config), tiers))
+        Ok((pager, tiers))
     }
 
     /// Takes over a spill directory and starts its I/O engine.

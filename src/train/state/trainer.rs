@@ -215,7 +215,7 @@ impl Trainer {
             self.memory.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
             (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
             let sizes = self.renderer.device_sizes();
-            probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.max(sizes)));
+            probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.widest(sizes)));
         }
         // The first view allocates memory, and is the largest.
         let rest = if seconds.len() > 1 { &mut seconds[1..] } else { &mut seconds[..] };
