@@ -227,7 +227,7 @@ fn split_cull(
         let acquired = start.elapsed().as_secs_f64();
         visible_rows(&tables, &scene.rules.adam, now, camera, &mut rows);
         let culled = start.elapsed().as_secs_f64();
-        gather(&tables, scene.rules.sh_degree(), &scene.rules.adam, now, &rows, &mut columns);
+        gather(&tables, scene.rules.sh_degree, &scene.rules.adam, now, &rows, &mut columns);
         let gathered = start.elapsed().as_secs_f64();
         let spans = [acquired, culled - acquired, gathered - culled];
         alone.iter_mut().zip(spans).for_each(|(sum, seconds)| *sum += seconds);

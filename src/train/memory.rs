@@ -332,7 +332,7 @@ impl HostBudget {
         let taken = self.bytes_beside_frames(scene, rendering, growth_due(scene)) - self.copies(scene) + self.staging;
         let left = self.bytes.saturating_sub(taken);
         let frame = scene.pager.frame_bytes() as u64;
-        let working = (scene.rules.page_rows() * working_row) as u64;
+        let working = (scene.rules.page_rows * working_row) as u64;
         frames_and_batch(left, frame, working, self.copies_pages)
     }
 
@@ -388,7 +388,7 @@ impl HostBudget {
     /// Bytes of a run with all pages in memory; `have_split` if pages have split.
     pub(crate) fn bytes_of_all(&self, scene: &PagedScene, view: u64, have_split: bool) -> u64 {
         let growth = growth_due(scene);
-        let rows = frames_in_memory(scene.rows_bound(), scene.rules.sh_degree(), have_split);
+        let rows = frames_in_memory(scene.rows_bound(), scene.rules.sh_degree, have_split);
         let around_rows = scene.pager.index().len() as f64 * growth * AROUND_ROWS;
         self.bytes_beside_frames(scene, view, growth) + rows + around_rows as u64
     }

@@ -148,7 +148,7 @@ impl World {
         };
         write_config(&out.join("config.toml"), &config, &resolved)?;
         let mut checkpoint = Checkpoint::new(opened.commits, &spill_dir, commit_options(&config));
-        checkpoint.set_optional(self.is_optional);
+        checkpoint.is_optional = self.is_optional;
         checkpoint.fill_reserve()?;
         assert!(spill_dir.join(RESERVE_NAME).exists());
         let (simd, text) = (resolved.simd, toml::to_string(&config).unwrap());
@@ -210,7 +210,7 @@ impl World {
         let path = out.join("torn.ply");
         let refused = save(trainer, dataset, &path).expect_err("pages of two steps are no result").to_string();
         assert!(refused.contains("failed half-way") && refused.contains("--resume") && !path.exists(), "{refused}");
-        let (step, last) = (trainer.steps_done(), checkpoint.last_step().unwrap());
+        let (step, last) = (trainer.steps_done(), checkpoint.last_step.unwrap());
         let is_read = error.to_string().contains("cannot be read");
         assert!(
             last + if is_read { 1 } else { 2 } >= step,

@@ -25,7 +25,7 @@ use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::map::commit::{CommitConfig, CommitError, Commits};
+use crate::page::map::commit::{CommitConfig, CommitError, Commits, MAP_NAME};
 use crate::page::map::opening::Opened;
 use crate::page::tool::uncommitted::remove_uncommitted;
 use crate::page::versions::paged_store::PagedStore;
@@ -76,12 +76,13 @@ pub struct Checkpoint {
     /// Creates the store at the first commit of a run in memory.
     first: Option<FirstCommit>,
     /// The folder created by that first commit.
-    spill: Option<SpillDir>,
-    /// Name under which the next commit is kept.
-    name: Option<String>,
-    folder: PathBuf,
+    pub(crate) spill: Option<SpillDir>,
+    /// Name under which the next commit is kept; later commits do not replace it.
+    pub(crate) name: Option<String>,
+    /// Folder of the store, which may not exist yet.
+    pub folder: PathBuf,
     /// The run can continue without commits: all pages are in memory.
-    is_optional: bool,
+    pub is_optional: bool,
     /// The run has waited for space in vain and goes on without commits, until one finds space.
     goes_without: bool,
     /// How long to wait for space.
@@ -97,9 +98,10 @@ pub struct Checkpoint {
     beside: Option<Beside>,
     /// How the run was started; see [`Checkpoint::set_origin`].
     origin: Option<Origin>,
-    done: u64,
-    /// Step of the last commit.
-    last_step: Option<u32>,
+    /// Commits since the store was opened.
+    pub(crate) done: u64,
+    /// Step of the last of them.
+    pub last_step: Option<u32>,
 }
 
 /// When a run commits, and how long it waits for space.
@@ -161,50 +163,10 @@ impl Checkpoint {
         (self.started, self.last, self.last_cut) = (Instant::now(), Instant::now(), Instant::now());
     }
 
-    /// Sets whether all pages are in memory, so that the run can continue without commits.
-    pub fn set_optional(&mut self, is_optional: bool) {
-        self.is_optional = is_optional;
-    }
-
-    /// Folder of the store, which may not exist yet.
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
-    /// Keeps the next commit under `name`; later commits do not replace it.
-    pub fn keep_next_as(&mut self, name: String) {
-        self.name = Some(name);
-    }
-
     /// Whether to commit after the last step. A run in memory without commits should not: it would write all pages to a
     /// checkpoint that is removed at once.
     pub fn needs_last_commit(&self) -> bool {
         self.commits.is_some()
-    }
-
-    /// Ends committing and returns the folder that the first commit of a run in memory created, if any.
-    pub fn into_folder(self) -> Option<SpillDir> {
-        self.spill
-    }
-
-    /// Whether the store has a commit since it was opened.
-    pub fn has_commit(&self) -> bool {
-        self.done > 0
-    }
-
-    /// Commits since the store was opened.
-    pub(crate) fn commits_done(&self) -> u64 {
-        self.done
-    }
-
-    /// The folder that the first commit of a run in memory created.
-    pub(crate) fn spill(&self) -> Option<&SpillDir> {
-        self.spill.as_ref()
-    }
-
-    /// Step of the last commit since the store was opened.
-    pub fn last_step(&self) -> Option<u32> {
-        self.last_step
     }
 
     /// Costs of the commits so far.
@@ -216,7 +178,7 @@ impl Checkpoint {
     /// Errors: as [`Checkpoint::commit`].
     pub fn between_steps(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
         if self.is_optional {
-            self.interval.limit_bytes(trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64);
+            self.interval.limit_bytes(trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree) as u64);
         }
         if !trainer.scene.pager.is_frozen() {
             // A failed write abandoned it; the next step returns the error.
@@ -228,7 +190,11 @@ impl Checkpoint {
             None if self.is_time() && self.first.is_some() => self.commit(trainer, metrics),
             None if self.is_time() && self.commits.is_some() => self.begin(trainer, metrics),
             None if self.may_commit_early() && self.space_is_short(trainer) => self.commit(trainer, metrics),
-            Some(beside) if trainer.scene.pager.is_frozen_written() || is_late(beside) => self.finish(trainer),
+            Some(beside)
+                if trainer.scene.pager.is_frozen_written() || beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS =>
+            {
+                self.finish(trainer)
+            }
             _ => Ok(()),
         }
     }
@@ -256,12 +222,6 @@ impl Checkpoint {
             crate::tell!("warning: {name} is not kept: there is no space for a commit");
         }
         self.last = Instant::now();
-    }
-
-    /// Abandons the commit in progress of a run whose pages are all in memory.
-    fn give_up(&mut self, trainer: &mut Trainer) {
-        self.beside = None;
-        trainer.scene.pager.abort_cut();
     }
 
     /// Creates the checkpoint of a run in memory at its first commit. On failure the run continues without commits;
@@ -395,7 +355,8 @@ impl Checkpoint {
         }
         if self.is_optional {
             // All pages are in memory: abandon the commit in progress; the step needs no write.
-            self.give_up(trainer);
+            self.beside = None;
+            trainer.scene.pager.abort_cut();
             if self.goes_without {
                 self.miss();
                 return Ok(());
@@ -452,7 +413,9 @@ impl Checkpoint {
                 // The first commit of a run in memory stores all pages.
                 let pager = &trainer.scene.pager;
                 let all = (pager.index().len() * pager.frame_bytes()) as u64;
-                pager.slot_space().map_or(all, |space| space.segment_bytes) + self.map_growth()
+                // A commit doubles the page map at most.
+                let map_bytes = std::fs::metadata(self.folder.join(MAP_NAME)).map_or(0, |map| map.len());
+                pager.slot_space().map_or(all, |space| space.segment_bytes) + map_bytes
             }
         };
         // The folder of a first commit that failed is gone.
@@ -493,7 +456,7 @@ impl Checkpoint {
                 Err(error) => return Err(error),
             }
         }
-        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree()) as u64 / 100 * RESULTS_PERCENT;
+        let room = trainer.scene.rows() * row_bytes(trainer.scene.rules.sh_degree) as u64 / 100 * RESULTS_PERCENT;
         let has_room = || free_bytes(&full).ok().flatten().is_none_or(|free| free >= room);
         match stop.exit_code() {
             Some(_) => Ok(()),
@@ -501,8 +464,7 @@ impl Checkpoint {
                 crate::tell!(
                     "warning: training goes on in memory without commits: if it ends now, the steps since {} are lost. There is \
                      room for the results, and commits begin again once there is room for them",
-                    self.last_step()
-                        .map_or("its beginning".to_string(), |step| format!("the commit after step {step}"))
+                    self.last_step.map_or("its beginning".to_string(), |step| format!("the commit after step {step}"))
                 );
                 self.goes_without = true;
                 self.miss();
@@ -511,7 +473,7 @@ impl Checkpoint {
             None => Err(TrainError::DriveFull {
                 folder,
                 needed: needed_text,
-                last_step: self.last_step(),
+                last_step: self.last_step,
                 elsewhere: String::new(),
             }),
         }
@@ -529,21 +491,12 @@ impl Checkpoint {
         let folder = error.file.parent().filter(|folder| folder.is_dir())?;
         (!is_same_drive(folder, &self.folder)).then(|| folder.to_path_buf())
     }
-
-    /// Most bytes by which one commit can grow the page map: at most it doubles.
-    fn map_growth(&self) -> u64 {
-        std::fs::metadata(self.folder.join(crate::page::map::commit::MAP_NAME)).map_or(0, |map| map.len())
-    }
 }
 
 /// Whether few slots are free and a commit would free enough.
 fn should_commit_for_slots(space: &SlotSpace) -> bool {
     let SlotSpace { total, free, retired, .. } = *space;
     free * FEW_FREE < total && retired * WORTH_FREEING >= total
-}
-
-fn is_late(beside: &Beside) -> bool {
-    beside.cut.elapsed().as_secs_f64() >= BESIDE_SECONDS
 }
 
 /// The error of a state that cannot be encoded.

@@ -86,7 +86,7 @@ impl Results<'_> {
     }
 
     fn has_last_step(&self) -> bool {
-        let last = self.checkpoint.as_deref().and_then(Checkpoint::last_step);
+        let last = self.checkpoint.as_deref().and_then(|checkpoint| checkpoint.last_step);
         last == Some(self.trainer.steps_done())
     }
 
@@ -128,7 +128,7 @@ impl Results<'_> {
         TrainError::DriveFull {
             folder: self.out.display().to_string(),
             needed,
-            last_step: self.checkpoint.as_deref().and_then(Checkpoint::last_step),
+            last_step: self.checkpoint.as_deref().and_then(|checkpoint| checkpoint.last_step),
             elsewhere: self.elsewhere(),
         }
     }

@@ -82,7 +82,7 @@ impl TrainingLoop<'_> {
             if due(save_every) && !is_last {
                 self.save_if_space(&self.out.join(saved_ply_name(done)))?;
                 if let Some(checkpoint) = self.checkpoint.as_deref_mut() {
-                    checkpoint.keep_next_as(format!("step-{done}"));
+                    checkpoint.name = Some(format!("step-{done}"));
                 }
             }
             if due(log_every) || is_last || due(eval_every) {
@@ -185,7 +185,7 @@ impl TrainingLoop<'_> {
         if rows == 0 {
             return Ok(());
         }
-        let store = self.checkpoint.as_deref().map_or(self.out, Checkpoint::folder);
+        let store = self.checkpoint.as_deref().map_or(self.out, |checkpoint| &checkpoint.folder);
         let problem = format!("the pages hold statistics of {rows} rows that the run's histogram lacks");
         let remedy = "the last commit is intact: make a consistent store with gsscale-ckpt salvage, then continue with \
                       gsscale-train --resume and --spill-dir";
@@ -246,13 +246,13 @@ impl TrainingLoop<'_> {
             crate::tell!("warning: {outgrown} (--host-mem), and no drive is set for its pages (--spill-dir)");
             return Ok(());
         };
-        let commits = Some(checkpoint.commits_done());
+        let commits = Some(checkpoint.done);
         if budget.failed_after == commits {
             trainer.memory.budget = Some(budget);
             return Ok(());
         }
         match checkpoint.commit(trainer, self.metrics) {
-            Ok(()) if checkpoint.has_commit() => {}
+            Ok(()) if checkpoint.done > 0 => {}
             Ok(()) => {
                 crate::tell!(
                     "warning: {outgrown} (--host-mem), and without commits its pages cannot be moved to a drive"
@@ -267,11 +267,11 @@ impl TrainingLoop<'_> {
             }
             Err(error) => return Err(error),
         }
-        checkpoint.set_optional(false);
+        checkpoint.is_optional = false;
         crate::tell!(
             "warning: {outgrown} (--host-mem): its pages move between memory and {}; a new run with --spill-dir can \
              choose a view order that moves fewer pages",
-            checkpoint.folder().display()
+            checkpoint.folder.display()
         );
         trainer.memory.budget = Some(budget);
         trainer.scene.pager.begin_paging(frames, budget.prefetch_bytes, PLAN_BYTES);

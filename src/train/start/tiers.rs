@@ -176,7 +176,7 @@ impl Tiers {
         let store = opened.paged_store(engine, layout, codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
         let mut checkpoint = Checkpoint::new(opened.commits, &folder, commit_options(config));
-        checkpoint.set_optional(is_in_memory);
+        checkpoint.is_optional = is_in_memory;
         checkpoint.fill_reserve()?;
         tiers.checkpoint = Some(checkpoint);
         Ok((pager, tiers))
@@ -220,7 +220,7 @@ impl Tiers {
     }
 
     fn has_checkpoint(&self) -> bool {
-        self.has_resumed || self.checkpoint.as_ref().is_some_and(Checkpoint::has_commit)
+        self.has_resumed || self.checkpoint.as_ref().is_some_and(|checkpoint| checkpoint.done > 0)
     }
 
     /// Whether pages may be evicted to a drive.
@@ -230,7 +230,7 @@ impl Tiers {
 
     /// Bytes of the files of the pages; 0 without a drive or if they cannot be listed.
     pub fn drive_bytes(&self) -> u64 {
-        let made = self.checkpoint.as_ref().and_then(Checkpoint::spill);
+        let made = self.checkpoint.as_ref().and_then(|checkpoint| checkpoint.spill.as_ref());
         let Some(spill) = self.spill.as_ref().or(made) else { return 0 };
         let files = std::fs::read_dir(spill.folder()).into_iter().flatten().flatten();
         files.filter_map(|file| file.metadata().ok()).map(|about| about.len()).sum()
@@ -252,7 +252,7 @@ impl Tiers {
     /// dropped before. Returns messages for the user.
     pub fn close(&mut self) -> Vec<String> {
         let is_kept = self.has_checkpoint() && (self.keeps || !self.is_done);
-        let made = self.checkpoint.take().and_then(Checkpoint::into_folder);
+        let made = self.checkpoint.take().and_then(|checkpoint| checkpoint.spill);
         let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();
         match spill.remove() {

@@ -181,7 +181,7 @@ mod tests {
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let pages = scene.pager.pages_of_view(&camera).len();
         assert!(pages > 2 * 48, "{pages} pages");
-        let render = RenderOptions { sh_degree: scene.rules.sh_degree(), ..options.render };
+        let render = RenderOptions { sh_degree: scene.rules.sh_degree, ..options.render };
         let targets = TargetCache::new(&[], 0, 1).unwrap();
         let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| {
             let comparing =

@@ -86,7 +86,7 @@ impl RunMemory<'_> {
     pub fn view_memory(&self) -> ViewMemory {
         let [working, rendering] = self.view_bytes();
         let width = row_width(self.working.columns.sh_degree) as u64;
-        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degree_last]
+        let [now, at_last] = [self.scene.rules.sh_degree, self.sh_degree_last]
             .map(|degree| working / width * row_width(degree) as u64 + rendering);
         ViewMemory { now, at_last }
     }
@@ -99,7 +99,7 @@ impl RunMemory<'_> {
             return held;
         }
         let visible = (rows as f64 * self.memory.visible_share) as u64;
-        let [now, at_last] = [self.scene.rules.sh_degree(), self.sh_degree_last]
+        let [now, at_last] = [self.scene.rules.sh_degree, self.sh_degree_last]
             .map(|degree| visible * WorkingSet::row_bytes(degree) as u64 + rendering);
         ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
     }
@@ -115,7 +115,7 @@ impl RunMemory<'_> {
             self.renderer.free_rows();
             self.memory.rendered_rows = 0;
         }
-        let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree()) as u64;
+        let working_due = visible * WorkingSet::row_bytes(self.scene.rules.sh_degree) as u64;
         if is_too_large(self.working.bytes() as u64, working_due) {
             self.shrink_working_set(visible as usize);
         }
@@ -167,7 +167,7 @@ impl RunMemory<'_> {
             // Between the passes, the batches keep the numbers of their rows in view.
             let numbers = (rows as f64 * self.memory.visible_share) as u64 * size_of::<u32>() as u64;
             (frames, self.memory.pages_most) = budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
-            self.shrink_working_set(self.memory.pages_most.saturating_mul(self.scene.rules.page_rows()));
+            self.shrink_working_set(self.memory.pages_most.saturating_mul(self.scene.rules.page_rows));
         }
         let pager = &mut self.scene.pager;
         let now = pager.frames_max();

@@ -245,7 +245,7 @@ impl Trainer {
 
     /// SH degree now and at the last step.
     pub fn sh_degrees(&self) -> (u8, u8) {
-        (self.scene.rules.sh_degree(), self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
+        (self.scene.rules.sh_degree, self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
     }
 
     pub fn steps_done(&self) -> u32 {
@@ -274,7 +274,7 @@ impl Trainer {
 
     /// Render options with the current SH degree.
     pub fn render_options(&self) -> RenderOptions {
-        RenderOptions { sh_degree: self.scene.rules.sh_degree(), ..self.options.render }
+        RenderOptions { sh_degree: self.scene.rules.sh_degree, ..self.options.render }
     }
 
     pub fn events(&self) -> &EventLog {
@@ -438,7 +438,7 @@ impl Trainer {
         let strategy = &self.options.strategy;
         let reads = strategy.reads_histogram(step) || strategy.growth_check(step).is_some();
         let is_steady = self.state.steps_skipped_in_a_row == 0 && self.idle.is_busy();
-        if reads || !is_steady || self.options.sh_degree_at(step + 1) > self.scene.rules.sh_degree() {
+        if reads || !is_steady || self.options.sh_degree_at(step + 1) > self.scene.rules.sh_degree {
             return false;
         }
         let count = RowCount::unlimited(self.scene.rows_bound());
@@ -482,7 +482,7 @@ impl Trainer {
         let kinds = self.options.strategy.events_after(step, scale, count, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);
-        if degree > self.scene.rules.sh_degree() {
+        if degree > self.scene.rules.sh_degree {
             self.scene.log_event(Event { step, kind: EventKind::RaiseShDegree { degree } });
         }
         Ok(())

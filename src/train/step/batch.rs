@@ -143,7 +143,7 @@ pub fn gather(rules: &SceneRules, pages: &[PinnedPage], step: u32, camera: &Came
     let tables = row_tables(pages);
     let WorkingSet { row_from_working, columns, .. } = working;
     catch_up::visible_rows(&tables, &rules.adam, step, camera, row_from_working);
-    catch_up::gather(&tables, rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+    catch_up::gather(&tables, rules.sh_degree, &rules.adam, step, row_from_working, columns);
 }
 
 impl RowBackend for RowsInHost<'_> {
@@ -183,7 +183,7 @@ impl RowBackend for RowsInHost<'_> {
         let WorkingSet { row_from_working, columns, gradients } = working;
         if is_again {
             let rules = &scene.rules;
-            catch_up::gather(&row_tables(pinned), rules.sh_degree(), &rules.adam, step, row_from_working, columns);
+            catch_up::gather(&row_tables(pinned), rules.sh_degree, &rules.adam, step, row_from_working, columns);
         }
         Ok(self.renderer.rows_out(batch, columns, gradients)?)
     }

@@ -50,8 +50,8 @@ impl DeviceTier {
         let name = renderer.name();
         let numbers = scene.rules.adam.numbers(steps);
         let numbers = numbers.ok_or(TrainError::Render(RenderError::NoPages { backend: name }))?;
-        let splits = *scene.rules.splits();
-        let flights = Flights::new(OneStep::new(&numbers, scene.rules.splits()));
+        let splits = scene.rules.splits;
+        let flights = Flights::new(OneStep::new(&numbers, &scene.rules.splits));
         let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;
         device.prepare_page_storage(&PageRules {

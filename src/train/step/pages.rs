@@ -44,11 +44,13 @@ pub struct SceneRules {
     pub adam: DeferredAdam,
     events: EventLog,
     seed: u64,
-    page_rows: usize,
+    /// Capacity of a page, rows.
+    pub(crate) page_rows: usize,
     pub(crate) strategy: Arc<dyn Strategy>,
     /// Limits within which an unseen row may split; used by page bounds.
-    splits: SplitLimits,
-    sh_degree: u8,
+    pub(crate) splits: SplitLimits,
+    /// As raised by events so far.
+    pub sh_degree: u8,
     /// Pages whose statistics are cleared keep their bounds, which stay valid: a device that clears them finds no new ones.
     keeps_bounds: bool,
 }
@@ -83,21 +85,6 @@ impl SceneRules {
             sh_degree: options.sh_degree_at(0),
             keeps_bounds: options.optimizer_on == OptimizerPlace::Device,
         }
-    }
-
-    /// Limits within which an unseen row may split.
-    pub(crate) fn splits(&self) -> &SplitLimits {
-        &self.splits
-    }
-
-    /// Current SH degree, as raised by events.
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
-    }
-
-    /// Capacity of a page, rows.
-    pub(crate) fn page_rows(&self) -> usize {
-        self.page_rows
     }
 
     /// Bounds of a page with these rows, for the index.

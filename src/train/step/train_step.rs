@@ -263,7 +263,7 @@ impl Passes<'_, '_> {
         let span = trace::span("rows out");
         self.backend.rows_out(self.scene, (number, !is_first), &self.pinned, at, self.working)?;
         if self.backend.has_gradients() {
-            let (WorkingSet { columns, gradients, .. }, degree) = (&mut *self.working, self.scene.rules.sh_degree());
+            let (WorkingSet { columns, gradients, .. }, degree) = (&mut *self.working, self.scene.rules.sh_degree);
             let parameters = self.comparison.photos.iter_mut();
             parameters
                 .for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.view.camera, degree));

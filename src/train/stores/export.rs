@@ -322,7 +322,7 @@ impl StoredStart {
 
     /// SH degree of its Gaussians.
     pub fn sh_degree(&self) -> u8 {
-        self.scene.rules.sh_degree()
+        self.scene.rules.sh_degree
     }
 
     /// Passes first pages to `take`: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with at
@@ -345,7 +345,7 @@ impl StoredStart {
             let (mut uid, mut columns) = (Vec::new(), Columns::default());
             self.scene.visit(&[page], &[], &mut |rules, tables| {
                 uid = tables.iter().flat_map(|table| table.uid).copied().collect();
-                columns = evaluate_all(tables, rules.sh_degree(), &rules.adam, now);
+                columns = evaluate_all(tables, rules.sh_degree, &rules.adam, now);
                 Ok::<(), TrainError>(())
             })?;
             if to_local(&mut columns, &meta, origin, scale) > 0 {
