@@ -265,19 +265,19 @@ pub struct HostBudget {
     /// The whole budget, bytes.
     pub(crate) bytes: u64,
     /// Bytes that do not grow with the scene, without staging.
-    constant: u64,
+    pub(crate) constant: u64,
     /// Whether densification rounds copy pages.
-    copies_pages: bool,
+    pub(crate) copies_pages: bool,
     /// Bytes for pages in transfer and the plan.
     pub(crate) staging: u64,
     /// Bytes of a view that depend on its pixels alone.
-    view_pixels: u64,
+    pub(crate) view_pixels: u64,
     /// The user set the budget (--host-mem), so it never rises.
-    is_named: bool,
+    pub(crate) is_named: bool,
     /// The budget has risen above the run's first share.
     pub(crate) is_raised: bool,
     /// The plan has shrunk to leave memory for frames.
-    is_plan_small: bool,
+    pub(crate) is_plan_small: bool,
     /// Number of commits when paging could not start for lack of drive space.
     pub(crate) failed_after: Option<u64>,
     /// Bytes in flight ahead of their step, each way, if a run in memory starts paging.
@@ -299,21 +299,6 @@ impl HostBudget {
             failed_after: None,
             prefetch_bytes: 0,
         }
-    }
-
-    /// Marks a budget that was raised at the start, with a warning.
-    pub(crate) fn raised_at_start(self) -> HostBudget {
-        HostBudget { is_raised: true, ..self }
-    }
-
-    /// Adds the staging that a run in memory needs if it starts paging.
-    pub fn in_memory(self, prefetch_bytes: usize, staging: u64) -> HostBudget {
-        HostBudget { prefetch_bytes, staging, ..self }
-    }
-
-    /// Notes that paging could not start for lack of drive space after this many commits.
-    pub(crate) fn with_failure_after(self, commits: Option<u64>) -> HostBudget {
-        HostBudget { failed_after: commits, ..self }
     }
 
     /// Frames for a step whose view needs `needed` pages: the budget minus the run's current memory and the growth that

@@ -52,9 +52,9 @@ impl Grown for Row {
 /// A file of Gaussians, read into a run's local frame with at most the run's SH degree.
 #[derive(Debug, Clone)]
 pub(crate) struct GaussianFile {
-    path: PathBuf,
+    pub path: PathBuf,
     meta: SceneMeta,
-    sh_degree: u8,
+    pub sh_degree: u8,
     sh_degree_most: u8,
     origin: [f64; 3],
     scale: f64,
@@ -83,14 +83,6 @@ impl GaussianFile {
     ) -> InputResult<GaussianFile> {
         let (meta, sh_degree) = gaussians_header(path)?;
         Ok(GaussianFile { path: path.to_path_buf(), meta, sh_degree, sh_degree_most, origin, scale, log_scales })
-    }
-
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
-    }
-
-    pub fn path(&self) -> &Path {
-        &self.path
     }
 
     /// Passes the Gaussians to `take` in batches, in the file's order, without those that are too far away or too large.
@@ -181,17 +173,13 @@ impl<'a> GaussianWriter<'a> {
 pub(crate) struct GaussianSpool<'a> {
     space: GaussianSpace<'a>,
     rows: Spool<Row>,
-    sh_degree: u8,
+    pub sh_degree: u8,
 }
 
 impl GaussianSpool<'_> {
     /// Number of Gaussians.
     pub fn rows(&self) -> usize {
         self.rows.len()
-    }
-
-    pub fn sh_degree(&self) -> u8 {
-        self.sh_degree
     }
 
     /// Partitions the Gaussians into pages of at most `fill` rows and passes the pages to `take` in the order of their

@@ -170,7 +170,7 @@ fn plan_in_memory(
     }
     if let Some(budget) = host_mem {
         let first = budget_in_memory(config, budget, &memory[0]);
-        trainer.memory.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.memory.budget = Some(HostBudget { is_raised: host_mem != asked, ..first });
     }
     Ok(())
 }
@@ -190,7 +190,7 @@ fn plan_frames(
     trainer.scene.pager.limit_frames(frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
         let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
-        trainer.memory.budget = Some(if host_mem == asked { first } else { first.raised_at_start() });
+        trainer.memory.budget = Some(HostBudget { is_raised: host_mem != asked, ..first });
     }
     for memory in memory {
         memory.frames = memory.frames.min(frames * plan.frame_bytes);

@@ -25,6 +25,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
+use crate::paging::stats::PagerStats;
 use crate::report::page_map::PageTile;
 use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
 use crate::report::run_report::write_run_report;
@@ -40,6 +41,7 @@ use crate::train::preflight::forecast::Forecast;
 use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
+use std::cell::OnceCell;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
@@ -76,33 +78,17 @@ pub(super) struct Begun {
     pub run: RunId,
 }
 
-/// Counters at the start of a measurement.
-struct Meter {
-    read: u64,
-    written: u64,
-    stall: f64,
-}
-
-impl Meter {
-    /// Starts a measurement.
-    fn start(trainer: &Trainer) -> Meter {
-        let stats = trainer.scene.pager.stats();
-        let (read, written, stall) = (stats.bytes_read, stats.bytes_written, stats.stall_seconds);
-        Meter { read, written, stall }
-    }
-
-    /// Costs since the start, with the CPU seconds of the run.
-    fn stop(&self, trainer: &Trainer, tiers: &Tiers, train_cpu_seconds: Option<f64>) -> StepCosts {
-        let stats = trainer.scene.pager.stats();
-        StepCosts {
-            train_cpu_seconds,
-            train_bytes_read: stats.bytes_read - self.read,
-            train_bytes_written: stats.bytes_written - self.written,
-            train_stall_seconds: stats.stall_seconds - self.stall,
-            device_bytes_peak: trainer.renderer.traffic().device_bytes_peak,
-            drive_bytes_peak: tiers.drive_bytes(),
-            forecast: None,
-        }
+/// Costs of the steps since the pager had counted `before`.
+fn costs_since(before: &PagerStats, trainer: &Trainer, tiers: &Tiers, metrics: &MetricsLog) -> StepCosts {
+    let stats = trainer.scene.pager.stats();
+    StepCosts {
+        train_cpu_seconds: metrics.cpu_seconds(),
+        train_bytes_read: stats.bytes_read - before.bytes_read,
+        train_bytes_written: stats.bytes_written - before.bytes_written,
+        train_stall_seconds: stats.stall_seconds - before.stall_seconds,
+        device_bytes_peak: trainer.renderer.traffic().device_bytes_peak,
+        drive_bytes_peak: tiers.drive_bytes(),
+        forecast: None,
     }
 }
 
@@ -181,7 +167,7 @@ pub(super) fn train_into(
         LivePage::new(live)
     });
     let mut progress = RunProgress::new(config.steps, request.quiet).after(trainer.steps_done());
-    let meter = Meter::start(&trainer);
+    let before = trainer.scene.pager.stats();
     metrics.start_clock(trainer.train_seconds());
     let looped = TrainingLoop {
         trainer: &mut trainer,
@@ -196,8 +182,7 @@ pub(super) fn train_into(
         forecast: Some(forecast),
     }
     .run();
-    let step_costs =
-        StepCosts { forecast: Some(forecast.facts()), ..meter.stop(&trainer, &*tiers, metrics.cpu_seconds()) };
+    let step_costs = StepCosts { forecast: Some(forecast.facts()), ..costs_since(&before, &trainer, tiers, &metrics) };
     let mut results = Results {
         trainer: &mut trainer,
         metrics: &mut metrics,
@@ -279,7 +264,10 @@ fn write_results(
         write_page_map(&out.join(PAGES_FILE), dataset, trainer)?;
         trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
         write_summary(&out.join(SUMMARY_FILE), &summary)?;
-        Ok(write_report(request)?)
+        let shown = OnceCell::new();
+        let count = |all| Count::new("pictures put into the report", all, request.quiet);
+        write_run_report(out, &|done, all| shown.get_or_init(|| count(all as u32)).show(done as u32))?;
+        Ok(())
     })?;
     tested?;
     exported?;
@@ -370,16 +358,6 @@ fn evaluate_result(
         }
         Ok(test)
     })
-}
-
-fn write_report(request: &RunRequest) -> InputResult<()> {
-    let shown = std::cell::OnceCell::new();
-    let show = |done: usize, all: usize| {
-        let count = || Count::new("pictures put into the report", all as u32, request.quiet);
-        shown.get_or_init(count).show(done as u32);
-    };
-    write_run_report(&request.out, &show)?;
-    Ok(())
 }
 
 /// The log of metrics of a new run, or of a run that resumes after `past`.

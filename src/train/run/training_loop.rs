@@ -21,7 +21,7 @@ use crate::train::error::TrainError;
 use crate::train::inputs::machine::StopFlag;
 use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
-use crate::train::memory::{PLAN_BYTES, host_bytes_peak};
+use crate::train::memory::{HostBudget, PLAN_BYTES, host_bytes_peak};
 use crate::train::preflight::forecast::Forecast;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;
@@ -53,7 +53,7 @@ impl TrainingLoop<'_> {
     /// Errors: as [`Trainer::step`], or an output cannot be written.
     pub fn run(&mut self) -> Result<(), TrainError> {
         let (steps, eval_every, save_every, log_every) = {
-            let options = self.trainer.options();
+            let options = &self.trainer.options;
             (options.steps, options.eval_every, options.save_every, options.log_every)
         };
         // A step in flight is always finished.
@@ -66,7 +66,7 @@ impl TrainingLoop<'_> {
             }
             self.trainer.ahead.is_allowed = self.may_run_ahead();
             let before = self.trainer.renderer.traffic();
-            let Some(outcome) = self.step()? else { break };
+            let Some(outcome) = self.with_space(Trainer::step)? else { break };
             self.check_statistics()?;
             let done = self.trainer.steps_done();
             let (due, is_last) = (|every: u32| every > 0 && done.is_multiple_of(every), done == steps);
@@ -106,7 +106,7 @@ impl TrainingLoop<'_> {
 
     /// Whether the loop neither reads nor changes the scene between the next step and the one after it.
     fn may_run_ahead(&mut self) -> bool {
-        let (done, options) = (self.trainer.steps_done() + 1, self.trainer.options());
+        let (done, options) = (self.trainer.steps_done() + 1, &self.trainer.options);
         let due = |every: u32| every > 0 && done.is_multiple_of(every);
         let is_wanted = due(options.eval_every) || due(options.save_every) || done >= options.steps;
         let is_due = self.checkpoint.as_deref().is_some_and(|checkpoint| checkpoint.is_due(self.trainer));
@@ -145,15 +145,8 @@ impl TrainingLoop<'_> {
     /// if a stop was requested meanwhile.
     fn log_due_events(&mut self) -> Result<bool, TrainError> {
         let (checks, allowed) = (self.trainer.growth().len(), self.trainer.state.growth.allowed());
-        loop {
-            match self.trainer.log_due_events(self.dataset, self.targets) {
-                Ok(()) => break,
-                Err(error) if error.is_out_of_space() => self.make_space(error)?,
-                Err(error) => return Err(self.commit_before_end(error)),
-            }
-            if self.stop.exit_code().is_some() {
-                return Ok(false);
-            }
+        if self.with_space(Trainer::log_due_events)?.is_none() {
+            return Ok(false);
         }
         if let Some(check) = self.trainer.growth().get(checks) {
             self.progress.say(&check.to_string());
@@ -164,12 +157,14 @@ impl TrainingLoop<'_> {
         Ok(true)
     }
 
-    /// Runs a step and repeats it after waiting for space if the drive is full. `None` if a stop was requested
-    /// meanwhile.
-    fn step(&mut self) -> Result<Option<StepOutcome>, TrainError> {
+    /// Does `work`, and repeats it after waiting for space while the drive is full. `None` if a stop was requested meanwhile.
+    fn with_space<T>(
+        &mut self,
+        work: fn(&mut Trainer, &Dataset, &TargetCache) -> Result<T, TrainError>,
+    ) -> Result<Option<T>, TrainError> {
         loop {
-            match self.trainer.step(self.dataset, self.targets) {
-                Ok(outcome) => return Ok(Some(outcome)),
+            match work(self.trainer, self.dataset, self.targets) {
+                Ok(done) => return Ok(Some(done)),
                 Err(error) if error.is_out_of_space() => self.make_space(error)?,
                 Err(error) => return Err(self.commit_before_end(error)),
             }
@@ -204,7 +199,7 @@ impl TrainingLoop<'_> {
     /// run keeps its previous commit.
     fn commit_last(&mut self) -> Result<(), TrainError> {
         let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
-        match self.trainer.steps_done() < self.trainer.options().steps || checkpoint.needs_last_commit() {
+        match self.trainer.steps_done() < self.trainer.options.steps || checkpoint.needs_last_commit() {
             true => checkpoint.commit_or_warn(self.trainer, self.metrics),
             false => Ok(()),
         }
@@ -262,7 +257,7 @@ impl TrainingLoop<'_> {
             Err(error) if error.is_out_of_space() => {
                 crate::tell!("warning: {outgrown} (--host-mem), and its pages cannot be moved to a drive: {error}");
                 // Try again after the next successful commit.
-                trainer.memory.budget = Some(budget.with_failure_after(commits));
+                trainer.memory.budget = Some(HostBudget { failed_after: commits, ..budget });
                 return Ok(());
             }
             Err(error) => return Err(error),

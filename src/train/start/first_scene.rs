@@ -199,7 +199,7 @@ impl Start {
         dataset.warnings.extend(file_warnings(file, &meta, far));
         dataset.warnings.extend(giants_warning(file, giants));
         options.check_rows(file, rows)?;
-        let sh_degree_start = gaussians.sh_degree().max(options.init.sh_degree);
+        let sh_degree_start = gaussians.sh_degree.max(options.init.sh_degree);
         Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
     }
 
@@ -316,7 +316,7 @@ impl Start {
                 taken.map(|_| ())
             }
             FirstRows::Gaussians(file) => {
-                let mut rows = GaussianWriter::new(file.path(), GaussianSpace { folder, memory: budget.bytes });
+                let mut rows = GaussianWriter::new(&file.path, GaussianSpace { folder, memory: budget.bytes });
                 let read = file.read(&mut |columns| rows.push_all(columns));
                 read.and_then(|_| rows.finish()).and_then(|rows| rows.for_each_page(fill, &mut take_state))
             }

@@ -108,7 +108,7 @@ pub(crate) fn budget_in_memory(config: &TrainConfig, host_mem: u64, memory: &Mem
     let frame_bytes = in_memory(config).frame_bytes();
     let ahead = prefetch_bytes(config, (host_mem / frame_bytes as u64) as usize, frame_bytes);
     let staging = staging_bytes(2 * ahead, codec(config));
-    HostBudget::new(host_mem, memory, config.host_mem.0 > 0).in_memory(ahead, staging)
+    HostBudget { prefetch_bytes: ahead, staging, ..HostBudget::new(host_mem, memory, config.host_mem.0 > 0) }
 }
 
 /// Staging of a run that has not begun, with this budget.

@@ -64,7 +64,7 @@ pub struct Trainer {
     pub renderer: Box<dyn Renderer>,
     /// The pages on the renderer's device, from the first step of a run that updates them there.
     pub(crate) device: Option<DeviceTier>,
-    pub(crate) options: RunOptions,
+    pub options: RunOptions,
     /// Which view each step trains on.
     turns: Turns,
     /// What the run knows of its photos.
@@ -239,10 +239,6 @@ impl Trainer {
         &self.turns.order
     }
 
-    pub fn options(&self) -> &RunOptions {
-        &self.options
-    }
-
     /// SH degree now and at the last step.
     pub fn sh_degrees(&self) -> (u8, u8) {
         (self.scene.rules.sh_degree, self.options.sh_degree_at(self.options.steps.saturating_sub(1)))
@@ -294,7 +290,10 @@ impl Trainer {
             let camera = photos::camera(&self.photos, dataset, view);
             self.run_memory().fit_frames(&camera);
         }
-        self.prepare_device()?;
+        if self.options.optimizer_on == OptimizerPlace::Device {
+            // The pages get their slots, so that the first plan knows them.
+            DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
+        }
         self.look_ahead(dataset);
         let photo = trace::span("photo");
         let target = targets.get(view)?;
@@ -445,14 +444,6 @@ impl Trainer {
         strategy.events_after(step, self.options.scene_scale, count, &self.scene.histogram).is_empty()
     }
 
-    /// Gives the pages of a run that updates on a device their slots, so that the first plan knows them.
-    fn prepare_device(&mut self) -> Result<(), TrainError> {
-        if self.options.optimizer_on == OptimizerPlace::Device {
-            DeviceTier::of_run(&mut self.device, &self.scene, &mut *self.renderer, self.options.steps)?;
-        }
-        Ok(())
-    }
-
     /// Copies back the pages that are newer on a device than in memory, so that the pages and their histogram are those
     /// of the last step. Nothing for a run that updates in host memory.
     /// Errors: the device failed: the run can go on from its last commit only.
@@ -593,7 +584,7 @@ impl Trainer {
     fn check_growth(&mut self, step: u32, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let strategy = self.options.strategy.clone();
         let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };
-        let positions = self.turns.held_out.positions();
+        let positions = &self.turns.held_out.positions;
         // Without held-out views the count stays as it is.
         if positions.is_empty() || self.state.growth.checks.last().is_some_and(|last| last.step > step) {
             return Ok(());

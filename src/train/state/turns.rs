@@ -77,7 +77,7 @@ const TRAIN_VIEWS_LEAST: usize = 4 * VIEWS_LEAST;
 #[derive(Debug, Clone, Default)]
 pub(crate) struct HeldOut {
     /// Ascending.
-    positions: Vec<usize>,
+    pub positions: Vec<usize>,
     /// Training views.
     views: usize,
     /// While it may check growth, the positions are held out.
@@ -96,10 +96,6 @@ impl HeldOut {
         let is_wanted = strategy.is_some() && views >= TRAIN_VIEWS_LEAST;
         let stride = stride(views);
         HeldOut { positions: (stride / 2..views).step_by(stride).filter(|_| is_wanted).collect(), views, strategy }
-    }
-
-    pub fn positions(&self) -> &[usize] {
-        &self.positions
     }
 
     /// The position that a step trains on whose turn is at `position`.
@@ -150,11 +146,11 @@ mod tests {
         let (decides, capped) = (of(0), of(1000));
         for (views, held) in [(11, 0), (12, 3), (15, 3), (150, 9), (256, 16), (10_000, 16)] {
             let held_out = HeldOut::new(&decides, views);
-            assert_eq!(held_out.positions().len(), held, "{views} views");
-            assert!(HeldOut::new(&capped, views).positions().is_empty());
+            assert_eq!(held_out.positions.len(), held, "{views} views");
+            assert!(HeldOut::new(&capped, views).positions.is_empty());
             // Every position has its turn, held-out ones once no check can come any more.
             let trained = |step: u32| (0..views).map(|at| held_out.trained_at(step, at)).collect::<Vec<usize>>();
-            assert!(trained(1600).iter().all(|at| *at < views && !held_out.positions().contains(at)));
+            assert!(trained(1600).iter().all(|at| *at < views && !held_out.positions.contains(at)));
             assert_eq!(trained(1700), (0..views).collect::<Vec<usize>>());
         }
     }

@@ -86,7 +86,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     let (meta, radius) = read_rows(&request.file, &mut rows)?;
     file_warnings(&request.file, &meta, 0).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let rows = rows.finish()?;
-    let (count, sh_degree) = (rows.rows(), rows.sh_degree());
+    let (count, sh_degree) = (rows.rows(), rows.sh_degree);
     let (config, options) = options_for(request, sh_degree, &meta)?;
     let layout =
         SlotLayout::new(capacity_bytes(options.page_rows, sh_degree), count.div_ceil(options.page_rows) as u64);
