@@ -42,7 +42,6 @@ use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
 use std::cell::OnceCell;
-use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Duration;
 
@@ -246,17 +245,27 @@ fn write_results(
         }
     }
     let trainer = &*results.trainer;
+    let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
+        steps: trainer.steps_done(),
         gaussians: written.rows + written.skipped,
+        train_seconds: trainer.train_seconds(),
+        host_bytes_peak: host_bytes_peak().unwrap_or(0),
         test: tested.as_ref().ok().copied().flatten(),
+        scene: request.scene.clone(),
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        ssim_variant: config.ssim_variant.to_string(),
         // A run without its evaluation or its export is not finished: a resume makes them.
         finished: trainer.steps_done() == config.steps && tested.is_ok() && exported.is_ok() && asked.is_none(),
+        rows_skipped_non_finite: rows_skipped,
+        steps_skipped_non_finite: steps_skipped,
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),
+        costs,
+        growth: trainer.growth().to_vec(),
         export: facts.next(),
         more_exports: facts.collect(),
-        costs,
+        tiers: trainer.tier_traffic(),
         commits: results.checkpoint.as_deref().map(Checkpoint::report),
-        ..summary_of(request, trainer)
     };
     results.write(|results| {
         let trainer = &*results.trainer;
@@ -380,31 +389,6 @@ fn warn_of_ply(config: &TrainConfig, written: &Written, ply: &Path) {
     }
     if written.skipped > 0 {
         crate::tell!("warning: {} Gaussians are not finite and are not in {}", written.skipped, ply.display());
-    }
-}
-
-/// The part of the summary that the trainer knows: not finished, not evaluated.
-fn summary_of(request: &RunRequest, trainer: &Trainer) -> Summary {
-    let (rows_skipped, steps_skipped) = trainer.skipped();
-    Summary {
-        steps: trainer.steps_done(),
-        gaussians: trainer.scene.rows(),
-        train_seconds: trainer.train_seconds(),
-        host_bytes_peak: host_bytes_peak().unwrap_or(0),
-        test: None,
-        scene: request.scene.clone(),
-        version: env!("CARGO_PKG_VERSION").to_string(),
-        ssim_variant: request.config.ssim_variant.to_string(),
-        finished: false,
-        rows_skipped_non_finite: rows_skipped,
-        steps_skipped_non_finite: steps_skipped,
-        photos: BTreeMap::new(),
-        costs: StepCosts::default(),
-        growth: trainer.growth().to_vec(),
-        export: None,
-        more_exports: Vec::new(),
-        tiers: trainer.tier_traffic(),
-        commits: None,
     }
 }
 
