@@ -5,8 +5,7 @@
 //! start of a run.
 
 use super::forecast::STEP_OVER_RENDERING;
-use super::plan;
-use super::plan::{Probe, largest_view};
+use super::plan::{self, Probe, largest_view};
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;

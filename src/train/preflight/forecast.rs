@@ -12,8 +12,7 @@
 
 use super::device_memory;
 use super::plan::{
-    LargestNeed, Probe, TierPlan, allow_largest_view, estimate, plan_tiers, rows_at_most, shrink_to_budget,
-    train_cameras,
+    Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most, train_cameras,
 };
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
@@ -206,13 +205,13 @@ pub(crate) fn plan_run(
     let (mut memory, probed) = estimate(config, dataset, trainer, &probe, last)?;
     device_memory::check_device_memory(config, &memory)?;
     let plan = plan_tiers(config, dataset, trainer, tiers, largest, host_mem, &mut memory)?;
+    let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
     if let Some(free) = plan.free_bytes.filter(|_| plan.frames.is_some() && tiers.spills()) {
         check_drive(config, free, plan.pages, plan.frame_bytes)?;
     }
     let growth = last as f64 / rows.max(1) as f64;
     let step_seconds = probed.seconds * STEP_OVER_RENDERING;
     let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
-    let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
     let drive = plan.frames.zip(frames_at_end).map_or(DriveUse::default(), |(now, then)| {
         drive_use(config, dataset, trainer, [now, then], growth, step_seconds, drive_rate)
     });
@@ -328,27 +327,6 @@ impl Forecast {
     pub fn memory_at_end(&self) -> &MemoryEstimate {
         &self.memory[2]
     }
-}
-
-/// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
-/// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run in memory.
-fn limit_memory(
-    config: &TrainConfig,
-    tiers: &TierPlan,
-    host_mem: Option<u64>,
-    [rows, last]: [u64; 2],
-    memory: &mut [MemoryEstimate; 3],
-) -> Option<u64> {
-    let mut frames_at_end = tiers.frames;
-    let Some((budget, now)) = host_mem.filter(|_| config.frames == 0).zip(tiers.frames) else { return frames_at_end };
-    // The plan has chosen the frames of the start.
-    for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
-        let growth = rows_then as f64 / rows.max(1) as f64;
-        let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
-        let frames = shrink_to_budget(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
-        frames_at_end = Some(if rows_then > rows { frames.min(now) } else { now });
-    }
-    frames_at_end
 }
 
 impl DriveUse {

@@ -20,8 +20,7 @@ use crate::scene::columns::row_width;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
 use crate::schedule::order::Order;
-use crate::schedule::visibility::ViewPages;
-use crate::schedule::visibility::visible_pages;
+use crate::schedule::visibility::{ViewPages, visible_pages};
 use crate::train::error::TrainError;
 use crate::train::memory::{
     BASE_BYTES, FRAMES_LEAST, HostBudget, INDEX_BYTES, MemoryEstimate, PLAN_BYTES, bytes_of_copies, frames_and_batch,
@@ -201,7 +200,7 @@ fn plan_frames(
 
 /// What the largest view needs.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct LargestNeed {
+struct LargestNeed {
     pub frame_bytes: u64,
     /// Pages of the view.
     pub pages: u64,
@@ -216,6 +215,12 @@ struct FirstFrames {
 }
 
 impl FirstFrames {
+    /// Those within `left` bytes for views in batches; see [`frames_and_batch`].
+    fn of_batches(config: &TrainConfig, left: u64, frame_bytes: u64, copies: bool) -> FirstFrames {
+        let (frames, pages_most) = frames_and_batch(left, frame_bytes, page_working(config), copies);
+        FirstFrames { frames: frames as u64, pages_most }
+    }
+
     /// Enough for every view in one batch.
     fn of_whole_views(frames: u64) -> FirstFrames {
         FirstFrames { frames, pages_most: usize::MAX }
@@ -309,27 +314,41 @@ fn frames_of_budget(
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     };
-    let left = left.saturating_sub(spare);
-    let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
-    Ok(FirstFrames { frames: (frames as u64).min(PAGES_MOST), pages_most })
+    let first = FirstFrames::of_batches(config, left.saturating_sub(spare), need.frame_bytes, memory.copies > 0);
+    Ok(FirstFrames { frames: first.frames.min(PAGES_MOST), ..first })
 }
 
 /// Reduces the estimate of a grown scene to `budget` as the run will do: by fewer frames and, if these do not hold the largest view of
 /// the grown scene (`need`), by views in batches. Returns the number of frames.
-pub(super) fn shrink_to_budget(
-    config: &TrainConfig,
-    need: &LargestNeed,
-    budget: u64,
-    memory: &mut MemoryEstimate,
-) -> u64 {
+fn shrink_to_budget(config: &TrainConfig, need: &LargestNeed, budget: u64, memory: &mut MemoryEstimate) -> u64 {
     let FirstFrames { frames, pages_most } = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
         let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
-        let (frames, pages_most) = frames_and_batch(left, need.frame_bytes, page_working(config), memory.copies > 0);
-        FirstFrames { frames: frames as u64, pages_most }
+        FirstFrames::of_batches(config, left, need.frame_bytes, memory.copies > 0)
     });
     in_batches(config, memory, pages_most, need.frame_bytes);
     memory.frames = memory.frames.min(frames.saturating_mul(need.frame_bytes));
     frames
+}
+
+/// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
+/// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run in memory.
+pub(super) fn limit_memory(
+    config: &TrainConfig,
+    tiers: &TierPlan,
+    host_mem: Option<u64>,
+    [rows, last]: [u64; 2],
+    memory: &mut [MemoryEstimate; 3],
+) -> Option<u64> {
+    let mut frames_at_end = tiers.frames;
+    let Some((budget, now)) = host_mem.filter(|_| config.frames == 0).zip(tiers.frames) else { return frames_at_end };
+    // The plan has chosen the frames of the start.
+    for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
+        let growth = rows_then as f64 / rows.max(1) as f64;
+        let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
+        let frames = shrink_to_budget(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
+        frames_at_end = Some(if rows_then > rows { frames.min(now) } else { now });
+    }
+    frames_at_end
 }
 
 /// Reduces the estimate to batches of `pages_most` pages: rows of a view, and copies of a round.
@@ -379,9 +398,9 @@ pub(super) fn allow_largest_view(
     let mut frames = needed;
     let of_page = frame_bytes + page_working(config) + u64::from(config.page_rows) * SPLAT_BYTES;
     if let Some(budget) = most.filter(|budget| needed * of_page > budget / 4 * PROBE_WHOLE_OF_4) {
-        let (fewer, pages) = frames_and_batch(budget / PROBE_BATCH_SHARE, frame_bytes, page_working(config), true);
-        if (fewer as u64) < needed {
-            (frames, trainer.memory.pages_most) = (fewer as u64, pages);
+        let fewer = FirstFrames::of_batches(config, budget / PROBE_BATCH_SHARE, frame_bytes, true);
+        if fewer.frames < needed {
+            (frames, trainer.memory.pages_most) = (fewer.frames, fewer.pages_most);
         }
     }
     trainer.scene.pager.allow_frames(frames as usize);

@@ -8,8 +8,7 @@
 
 use super::changes::with_absolute_paths;
 use super::live::LivePage;
-use super::out_folder;
-use super::out_folder::remove_mark;
+use super::out_folder::{self, remove_mark};
 use super::request::{RunOutcome, RunRequest};
 use super::training_loop::TrainingLoop;
 use crate::base::error::{InputError, InputResult};
