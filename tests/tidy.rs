@@ -51,7 +51,7 @@ const START_UP_ROOMS: &[&str] = &["inputs", "preflight", "run", "start", "stores
 const SPREAD_TYPES: &[&str] = &["gpu Gpu", "scene Columns"];
 
 /// Names that several types of src have: to become fewer.
-const SHARED_TYPE_NAMES_MAX: usize = 29;
+const SHARED_TYPE_NAMES_MAX: usize = 12;
 
 /// Files that may hold `unsafe`, each block with its argument.
 const UNSAFE_FILES: &[&str] = &[

@@ -15,7 +15,7 @@ use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
-use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, Rgb, Schedule, Up};
+use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, RgbColor, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
@@ -220,7 +220,7 @@ config_keys! {
         /// refined ones. Not with --optimizer-on device
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers;
         /// Background colour, RGB in 0..1
-        [value_name = "R,G,B"] background: Rgb = Rgb([0.0; 3]) => Numbers;
+        [value_name = "R,G,B"] background: RgbColor = RgbColor([0.0; 3]) => Numbers;
     }
     "Densification" {
         /// long-axis (split along the longest axis; at --max-gaussians, or at the number that --quality decides, remove the

@@ -75,13 +75,13 @@ as_text!(ByteSize);
 
 /// A colour: three numbers in 0..1, in the file `[0.0, 0.0, 0.0]`, on the command line `0,0,0`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct Rgb(pub [f64; 3]);
+pub struct RgbColor(pub [f64; 3]);
 
-impl std::str::FromStr for Rgb {
+impl std::str::FromStr for RgbColor {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
         let unknown = || format!("'{text}' is not a colour; write R,G,B with numbers in 0..1");
-        three_numbers(text).map(Rgb).ok_or_else(unknown)
+        three_numbers(text).map(RgbColor).ok_or_else(unknown)
     }
 }
 

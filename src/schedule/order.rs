@@ -15,7 +15,7 @@
 use super::tour::tour;
 use crate::base::rng::{Purpose, Stream};
 use crate::scene::camera::Camera;
-use crate::schedule::tour::{Place, cut, mean, places};
+use crate::schedule::tour::{ViewPlace, cut, mean, places};
 use std::fmt;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -68,7 +68,7 @@ pub struct ViewOrder {
     seed: u64,
     views: usize,
     /// Empty for a shuffle.
-    places: Arc<[Place]>,
+    places: Arc<[ViewPlace]>,
     /// The way there; empty but for a tour.
     way: Arc<[u32]>,
     epoch: u64,
@@ -170,8 +170,8 @@ impl ViewOrder {
 /// memory, 25 groups read .021 of what they need in this order and .040 in random order, 100 groups .021 and .084
 /// (`tests/storage/replay.rs` prints such figures); the price is that a neighbouring group comes next, and the next epoch
 /// draws another direction anyway.
-fn order_groups(places: &[Place], groups: &mut Vec<Vec<u32>>, draws: &mut Stream) {
-    let middles: Vec<Place> = groups.iter().map(|group| mean(places, group)).collect();
+fn order_groups(places: &[ViewPlace], groups: &mut Vec<Vec<u32>>, draws: &mut Stream) {
+    let middles: Vec<ViewPlace> = groups.iter().map(|group| mean(places, group)).collect();
     let mut way = tour(&middles);
     if draws.below(2) == 1 {
         way.reverse();

@@ -26,7 +26,7 @@ const ROUNDS_MAX: usize = 30;
 const POWER_ITERATIONS: usize = 60;
 
 /// The numbers of all places in the order of the way.
-pub fn tour(places: &[Place]) -> Vec<u32> {
+pub fn tour(places: &[ViewPlace]) -> Vec<u32> {
     let mut way = serpentine(places);
     shorten(places, &mut way);
     if places.len() > NEAREST_MAX {
@@ -37,17 +37,17 @@ pub fn tour(places: &[Place]) -> Vec<u32> {
     if length(places, &other) < length(places, &way) { other } else { way }
 }
 
-fn step(places: &[Place], a: u32, b: u32) -> f64 {
+fn step(places: &[ViewPlace], a: u32, b: u32) -> f64 {
     distance_sq(&places[a as usize], &places[b as usize]).sqrt()
 }
 
-pub fn length(places: &[Place], way: &[u32]) -> f64 {
+pub fn length(places: &[ViewPlace], way: &[u32]) -> f64 {
     way.windows(2).map(|pair| step(places, pair[0], pair[1])).sum()
 }
 
 /// Strips of the plane of the two widest directions, there and back.
-fn serpentine(places: &[Place]) -> Vec<u32> {
-    let mut left: Vec<Place> = centred(places);
+fn serpentine(places: &[ViewPlace]) -> Vec<u32> {
+    let mut left: Vec<ViewPlace> = centred(places);
     let (along, extent) = extract_principal_axis(&mut left);
     let (across, breadth) = extract_principal_axis(&mut left);
     let mut way: Vec<u32> = (0..places.len() as u32).collect();
@@ -66,7 +66,7 @@ fn serpentine(places: &[Place]) -> Vec<u32> {
     way
 }
 
-fn centred(places: &[Place]) -> Vec<Place> {
+fn centred(places: &[ViewPlace]) -> Vec<ViewPlace> {
     let mut middle = [0.0; 6];
     for place in places {
         (0..6).for_each(|i| middle[i] += place[i] / places.len() as f64);
@@ -76,11 +76,11 @@ fn centred(places: &[Place]) -> Vec<Place> {
 
 /// The coordinates along the direction in which centred places vary most, with their standard deviation; the places
 /// lose that direction.
-fn extract_principal_axis(places: &mut [Place]) -> (Vec<f64>, f64) {
+fn extract_principal_axis(places: &mut [ViewPlace]) -> (Vec<f64>, f64) {
     // Started from the coordinate that varies most, which is never across the widest direction.
     let spread = |i: usize| places.iter().map(|p| p[i] * p[i]).sum::<f64>();
     let widest = (0..6).fold(0, |best, i| if spread(i) > spread(best) { i } else { best });
-    let mut direction: Place = std::array::from_fn(|i| f64::from(u8::from(i == widest)));
+    let mut direction: ViewPlace = std::array::from_fn(|i| f64::from(u8::from(i == widest)));
     for _ in 0..POWER_ITERATIONS {
         let mut next = [0.0; 6];
         for place in places.iter() {
@@ -102,7 +102,7 @@ fn extract_principal_axis(places: &mut [Place]) -> (Vec<f64>, f64) {
 }
 
 /// From `first`, always on to the nearest place that is left.
-fn nearest(places: &[Place], first: u32) -> Vec<u32> {
+fn nearest(places: &[ViewPlace], first: u32) -> Vec<u32> {
     let mut left: Vec<u32> = (0..places.len() as u32).filter(|&p| p != first).collect();
     let mut way = vec![first];
     way.truncate(places.len());
@@ -120,7 +120,7 @@ fn nearest(places: &[Place], first: u32) -> Vec<u32> {
 }
 
 /// Turns round parts of the way as long as that makes it shorter. The ends are free.
-fn shorten(places: &[Place], way: &mut [u32]) {
+fn shorten(places: &[ViewPlace], way: &mut [u32]) {
     for _ in 0..ROUNDS_MAX {
         let mut gained = false;
         for i in 0..way.len().saturating_sub(1) {
@@ -147,12 +147,12 @@ fn shorten(places: &[Place], way: &mut [u32]) {
 const CENTRE_WEIGHT: f64 = 0.1;
 
 /// Weighted centre, and point looked at.
-pub type Place = [f64; 6];
+pub type ViewPlace = [f64; 6];
 
 /// Part of the mean curvature added to the system for the common point, so that parallel axes have one too: their centre.
 const RIDGE: f64 = 1e-6;
 
-pub fn places(cameras: &[Camera]) -> Vec<Place> {
+pub fn places(cameras: &[Camera]) -> Vec<ViewPlace> {
     let depth = depth_of_subject(cameras);
     let place = |camera: &Camera| {
         let (c, f) = (centre(camera), forward(camera));
@@ -218,13 +218,13 @@ fn solve(a: [[f64; 3]; 3], b: [f64; 3]) -> [f64; 3] {
 }
 
 /// Squared distance of two places.
-pub fn distance_sq(a: &Place, b: &Place) -> f64 {
+pub fn distance_sq(a: &ViewPlace, b: &ViewPlace) -> f64 {
     (0..6).map(|i| (a[i] - b[i]) * (a[i] - b[i])).sum()
 }
 
 /// Cuts `views` into `groups` neighbourhoods (at least one view each, so at most as many as there are views) by halving
 /// along the longest axis, again and again. Every cut is moved by up to `play` of a group's size at random.
-pub fn cut(places: &[Place], mut views: Vec<u32>, groups: usize, play: f64, draws: &mut Stream) -> Vec<Vec<u32>> {
+pub fn cut(places: &[ViewPlace], mut views: Vec<u32>, groups: usize, play: f64, draws: &mut Stream) -> Vec<Vec<u32>> {
     if groups <= 1 || views.len() <= 1 {
         return vec![views];
     }
@@ -241,7 +241,7 @@ pub fn cut(places: &[Place], mut views: Vec<u32>, groups: usize, play: f64, draw
     out
 }
 
-fn longest_axis(places: &[Place], views: &[u32]) -> usize {
+fn longest_axis(places: &[ViewPlace], views: &[u32]) -> usize {
     let mut axis = (0, f64::NEG_INFINITY);
     for i in 0..6 {
         let (low, high) = views.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| {
@@ -256,7 +256,7 @@ fn longest_axis(places: &[Place], views: &[u32]) -> usize {
 }
 
 /// Mean of the places of `views`, which is not empty.
-pub fn mean(places: &[Place], views: &[u32]) -> Place {
+pub fn mean(places: &[ViewPlace], views: &[u32]) -> ViewPlace {
     let sum = |i: usize| views.iter().map(|&v| places[v as usize][i]).sum::<f64>();
     std::array::from_fn(|i| sum(i) / views.len() as f64)
 }

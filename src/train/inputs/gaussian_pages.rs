@@ -28,13 +28,13 @@ const ROWS_AT_ONCE: usize = 1024;
 /// A Gaussian with its number in the file.
 #[derive(Debug, Clone, Copy, bytemuck::Zeroable, bytemuck::Pod)]
 #[repr(C)]
-struct Row {
+struct GaussianRow {
     head: [f32; ROW_HEAD],
     sh_n: [[f32; 15]; 3],
     row: u32,
 }
 
-impl Placed for Row {
+impl Placed for GaussianRow {
     fn point(&self) -> [f32; 3] {
         [self.head[0], self.head[1], self.head[2]]
     }
@@ -43,7 +43,7 @@ impl Placed for Row {
     }
 }
 
-impl Grown for Row {
+impl Grown for GaussianRow {
     fn log_size(&self) -> f32 {
         self.head[7].max(self.head[8]).max(self.head[9])
     }
@@ -127,7 +127,7 @@ pub(crate) struct GaussianWriter<'a> {
     /// The source file, for messages.
     file: &'a Path,
     space: GaussianSpace<'a>,
-    rows: SpoolWriter<Row>,
+    rows: SpoolWriter<GaussianRow>,
     next: u32,
     width: usize,
 }
@@ -151,7 +151,7 @@ impl<'a> GaussianWriter<'a> {
     /// Adds one Gaussian; all must have the same SH degree.
     /// Errors: the folder cannot be written, or there are 2^32 rows.
     pub fn push(&mut self, values: &[f32]) -> InputResult<()> {
-        let mut row = Row { head: [0.0; ROW_HEAD], sh_n: [[0.0; 15]; 3], row: self.next };
+        let mut row = GaussianRow { head: [0.0; ROW_HEAD], sh_n: [[0.0; 15]; 3], row: self.next };
         row.head.copy_from_slice(&values[..ROW_HEAD]);
         row.sh_n.as_flattened_mut()[..values.len() - ROW_HEAD].copy_from_slice(&values[ROW_HEAD..]);
         self.rows.push(row)?;
@@ -172,7 +172,7 @@ impl<'a> GaussianWriter<'a> {
 /// Gaussians after reading, in memory and temporary files.
 pub(crate) struct GaussianSpool<'a> {
     space: GaussianSpace<'a>,
-    rows: Spool<Row>,
+    rows: Spool<GaussianRow>,
     pub sh_degree: u8,
 }
 
@@ -191,14 +191,14 @@ impl GaussianSpool<'_> {
         take: &mut dyn FnMut(PageId, SceneState) -> InputResult<()>,
     ) -> InputResult<()> {
         let GaussianSpool { space, rows, sh_degree } = self;
-        let records = (space.memory / 2 / (2 * size_of::<Row>())).max(fill);
+        let records = (space.memory / 2 / (2 * size_of::<GaussianRow>())).max(fill);
         let space = PageSpace { list: space.of_list(), records };
         paginate(rows, fill, space, &mut |id, rows| take(id, state_of(rows, sh_degree)))?;
         Ok(())
     }
 }
 
-fn state_of(rows: &[Row], sh_degree: u8) -> SceneState {
+fn state_of(rows: &[GaussianRow], sh_degree: u8) -> SceneState {
     let mut columns = Columns::zeros(0, sh_degree);
     let mut values = [0.0; ROW_HEAD + 45];
     for row in rows {

@@ -12,7 +12,7 @@
 use super::begin::{FirstTrainer, first_trainer, plan_and_train};
 use super::changes::with_absolute_paths;
 use super::request::{RunOutcome, RunRequest};
-use super::run_folder::{Begun, Past};
+use super::run_folder::{Begun, PastRun};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::units::format_grouped;
@@ -68,7 +68,7 @@ pub(super) fn train_more_steps(
     request.config.init_ply = absolute(&kept).to_string_lossy().into_owned();
     let host_mem = host_budget(request.config.host_mem.0);
     let start = Start::read(&scene, &request.config, host_mem)?;
-    let past = Past {
+    let past = PastRun {
         config: with_absolute_paths(request.config.clone()),
         metrics_bytes: metrics_until(&out, summary.steps),
         step: summary.steps,

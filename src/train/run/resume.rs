@@ -13,7 +13,7 @@ use super::changes::{Changes, kept_config};
 use super::more_steps::{text_of_rates, train_more_steps};
 use super::out_folder::{self, check_restart, has_results, settings_of_mark};
 use super::request::{Existing, RunOutcome, RunRequest};
-use super::run_folder::{Begun, Past};
+use super::run_folder::{Begun, PastRun};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
@@ -281,7 +281,7 @@ fn resume_from(
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
     restore(&mut trainer, &state)?;
-    let past = Past {
+    let past = PastRun {
         config: kept_config(&earlier.path, &earlier.config, &config)?,
         metrics_bytes: state.metrics_bytes,
         step: state.trainer.step,

@@ -45,7 +45,7 @@ use std::path::Path;
 use std::time::Duration;
 
 /// The past of a resumed run.
-pub(super) struct Past {
+pub(super) struct PastRun {
     /// The config to keep from now on.
     pub config: TrainConfig,
     /// Length of its metrics.
@@ -67,7 +67,7 @@ pub(super) struct Begun {
     /// SH degree of the first step.
     pub sh_degree_start: u8,
     /// The past of a resumed run.
-    pub past: Option<Past>,
+    pub past: Option<PastRun>,
     /// Budget, bytes.
     pub host_mem: Option<u64>,
     /// Bytes allocated by the graphics driver.
@@ -369,7 +369,7 @@ fn evaluate_result(
 }
 
 /// The log of metrics of a new run, or of a run that resumes after `past`.
-fn open_metrics(log: LogFormat, out: &Path, past: Option<&Past>) -> InputResult<MetricsLog> {
+fn open_metrics(log: LogFormat, out: &Path, past: Option<&PastRun>) -> InputResult<MetricsLog> {
     let metrics = MetricsLog::open(&out.join(METRICS_FILE), past.map(|past| past.metrics_bytes))?;
     match log {
         LogFormat::Json => Ok(metrics),

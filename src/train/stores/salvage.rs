@@ -87,7 +87,7 @@ struct Kept {
 }
 
 /// Facts before pages are copied.
-struct Source {
+struct SalvageSource {
     folder: PathBuf,
     store: u128,
     layout: SlotLayout,
@@ -136,7 +136,7 @@ fn source_of(
     format: Option<SpillFormat>,
     scan: Scan,
     mut notes: Vec<String>,
-) -> Result<Source, InputError> {
+) -> Result<SalvageSource, InputError> {
     let nothing = || {
         let problem = format!("no slot header in its {} segment files is whole", scan.segments);
         InputError::new(&place.folder, problem, "check whether this is the folder that was meant")
@@ -165,10 +165,10 @@ fn source_of(
         },
         |format| format.layout,
     );
-    Ok(Source { folder: place.folder.clone(), store, layout, scan, notes })
+    Ok(SalvageSource { folder: place.folder.clone(), store, layout, scan, notes })
 }
 
-impl Source {
+impl SalvageSource {
     fn reader(&self) -> SlotReader {
         SlotReader::new(&self.folder, self.store, self.layout.slot_bytes)
     }
@@ -185,7 +185,11 @@ impl Source {
 }
 
 /// Rebuilds the last generation, with older versions in place of damaged ones.
-fn with_state(store: &StoreReader, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+fn with_state(
+    store: &StoreReader,
+    mut source: SalvageSource,
+    request: &SalvageRequest,
+) -> Result<Salvaged, TrainError> {
     let latest = store.find(None)?;
     let mut state = run_state_of(store, latest)?;
     let mut reader = source.reader();
@@ -265,7 +269,7 @@ fn clear_statistics(page: &mut SceneState) {
     page.count.fill(0);
 }
 
-fn commit(mut copy: NewStore, state: &RunState, source: &Source) -> Result<(), TrainError> {
+fn commit(mut copy: NewStore, state: &RunState, source: &SalvageSource) -> Result<(), TrainError> {
     let bytes = state.to_bytes().map_err(CommitError::Contradiction)?;
     copy.commit(&bytes, format!("salvaged from {}", source.folder.display()).as_bytes(), &[])?;
     Ok(copy.finish()?)
@@ -297,7 +301,11 @@ impl Whole {
 }
 
 /// Rebuilds a store without its map from the newest undamaged version of every page.
-fn without_state(place: &StorePlace, mut source: Source, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+fn without_state(
+    place: &StorePlace,
+    mut source: SalvageSource,
+    request: &SalvageRequest,
+) -> Result<Salvaged, TrainError> {
     let mut reader = source.reader();
     let found = source.by_page();
     let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
@@ -417,7 +425,7 @@ fn config_for(
     place: &StorePlace,
     request: &SalvageRequest,
     (rows, degree): (u32, u8),
-    source: &mut Source,
+    source: &mut SalvageSource,
 ) -> Result<(TrainConfig, DatasetPrint), InputError> {
     let file = request.config.clone().or_else(|| place.run.as_ref().map(|run| run.join(CONFIG_FILE)));
     let mut print =
