@@ -1,5 +1,6 @@
-// One pass of a stable sort of 32-bit keys with 32-bit values, by 4 bits of the key: every block of 2048 keys moves its
-// keys to the places that the scanned histogram reserves for it. Used twice: for rows by the bits of their depth (the
+// One pass of a stable sort of 32-bit keys with 32-bit values, by a digit of 8 bits of the key: every block of 1024 keys sorts its keys in
+// workgroup memory, by one half of the digit and then by the other, and moves them to the places that the scanned histogram reserves for
+// it, keys of a digit side by side. Used twice: for rows by the bits of their depth (the
 // twin of src/kernels/radix_sort.rs), and for intersections by tile.
 //
 // No workgroup waits for another, and the execution order of workgroups cannot change a place.
@@ -32,12 +33,13 @@ struct SortUniforms {
 
 /// Keys per invocation; they are adjacent, so that the order within a block is that of the invocations.
 const KEYS: u32 = 8u;
-const BLOCK_KEYS: u32 = 2048u;
-const DIGITS: u32 = 16u;
-/// Words with an invocation's counts: digits w and w + 8 in the halves of word w.
+const LANES: u32 = 128u;
+const BLOCK_KEYS: u32 = 1024u;
+const DIGITS: u32 = 256u;
+/// Words with an invocation's counts: halves of digits w and w + 8 in the halves of word w.
 const WORDS: u32 = 8u;
 
-/// Number of keys of each digit in one invocation, 4 bits each (a count of 8 fits): digits 0 to 7, then 8 to 15.
+/// Number of keys of each half of a digit in one invocation, 4 bits each (a count of 8 fits): digits 0 to 7, then 8 to 15.
 struct DigitCounts {
     low: u32,
     high: u32,
@@ -61,13 +63,20 @@ fn digit_word(counts: DigitCounts, word: u32) -> u32 {
 }
 
 /// The invocations' entries of a word are adjacent, with one word of padding after every 8, against bank conflicts.
-const WORD_STRIDE: u32 = 288u;
+const WORD_STRIDE: u32 = 144u;
 /// [words][invocations]: counts, then counts of the invocations before.
-var<workgroup> counts_before: array<u32, 2304>;
+var<workgroup> counts_before: array<u32, 1152>;
 /// [words][parts]
-var<workgroup> part_counts: array<u32, 512>;
-/// First place of this block's keys of each digit.
-var<workgroup> block_places: array<u32, 16>;
+var<workgroup> part_counts: array<u32, 256>;
+/// By half of a digit: keys of the block, then those with a lower one.
+var<workgroup> half_counts: array<u32, 16>;
+var<workgroup> half_first: array<u32, 16>;
+/// Keys and values of the block, in their order so far.
+var<workgroup> block_keys: array<u32, BLOCK_KEYS>;
+var<workgroup> block_values: array<u32, BLOCK_KEYS>;
+/// Place in the block of the first key of each digit.
+var<workgroup> digit_first: array<u32, DIGITS>;
+var<workgroup> digit_counts: array<atomic<u32>, DIGITS>;
 
 fn counts_at(word: u32, lane: u32) -> u32 {
     return word * WORD_STRIDE + lane + lane / 8u;
@@ -86,76 +95,49 @@ fn depth_keys(workgroup: Group, place: Place) {
     values_out[row] = row;
 }
 
-/// [words][parts]: counts of runs of invocations.
-var<workgroup> counts_of_parts: array<u32, 2048>;
+/// Number of keys of a block.
+fn keys_of(block: u32) -> u32 {
+    let count = min(live[sort.live_at], sort.capacity);
+    return min(count - min(count, block * BLOCK_KEYS), BLOCK_KEYS);
+}
+
+fn digit_of(key: u32) -> u32 {
+    return (key >> sort.shift) & (DIGITS - 1u);
+}
 
 /// First half of a pass: fills the histogram.
-@compute @workgroup_size(256)
-fn radix_histogram(workgroup: Group, place: SubgroupPlace) {
+@compute @workgroup_size(128)
+fn radix_histogram(workgroup: Group, place: Place) {
     let block = linear_group(workgroup);
-    let count = min(live[sort.live_at], sort.capacity);
-    let first = block * BLOCK_KEYS + place.lane * KEYS;
-    var counts = DigitCounts(0u, 0u);
-    for (var i = 0u; i < KEYS; i++) {
-        if first + i < count {
-            counts = digit_add(counts, (keys[first + i] >> sort.shift) & (DIGITS - 1u));
-        }
-    }
-#ifdef SUBGROUPS
-    let parts = subgroups_of(place, 256u);
-    for (var word = 0u; word < WORDS; word++) {
-        let sum = subgroup_scan_u32(digit_word(counts, word), place.lane).y;
-        if subgroup_lane_of(place) == 0u {
-            counts_of_parts[word * parts + subgroup_of(place)] = sum;
-        }
+    let size = keys_of(block);
+    for (var i = place.lane; i < size; i += LANES) {
+        atomicAdd(&digit_counts[digit_of(keys[block * BLOCK_KEYS + i])], 1u);
     }
     workgroupBarrier();
-#else
-    let parts = 32u;
-    for (var word = 0u; word < WORDS; word++) {
-        counts_of_parts[word * 256u + place.lane] = digit_word(counts, word);
-    }
-    workgroupBarrier();
-    var sum = 0u;
-    for (var i = 0u; i < 8u; i++) {
-        sum += counts_of_parts[place.lane * 8u + i];
-    }
-    workgroupBarrier();
-    counts_of_parts[place.lane] = sum;
-    workgroupBarrier();
-#endif
-    if place.lane < DIGITS && block < sort.blocks {
-        var total = 0u;
-        for (var part = 0u; part < parts; part++) {
-            total += counts_of_parts[(place.lane & 7u) * parts + part];
-        }
-        histogram[place.lane * sort.blocks + block] = (total >> (16u * (place.lane / 8u))) & 0xffffu;
+    for (var digit = place.lane; digit < DIGITS && block < sort.blocks; digit += LANES) {
+        histogram[digit * sort.blocks + block] = atomicLoad(&digit_counts[digit]);
     }
 }
 
-/// Second half of a pass, after the scan of the histogram: moves keys and values.
-@compute @workgroup_size(256)
-fn radix_sort(workgroup: Group, place: SubgroupPlace) {
-    let block = linear_group(workgroup);
-    let count = min(live[sort.live_at], sort.capacity);
-    let first = block * BLOCK_KEYS + place.lane * KEYS;
-    if place.lane < DIGITS && block < sort.blocks {
-        block_places[place.lane] = places[place.lane * sort.blocks + block];
-    }
-    var counts = DigitCounts(0u, 0u);
+/// Sorts the keys of the block, of which there are `size`, by the 4 bits from `shift` on.
+fn sort_block(place: SubgroupPlace, size: u32, shift: u32) {
+    let first = place.lane * KEYS;
     var key: array<u32, KEYS>;
-    /// Number of earlier keys of the same digit in this invocation.
+    var value: array<u32, KEYS>;
+    /// Number of earlier keys of the same half digit in this invocation.
     var rank: array<u32, KEYS>;
+    var counts = DigitCounts(0u, 0u);
     for (var i = 0u; i < KEYS; i++) {
-        if first + i < count {
-            key[i] = keys[first + i];
-            let digit = (key[i] >> sort.shift) & (DIGITS - 1u);
-            rank[i] = digit_count(counts, digit);
-            counts = digit_add(counts, digit);
+        if first + i < size {
+            key[i] = block_keys[first + i];
+            value[i] = block_values[first + i];
+            let half = (key[i] >> shift) & 15u;
+            rank[i] = digit_count(counts, half);
+            counts = digit_add(counts, half);
         }
     }
 #ifdef SUBGROUPS
-    let parts = subgroups_of(place, 256u);
+    let parts = subgroups_of(place, LANES);
     for (var word = 0u; word < WORDS; word++) {
         let sums = subgroup_scan_u32(digit_word(counts, word), place.lane);
         counts_before[counts_at(word, place.lane)] = sums.x;
@@ -177,9 +159,10 @@ fn radix_sort(workgroup: Group, place: SubgroupPlace) {
         counts_before[counts_at(word, place.lane)] = digit_word(counts, word);
     }
     workgroupBarrier();
-    // 32 parts of 8 invocations per word: each invocation processes one part of one word.
-    let word = place.lane / 32u;
-    let part = place.lane % 32u;
+    // 16 parts of 8 invocations per word: each invocation processes one part of one word.
+    let parts = 16u;
+    let word = place.lane / parts;
+    let part = place.lane % parts;
     var sum = 0u;
     for (var i = 0u; i < 8u; i++) {
         let at = counts_at(word, 8u * part + i);
@@ -191,20 +174,64 @@ fn radix_sort(workgroup: Group, place: SubgroupPlace) {
     workgroupBarrier();
     var base = 0u;
     for (var p = 0u; p < part; p++) {
-        base += part_counts[word * 32u + p];
+        base += part_counts[word * parts + p];
     }
     for (var i = 0u; i < 8u; i++) {
         counts_before[counts_at(word, 8u * part + i)] += base;
     }
-    workgroupBarrier();
 #endif
-    for (var i = 0u; i < KEYS; i++) {
-        if first + i < count {
-            let digit = (key[i] >> sort.shift) & (DIGITS - 1u);
-            let pair = counts_before[counts_at(digit & 7u, place.lane)];
-            let to = block_places[digit] + ((pair >> (16u * (digit / 8u))) & 0xffffu) + rank[i];
-            keys_out[to] = key[i];
-            values_out[to] = values[first + i];
+    if place.lane < 16u {
+        var total = 0u;
+        for (var part = 0u; part < parts; part++) {
+            total += part_counts[(place.lane & 7u) * parts + part];
         }
+        half_counts[place.lane] = (total >> (16u * (place.lane / 8u))) & 0xffffu;
+    }
+    workgroupBarrier();
+    if place.lane < 16u {
+        var before = 0u;
+        for (var half = 0u; half < place.lane; half++) {
+            before += half_counts[half];
+        }
+        half_first[place.lane] = before;
+    }
+    workgroupBarrier();
+    for (var i = 0u; i < KEYS; i++) {
+        if first + i < size {
+            let half = (key[i] >> shift) & 15u;
+            let pair = counts_before[counts_at(half & 7u, place.lane)];
+            let to = half_first[half] + ((pair >> (16u * (half / 8u))) & 0xffffu) + rank[i];
+            block_keys[to] = key[i];
+            block_values[to] = value[i];
+        }
+    }
+    workgroupBarrier();
+}
+
+/// Second half of a pass, after the scan of the histogram: moves keys and values.
+@compute @workgroup_size(128)
+fn radix_sort(workgroup: Group, place: SubgroupPlace) {
+    let block = linear_group(workgroup);
+    let size = keys_of(block);
+    for (var i = place.lane; i < size; i += LANES) {
+        block_keys[i] = keys[block * BLOCK_KEYS + i];
+        block_values[i] = values[block * BLOCK_KEYS + i];
+    }
+    workgroupBarrier();
+    sort_block(place, size, sort.shift);
+    sort_block(place, size, sort.shift + 4u);
+    for (var i = place.lane; i < size; i += LANES) {
+        let digit = digit_of(block_keys[i]);
+        if i == 0u || digit_of(block_keys[max(i, 1u) - 1u]) != digit {
+            digit_first[digit] = i;
+        }
+    }
+    workgroupBarrier();
+    for (var i = place.lane; i < size; i += LANES) {
+        let key = block_keys[i];
+        let digit = digit_of(key);
+        let to = places[digit * sort.blocks + block] + i - digit_first[digit];
+        keys_out[to] = key;
+        values_out[to] = block_values[i];
     }
 }

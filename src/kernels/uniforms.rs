@@ -117,9 +117,9 @@ pub const WEIGHED_SUMS: u32 = 11;
 /// Values per workgroup of the scan.
 pub const SCAN_BLOCK: u32 = 2048;
 /// Keys per workgroup of the sort.
-pub const SORT_BLOCK: u32 = 2048;
+pub const SORT_BLOCK: u32 = 1024;
 /// Bits per pass of the sort.
-pub const DIGIT_BITS: u32 = 4;
+pub const DIGIT_BITS: u32 = 8;
 /// Number of values of a digit.
 pub const DIGITS: u32 = 1 << DIGIT_BITS;
 /// Rows per workgroup of `fold_rows`.
