@@ -110,6 +110,10 @@ fn digit_of(key: u32) -> u32 {
 fn radix_histogram(workgroup: Group, place: Place) {
     let block = linear_group(workgroup);
     let size = keys_of(block);
+    for (var digit = place.lane; digit < DIGITS; digit += LANES) {
+        atomicStore(&digit_counts[digit], 0u);
+    }
+    workgroupBarrier();
     for (var i = place.lane; i < size; i += LANES) {
         atomicAdd(&digit_counts[digit_of(keys[block * BLOCK_KEYS + i])], 1u);
     }

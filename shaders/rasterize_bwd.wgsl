@@ -253,6 +253,10 @@ fn rasterize_bwd(
     let here = pixels_of(n, place.lane, view.range, view.grid);
     var pixels = pixels_behind(here.at, here.plane, here.inside);
     let stop = pixels.stop;
+    if place.lane == 0u {
+        atomicStore(&tile_stop, 0u);
+    }
+    workgroupBarrier();
     atomicMax(&tile_stop, max(max(stop.x, stop.y), max(stop.z, stop.w)));
 
     let stop_of_tile = workgroupUniformLoad(&tile_stop);

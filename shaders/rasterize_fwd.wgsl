@@ -153,6 +153,10 @@ fn rasterize_fwd(
 #end
     }
 #else
+    if place.lane == 0u {
+        atomicStore(&finished, 0u);
+    }
+    workgroupBarrier();
     var alive = are_alive(pixels);
     if !alive {
         atomicAdd(&finished, 1u);

@@ -19,7 +19,8 @@
 //!    its index with `linear_group` of `shared/dispatch.wgsl`.
 //! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
 //! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
-//! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed.
+//! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed. Workgroup memory is
+//!    arbitrary too: a stage writes a word before it reads the word.
 //! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
 //!
 //! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
