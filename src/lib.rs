@@ -73,6 +73,25 @@
 //!    [`densify::strategy::Strategy::after_update`]; `densify/mcmc.rs` is the example.
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
+//! **A growth score**
+//! 1. `densify/long_axis.rs` ranks rows by [`densify::long_axis::GrowthScore`]; `train/step/update.rs` gives the strategy what it reads of
+//!    the rows of a view. A score that an optimizer on the device does not know is refused in `train/run/begin.rs`.
+//! 2. The word and its help, as above: `config/values.rs` and `config/file.rs`.
+//!
+//! **A camera model**
+//! 1. `scene/camera.rs`: a field, and `scene/frustum.rs`: what such a camera can see. Nothing compiles wrongly without them, and yet rows
+//!    are culled: the frustum stands again in `gather.wgsl` and its twin (`tests/numerics/twins/gather.rs`).
+//! 2. `kernels/project_fwd.rs`, `project_bwd.rs` with `covariance.wgsl` and `project_bwd.wgsl`; viewing directions in `kernels/sh_fwd.rs`,
+//!    `sh_bwd.rs` and `shared/camera.wgsl`; `photos/pose.rs` for the gradient of a pose.
+//! 3. `dataset/`: the reader that knows the model, undistortion, the focal length in metres of the world (times the scale of the frame),
+//!    `scene/init.rs` and `dataset/disturb.rs`, which ask what a camera sees, and the digest of resumes.
+//!
+//! **A page codec**
+//! 1. `page/format/slot_header.rs`: a [`page::format::slot_header::StoredAs`] with its number on the drive and its name, and a bit of the
+//!    features, so that older programs refuse the slot. `page/format/codec.rs`: both directions, and the word in `FromStr`.
+//! 2. Counts by codec in `train/stores/` and `tools/ckpt.rs`; the word of `--spill-codec` in `config/values.rs`; the sample of
+//!    `tests/fuzz/targets/pages.rs`; the length of the list in `tests/fixtures/store_v1.json`.
+//!
 //! **A loss term** is a kind of [`photos`] that learns nothing, also where the term does not look at the photo:
 //! 1. A file in `photos/`: a [`photos::parameter::PhotoParameter`] whose `adds_loss` and `needs_picture` are true. `target` gets the corrected picture
 //!    and the photo that the loss compares, computes value and gradient, keeps both, and returns the photo. `loss` gives the value,

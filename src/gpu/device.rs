@@ -103,8 +103,8 @@ pub struct GpuOptions {
     pub budget: Option<u64>,
     /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
-    /// Whether shaders read uniforms as uniform blocks (`Some(true)`) or as storage; `None`: as storage on software
-    /// adapters that can bind a storage buffer more than stages use.
+    /// Whether shaders read uniforms as uniform blocks (`Some(true)`) or as storage; `None`: as storage on software adapters. An adapter that
+    /// binds no more storage buffers than stages use gets blocks.
     ///
     /// Mesa's lavapipe specialises a shader for the uniform values that decide branches, once per set of values, and
     /// keeps every variant as long as the pipeline: a view with new counts then costs time and some 100 KB of host
@@ -176,8 +176,8 @@ impl Gpu {
         let staging = Staging::new(Arc::clone(&driver), Arc::clone(&pool));
         let profiler = Profiler::new(&driver, Arc::clone(&staging), summary.timestamps && options.profile);
         driver.faults.check()?;
-        let as_storage = summary.kind == DeviceKind::Software && uniforms_fit_storage(limits);
-        let uniform_blocks = options.uniform_blocks.unwrap_or(!as_storage);
+        let wants_blocks = options.uniform_blocks.unwrap_or(summary.kind != DeviceKind::Software);
+        let uniform_blocks = wants_blocks || !uniforms_fit_storage(limits);
         let alignment = limits.min_uniform_buffer_offset_alignment.max(limits.min_storage_buffer_offset_alignment);
         let own_max = limits.max_storage_buffer_binding_size.min(BINDING_MAX);
         Ok(Gpu {

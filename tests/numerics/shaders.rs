@@ -32,7 +32,12 @@ const LAYOUTS: &[&[StructLayout]] = &[
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
 const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
     ("radix_sort.wgsl", "radix_histogram", [128, 1, 1], "the sort's"),
-    ("radix_sort.wgsl", "radix_sort", [128, 1, 1], "a block of keys and their counts fill the memory that every device has"),
+    (
+        "radix_sort.wgsl",
+        "radix_sort",
+        [128, 1, 1],
+        "a block of keys and their counts fill the memory that every device has",
+    ),
     ("image_loss.wgsl", "ssim_map", [64, 1, 1], "four pixels of a tile to an invocation"),
     ("image_loss.wgsl", "gradient", [64, 1, 1], "four pixels of a tile to an invocation"),
     ("rasterize_fwd.wgsl", "rasterize_fwd", [64, 1, 1], "four pixels of a tile to an invocation"),

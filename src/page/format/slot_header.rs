@@ -45,6 +45,15 @@ pub enum StoredAs {
 
 impl StoredAs {
     const ALL: [StoredAs; 3] = [StoredAs::Raw, StoredAs::ShuffledZstd, StoredAs::Halves];
+
+    /// The name for people.
+    pub fn name(self) -> &'static str {
+        match self {
+            StoredAs::Raw => "raw",
+            StoredAs::ShuffledZstd => "shuffled zstd",
+            StoredAs::Halves => "halves",
+        }
+    }
 }
 
 /// A [`SlotRef`] on the drive.

@@ -219,7 +219,7 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
         file: segment_file_name(slot.place.segment),
         offset: slot.place.offset,
         serial: header.serial,
-        codec: ["raw", "shuffled zstd", "halves"][slot.codec as usize].to_string(),
+        codec: slot.codec.name().to_string(),
         payload_bytes: [slot.payload_bytes, slot.stored_bytes],
         checksum: format!("{:032x}", slot.checksum),
         rows: meta.rows,
