@@ -74,15 +74,15 @@
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
 //! **A growth score**
-//! 1. `densify/long_axis.rs` ranks rows by [`densify::long_axis::GrowthScore`]; `train/step/update.rs` gives the strategy what it reads of
+//! 1. `densify/long_axis.rs` ranks rows by [`densify::long_axis::GrowthScore`]; `train/step/batch.rs` gives the strategy what it reads of
 //!    the rows of a view. A score that an optimizer on the device does not know is refused in `train/run/begin.rs`.
 //! 2. The word and its help, as above: `config/values.rs` and `config/file.rs`.
 //!
 //! **A camera model**
 //! 1. `scene/camera.rs`: a field, and `scene/frustum.rs`: what such a camera can see. Nothing compiles wrongly without them, and yet rows
 //!    are culled: the frustum stands again in `gather.wgsl` and its twin (`tests/numerics/twins/gather.rs`).
-//! 2. `kernels/project_fwd.rs`, `project_bwd.rs` with `covariance.wgsl` and `project_bwd.wgsl`; viewing directions in `kernels/sh_fwd.rs`,
-//!    `sh_bwd.rs` and `shared/camera.wgsl`; `photos/pose.rs` for the gradient of a pose.
+//! 2. `kernels/project_fwd.rs` and `kernels/project_bwd.rs` with `shared/covariance.wgsl` and `project_bwd.wgsl`; viewing directions in
+//!    `kernels/sh_fwd.rs`, `kernels/sh_bwd.rs` and `shared/camera.wgsl`; `photos/pose.rs` for the gradient of a pose.
 //! 3. `dataset/`: the reader that knows the model, undistortion, the focal length in metres of the world (times the scale of the frame),
 //!    `scene/init.rs` and `dataset/disturb.rs`, which ask what a camera sees, and the digest of resumes.
 //!
