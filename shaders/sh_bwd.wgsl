@@ -3,8 +3,8 @@
 // Every entry of v_means, v_sh0 and of the bands in use is written, with zeros for culled rows. The gradients of unused
 // bands are zero and not stored.
 //
-// The stage also writes what densification reads of a row, and into the last word of the row's record the largest magnitude of the
-// gradients here.
+// The stage also writes the row's input of densification. The last word of the row's record receives the largest magnitude of the
+// gradients of colours.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"

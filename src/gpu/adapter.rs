@@ -151,7 +151,7 @@ fn refusal(has: &wgpu::Limits) -> Option<String> {
     Some(format!("it has {has} {what}, but {need} are needed"))
 }
 
-/// Whether an adapter with these limits can bind a uniform as a storage buffer more.
+/// Whether an adapter with these limits binds one storage buffer more than stages use, as a uniform read from storage needs.
 pub(super) fn uniforms_fit_storage(has: &wgpu::Limits) -> bool {
     has.max_storage_buffers_per_shader_stage > STORAGE_BUFFERS_MOST
 }

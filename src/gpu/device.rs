@@ -57,7 +57,8 @@ pub enum Subgroups {
     Best,
     /// The same without that path.
     AnySize,
-    /// In workgroup memory, as if subgroups had this size: 4, 8, 16, 32 or 64. For tests of sizes that no adapter at hand has.
+    /// In workgroup memory, as if subgroups had this size: 4, 8, 16, 32 or 64; shaders refuse others. For tests of sizes that no
+    /// adapter at hand has.
     Emulated(u32),
     /// Without subgroups.
     Off,
@@ -68,23 +69,23 @@ const SUBGROUP_LEAST: u32 = 4;
 
 impl Subgroups {
     /// The defines of shaders on an adapter whose subgroups have these sizes, if it has any.
-    fn defines(self, sizes: Option<(u32, u32)>) -> Defines<'static> {
-        let sizes = sizes.filter(|(least, _)| *least >= SUBGROUP_LEAST);
-        match (self, sizes) {
-            (Subgroups::Emulated(4), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "4u")],
-            (Subgroups::Emulated(8), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "8u")],
-            (Subgroups::Emulated(16), _) => &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "16u")],
-            (Subgroups::Emulated(32), _) => {
-                &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "32u"), ("SUBGROUPS_OF_32", "")]
-            }
-            (Subgroups::Emulated(_), _) => {
-                &[("SUBGROUPS", ""), ("EMULATED_SUBGROUPS", ""), ("SUBGROUP_SIZE", "64u"), ("SUBGROUPS_OF_32", "")]
-            }
-            (Subgroups::Off, _) | (_, None) => &[],
-            (Subgroups::Best, Some((8, 8))) => &[("SUBGROUPS", ""), ("SUBGROUPS_OF_8", "")],
-            (_, Some((32.., _))) => &[("SUBGROUPS", ""), ("SUBGROUPS_OF_32", "")],
-            _ => &[("SUBGROUPS", "")],
+    fn defines(self, sizes: Option<(u32, u32)>) -> Vec<(&'static str, String)> {
+        let (least, most) = match (self, sizes) {
+            (Subgroups::Off, _) => (0, 0),
+            (Subgroups::Emulated(size), _) => (size, size),
+            (_, sizes) => sizes.unwrap_or_default(),
+        };
+        if least < SUBGROUP_LEAST {
+            return Vec::new();
         }
+        let mut defines = vec![("SUBGROUPS", String::new())];
+        if let Subgroups::Emulated(size) = self {
+            defines.extend([("EMULATED_SUBGROUPS", String::new()), ("SUBGROUP_SIZE", format!("{size}u"))]);
+        }
+        let is_of_8 = self == Subgroups::Best && (least, most) == (8, 8);
+        defines.extend(is_of_8.then_some(("SUBGROUPS_OF_8", String::new())));
+        defines.extend((least >= 32).then_some(("SUBGROUPS_OF_32", String::new())));
+        defines
     }
 }
 
@@ -93,10 +94,9 @@ impl Subgroups {
 pub struct GpuOptions {
     /// Lowers the largest binding, bytes.
     pub max_binding_bytes: Option<u64>,
-    /// Lowers the number of rows of a column window.
-    pub window_rows: Option<u64>,
     /// Waits for each submission before continuing: the baseline in tests of overlap.
     pub serial: bool,
+    /// How shaders add up what neighbouring invocations hold.
     pub subgroups: Subgroups,
     /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit. From 128 MiB on the limit holds for the memory
     /// blocks of the API, below for the buffers in them.
@@ -132,7 +132,6 @@ pub struct Gpu {
     summary: AdapterSummary,
     offset_alignment: u64,
     max_binding_bytes: u64,
-    window_rows: u64,
 }
 
 impl fmt::Debug for Gpu {
@@ -157,7 +156,8 @@ impl Gpu {
         let driver = Arc::new(Driver::open(&adapter, &summary.name, features, limits.clone(), blocks, bus)?);
         let open = |defines| Gpu::on_driver(Arc::clone(&driver), summary.clone(), &limits, options, defines);
         // The check has a device of its own, so that it leaves nothing on the one that is used.
-        let gpu = if is_native && !open(defines)?.has_subgroups_in_order()? { open(&[])? } else { open(defines)? };
+        let in_order = !is_native || open(defines.clone())?.has_subgroups_in_order()?;
+        let gpu = open(if in_order { defines } else { Vec::new() })?;
         let fault = options.fault.or_else(InjectedFault::from_environment);
         Ok(Gpu { injector: Injector::new(fault), ..gpu })
     }
@@ -168,7 +168,7 @@ impl Gpu {
         summary: AdapterSummary,
         limits: &wgpu::Limits,
         options: &GpuOptions,
-        subgroup_defines: Defines<'static>,
+        subgroup_defines: Vec<(&'static str, String)>,
     ) -> GpuResult<Gpu> {
         let budget = options.budget.map_or(u64::MAX, bytes_for_buffers);
         let block_limit = options.budget.filter(|budget| *budget >= BLOCKS_COUNT_FROM);
@@ -194,7 +194,6 @@ impl Gpu {
             summary,
             offset_alignment: u64::from(limits.min_storage_buffer_offset_alignment),
             max_binding_bytes: options.max_binding_bytes.map_or(own_max, |lowered| lowered.min(own_max)),
-            window_rows: options.window_rows.unwrap_or(u64::MAX),
             driver,
         })
     }
@@ -228,11 +227,6 @@ impl Gpu {
     /// Largest binding, bytes: longer columns are bound in windows.
     pub fn max_binding_bytes(&self) -> u64 {
         self.max_binding_bytes
-    }
-
-    /// Most rows of a column window, regardless of the binding limit.
-    pub fn window_rows(&self) -> u64 {
-        self.window_rows
     }
 
     /// Alignment of the offsets of bound windows, bytes.

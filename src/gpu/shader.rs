@@ -62,7 +62,7 @@ type PipelineKey = (String, String, Vec<(String, String)>);
 #[derive(Debug)]
 pub(super) struct Pipelines {
     driver: Arc<Driver>,
-    subgroup_defines: Defines<'static>,
+    subgroup_defines: Vec<(&'static str, String)>,
     uniform_blocks: bool,
     compiled: Mutex<BTreeMap<PipelineKey, Arc<Pipeline>>>,
 }
@@ -70,7 +70,11 @@ pub(super) struct Pipelines {
 impl Pipelines {
     /// No pipelines yet. `subgroup_defines` are set for every shader that knows them; without `uniform_blocks` shaders
     /// read uniforms as storage.
-    pub(super) fn new(driver: Arc<Driver>, subgroup_defines: Defines<'static>, uniform_blocks: bool) -> Self {
+    pub(super) fn new(
+        driver: Arc<Driver>,
+        subgroup_defines: Vec<(&'static str, String)>,
+        uniform_blocks: bool,
+    ) -> Self {
         Pipelines { driver, subgroup_defines, uniform_blocks, compiled: Mutex::default() }
     }
 
@@ -83,7 +87,8 @@ impl Pipelines {
     pub(super) fn get(&self, source: &Source, entry: &str, defines: Defines<'_>) -> GpuResult<Arc<Pipeline>> {
         let mut all = defines.to_vec();
         let known = knows(source)?;
-        all.extend(self.subgroup_defines.iter().filter(|(name, _)| known.contains(*name)));
+        let own = self.subgroup_defines.iter().map(|(name, value)| (*name, value.as_str()));
+        all.extend(own.filter(|(name, _)| known.contains(*name)));
         all.sort_unstable();
         all.dedup();
         let owned = all.iter().map(|(n, v)| (n.to_string(), v.to_string())).collect();

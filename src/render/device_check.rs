@@ -1,4 +1,5 @@
-//! Whether a device computes what the CPU computes: views of generated Gaussians, drawn and taken back on both.
+//! Whether a device computes what the CPU computes: views of generated Gaussians are drawn, and their
+//! gradients computed, on both.
 //!
 //! A driver may compile a stage wrongly; then a run would train something else for hours. Views are compared as a whole, and the first
 //! wrong output names the stage in which the fault lies.

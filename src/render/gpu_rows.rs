@@ -258,7 +258,7 @@ impl RowGradients {
 /// Splits `rows` rows into windows so that no binding of `row_bytes` per row exceeds the device's limit.
 pub(super) fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Item = Window> {
     let rows = u64::from(rows);
-    let most = (gpu.max_binding_bytes() / row_bytes).min(gpu.window_rows());
+    let most = gpu.max_binding_bytes() / row_bytes;
     let step = (most / WINDOW_STEP * WINDOW_STEP).max(WINDOW_STEP);
     (0..rows.div_ceil(step)).map(move |i| Window { first: i * step, rows: (rows - i * step).min(step) as u32 })
 }

@@ -26,7 +26,7 @@ use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::commits::checkpoint::Checkpoint;
 use gsscale::train::commits::results::save;
 use gsscale::train::error::TrainError;
-use gsscale::train::inputs::machine::StopFlag;
+use gsscale::train::inputs::signals::StopFlag;
 use gsscale::train::log::progress::RunProgress;
 use gsscale::train::log::report::MetricsLog;
 use gsscale::train::run::training_loop::TrainingLoop;

@@ -19,7 +19,7 @@ use crate::page::folder::file_system::free_bytes;
 use crate::report::run_files::PLY_FILE;
 use crate::scene::rotation::Rotation;
 use crate::train::error::TrainError;
-use crate::train::inputs::machine::StopFlag;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
 use std::path::Path;

@@ -1,8 +1,5 @@
-//! What a run takes of its machine: worker threads, instruction path and renderer by the config, once, before other work; folders on the
-//! drives of its paths; and signals.
-//!
-//! The first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) asks the loop to stop after its step, the second ends the process at once.
-//! SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file size limit) is ignored.
+//! What a run takes of its machine: worker threads, instruction path and renderer by the config, once, before other work; and folders on
+//! the drives of its paths.
 
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
@@ -17,10 +14,7 @@ use crate::render::cpu::CpuRenderer;
 use crate::render::device_check;
 #[cfg(feature = "gpu")]
 use crate::render::gpu::GpuRenderer;
-use signal_hook::consts::{SIGINT, SIGTERM};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 /// Most worker threads per core, and how many are started on any machine if asked for.
 const THREADS_PER_CORE: usize = 4;
@@ -29,7 +23,7 @@ const THREADS_LEAST_BOUND: usize = 32;
 /// Starts the worker threads of `config`, checks its instruction path, and makes a file size limit an ordinary error.
 /// Errors: this machine lacks the instructions.
 pub fn set_up(config: &TrainConfig) -> InputResult<()> {
-    survive_file_size_limit();
+    super::signals::survive_file_size_limit();
     if config.threads > 0 {
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let (asked, most) = (config.threads as usize, THREADS_LEAST_BOUND.max(THREADS_PER_CORE * cores));
@@ -75,18 +69,7 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn R
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
     let opened = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
     match opened {
-        Ok(renderer) => match wrong_stage(choice) {
-            None => Ok((renderer, None)),
-            Some(wrong) if *choice == DeviceChoice::Auto => Ok((
-                Box::new(CpuRenderer::new()),
-                Some(format!("the CPU renders, since the GPU computes wrongly: {wrong}")),
-            )),
-            Some(wrong) => {
-                let problem = format!("this GPU or its driver computes wrongly: {wrong}");
-                let remedy = "use --device cpu; an update of the driver may help, and gsscale-bench doctor tells more";
-                Err(InputError::new("--device", problem, remedy))
-            }
-        },
+        Ok(renderer) => accept_or_refuse(choice, renderer, difference_from_cpu(choice)),
         Err(GpuError::NoHardwareGpu { .. }) => {
             let word = "there is no hardware GPU: the CPU renders (--list-devices shows what was found)";
             Ok((Box::new(CpuRenderer::new()), Some(word.to_string())))
@@ -103,16 +86,33 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn R
     }
 }
 
-/// The first difference between the device and the CPU, found in about a second, on an opened device of its own: the check leaves nothing
-/// on that of the run. Drivers in software are those of the tests, which compare every stage, and are not checked unless
-/// `GSSCALE_CHECK_DEVICE` is set.
+/// The first difference between the device and the CPU, found in about a second. The device is opened for this comparison alone, so that
+/// nothing of it stays on the run's device. A software driver is compared only if `GSSCALE_CHECK_DEVICE` is set: the tests compare every
+/// stage on software drivers.
 #[cfg(feature = "gpu")]
-fn wrong_stage(choice: &DeviceChoice) -> Option<String> {
+fn difference_from_cpu(choice: &DeviceChoice) -> Option<String> {
     let gpu = Gpu::open_with(choice, &GpuOptions::default()).ok()?;
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
         return None;
     }
     device_check::check(&mut GpuRenderer::new(gpu).ok()?).err()
+}
+
+/// The renderer of the device, if no `difference` from the CPU was found. Otherwise the CPU renders for `auto`, with a message.
+/// Errors: a difference was found on a device that the user named.
+#[cfg(feature = "gpu")]
+fn accept_or_refuse(
+    choice: &DeviceChoice,
+    renderer: Box<dyn Renderer>,
+    difference: Option<String>,
+) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
+    let Some(difference) = difference else { return Ok((renderer, None)) };
+    let problem = format!("the GPU did not pass the comparison with the CPU: {difference}");
+    if *choice == DeviceChoice::Auto {
+        return Ok((Box::new(CpuRenderer::new()), Some(format!("the CPU renders: {problem}"))));
+    }
+    let remedy = "use --device cpu; an update of the driver may help, and gsscale-bench doctor tells more";
+    Err(InputError::new("--device", problem, remedy))
 }
 
 #[cfg(feature = "gpu")]
@@ -137,55 +137,21 @@ pub(crate) fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
-/// Turns writes beyond the file size limit into I/O errors, instead of ending the process.
-pub fn survive_file_size_limit() {
-    // If the system refuses the handler, the default action stays.
-    #[cfg(unix)]
-    let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
-}
+#[cfg(all(test, feature = "gpu"))]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
 
-/// The stop request of the process, with its signal.
-#[derive(Debug, Clone, Default)]
-pub struct StopFlag {
-    signal: Arc<AtomicUsize>,
-    asked: Arc<AtomicBool>,
-}
-
-impl StopFlag {
-    /// Installs the handlers. A second signal ends the process with exit code 129, 130 or 143.
-    /// Errors: the system refused a handler.
-    pub fn listen() -> std::io::Result<StopFlag> {
-        let flag = StopFlag::default();
-        let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];
-        #[cfg(unix)]
-        if !is_ignored(signal_hook::consts::SIGHUP) {
-            signals.push((signal_hook::consts::SIGHUP, 129));
-        }
-        for (signal, code) in signals {
-            // Register this handler first, so that it sees the flag of an earlier signal, not its own.
-            signal_hook::flag::register_conditional_shutdown(signal, code, Arc::clone(&flag.asked))?;
-            signal_hook::flag::register(signal, Arc::clone(&flag.asked))?;
-            signal_hook::flag::register_usize(signal, Arc::clone(&flag.signal), signal as usize)?;
-        }
-        Ok(flag)
-    }
-
-    /// Exit code of the stop request, 129, 130 or 143; `None` without a request.
-    pub fn exit_code(&self) -> Option<i32> {
-        match self.signal.load(Ordering::Relaxed) as i32 {
-            0 => None,
-            signal => Some(128 + signal),
+    #[test]
+    fn a_gpu_that_differs_from_the_cpu_is_refused_or_with_auto_replaced() {
+        let differs = || Some("stage sh_fwd".to_string());
+        let of = |choice, wrong| accept_or_refuse(&choice, Box::new(CpuRenderer::new()), wrong);
+        assert_eq!(of(DeviceChoice::Gpu, None).unwrap().1, None);
+        let (renderer, message) = of(DeviceChoice::Auto, differs()).unwrap();
+        assert!(renderer.name() == CpuRenderer::new().name() && message.unwrap().contains("stage sh_fwd"));
+        for asked in [DeviceChoice::Gpu, DeviceChoice::Named("card".into())] {
+            let refusal = of(asked, differs()).err().unwrap().to_string();
+            assert!(refusal.contains("stage sh_fwd") && refusal.contains("--device cpu"), "{refusal}");
         }
     }
-}
-
-/// Whether the process was started with this signal ignored.
-#[cfg(unix)]
-#[allow(unsafe_code)]
-fn is_ignored(signal: i32) -> bool {
-    let mut action = std::mem::MaybeUninit::<libc::sigaction>::zeroed();
-    // SAFETY: without a new action the call only writes the current one to memory that is large enough for it.
-    let answer = unsafe { libc::sigaction(signal, std::ptr::null(), action.as_mut_ptr()) };
-    // SAFETY: zeros are a valid `sigaction`, and the call wrote at most a valid one over them.
-    answer == 0 && unsafe { action.assume_init() }.sa_sigaction == libc::SIG_IGN
 }

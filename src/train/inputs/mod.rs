@@ -4,3 +4,4 @@
 pub mod dataset_print;
 pub(crate) mod gaussian_pages;
 pub mod machine;
+pub mod signals;

@@ -18,7 +18,7 @@ use crate::report::run_files::saved_ply_name;
 use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::save;
 use crate::train::error::TrainError;
-use crate::train::inputs::machine::StopFlag;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::{HostBudget, PLAN_BYTES, host_bytes_peak};

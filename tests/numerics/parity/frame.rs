@@ -204,10 +204,10 @@ fn limits_and_forms_of_a_device_change_no_bit() {
     let want = results(&mut whole, &view, &options, &target);
     assert!(want.grads.radii.iter().filter(|r| r[0] > 0).count() > 500, "most rows are drawn");
     // The widest column has 180 bytes a row: 4000 rows are cut in four, the splats (48 bytes) just fit.
-    let cut = GpuOptions { max_binding_bytes: Some(48 * 4000), window_rows: Some(384), ..plain };
+    let cut = GpuOptions { max_binding_bytes: Some(48 * 4000), ..plain };
     // No more intersections than the lowered binding holds with their gradients.
     for (what, form, capacity) in [
-        ("windows", GpuOptions { window_rows: None, ..cut }, 5000),
+        ("windows", cut, 5000),
         ("uniforms in blocks", GpuOptions { uniform_blocks: Some(true), ..plain }, 5000),
         ("uniforms in storage", GpuOptions { uniform_blocks: Some(false), ..plain }, 5000),
         ("a wait for each submission", GpuOptions { serial: true, ..plain }, 5000),

@@ -1,0 +1,60 @@
+//! Signals: the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) asks the loop to stop after its step, the second ends
+//! the process at once. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
+//! size limit) is ignored.
+
+use signal_hook::consts::{SIGINT, SIGTERM};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+
+/// Turns writes beyond the file size limit into I/O errors, instead of ending the process.
+pub fn survive_file_size_limit() {
+    // If the system refuses the handler, the default action stays.
+    #[cfg(unix)]
+    let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
+}
+
+/// The stop request of the process, with its signal.
+#[derive(Debug, Clone, Default)]
+pub struct StopFlag {
+    signal: Arc<AtomicUsize>,
+    asked: Arc<AtomicBool>,
+}
+
+impl StopFlag {
+    /// Installs the handlers. A second signal ends the process with exit code 129, 130 or 143.
+    /// Errors: the system refused a handler.
+    pub fn listen() -> std::io::Result<StopFlag> {
+        let flag = StopFlag::default();
+        let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];
+        #[cfg(unix)]
+        if !is_ignored(signal_hook::consts::SIGHUP) {
+            signals.push((signal_hook::consts::SIGHUP, 129));
+        }
+        for (signal, code) in signals {
+            // Register this handler first, so that it sees the flag of an earlier signal, not its own.
+            signal_hook::flag::register_conditional_shutdown(signal, code, Arc::clone(&flag.asked))?;
+            signal_hook::flag::register(signal, Arc::clone(&flag.asked))?;
+            signal_hook::flag::register_usize(signal, Arc::clone(&flag.signal), signal as usize)?;
+        }
+        Ok(flag)
+    }
+
+    /// Exit code of the stop request, 129, 130 or 143; `None` without a request.
+    pub fn exit_code(&self) -> Option<i32> {
+        match self.signal.load(Ordering::Relaxed) as i32 {
+            0 => None,
+            signal => Some(128 + signal),
+        }
+    }
+}
+
+/// Whether the process was started with this signal ignored.
+#[cfg(unix)]
+#[allow(unsafe_code)]
+fn is_ignored(signal: i32) -> bool {
+    let mut action = std::mem::MaybeUninit::<libc::sigaction>::zeroed();
+    // SAFETY: without a new action the call only writes the current one to memory that is large enough for it.
+    let answer = unsafe { libc::sigaction(signal, std::ptr::null(), action.as_mut_ptr()) };
+    // SAFETY: zeros are a valid `sigaction`, and the call wrote at most a valid one over them.
+    answer == 0 && unsafe { action.assume_init() }.sa_sigaction == libc::SIG_IGN
+}
