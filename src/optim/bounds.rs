@@ -14,7 +14,7 @@
 //! evaluation; 3. the same bits on every instruction path; 4. bounds of finite rows are finite.
 
 use super::deferred::DeferredAdam;
-use super::lanes::{LANES, LaneDrifts, by_element, drifted_lanes, tables_of};
+use super::lanes::{LANES, LaneDrifts, by_element, drifted_lanes, marked_rows, tables_of};
 use super::moments::Moments;
 use crate::base::math::exp32;
 use crate::base::simd::{Kernel, dispatch};
@@ -73,15 +73,12 @@ impl Kernel for LowestOpacity<'_> {
         let whole = rows.rows() / LANES * LANES;
         for first in (0..whole).step_by(LANES) {
             let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.tables.limit(stamp));
-            let (limits, direct) = drifted_lanes::<1>(adam, Column::Opacities, tables, first, &drifts);
-            if direct {
-                (0..LANES).for_each(|l| lowest[l] = lowest[l].min(of_row(first + l)));
-                continue;
-            }
+            let (limits, direct) = drifted_lanes::<1, true>(adam, Column::Opacities, tables, first, &drifts);
             let values = &values[first..first + LANES];
             for l in 0..LANES {
                 lowest[l] = lowest[l].min(hull(values[l], limits[0][l], slack)[0]);
             }
+            marked_rows(first, direct, direct).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
         }
         (whole..rows.rows()).for_each(|row| lowest[0] = lowest[0].min(of_row(row)));
         lowest.into_iter().fold(f32::INFINITY, f32::min)
@@ -103,8 +100,8 @@ impl Kernel for BoundRows<'_> {
         let mut bounds = PageBounds::EMPTY;
         let whole = rows.rows() / LANES * LANES;
         for first in (0..whole).step_by(LANES) {
-            if !lanes.add(adam, rows, splits, first) {
-                (first..first + LANES).for_each(|row| add_row(&mut bounds, adam, rows, splits, row));
+            for row in lanes.add(adam, rows, splits, first) {
+                add_row(&mut bounds, adam, rows, splits, row);
             }
         }
         (whole..rows.rows()).for_each(|row| add_row(&mut bounds, adam, rows, splits, row));
@@ -123,17 +120,19 @@ impl LaneBounds {
     const EMPTY: LaneBounds =
         LaneBounds { lo: [[f32::INFINITY; LANES]; 3], hi: [[f32::NEG_INFINITY; LANES]; 3], sigma_max: [0.0; LANES] };
 
-    /// Adds [`LANES`] rows from `first` on and returns true; if one of them needs the direct sum, adds none and returns
-    /// false.
+    /// Adds [`LANES`] rows from `first` on; returns those whose limits need the direct sum.
     #[inline(always)]
-    fn add(&mut self, adam: &DeferredAdam, rows: &Rows<'_>, splits: &SplitLimits, first: usize) -> bool {
+    fn add(
+        &mut self,
+        adam: &DeferredAdam,
+        rows: &Rows<'_>,
+        splits: &SplitLimits,
+        first: usize,
+    ) -> impl Iterator<Item = usize> {
         let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| adam.tables.limit(stamp));
         let (means, scales) = (tables_of(rows, Column::Means), tables_of(rows, Column::Scales));
-        let (mean_limits, a) = drifted_lanes::<3>(adam, Column::Means, means, first, &drifts);
-        let (scale_limits, b) = drifted_lanes::<3>(adam, Column::Scales, scales, first, &drifts);
-        if a | b {
-            return false;
-        }
+        let (mean_limits, a) = drifted_lanes::<3, true>(adam, Column::Means, means, first, &drifts);
+        let (scale_limits, b) = drifted_lanes::<3, true>(adam, Column::Scales, scales, first, &drifts);
         let (from, to) = (first * 3, (first + LANES) * 3);
         let (means, scales) = (by_element::<3>(&means[0][from..to]), by_element::<3>(&scales[0][from..to]));
         let (grad2d, count) = (&rows.grad2d[first..first + LANES], &rows.count[first..first + LANES]);
@@ -155,7 +154,7 @@ impl LaneBounds {
                 self.hi[c][l] = self.hi[c][l].max(outwards(hi, reach[l]));
             }
         }
-        true
+        marked_rows(first, a, b)
     }
 
     /// Combines all lanes with `bounds`.

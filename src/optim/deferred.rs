@@ -9,14 +9,16 @@
 
 use super::adam::AdamConfig;
 use super::decay::Decay;
-use super::drift::{Drift, DriftTables, EpsFloor, RECENT, drifted, flush, needs_direct_sum};
+use super::drift::{
+    Drift, DriftTables, EpsFloor, RECENT, drifted, flush, is_without_quotient, needs_direct_sum, of_column,
+};
 use super::moments::Moments;
 use super::rates::Rates;
 use crate::base::simd::{LANES, SimdPath};
 use crate::scene::columns::Column;
 use crate::scene::log_scales::LogScaleRange;
 use crate::scene::optimizer_numbers::{RunNumbers, StepNumbers};
-use crate::scene::rows::{RowBlock, first_lane};
+use crate::scene::rows::first_lane;
 
 /// A value per lane of a row; all lanes of `sh_n` share one.
 #[derive(Debug, Clone)]
@@ -126,9 +128,14 @@ impl DeferredAdam {
         self.evaluate_with(&self.tables.drift(stamp, now), column, value, m, v, stamp, now)
     }
 
-    /// The limit of a value that gets no more gradients; it moves there from `value` monotonically.
+    /// A value that bounds, together with `value`, all later values without further gradients: the limit to which the
+    /// value moves monotonically, or, where eps matters, the limit without eps, which lies farther away.
     pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
-        self.evaluate_with(self.tables.limit(stamp), column, value, m, v, stamp, u32::MAX)
+        if is_without_quotient(m, v) {
+            return self.moved_directly(column, value, m, v, stamp, u32::MAX);
+        }
+        let sums = of_column(self.tables.limit(stamp), column);
+        drifted(value, m, v, sums, self.base_rate(column), self.eps.of_limit(v))
     }
 
     /// Base rate of a column, as the evaluation uses it.
@@ -141,13 +148,16 @@ impl DeferredAdam {
         if stamp >= now {
             return value;
         }
-        let of_means = column == Column::Means;
-        let rate = self.lane_rates.of(column);
         if needs_direct_sum(m, v, self.eps.floor) {
-            return flush(value - self.tables.direct_sum(m, v, stamp, now, of_means) * rate);
+            return self.moved_directly(column, value, m, v, stamp, now);
         }
-        let sums = if of_means { [drift[0], drift[1], drift[2]] } else { [drift[4], drift[5], drift[6]] };
-        drifted(value, m, v, sums, rate, self.eps.eps)
+        drifted(value, m, v, of_column(drift, column), self.base_rate(column), self.eps.eps)
+    }
+
+    /// A value after its movement by the direct sum.
+    fn moved_directly(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
+        let [sum] = self.tables.direct_sums(&[m], &[v], stamp, now, usize::from(column == Column::Means));
+        flush(value - sum * self.base_rate(column))
     }
 
     /// The decay of the moments over `k` steps.
@@ -168,8 +178,8 @@ impl DeferredAdam {
 
     /// The numbers of a run of `steps` steps, for backends that update rows themselves; `None` for optimizers that only the CPU has:
     /// moments of 16 bits, and rows that do not catch up. The sums of the series are those of the CPU, to the bit: they are
-    /// computed in f64 and rounded once. The direct sum, which the CPU computes in f64, has f32 tables here: its relative
-    /// error is some 1e-6 (`tests/numerics/device_adam.rs`).
+    /// computed in f64 and rounded once. The factors of the direct sum, which the CPU multiplies in f64, are multiplied in
+    /// f32 there: its relative error is some 1e-6 (`tests/numerics/device_adam.rs`).
     pub fn numbers(&self, steps: u32) -> Option<RunNumbers> {
         let tables = &self.tables;
         if tables.is_still() || self.moments != Moments::F32 {
@@ -225,17 +235,6 @@ impl<'a> AdamNow<'a> {
     pub(crate) fn drift(&self, stamp: u32) -> &Drift {
         let gap = self.now.saturating_sub(stamp) as usize;
         if gap < RECENT { &self.recent[gap] } else { self.adam.tables.limit(stamp) }
-    }
-
-    /// Moves the values of one loaded row to now, lane by lane, if eps affects one of them.
-    pub(super) fn evaluate_block_directly(&self, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
-        let drift = self.drift(stamp);
-        for column in Column::ALL {
-            let first = first_lane(column);
-            for l in first..first + column.width(3) {
-                value[l] = self.adam.evaluate_with(drift, column, value[l], m[l], v[l], stamp, self.now);
-            }
-        }
     }
 
     /// The numbers of this step, for backends that update rows themselves.

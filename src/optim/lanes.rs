@@ -1,12 +1,12 @@
 //! Sixteen rows at a time: moves the elements of a column by the series, one vector per element.
 //!
-//! Not here: rows with second moments so small that eps matters; they are reported, and the caller evaluates them one
-//! by one.
+//! Not here: rows with second moments so small that eps matters; they are marked, and the caller evaluates them one by
+//! one.
 //!
 //! Invariant: the bits are those of `RowsNow` on every instruction path.
 
 use super::deferred::{AdamNow, DeferredAdam};
-use super::drift::{Drift, EpsFloor, drifted, needs_direct_sum};
+use super::drift::{Drift, drifted, is_without_quotient, needs_direct_sum};
 use crate::base::simd::Kernel;
 pub(crate) use crate::base::simd::LANES;
 use crate::scene::columns::Column;
@@ -45,16 +45,16 @@ pub(crate) fn tables_of<'a>(rows: &Rows<'a>, column: Column) -> [&'a [f32]; 3] {
     [rows.columns.column(column), rows.exp_avg.column(column), rows.exp_avg_sq.column(column)]
 }
 
-/// The `W` elements of rows `first..` in a column after their drift, and whether one of them needs the direct sum instead.
+/// The `W` elements of rows `first..` in a column after their drift, and the rows that need the direct sum instead, whose
+/// elements in need stay as stored. As a limit (`IS_LIMIT`, [`DeferredAdam::limit`]) only rows without a quotient need it.
 #[inline(always)]
-pub(crate) fn drifted_lanes<const W: usize>(
+pub(crate) fn drifted_lanes<const W: usize, const IS_LIMIT: bool>(
     adam: &DeferredAdam,
     column: Column,
     tables: [&[f32]; 3],
     first: usize,
     drifts: &LaneDrifts,
-) -> ([[f32; LANES]; W], bool) {
-    let EpsFloor { eps, floor } = adam.eps;
+) -> ([[f32; LANES]; W], [bool; LANES]) {
     let rate = adam.base_rate(column);
     let sums = drifts.of(column);
     let (from, to) = (first * W, (first + LANES) * W);
@@ -64,18 +64,32 @@ pub(crate) fn drifted_lanes<const W: usize>(
     let m = by_element::<W>(&tables[1][from..to]);
     let v = by_element::<W>(&tables[2][from..to]);
     let mut out = [[0.0; LANES]; W];
-    let mut direct = false;
+    let mut direct = [false; LANES];
     for c in 0..W {
-        let mut lanes = [false; LANES];
         for l in 0..LANES {
-            out[c][l] = drifted(value[c][l], m[c][l], v[c][l], [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
-            lanes[l] = needs_direct_sum(m[c][l], v[c][l], floor);
-        }
-        for lane in lanes {
-            direct |= lane;
+            let (value, m, v) = (value[c][l], m[c][l], v[c][l]);
+            let eps = if IS_LIMIT { adam.eps.of_limit(v) } else { adam.eps.eps };
+            let is_direct = if IS_LIMIT { is_without_quotient(m, v) } else { needs_direct_sum(m, v, adam.eps.floor) };
+            let moved = drifted(value, m, v, [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
+            out[c][l] = if is_direct { value } else { moved };
+            direct[l] |= is_direct;
         }
     }
     (out, direct)
+}
+
+/// The marked rows of [`LANES`] rows from `first` on.
+#[inline(always)]
+pub(crate) fn marked_rows(first: usize, a: [bool; LANES], b: [bool; LANES]) -> impl Iterator<Item = usize> {
+    let mut marks = 0u32;
+    for l in 0..LANES {
+        marks |= u32::from(a[l] | b[l]) << l;
+    }
+    std::iter::from_fn(move || {
+        let lane = (marks != 0).then_some(marks.trailing_zeros() as usize)?;
+        marks &= marks - 1;
+        Some(first + lane)
+    })
 }
 
 /// `[LANES][W]` to `[W][LANES]`.
@@ -109,16 +123,13 @@ impl Kernel for SizeRows<'_, '_> {
         let whole = rows.rows() / LANES * LANES;
         for first in (0..whole).step_by(LANES) {
             let drifts = LaneDrifts::gather(&rows.stamp[first..], |stamp| at.drift(stamp));
-            let (scales, a) = drifted_lanes::<3>(adam, Column::Scales, scale_tables, first, &drifts);
-            let (opacity, b) = drifted_lanes::<1>(adam, Column::Opacities, opacity_tables, first, &drifts);
-            if a | b {
-                (first..first + LANES).for_each(|row| size_row(at, rows, row, log_scales, opacities));
-                continue;
-            }
+            let (scales, a) = drifted_lanes::<3, false>(adam, Column::Scales, scale_tables, first, &drifts);
+            let (opacity, b) = drifted_lanes::<1, false>(adam, Column::Opacities, opacity_tables, first, &drifts);
             for l in 0..LANES {
                 log_scales[first + l] = scales[0][l].max(scales[1][l]).max(scales[2][l]);
             }
             opacities[first..first + LANES].copy_from_slice(&opacity[0]);
+            marked_rows(first, a, b).for_each(|row| size_row(at, rows, row, log_scales, opacities));
         }
         (whole..rows.rows()).for_each(|row| size_row(at, rows, row, log_scales, opacities));
     }

@@ -18,7 +18,7 @@
 use super::adam::AdamConfig;
 use super::decay::Decay;
 use super::deferred::{AdamNow, DeferredAdam, OfLanes};
-use super::drift::{EpsFloor, drifted, flush, needs_direct_sum};
+use super::drift::{EpsFloor, drifted, flush, needs_direct_sum, of_column};
 use super::lanes::SizeRows;
 use super::moments::{Moments, round_block};
 use super::row_vectors::{RowVectors, Table, TableMut, is_of_row_behind};
@@ -150,7 +150,7 @@ impl RowsNow for AdamNow<'_> {
         rows.columns.load_row_any(row, out);
         rows.exp_avg.load_row_any(row, &mut m);
         rows.exp_avg_sq.load_row_any(row, &mut v);
-        evaluate_block(self, out, &m, &v, rows.stamp[row]);
+        dispatch(self.adam.simd, EvaluateBlock { at: self, value: out, m: &m, v: &v, stamp: rows.stamp[row] });
     }
 
     fn evaluate_element(&self, rows: &Rows<'_>, column: Column, row: usize, element: usize) -> f32 {
@@ -244,20 +244,24 @@ struct Past<const W: usize> {
 /// The current values of a row; `None` if eps affects one of them or a value loaded with them.
 #[inline(always)]
 fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVectors<W>> {
+    let (now, is_direct) = drifted_row(at, past);
+    (!is_direct).then_some(now)
+}
+
+/// The values of a row after their drift, and whether one of them needs the direct sum instead.
+#[inline(always)]
+fn drifted_row<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> (RowVectors<W>, bool) {
     if past.stamp >= at.now() {
-        return Some(past.value);
+        return (past.value, false);
     }
     let (EpsFloor { eps, floor }, rates) = (at.adam.eps, &at.adam.lane_rates);
     let (value, m, v) = (&past.value.0, &past.m.0, &past.v.0);
-    let mut direct = false;
+    let mut is_direct = false;
     for l in 0..RowVectors::<W>::USED {
-        direct |= needs_direct_sum(m[l], v[l], floor);
-    }
-    if direct {
-        return None;
+        is_direct |= needs_direct_sum(m[l], v[l], floor);
     }
     let drift = at.drift(past.stamp);
-    let (means, others) = ([drift[0], drift[1], drift[2]], [drift[4], drift[5], drift[6]]);
+    let (means, others) = (of_column(drift, Column::Means), of_column(drift, Column::ShN));
     let mut sums = [[0.0; SH_N_LANE]; 3];
     for p in 0..3 {
         for l in 0..SH_N_LANE {
@@ -272,7 +276,7 @@ fn evaluate<const W: usize>(at: &AdamNow<'_>, past: &Past<W>) -> Option<RowVecto
     for l in SH_N_LANE..RowVectors::<W>::USED {
         now[l] = drifted(value[l], m[l], v[l], others, rates.sh_n, eps);
     }
-    Some(RowVectors(now))
+    (RowVectors(now), is_direct)
 }
 
 /// Evaluates the last row of a table, or one for which [`evaluate`] returned `None`. Loads the row itself, because an
@@ -285,12 +289,33 @@ fn evaluate_alone<const W: usize>(at: &AdamNow<'_>, view: &Rows<'_>, row: usize)
     RowVectors::of_block(&now)
 }
 
-/// Moves the values of one row of any width to now.
-fn evaluate_block(at: &AdamNow<'_>, value: &mut RowBlock, m: &RowBlock, v: &RowBlock, stamp: u32) {
-    let [then, m_vectors, v_vectors] = [&*value, m, v].map(RowVectors::of_block);
-    match evaluate(at, &Past::<45> { value: then, m: m_vectors, v: v_vectors, stamp }) {
-        Some(now) => *value = now.to_block(),
-        None => at.evaluate_block_directly(value, m, v, stamp),
+/// Moves the values of one row of any width to now, by the series or by the direct sum.
+struct EvaluateBlock<'k, 'a> {
+    at: &'k AdamNow<'a>,
+    value: &'k mut RowBlock,
+    m: &'k RowBlock,
+    v: &'k RowBlock,
+    stamp: u32,
+}
+
+impl Kernel for EvaluateBlock<'_, '_> {
+    type Out = ();
+    #[inline(always)]
+    fn run<const FMA: bool>(self) {
+        let EvaluateBlock { at, value, m, v, stamp } = self;
+        let then = Past::<45> { value: RowVectors(*value), m: RowVectors(*m), v: RowVectors(*v), stamp };
+        let (now, is_direct) = drifted_row(at, &then);
+        if !is_direct {
+            *value = now.0;
+            return;
+        }
+        let moved = at.adam.tables.direct_sums(m, v, stamp, at.now(), 3);
+        let rates = &at.adam.lane_rates;
+        for l in 0..BLOCK_LANES {
+            let rate = if l < SH_N_LANE { rates.narrow[l] } else { rates.sh_n };
+            let directly = flush(value[l] - moved[l] * rate);
+            value[l] = if needs_direct_sum(m[l], v[l], at.adam.eps.floor) { directly } else { now.0[l] };
+        }
     }
 }
 

@@ -10,7 +10,7 @@ use crate::base::math::exp32;
 use crate::base::room;
 use crate::base::simd::{Kernel, dispatch};
 use crate::optim::deferred::{AdamNow, DeferredAdam};
-use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, tables_of};
+use crate::optim::lanes::{LANES, LaneDrifts, drifted_lanes, marked_rows, tables_of};
 use crate::optim::row_kernels::{ROWS_PER_TASK, evaluate_rows};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
@@ -142,26 +142,21 @@ impl Kernel for CullRows<'_, '_> {
 #[inline(always)]
 fn cull_lanes(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
     let drifts = LaneDrifts::gather(&view.stamp[first..], |stamp| at.drift(stamp));
-    let (means, a) = drifted_lanes::<3>(at.adam, Column::Means, tables_of(view, Column::Means), first, &drifts);
-    let (scales, b) = drifted_lanes::<3>(at.adam, Column::Scales, tables_of(view, Column::Scales), first, &drifts);
-    if a | b {
-        return cull_row_by_row(at, frustum, view, first);
-    }
+    let (means, a) = drifted_lanes::<3, false>(at.adam, Column::Means, tables_of(view, Column::Means), first, &drifts);
+    let (scales, b) =
+        drifted_lanes::<3, false>(at.adam, Column::Scales, tables_of(view, Column::Scales), first, &drifts);
     let mut drawn = [false; LANES];
     for l in 0..LANES {
         let sigma_max = exp32(scales[0][l].max(scales[1][l]).max(scales[2][l]));
         drawn[l] = frustum.may_draw([means[0][l], means[1][l], means[2][l]], sigma_max);
     }
+    marked_rows(first, a, b).for_each(|row| drawn[row - first] = cull_row(at, frustum, view, row));
     drawn
 }
 
+/// Culls one row by exact evaluation.
 #[cold]
 #[inline(never)]
-fn cull_row_by_row(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, first: usize) -> [bool; LANES] {
-    std::array::from_fn(|l| cull_row(at, frustum, view, first + l))
-}
-
-/// Culls one row by exact evaluation.
 fn cull_row(at: &AdamNow<'_>, frustum: &Frustum, view: &Rows<'_>, row: usize) -> bool {
     let of = |column: Column| std::array::from_fn::<f32, 3, _>(|c| at.evaluate_element(view, column, row, c));
     let s = of(Column::Scales);
