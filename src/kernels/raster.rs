@@ -38,6 +38,12 @@ impl Lists<'_> {
     pub fn tile(&self, tile: usize) -> &[AtomicU64] {
         &self.isects[self.tile_offsets[tile] as usize..self.tile_offsets[tile + 1] as usize]
     }
+
+    /// The same, empty beyond the last tile.
+    #[inline(always)]
+    pub fn tile_or_none(&self, tile: usize) -> &[AtomicU64] {
+        if tile + 1 < self.tile_offsets.len() { self.tile(tile) } else { &[] }
+    }
 }
 
 /// 2^x for x in [-30, 30], within 2.7e-7 relative; unspecified outside, but never a trap.

@@ -15,12 +15,12 @@ use super::lanes::Lane;
 use super::raster::{Lists, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::rasterize_fwd::Raster;
 use super::splats::{LOG2_ALPHA_MIN, ROWS_PER_CHUNK};
-use super::tile_block::{Block, ROWS, prefetch_splats};
+use super::tile_block::{Block, Local, ROWS, prefetch_list, prefetch_splats};
 use crate::base::room;
-use crate::base::simd::{Kernel, LANES, dispatch, fma};
+use crate::base::simd::{Kernel, LANES, dispatch, fma, prefetch};
 use rayon::prelude::*;
 use std::cell::RefCell;
-use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering::Relaxed};
 
 /// The statistics that [`rasterize_bwd`] collects besides gradients.
 #[derive(Debug)]
@@ -89,6 +89,7 @@ impl Row {
 }
 
 impl Tile {
+    #[inline(always)]
     fn load(&mut self, lists: &Lists<'_>, raster: &Raster, upstream: &Upstream<'_>, errors: &[f32], tile: usize) {
         let grid = lists.grid;
         let (tx, ty) = grid.position(tile);
@@ -122,24 +123,49 @@ impl Tile {
     }
 }
 
-/// The way back through one tile; `WEIGHS` collects weights.
-struct BackTile<'a, const WEIGHS: bool> {
+/// The way back through one tile.
+struct BackTile<'a> {
     lists: &'a Lists<'a>,
     chunk_offsets: &'a [u64],
+    raster: &'a Raster,
+    upstream: &'a Upstream<'a>,
     tile: usize,
     cap: f32,
     state: &'a mut Tile,
     partials: &'a [Partial],
     /// Empty unless weights are collected.
+    errors: &'a [f32],
     weight_partials: &'a [WeightPartial],
+    weighs: bool,
 }
 
-impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
+impl Kernel for BackTile<'_> {
     type Out = ();
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        let BackTile { lists, chunk_offsets, tile, cap, state, partials, weight_partials } = self;
+        if self.weighs { self.go_back::<FMA, true>() } else { self.go_back::<FMA, false>() }
+    }
+}
+
+impl BackTile<'_> {
+    /// Goes back to front; `WEIGHS` collects weights.
+    #[inline(always)]
+    fn go_back<const FMA: bool, const WEIGHS: bool>(self) {
+        let BackTile {
+            lists,
+            chunk_offsets,
+            raster,
+            upstream,
+            tile,
+            cap,
+            state,
+            partials,
+            errors,
+            weight_partials,
+            ..
+        } = self;
+        state.load(lists, raster, upstream, errors, tile);
         let Tile { rows, row_stop, block, sums, weights, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
@@ -152,7 +178,15 @@ impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
                 continue;
             }
             block.fill::<FMA>(list, lists.splats, y0, cap);
-            prefetch_splats(&all[number.saturating_sub(1) * BLOCK..number * BLOCK], lists.splats);
+            // The entries of the block after next are loaded, and with the entries of the next block its splats. After the
+            // last block comes the last of the next tile: the same thread most likely goes on there.
+            let of_next_tile = last_block(lists.tile_or_none(tile + 1));
+            prefetch_list(match number {
+                0 => &[],
+                1 => of_next_tile,
+                _ => last_block(&all[..(number - 1) * BLOCK]),
+            });
+            prefetch_splats(if number > 0 { last_block(&all[..number * BLOCK]) } else { of_next_tile }, lists.splats);
             let mut touched = 0;
             for (reach, &stop) in block.reach.iter_mut().zip(row_stop.iter()) {
                 // Splats at or after the row's last stop have no effect.
@@ -161,6 +195,7 @@ impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
                 touched |= *reach;
             }
             for i in bits(touched) {
+                prefetch(partials, index_of(chunk_offsets, &block.locals[i]));
                 sums[i] = Sums::default();
                 if WEIGHS {
                     weights[i] = [[0.0; LANES]; 2];
@@ -173,9 +208,7 @@ impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
                 halves[i] = sums[i].halves(&x, block.locals[i].mean_x);
             }
             for i in bits(touched) {
-                let local = &block.locals[i];
-                let chunk = local.row as usize / ROWS_PER_CHUNK;
-                let at = (chunk_offsets[chunk] + local.emit) as usize;
+                let at = index_of(chunk_offsets, &block.locals[i]);
                 for (out, half) in partials[at].iter().zip(&halves[i].0) {
                     out.store(sum_of_half(half).to_bits(), Relaxed);
                 }
@@ -188,6 +221,18 @@ impl<const WEIGHS: bool> Kernel for BackTile<'_, WEIGHS> {
             }
         }
     }
+}
+
+/// The last entries of a list, as many as a block holds or fewer, so that whole blocks come before them.
+#[inline(always)]
+fn last_block(list: &[AtomicU64]) -> &[AtomicU64] {
+    &list[list.len().saturating_sub(1) / BLOCK * BLOCK..]
+}
+
+/// The emit index of an intersection.
+#[inline(always)]
+fn index_of(chunk_offsets: &[u64], local: &Local) -> usize {
+    (chunk_offsets[local.row as usize / ROWS_PER_CHUNK] + local.emit) as usize
 }
 
 /// The last steps of the sum over lanes, pairwise.
@@ -318,14 +363,22 @@ pub fn rasterize_bwd(
     let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
     tiles.for_each(|tile| {
         SCRATCH.with_borrow_mut(|state| {
-            state.load(lists, raster, upstream, errors, tile);
-            if weighs {
-                let work = BackTile::<true> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
-                dispatch(lists.simd, work);
-            } else {
-                let work = BackTile::<false> { lists, chunk_offsets, tile, cap, state, partials, weight_partials };
-                dispatch(lists.simd, work);
-            }
+            dispatch(
+                lists.simd,
+                BackTile {
+                    lists,
+                    chunk_offsets,
+                    raster,
+                    upstream,
+                    tile,
+                    cap,
+                    state,
+                    partials,
+                    errors,
+                    weight_partials,
+                    weighs,
+                },
+            );
         });
     });
 }

@@ -78,19 +78,19 @@ impl Row {
     };
 
     /// Stops the lanes whose next transmittance is at or below their floor, at list index `at`.
-    #[cold]
-    #[inline(never)]
+    #[inline(always)]
     fn stop_lanes(&mut self, at: u32, t: &Lane, next: &mut Lane, weight: &mut Lane) {
+        let mut alive = false;
         for lane in 0..LANES {
-            if next[lane] <= self.floor[lane] {
-                self.t_final[lane] = t[lane];
-                self.stop[lane] = at;
-                self.floor[lane] = -1.0;
-                next[lane] = 0.0;
-                weight[lane] = 0.0;
-            }
+            let stops = next[lane] <= self.floor[lane];
+            self.t_final[lane] = if stops { t[lane] } else { self.t_final[lane] };
+            self.stop[lane] = if stops { at } else { self.stop[lane] };
+            self.floor[lane] = if stops { -1.0 } else { self.floor[lane] };
+            next[lane] = if stops { 0.0 } else { next[lane] };
+            weight[lane] = if stops { 0.0 } else { weight[lane] };
+            alive |= self.floor[lane] > 0.0;
         }
-        self.alive = self.floor.iter().any(|&f| f > 0.0);
+        self.alive = alive;
     }
 }
 
@@ -106,6 +106,7 @@ thread_local! {
 }
 
 impl Tile {
+    #[inline(always)]
     fn reset(&mut self, grid: Grid, tile: usize) {
         let (tx, ty) = grid.position(tile);
         let columns = (grid.width - tx * TILE).min(TILE) as usize;
@@ -117,6 +118,7 @@ impl Tile {
         self.rows[rows..].fill(Row::DEAD);
     }
 
+    #[inline(always)]
     fn write(&self, background: [f32; 3], rgb: &mut [f32], t_final: &mut [f32], stop: &mut [u32]) {
         for (row, state) in self.rows.iter().enumerate() {
             let at = row * LANES..(row + 1) * LANES;
@@ -140,6 +142,9 @@ struct BlendTile<'a> {
     tile: usize,
     cap: f32,
     state: &'a mut Tile,
+    rgb: &'a mut [f32],
+    t_final: &'a mut [f32],
+    stop: &'a mut [u32],
 }
 
 impl Kernel for BlendTile<'_> {
@@ -148,15 +153,21 @@ impl Kernel for BlendTile<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(self) -> u64 {
-        let BlendTile { lists, tile, cap, state: Tile { rows, block } } = self;
+        let BlendTile { lists, tile, cap, state, rgb, t_final, stop } = self;
+        state.reset(lists.grid, tile);
+        let Tile { rows, block } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
         let mut rows_done = 0u64;
         let all = lists.tile(tile);
         for (number, list) in all.chunks(BLOCK).enumerate() {
             block.fill::<FMA>(list, lists.splats, y0, cap);
-            let next = all.len().min((number + 1) * BLOCK)..all.len().min((number + 2) * BLOCK);
-            prefetch_splats(&all[next], lists.splats);
+            let coming = match (number + 1) * BLOCK {
+                at if at < all.len() => &all[at..],
+                // The same thread most likely goes on with the next tile.
+                _ => lists.tile_or_none(tile + 1),
+            };
+            prefetch_splats(&coming[..coming.len().min(BLOCK)], lists.splats);
             let mut alive = false;
             for (y, row) in rows.iter_mut().enumerate() {
                 if row.alive {
@@ -168,6 +179,7 @@ impl Kernel for BlendTile<'_> {
                 break;
             }
         }
+        state.write(lists.background, rgb, t_final, stop);
         rows_done
     }
 }
@@ -227,9 +239,7 @@ pub fn rasterize_fwd(lists: &Lists<'_>, out: &mut Raster) {
         .filter(|(tile, _)| lists.range.contains(lists.grid, *tile))
         .for_each(|(tile, (((rgb, t_final), stop), evaluated))| {
             SCRATCH.with_borrow_mut(|state| {
-                state.reset(lists.grid, tile);
-                let rows = dispatch(lists.simd, BlendTile { lists, tile, cap, state });
-                state.write(lists.background, rgb, t_final, stop);
+                let rows = dispatch(lists.simd, BlendTile { lists, tile, cap, state, rgb, t_final, stop });
                 *evaluated = rows * LANES as u64;
             });
         });

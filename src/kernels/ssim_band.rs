@@ -25,8 +25,16 @@ use std::ops::Range;
 const TILE: usize = 16 * LANES - 2 * RADIUS;
 /// Columns (and rows) of input that a gradient needs on each side.
 const HALO: usize = 2 * RADIUS;
-/// Floats in one row of scratch: 16 vectors of map and another one for loads of the window's right half.
-const STRIDE: usize = 17 * LANES;
+/// Vectors in one row of scratch: 16 of the map and another one for loads of the window's right half.
+const VECTORS: usize = 17;
+/// Floats in one row of scratch.
+const STRIDE: usize = VECTORS * LANES;
+/// Rows that are computed together, so that a row above and below them is loaded once for all.
+const GROUP: usize = 4;
+/// Input rows of a group.
+const GROUP_WINDOW: usize = WINDOW - 1 + GROUP;
+/// Rows of a ring: at least those of a group's window.
+const RING: usize = 16;
 
 /// (0.01 L)^2 and (0.03 L)^2 for the value range L = 1.
 const C1: f32 = 1e-4;
@@ -47,7 +55,22 @@ const TAPS: [f32; WINDOW] = [
     1.028_380_1e-3,
 ];
 
-type Row = [f32; STRIDE];
+/// One row of scratch.
+#[derive(Clone, Copy)]
+#[repr(C, align(64))]
+struct Row([Lane; VECTORS]);
+
+impl Row {
+    const ZERO: Row = Row([[0.0; LANES]; VECTORS]);
+
+    /// Sixteen values from column `at` on.
+    #[inline(always)]
+    fn from(&self, at: usize) -> Lane {
+        let mut lane = [0.0; LANES];
+        lane.copy_from_slice(&self.0.as_flattened()[at..at + LANES]);
+        lane
+    }
+}
 
 /// Sums over the used pixels of one band.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -90,9 +113,10 @@ struct InputRow {
 }
 
 struct Scratch {
-    input: [InputRow; WINDOW],
-    derivatives: [[Row; 3]; WINDOW],
-    columns: [Row; 4],
+    input: [InputRow; RING],
+    derivatives: [[Row; 3]; RING],
+    /// Sums down the columns, by row of the group and map.
+    columns: [[Row; 4]; GROUP],
     domain: Row,
     owned: Row,
 }
@@ -118,13 +142,12 @@ impl Kernel for BandKernel<'_> {
 
     #[inline(always)]
     fn run<const FMA: bool>(mut self) -> BandSums {
-        const ZERO: Row = [0.0; STRIDE];
         let mut scratch = Scratch {
-            input: [const { InputRow { maps: [ZERO; 4], weight: ZERO } }; WINDOW],
-            derivatives: [[ZERO; 3]; WINDOW],
-            columns: [ZERO; 4],
-            domain: ZERO,
-            owned: ZERO,
+            input: [const { InputRow { maps: [Row::ZERO; 4], weight: Row::ZERO } }; RING],
+            derivatives: [[Row::ZERO; 3]; RING],
+            columns: [[Row::ZERO; 4]; GROUP],
+            domain: Row::ZERO,
+            owned: Row::ZERO,
         };
         let mut sums = LaneSums::default();
         let width = self.pair.width;
@@ -145,15 +168,17 @@ impl BandKernel<'_> {
     fn walk<const FMA: bool>(&mut self, tile: &Tile, scratch: &mut Scratch, sums: &mut LaneSums) {
         self.mark_columns(tile, scratch);
         let margin = if self.gradient.is_some() { HALO } else { RADIUS };
-        for i in 0..self.rows.len() + 2 * margin {
-            let row = (self.rows.start + i) as isize - margin as isize;
-            self.load_row::<FMA>(tile, row, &mut scratch.input[i % WINDOW]);
-            if i >= 2 * RADIUS {
-                self.map_row::<FMA>(tile, row - RADIUS as isize, i, scratch, sums);
+        for first in (0..self.rows.len() + 2 * margin).step_by(GROUP) {
+            let top = (self.rows.start + first) as isize - margin as isize;
+            for g in 0..GROUP {
+                self.load_row::<FMA>(tile, top + g as isize, &mut scratch.input[(first + g) % RING]);
             }
-            if i >= 4 * RADIUS && self.gradient.is_some() {
-                // Both margins are loaded: the row is one of the band's own.
-                self.gradient_row::<FMA>(tile, i - 4 * RADIUS, i, scratch, sums);
+            // The first rows of a group may lack rows of their windows: nothing reads their results.
+            if first + GROUP > 2 * RADIUS {
+                self.map_rows::<FMA>(tile, top - RADIUS as isize, first, scratch, sums);
+            }
+            if first + GROUP > 4 * RADIUS && self.gradient.is_some() {
+                self.gradient_rows::<FMA>(tile, first, scratch, sums);
             }
         }
     }
@@ -164,8 +189,8 @@ impl BandKernel<'_> {
         for j in 0..STRIDE {
             let column = (tile.own.start + j).wrapping_sub(RADIUS);
             let counts = inside.contains(&column) && j < tile.own.len() + 2 * RADIUS;
-            scratch.domain[j] = f32::from(u8::from(counts));
-            scratch.owned[j] = f32::from(u8::from(counts && tile.own.contains(&column)));
+            scratch.domain.0[j / LANES][j % LANES] = f32::from(u8::from(counts));
+            scratch.owned.0[j / LANES][j % LANES] = f32::from(u8::from(counts && tile.own.contains(&column)));
         }
     }
 
@@ -175,30 +200,30 @@ impl BandKernel<'_> {
         let height = self.pair.height;
         let inside = (0..height as isize).contains(&row);
         if !inside && self.variant != SsimVariant::Reflect {
-            entry.maps = [[0.0; STRIDE]; 4];
-            entry.weight = [0.0; STRIDE];
+            entry.maps = [Row::ZERO; 4];
+            entry.weight = Row::ZERO;
             return;
         }
         let row = reflect(row, height);
-        let [x, y, squares, products] = &mut entry.maps;
+        let InputRow { maps: [x, y, squares, products], weight } = entry;
         let span = tile.at..tile.at + tile.loaded.len();
-        for outside in [0..span.start, span.end..STRIDE] {
-            x[outside.clone()].fill(0.0);
-            y[outside.clone()].fill(0.0);
-            entry.weight[outside].fill(0.0);
-        }
-        self.copy_row(row, tile, &mut x[span.clone()], &mut y[span.clone()], &mut entry.weight[span.clone()]);
-        if self.variant == SsimVariant::Reflect {
-            self.mirror_columns(tile, span, x, y);
-        }
-        for at in (0..STRIDE).step_by(LANES) {
-            let (a, b) = (load(x, at), load(y, at));
-            let mut sum = multiply(b, b);
-            for l in 0..LANES {
-                sum[l] = fma::<FMA>(a[l], a[l], sum[l]);
+        {
+            let [x, y, weight] = [&mut *x, &mut *y, weight].map(|row| row.0.as_flattened_mut());
+            for outside in [0..span.start, span.end..STRIDE] {
+                x[outside.clone()].fill(0.0);
+                y[outside.clone()].fill(0.0);
+                weight[outside].fill(0.0);
             }
-            store(squares, at, sum);
-            store(products, at, multiply(a, b));
+            self.copy_row(row, tile, &mut x[span.clone()], &mut y[span.clone()], &mut weight[span.clone()]);
+            if self.variant == SsimVariant::Reflect {
+                self.mirror_columns(tile, span, x, y);
+            }
+        }
+        // One loop over plain slices: two nested ones are vectorised across the rows of vectors, with gathers.
+        let [x, y, squares, products] = [x, y, squares, products].map(|row| row.0.as_flattened_mut());
+        for (((x, y), square), product) in x.iter().zip(&*y).zip(squares).zip(products) {
+            *square = fma::<FMA>(*x, *x, y * y);
+            *product = x * y;
         }
     }
 
@@ -211,10 +236,11 @@ impl BandKernel<'_> {
         x.copy_from_slice(&self.pair.rgb[plane + span.start..plane + span.end]);
         match self.pair.reference {
             Reference::Bytes(bytes) => {
-                let (interleaved, _) = bytes[3 * span.start..3 * span.end].as_chunks::<3>();
-                let channel = self.channel;
-                for (y, pixel) in y.iter_mut().zip(interleaved) {
-                    *y = f32::from(pixel[channel]) / 255.0;
+                let bytes = &bytes[3 * span.start..3 * span.end];
+                match self.channel {
+                    0 => channel_of::<0>(bytes, y),
+                    1 => channel_of::<1>(bytes, y),
+                    _ => channel_of::<2>(bytes, y),
                 }
             }
             Reference::Planar(values) => y.copy_from_slice(&values[plane + span.start..plane + span.end]),
@@ -234,7 +260,7 @@ impl BandKernel<'_> {
     }
 
     /// Fills the columns outside the picture with their mirror images, as far as a window reaches.
-    fn mirror_columns(&self, tile: &Tile, span: Range<usize>, x: &mut Row, y: &mut Row) {
+    fn mirror_columns(&self, tile: &Tile, span: Range<usize>, x: &mut [f32], y: &mut [f32]) {
         let origin = tile.own.start as isize - HALO as isize;
         for j in (span.start.saturating_sub(RADIUS)..span.start).chain(span.end..(span.end + RADIUS).min(STRIDE)) {
             let column = origin + j as isize;
@@ -246,103 +272,171 @@ impl BandKernel<'_> {
         }
     }
 
-    /// Computes SSIM and its three derivatives along map row `row`, whose last input row is at ring index `i`.
+    /// Computes SSIM and its three derivatives along the map rows from `top` on; the last input row of the first one's
+    /// window is at ring index `first`.
     #[inline(always)]
-    fn map_row<const FMA: bool>(&self, tile: &Tile, row: isize, i: usize, scratch: &mut Scratch, sums: &mut LaneSums) {
+    fn map_rows<const FMA: bool>(
+        &self,
+        tile: &Tile,
+        top: isize,
+        first: usize,
+        scratch: &mut Scratch,
+        sums: &mut LaneSums,
+    ) {
         let Scratch { input, derivatives, columns, domain: in_domain, owned } = scratch;
-        let derivatives = &mut derivatives[(i - 2 * RADIUS) % WINDOW];
+        let vectors = (tile.own.len() + 2 * RADIUS).div_ceil(LANES);
+        let window: [&InputRow; GROUP_WINDOW] = from_fn(|k| &input[(first + RING + 1 - WINDOW + k) % RING]);
+        for m in 0..4 {
+            let rows = window.map(|row| &row.maps[m]);
+            for v in 0..=vectors {
+                let of_rows = down::<FMA>(&rows, v);
+                for g in 0..GROUP {
+                    columns[g][m].0[v] = of_rows[g];
+                }
+            }
+        }
         let rows_with_weight = self.variant.domain(self.pair.height);
-        if row < 0 || !rows_with_weight.contains(&(row as usize)) {
-            *derivatives = [[0.0; STRIDE]; 3];
-            return;
-        }
-        let window: [&InputRow; WINDOW] = from_fn(|k| &input[(i + 1 + k) % WINDOW]);
-        let end = (tile.own.len() + 2 * RADIUS).next_multiple_of(LANES);
-        for at in (0..end + LANES).step_by(LANES) {
-            for m in 0..4 {
-                let mut sum = [0.0; LANES];
-                for k in 0..WINDOW {
-                    sum = add_scaled::<FMA>(TAPS[k], load(&window[k].maps[m], at), sum);
-                }
-                store(&mut columns[m], at, sum);
+        for g in 0..GROUP {
+            let row = top + g as isize;
+            let derivatives = &mut derivatives[(first + g) % RING];
+            if row < 0 || !rows_with_weight.contains(&(row as usize)) {
+                *derivatives = [Row::ZERO; 3];
+                continue;
             }
-        }
-        let sum_row = self.rows.contains(&(row as usize));
-        for at in (0..end).step_by(LANES) {
-            let [mx, my] = [across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at)];
-            let [squares, products] = [across::<FMA>(&columns[2], at), across::<FMA>(&columns[3], at)];
-            let weight = multiply(load(&window[RADIUS].weight, at + RADIUS), load(in_domain, at));
-            let [mut ssim, mut v_mean, mut v_square, mut v_product] = [weight; 4];
-            for l in 0..LANES {
-                let point = ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]);
-                ssim[l] *= point[0];
-                v_mean[l] *= point[1];
-                v_square[l] *= point[2];
-                v_product[l] *= point[3];
-            }
-            if sum_row {
-                let owned = load(owned, at);
+            let sum_row = self.rows.contains(&(row as usize));
+            let (columns, weights) = (&columns[g], &window[g + RADIUS].weight);
+            // At most sixteen values a lane: added up in f32.
+            let mut of_row = [0.0; LANES];
+            for v in 0..vectors {
+                let at = v * LANES;
+                let [mx, my] = [across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at)];
+                let [squares, products] = [across::<FMA>(&columns[2], at), across::<FMA>(&columns[3], at)];
+                let weight = multiply(weights.from(at + RADIUS), in_domain.0[v]);
+                let [mut ssim, mut v_mean, mut v_square, mut v_product] = [weight; 4];
                 for l in 0..LANES {
-                    sums.ssim[l] += f64::from(ssim[l] * owned[l]);
+                    let point = ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]);
+                    ssim[l] *= point[0];
+                    v_mean[l] *= point[1];
+                    v_square[l] *= point[2];
+                    v_product[l] *= point[3];
+                }
+                if sum_row {
+                    let owned = owned.0[v];
+                    for l in 0..LANES {
+                        of_row[l] += ssim[l] * owned[l];
+                    }
+                }
+                if self.gradient.is_some() {
+                    (derivatives[0].0[v], derivatives[1].0[v], derivatives[2].0[v]) = (v_mean, v_square, v_product);
                 }
             }
-            if self.gradient.is_some() {
-                store(&mut derivatives[0], at, v_mean);
-                store(&mut derivatives[1], at, v_square);
-                store(&mut derivatives[2], at, v_product);
-            }
+            add_row(&mut sums.ssim, &of_row);
         }
     }
 
-    /// Computes the gradient of the band's row `own_row`, ten above ring index `i`, and the differences along it.
+    /// Computes the gradient of a group of rows, ten above ring index `first`, and the differences along them.
     #[inline(always)]
-    fn gradient_row<const FMA: bool>(
+    fn gradient_rows<const FMA: bool>(
         &mut self,
         tile: &Tile,
-        own_row: usize,
-        i: usize,
+        first: usize,
         scratch: &mut Scratch,
         sums: &mut LaneSums,
     ) {
         let Some(out) = &mut self.gradient else { return };
         let Scratch { input, derivatives, columns, .. } = scratch;
-        let window: [&[Row; 3]; WINDOW] = from_fn(|k| &derivatives[(i + 2 + k) % WINDOW]);
-        let centre = &input[(i + 1) % WINDOW];
-        let end = tile.own.len().next_multiple_of(LANES);
-        for at in (0..end + LANES).step_by(LANES) {
-            for m in 0..3 {
-                let mut sum = [0.0; LANES];
-                for k in 0..WINDOW {
-                    sum = add_scaled::<FMA>(TAPS[k], load(&window[k][m], at), sum);
+        let vectors = tile.own.len().div_ceil(LANES);
+        let window: [&[Row; 3]; GROUP_WINDOW] = from_fn(|k| &derivatives[(first + RING + 1 - WINDOW + k) % RING]);
+        for m in 0..3 {
+            let rows = window.map(|row| &row[m]);
+            for v in 0..=vectors {
+                let of_rows = down::<FMA>(&rows, v);
+                for g in 0..GROUP {
+                    columns[g][m].0[v] = of_rows[g];
                 }
-                store(&mut columns[m], at, sum);
             }
         }
-        let first = own_row * self.pair.width + tile.own.start;
-        let v_row = &mut out.v_plane[first..first + tile.own.len()];
-        for (v, at) in v_row.chunks_mut(LANES).zip((0..end).step_by(LANES)) {
-            let (v_mean, v_square) = (across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at));
-            let v_product = across::<FMA>(&columns[2], at);
-            let (x, y) = (load(&centre.maps[0], at + HALO), load(&centre.maps[1], at + HALO));
-            let weight = load(&centre.weight, at + HALO);
-            let [mut v_pixel, mut difference] = [[0.0; LANES]; 2];
-            for l in 0..LANES {
-                difference[l] = x[l] - y[l];
-                let above = if difference[l] > 0.0 { out.l1_weight } else { 0.0 };
-                let below = if difference[l] < 0.0 { out.l1_weight } else { 0.0 };
-                let v_ssim = fma::<FMA>(2.0 * x[l], v_square[l], fma::<FMA>(y[l], v_product[l], v_mean[l]));
-                v_pixel[l] = weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, above - below);
+        for g in 0..GROUP {
+            // Both margins are loaded: rows between them are the band's own.
+            let Some(own_row) = (first + g).checked_sub(4 * RADIUS).filter(|row| *row < self.rows.len()) else {
+                continue;
+            };
+            let centre = &input[(first + g + RING - 2 * RADIUS) % RING];
+            let columns = &columns[g];
+            let [mut l1, mut squares] = [[0.0; LANES]; 2];
+            let at = own_row * self.pair.width + tile.own.start;
+            let v_row = &mut out.v_plane[at..at + tile.own.len()];
+            for (v, v_out) in v_row.chunks_mut(LANES).enumerate() {
+                let at = v * LANES;
+                let (v_mean, v_square) = (across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at));
+                let v_product = across::<FMA>(&columns[2], at);
+                let (x, y) = (centre.maps[0].from(at + HALO), centre.maps[1].from(at + HALO));
+                let weight = centre.weight.from(at + HALO);
+                let [mut v_pixel, mut difference] = [[0.0; LANES]; 2];
+                for l in 0..LANES {
+                    difference[l] = x[l] - y[l];
+                    let above = if difference[l] > 0.0 { out.l1_weight } else { 0.0 };
+                    let below = if difference[l] < 0.0 { out.l1_weight } else { 0.0 };
+                    let v_ssim = fma::<FMA>(2.0 * x[l], v_square[l], fma::<FMA>(y[l], v_product[l], v_mean[l]));
+                    v_pixel[l] = weight[l] * fma::<FMA>(out.ssim_weight, v_ssim, above - below);
+                }
+                v_out.copy_from_slice(&v_pixel[..v_out.len()]);
+                // Columns beyond the tile belong to the next tile.
+                difference[v_out.len()..].fill(0.0);
+                for l in 0..LANES {
+                    l1[l] += difference[l].abs();
+                    squares[l] = fma::<FMA>(difference[l], difference[l], squares[l]);
+                }
             }
-            v.copy_from_slice(&v_pixel[..v.len()]);
-            // Columns beyond the tile belong to the next tile.
-            difference[v.len()..].fill(0.0);
-            for l in 0..LANES {
-                let difference = f64::from(difference[l]);
-                sums.l1[l] += difference.abs();
-                sums.squares[l] += difference * difference;
+            add_row(&mut sums.l1, &l1);
+            add_row(&mut sums.squares, &squares);
+        }
+    }
+}
+
+/// Adds the sums of a row.
+#[inline(always)]
+fn add_row(sums: &mut [f64; LANES], of_row: &Lane) {
+    for l in 0..LANES {
+        sums[l] += f64::from(of_row[l]);
+    }
+}
+
+/// One channel of interleaved bytes as values from 0 to 1.
+#[inline(always)]
+fn channel_of<const CHANNEL: usize>(bytes: &[u8], out: &mut [f32]) {
+    let (blocks, rest) = bytes.as_chunks::<{ 3 * LANES }>();
+    let (out_blocks, out_rest) = out.as_chunks_mut::<LANES>();
+    for (out, block) in out_blocks.iter_mut().zip(blocks) {
+        let bytes: [u8; LANES] = from_fn(|l| block[3 * l + CHANNEL]);
+        for l in 0..LANES {
+            out[l] = f32::from(bytes[l]) / 255.0;
+        }
+    }
+    for (out, pixel) in out_rest.iter_mut().zip(rest.as_chunks::<3>().0) {
+        *out = f32::from(pixel[CHANNEL]) / 255.0;
+    }
+}
+
+/// Applies the window down the columns of vector `v`, for each row of a group.
+#[inline(always)]
+fn down<const FMA: bool>(window: &[&Row; GROUP_WINDOW], v: usize) -> [Lane; GROUP] {
+    /// Adds row `K` of the window to the sums that it belongs to.
+    #[inline(always)]
+    fn add<const FMA: bool, const K: usize>(value: &Lane, sums: &mut [Lane; GROUP]) {
+        for (g, sum) in sums.iter_mut().enumerate() {
+            if K >= g && K - g < WINDOW {
+                *sum = add_scaled::<FMA>(TAPS[K - g], *value, *sum);
             }
         }
     }
+    let mut sums = [[0.0; LANES]; GROUP];
+    // Written out, because the compiler does not unroll a loop of this size.
+    macro_rules! add_rows {
+        ($($k:literal)*) => { $(add::<FMA, $k>(&window[$k].0[v], &mut sums);)* };
+    }
+    add_rows!(0 1 2 3 4 5 6 7 8 9 10 11 12 13);
+    sums
 }
 
 /// `[S, dS/dmx, dS/dE[xx], dS/dE[xy]]` from the windowed means of x, y, x^2 + y^2 and x y.
@@ -372,23 +466,14 @@ fn add_scaled<const FMA: bool>(tap: f32, v: Lane, mut sum: Lane) -> Lane {
 /// Applies the window along a row: sixteen results, the first from columns `at..at + 11`.
 #[inline(always)]
 fn across<const FMA: bool>(row: &Row, at: usize) -> Lane {
+    let values = &row.0.as_flattened()[at..at + LANES + WINDOW - 1];
     let mut sum = [0.0; LANES];
     for k in 0..WINDOW {
-        sum = add_scaled::<FMA>(TAPS[k], load(row, at + k), sum);
+        let mut shifted = [0.0; LANES];
+        shifted.copy_from_slice(&values[k..k + LANES]);
+        sum = add_scaled::<FMA>(TAPS[k], shifted, sum);
     }
     sum
-}
-
-#[inline(always)]
-fn load(row: &Row, at: usize) -> Lane {
-    let mut lane = [0.0; LANES];
-    lane.copy_from_slice(&row[at..at + LANES]);
-    lane
-}
-
-#[inline(always)]
-fn store(row: &mut Row, at: usize, lane: Lane) {
-    row[at..at + LANES].copy_from_slice(&lane);
 }
 
 #[inline(always)]

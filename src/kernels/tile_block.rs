@@ -12,6 +12,8 @@ use crate::base::simd::{LANES, fma, prefetch};
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
 pub(super) const ROWS: usize = TILE as usize;
+/// Bytes of a cache line.
+const CACHE_LINE: usize = 64;
 
 /// A splat relative to one tile.
 #[derive(Clone, Copy)]
@@ -41,6 +43,14 @@ pub(super) struct Block<const N: usize> {
     pub locals: [Local; N],
     /// Bit i of `reach[row]`: splat i can reach the row.
     pub reach: [u64; ROWS],
+}
+
+/// Prefetches a list.
+#[inline(always)]
+pub(super) fn prefetch_list(list: &[AtomicU64]) {
+    for at in (0..list.len()).step_by(CACHE_LINE / size_of::<AtomicU64>()) {
+        prefetch(list, at);
+    }
 }
 
 /// Prefetches the splats of a list that will soon be filled into a block.
