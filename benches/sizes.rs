@@ -11,6 +11,7 @@ pub mod support;
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::machine::host_bytes_peak;
 use gsscale::base::machine::process_cpu_seconds;
 use gsscale::config::file::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
@@ -24,7 +25,6 @@ use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::init::InitOptions;
 use gsscale::scene::partition::first_fill;
 use gsscale::train::error::TrainError;
-use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::start::tiers::{self, Tiers};
 use gsscale::train::state::trainer::Trainer;
 use gsscale::train::step::pages::PagedScene;

@@ -32,7 +32,7 @@ const LAYERS: &[(&str, &str)] = &[
 /// For each room of src/train, the rooms that it may name.
 const TRAIN_ROOMS: &[(&str, &str)] = &[
     ("error", ""),
-    ("inputs", ""),
+    ("inputs", "error"),
     ("step", "error"),
     ("log", "step"),
     ("memory", "step"),

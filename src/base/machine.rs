@@ -84,7 +84,37 @@ fn left_in_group(folder: &Path, files: &GroupFiles) -> Option<u64> {
     Some(limit.saturating_sub(used.saturating_sub(cache)))
 }
 
+/// Peak resident size of this process, bytes; `None` if the system does not report it.
+pub fn host_bytes_peak() -> Option<u64> {
+    status_field("VmHWM:")
+}
+
+/// Makes [`host_bytes_peak`] count from now on, for a process that trains several times. Where the system cannot do that, the peak stays
+/// that of the whole process.
+pub fn reset_host_bytes_peak() {
+    // Linux; a failure leaves the larger peak.
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Current resident size of this process, bytes; `None` if the system does not report it.
+pub fn host_bytes_now() -> Option<u64> {
+    status_field("VmRSS:")
+}
+
+/// A size in /proc/self/status, bytes.
+pub fn status_field(name: &str) -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/self/status").ok()?;
+    field(&text, name)
+}
+
+fn field(text: &str, name: &str) -> Option<u64> {
+    let line = text.lines().find(|l| l.starts_with(name))?;
+    let kib: u64 = line[name.len()..].trim().trim_end_matches("kB").trim().parse().ok()?;
+    Some(kib * 1024)
+}
+
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
@@ -129,5 +159,17 @@ mod tests {
         assert_eq!(cpu_seconds_of(stat), Some([2.5, 0.5]));
         assert_eq!(cpu_seconds_of("12 (a) S 1"), None);
         assert_eq!(cpu_seconds_of(""), None);
+    }
+
+    #[test]
+    #[cfg(target_os = "linux")]
+    fn a_reset_peak_forgets_memory_that_was_given_back() {
+        const HELD: usize = 256 << 20;
+        drop(std::hint::black_box(vec![1u8; HELD]));
+        let before = host_bytes_peak().unwrap();
+        assert!(before >= HELD as u64, "{before}");
+        reset_host_bytes_peak();
+        let after = host_bytes_peak().unwrap();
+        assert!(after + HELD as u64 / 2 < before, "{before} bytes, then {after}");
     }
 }

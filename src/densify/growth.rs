@@ -16,7 +16,7 @@
 //! Otherwise it undoes the last doubling: the rows of least weight go ([`super::long_axis`]). The last check begins no trial,
 //! since no check would judge it.
 //!
-//! Not here: how the loss is measured (`train::state::leave_out`), which views are held out (`train::state::turns`).
+//! Not here: how the loss is measured (`train::state::growth_checks`), which views are held out (`train::state::turns`).
 //!
 //! Invariants: 1. a decision is a function of the step, the loss and the earlier decisions, which are part of commits; 2.
 //! the allowed number falls only by a doubling that was on trial, and never below the first number.

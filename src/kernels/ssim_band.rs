@@ -58,10 +58,10 @@ const TAPS: [f32; WINDOW] = [
 /// One row of scratch.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
-struct Row([Lane; VECTORS]);
+struct PixelRow([Lane; VECTORS]);
 
-impl Row {
-    const ZERO: Row = Row([[0.0; LANES]; VECTORS]);
+impl PixelRow {
+    const ZERO: PixelRow = PixelRow([[0.0; LANES]; VECTORS]);
 
     /// Sixteen values from column `at` on.
     #[inline(always)]
@@ -108,17 +108,17 @@ pub(super) struct BandKernel<'a> {
 
 /// One input row with its margins: x, y, x^2 + y^2, x y and the weight of the pixel (0 outside the picture).
 struct InputRow {
-    maps: [Row; 4],
-    weight: Row,
+    maps: [PixelRow; 4],
+    weight: PixelRow,
 }
 
 struct Scratch {
     input: [InputRow; RING],
-    derivatives: [[Row; 3]; RING],
+    derivatives: [[PixelRow; 3]; RING],
     /// Sums down the columns, by row of the group and map.
-    columns: [[Row; 4]; GROUP],
-    domain: Row,
-    owned: Row,
+    columns: [[PixelRow; 4]; GROUP],
+    domain: PixelRow,
+    owned: PixelRow,
 }
 
 struct Tile {
@@ -143,11 +143,11 @@ impl Kernel for BandKernel<'_> {
     #[inline(always)]
     fn run<const FMA: bool>(mut self) -> BandSums {
         let mut scratch = Scratch {
-            input: [const { InputRow { maps: [Row::ZERO; 4], weight: Row::ZERO } }; RING],
-            derivatives: [[Row::ZERO; 3]; RING],
-            columns: [[Row::ZERO; 4]; GROUP],
-            domain: Row::ZERO,
-            owned: Row::ZERO,
+            input: [const { InputRow { maps: [PixelRow::ZERO; 4], weight: PixelRow::ZERO } }; RING],
+            derivatives: [[PixelRow::ZERO; 3]; RING],
+            columns: [[PixelRow::ZERO; 4]; GROUP],
+            domain: PixelRow::ZERO,
+            owned: PixelRow::ZERO,
         };
         let mut sums = LaneSums::default();
         let width = self.pair.width;
@@ -200,8 +200,8 @@ impl BandKernel<'_> {
         let height = self.pair.height;
         let inside = (0..height as isize).contains(&row);
         if !inside && self.variant != SsimVariant::Reflect {
-            entry.maps = [Row::ZERO; 4];
-            entry.weight = Row::ZERO;
+            entry.maps = [PixelRow::ZERO; 4];
+            entry.weight = PixelRow::ZERO;
             return;
         }
         let row = reflect(row, height);
@@ -300,7 +300,7 @@ impl BandKernel<'_> {
             let row = top + g as isize;
             let derivatives = &mut derivatives[(first + g) % RING];
             if row < 0 || !rows_with_weight.contains(&(row as usize)) {
-                *derivatives = [Row::ZERO; 3];
+                *derivatives = [PixelRow::ZERO; 3];
                 continue;
             }
             let sum_row = self.rows.contains(&(row as usize));
@@ -346,7 +346,7 @@ impl BandKernel<'_> {
         let Some(out) = &mut self.gradient else { return };
         let Scratch { input, derivatives, columns, .. } = scratch;
         let vectors = tile.own.len().div_ceil(LANES);
-        let window: [&[Row; 3]; GROUP_WINDOW] = from_fn(|k| &derivatives[(first + RING + 1 - WINDOW + k) % RING]);
+        let window: [&[PixelRow; 3]; GROUP_WINDOW] = from_fn(|k| &derivatives[(first + RING + 1 - WINDOW + k) % RING]);
         for m in 0..3 {
             let rows = window.map(|row| &row[m]);
             for v in 0..=vectors {
@@ -420,7 +420,7 @@ fn channel_of<const CHANNEL: usize>(bytes: &[u8], out: &mut [f32]) {
 
 /// Applies the window down the columns of vector `v`, for each row of a group.
 #[inline(always)]
-fn down<const FMA: bool>(window: &[&Row; GROUP_WINDOW], v: usize) -> [Lane; GROUP] {
+fn down<const FMA: bool>(window: &[&PixelRow; GROUP_WINDOW], v: usize) -> [Lane; GROUP] {
     /// Adds row `K` of the window to the sums that it belongs to.
     #[inline(always)]
     fn add<const FMA: bool, const K: usize>(value: &Lane, sums: &mut [Lane; GROUP]) {
@@ -465,7 +465,7 @@ fn add_scaled<const FMA: bool>(tap: f32, v: Lane, mut sum: Lane) -> Lane {
 
 /// Applies the window along a row: sixteen results, the first from columns `at..at + 11`.
 #[inline(always)]
-fn across<const FMA: bool>(row: &Row, at: usize) -> Lane {
+fn across<const FMA: bool>(row: &PixelRow, at: usize) -> Lane {
     let values = &row.0.as_flattened()[at..at + LANES + WINDOW - 1];
     let mut sum = [0.0; LANES];
     for k in 0..WINDOW {

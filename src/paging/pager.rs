@@ -55,13 +55,15 @@ pub struct PagerConfig {
     pub prefetch_bytes: usize,
     /// Bytes for the plan of the coming steps; what does not fit is planned later.
     pub plan_bytes: usize,
+    /// When planned transfers go on.
+    pub transfers: Transfers,
 }
 
 impl PagerConfig {
     /// Everything in memory, for pages of `page_rows` rows.
     pub fn in_memory(page_rows: usize, sh_degree: u8) -> PagerConfig {
-        let policy = EvictPolicy::default();
-        PagerConfig { page_rows, sh_degree, frames: usize::MAX, policy, prefetch_bytes: 0, plan_bytes: 0 }
+        let (policy, transfers) = (EvictPolicy::default(), Transfers::default());
+        PagerConfig { page_rows, sh_degree, frames: usize::MAX, policy, prefetch_bytes: 0, plan_bytes: 0, transfers }
     }
 
     /// Bytes of one frame: header space and the payload of a full page, as a slot has them.
@@ -76,7 +78,6 @@ pub struct Pager {
     config: PagerConfig,
     tier: Tier,
     look_ahead: LookAhead,
-    transfers: Transfers,
 }
 
 impl Pager {
@@ -97,7 +98,7 @@ impl Pager {
             counters: Counters::default(),
         };
         let look_ahead = LookAhead::new(config.policy, config.plan_bytes);
-        Pager { tier, look_ahead, transfers: Transfers::default(), config }
+        Pager { tier, look_ahead, config }
     }
 
     /// A pager over a store that holds these pages, none of them in memory. `events` is the length of the event log.
@@ -203,11 +204,6 @@ impl Pager {
         }
         self.look_ahead.refresh_near(step, self.tier.index.metas());
         self.look_ahead.apply_changed(&mut self.tier.frames);
-    }
-
-    /// Sets when pages move.
-    pub fn set_transfers(&mut self, transfers: Transfers) {
-        self.transfers = transfers;
     }
 
     /// The most bytes that [`Pager::prefetch`] has in flight, reads and writes together.
@@ -354,9 +350,9 @@ impl Pager {
     /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
     /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
     pub fn prefetch(&mut self, step: u32) {
-        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+        if self.config.transfers != Transfers::Demand && self.tier.mover.has_store() {
             self.tier.poll(false);
-            let transfers = self.transfers;
+            let transfers = self.config.transfers;
             self.prefetching().coming_steps(step, transfers);
         }
     }
@@ -364,14 +360,14 @@ impl Pager {
     /// Begins to read the pages of the next batch of the present step, as far as frames of pages that the step does not need
     /// earlier can be had, and bytes in flight allow it. Never blocks. Calling it again continues.
     pub fn prefetch_batch(&mut self, pages: &[PageNo]) {
-        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+        if self.config.transfers != Transfers::Demand && self.tier.mover.has_store() {
             self.prefetching().listed(pages, Asker::Step);
         }
     }
 
     /// As [`Pager::prefetch_batch`], between steps: of pages that are acquired next.
     pub fn prefetch_pages(&mut self, pages: impl Iterator<Item = PageNo>) {
-        if self.transfers != Transfers::Demand && self.tier.mover.has_store() {
+        if self.config.transfers != Transfers::Demand && self.tier.mover.has_store() {
             let pages: Vec<PageNo> = pages.collect();
             // So that none of them is evicted for another one.
             self.set_use_in_step(0, pages.iter().copied(), UseInStep::Coming);

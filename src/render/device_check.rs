@@ -7,7 +7,7 @@
 //! Not here: the stages one by one, which the tests compare (`tests/numerics/parity`).
 
 use super::cpu::CpuRenderer;
-use super::{Gradients, LossOptions, LossValue, RenderOptions, Renderer};
+use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
 use crate::base::rng::{Purpose, Stream};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
@@ -36,22 +36,43 @@ pub struct View {
     pub grads: Gradients,
 }
 
-/// Compares views on a device with the CPU's, clean and with one in a hundred Gaussians broken. Returns the number of views.
-/// Errors: the first view that differs, with the stage, or the message of the device.
-pub fn check(device: &mut dyn Renderer) -> Result<usize, String> {
+/// What a comparison found.
+pub enum DeviceVerdict {
+    Agrees(Vec<Agreement>),
+    /// The first view that differs, and the stage.
+    Differs(String),
+}
+
+/// The largest differences of a view within the limits.
+pub struct Agreement {
+    pub view: String,
+    /// Of a value of the picture.
+    pub pixel: f32,
+    pub loss: f64,
+    /// Of gradients, relative L2 of a column.
+    pub gradients: f64,
+}
+
+/// Compares views on a device with the CPU's, clean and with one in a hundred Gaussians broken.
+/// Errors: those of the device.
+pub fn check(device: &mut dyn Renderer) -> Result<DeviceVerdict, RenderError> {
     let mut cpu = CpuRenderer::new();
+    let mut agreements = Vec::new();
     for (rows, [width, height], sh_degree) in VIEWS {
         for broken in [false, true] {
             let (columns, camera) = scene(rows, width, height, broken);
             let options = RenderOptions { sh_degree, background: [0.2, 0.4, 0.1], ..RenderOptions::default() };
             let with = if broken { ", one in a hundred broken" } else { "" };
             let what = format!("{rows} Gaussians at {width}x{height}, degree {sh_degree}{with}");
-            let want = view(&mut cpu, &columns, &camera, &options).map_err(|e| format!("{what}: the CPU: {e}"))?;
-            let got = view(device, &columns, &camera, &options).map_err(|e| format!("{what}: {e}"))?;
-            compare(&got, &want).map_err(|why| format!("{what}: {why}"))?;
+            let want = view(&mut cpu, &columns, &camera, &options)?;
+            let got = view(device, &columns, &camera, &options)?;
+            match compare(&got, &want) {
+                Ok((pixel, loss, gradients)) => agreements.push(Agreement { view: what, pixel, loss, gradients }),
+                Err(why) => return Ok(DeviceVerdict::Differs(format!("{what}: {why}"))),
+            }
         }
     }
-    Ok(2 * VIEWS.len())
+    Ok(DeviceVerdict::Agrees(agreements))
 }
 
 /// Gaussians in front of a camera; some are large, opaque, behind it or off the picture, and if `broken` one in a hundred is not finite.
@@ -89,22 +110,24 @@ pub fn view(
     columns: &Columns,
     camera: &Camera,
     options: &RenderOptions,
-) -> Result<View, String> {
+) -> Result<View, RenderError> {
     let (width, height) = (camera.width, camera.height);
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
     let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
     let target = Target { width, height, rgb, mask };
     let mut grads = Gradients::default();
-    let drawn = renderer.draw(columns, camera, options).and_then(|()| renderer.loss(&target, &LossOptions::default()));
-    drawn.and_then(|()| renderer.backpropagate(columns, &mut grads)).map_err(|e| e.to_string())?;
-    let loss = renderer.loss_value().map_err(|e| e.to_string())?;
-    let image = renderer.image().map_err(|e| e.to_string())?.clone();
+    renderer.draw(columns, camera, options)?;
+    renderer.loss(&target, &LossOptions::default())?;
+    renderer.backpropagate(columns, &mut grads)?;
+    let loss = renderer.loss_value()?;
+    let image = renderer.image()?.clone();
     Ok(View { image, loss, grads })
 }
 
-/// The first output that is wrong names the stage.
-fn compare(got: &View, want: &View) -> Result<(), String> {
+/// The largest differences: of a value of the picture, of the loss, of gradients.
+/// Errors: the first output that is wrong, which names the stage.
+fn compare(got: &View, want: &View) -> Result<(f32, f64, f64), String> {
     let radii = got.grads.radii.iter().zip(&want.grads.radii).filter(|(g, w)| g != w).count();
     if radii * RADIUS_ONE_OF > want.grads.radii.len() {
         return Err(format!("{radii} footprints have another size: stage project_fwd, or the sort"));
@@ -127,14 +150,16 @@ fn compare(got: &View, want: &View) -> Result<(), String> {
     if exceeds(means2d, GRADIENT) {
         return Err(format!("gradients of footprints are others ({means2d:.1e} relative): stage rasterize_bwd"));
     }
+    let mut gradients = means2d;
     for column in Column::ALL {
         let error = l2(got.grads.columns.column(column), want.grads.columns.column(column));
         if exceeds(error, GRADIENT) {
             let stage = if matches!(column, Column::Sh0 | Column::ShN) { "sh_bwd" } else { "project_bwd" };
             return Err(format!("gradients of {column:?} are others ({error:.1e} relative): stage {stage}"));
         }
+        gradients = gradients.max(error);
     }
-    Ok(())
+    Ok((worst, loss, gradients))
 }
 
 /// Whether a difference is above a limit; NaN is above any.

@@ -13,6 +13,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::memory_available;
+use crate::base::machine::{host_bytes_now, status_field};
 use crate::base::units::{format_bytes, format_bytes_up, format_grouped};
 use crate::dataset::loader::{Dataset, View};
 use crate::dataset::target_cache::TargetCache;
@@ -133,34 +134,6 @@ pub(crate) fn bytes_of_copies(pages: usize, frame_bytes: usize) -> u64 {
 pub(crate) fn frames_in_memory(rows: u64, sh_degree: u8, has_grown: bool) -> u64 {
     let spare = if has_grown { GROWN_SPARE } else { 1.0 };
     (rows as f64 * row_bytes(sh_degree) as f64 * spare) as u64
-}
-
-/// Peak resident size of this process, bytes; `None` if the system does not report it.
-pub fn host_bytes_peak() -> Option<u64> {
-    status_field("VmHWM:")
-}
-
-/// Makes [`host_bytes_peak`] count from now on, for a process that trains several times. Where the system cannot do that, the peak stays
-/// that of the whole process.
-pub fn reset_host_bytes_peak() {
-    // Linux; a failure leaves the larger peak.
-    let _ = std::fs::write("/proc/self/clear_refs", "5");
-}
-
-/// Current resident size of this process, bytes; `None` if the system does not report it.
-pub fn host_bytes_now() -> Option<u64> {
-    status_field("VmRSS:")
-}
-
-fn status_field(name: &str) -> Option<u64> {
-    let text = std::fs::read_to_string("/proc/self/status").ok()?;
-    field(&text, name)
-}
-
-fn field(text: &str, name: &str) -> Option<u64> {
-    let line = text.lines().find(|l| l.starts_with(name))?;
-    let kib: u64 = line[name.len()..].trim().trim_end_matches("kB").trim().parse().ok()?;
-    Some(kib * 1024)
 }
 
 /// Memory of a small plan, bytes: enough for the steps of the prefetch.
@@ -403,22 +376,4 @@ pub(crate) fn frames_and_batch(left: u64, frame: u64, working: u64, copies: bool
 fn growth_due(scene: &PagedScene) -> f64 {
     let (rows, bound) = (scene.rows().max(1) as f64, scene.rows_bound() as f64);
     1.0 + UNEVEN * (bound / rows - 1.0).max(0.0)
-}
-
-#[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
-    use super::*;
-
-    #[test]
-    #[cfg(target_os = "linux")]
-    fn a_reset_peak_forgets_memory_that_was_given_back() {
-        const HELD: usize = 256 << 20;
-        drop(std::hint::black_box(vec![1u8; HELD]));
-        let before = host_bytes_peak().unwrap();
-        assert!(before >= HELD as u64, "{before}");
-        reset_host_bytes_peak();
-        let after = host_bytes_peak().unwrap();
-        assert!(after + HELD as u64 / 2 < before, "{before} bytes, then {after}");
-    }
 }

@@ -43,6 +43,10 @@ fn a_lost_device_loses_the_steps_since_the_last_commit_alone() {
     let (is_done, said) = run_with_loss("memory", "lost@40", "");
     let restarts = said.matches("the run goes on in this process").count();
     assert!(!is_done && restarts == 3 && said.lines().any(is_loss), "{said}");
+    // A loss during the comparison with the CPU says nothing about the device's results.
+    let mut run = work.command(TRAIN, &format!("{GROWING} --out checked"));
+    let output = run.env("GSSCALE_GPU_FAULT", "lost@40").env("GSSCALE_CHECK_DEVICE", "1").output().unwrap();
+    assert!(!output.status.success() && stderr(&output).lines().any(is_loss), "{}", stderr(&output));
 }
 
 /// Steps without events, after every page has been loaded: only the photo, tables and counts cross the bus.

@@ -14,6 +14,7 @@ use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::error::PagingError;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::prefetch::Transfers;
 use gsscale::render::RenderOptions;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
@@ -72,6 +73,7 @@ fn scene(faults: Option<&Faults>) -> PagedScene {
         policy: EvictPolicy::FarthestNextUse,
         prefetch_bytes: 1 << 20,
         plan_bytes: 1 << 20,
+        transfers: Transfers::Overlap,
     };
     PagedScene::new(&columns(), Pager::new(config, store), &options).unwrap()
 }

@@ -21,7 +21,7 @@ use gsscale::densify::strategy::StrategyName;
 use gsscale::gpu::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions};
 use gsscale::optim::method::OptimizerPlace;
 use gsscale::render::cpu::CpuRenderer;
-use gsscale::render::device_check::{self, View, scene, view};
+use gsscale::render::device_check::{self, DeviceVerdict, View, scene, view};
 use gsscale::render::gpu::GpuRenderer;
 use gsscale::render::{RenderOptions, Renderer};
 use gsscale::report::html::{Cell, Page};
@@ -183,8 +183,15 @@ impl Doctor<'_> {
 
     /// Views of generated Gaussians, clean and with one in a hundred broken, in every SH degree, from one to several workgroups.
     fn parity(&self) -> Result<(String, Value), String> {
-        let views = device_check::check(&mut self.renderer(false)?)?;
-        Ok((format!("{views} views agree with the CPU"), Value::Null))
+        match device_check::check(&mut self.renderer(false)?).map_err(|e| e.to_string())? {
+            DeviceVerdict::Differs(difference) => Err(difference),
+            DeviceVerdict::Agrees(views) => {
+                let figures = views.iter().map(
+                    |of| json!({ "view": of.view, "pixel": of.pixel, "loss": of.loss, "gradients": of.gradients }),
+                );
+                Ok((format!("{} views agree with the CPU", views.len()), figures.collect()))
+            }
+        }
     }
 
     fn same_bytes(&self) -> Result<(String, Value), String> {
@@ -193,7 +200,7 @@ impl Doctor<'_> {
         for _ in 0..2 {
             let mut gpu = self.renderer(false)?;
             for _ in 0..2 {
-                let view = view(&mut gpu, &columns, &camera, &RenderOptions::default())?;
+                let view = view(&mut gpu, &columns, &camera, &RenderOptions::default()).map_err(|e| e.to_string())?;
                 hashes.push(xxhash_rust::xxh3::xxh3_64(bytemuck::cast_slice(&bits(&view))));
             }
         }
@@ -355,7 +362,7 @@ impl CityScene {
     fn stage_seconds(&self, renderer: &mut GpuRenderer) -> Result<Value, String> {
         let camera = &self.prepared.dataset.views[0].camera;
         for _ in 0..TIMED {
-            view(renderer, &self.columns, camera, &RenderOptions::default())?;
+            view(renderer, &self.columns, camera, &RenderOptions::default()).map_err(|e| e.to_string())?;
         }
         let times = renderer.gpu().stage_times().map_err(|e| e.to_string())?;
         Ok(times.iter().map(|t| (t.stage.to_string(), Value::from(t.seconds / TIMED as f64))).collect())

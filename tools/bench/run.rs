@@ -3,6 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::machine::host_bytes_peak;
 use gsscale::base::machine::{cpu_model, process_cpu_seconds};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
@@ -11,7 +12,6 @@ use gsscale::dataset::target_cache::TargetCache;
 use gsscale::gpu::DeviceChoice;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::train::error::TrainError;
-use gsscale::train::memory::host_bytes_peak;
 use gsscale::train::start::first_scene::prepare;
 use gsscale::train::state::trainer::Trainer;
 use serde_json::{Value, json};

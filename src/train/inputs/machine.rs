@@ -2,18 +2,22 @@
 //! the drives of its paths.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::machine::host_bytes_now;
 use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
 use crate::config::values::Device;
 use crate::gpu::DeviceChoice;
 #[cfg(feature = "gpu")]
-use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions, GpuResult};
+use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions};
+#[cfg(feature = "gpu")]
+use crate::render::RenderError;
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
 #[cfg(feature = "gpu")]
-use crate::render::device_check;
+use crate::render::device_check::{self, DeviceVerdict};
 #[cfg(feature = "gpu")]
 use crate::render::gpu::GpuRenderer;
+use crate::train::error::TrainError;
 use std::path::{Path, PathBuf};
 
 /// Most worker threads per core, and how many are started on any machine if asked for.
@@ -44,80 +48,113 @@ pub fn set_up(config: &TrainConfig) -> InputResult<()> {
     Err(InputError::new("--simd", problem, "use --simd auto"))
 }
 
-/// The renderer of `--device`, and a message about the choice. `auto` uses a working hardware GPU, else the CPU; it
-/// never uses a software adapter, since the CPU renderer is faster.
-/// Errors: the named device does not exist or cannot be used.
-pub fn renderer(config: &TrainConfig) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
+/// The renderer of a run.
+pub struct OpenedDevice {
+    pub renderer: Box<dyn Renderer>,
+    /// A message about the choice.
+    pub word: Option<String>,
+    /// Host memory that the driver took, bytes.
+    pub driver: u64,
+}
+
+impl OpenedDevice {
+    fn cpu(word: Option<&str>) -> OpenedDevice {
+        // Without a search for a device, a difference of memory is the noise of the allocator.
+        OpenedDevice { renderer: Box::new(CpuRenderer::new()), word: word.map(str::to_string), driver: 0 }
+    }
+}
+
+/// The renderer of `--device`. `auto` uses a working hardware GPU, else the CPU; it never uses a software adapter, since the
+/// CPU renderer is faster.
+/// Errors: the named device does not exist, cannot be used, or differs from the CPU; a device was lost.
+pub fn renderer(config: &TrainConfig) -> Result<OpenedDevice, TrainError> {
     match &config.device {
-        Device::Cpu => Ok((Box::new(CpuRenderer::new()), None)),
+        Device::Cpu => Ok(OpenedDevice::cpu(None)),
         Device::Gpu(choice) => of_gpu(config, choice),
     }
 }
 
 /// Without GPU support `auto` means the CPU.
 #[cfg(not(feature = "gpu"))]
-fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
+fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     if *choice == DeviceChoice::Auto {
-        return Ok((Box::new(CpuRenderer::new()), None));
+        return Ok(OpenedDevice::cpu(None));
     }
     let problem = "this program was built without GPU support";
-    Err(InputError::new("--device", problem, "use --device cpu, or build with the feature gpu (it is on by default)"))
+    let remedy = "use --device cpu, or build with the feature gpu (it is on by default)";
+    Err(InputError::new("--device", problem, remedy).into())
 }
 
 #[cfg(feature = "gpu")]
-fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
+fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
+    let is_auto = *choice == DeviceChoice::Auto;
+    match compared_with_cpu(choice) {
+        Ok(Compared::Differs(difference)) => return refused(choice, &difference),
+        Ok(Compared::Agrees | Compared::Software) => {}
+        Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
+        // What keeps the run from its device as well is said below.
+        Err(error) => crate::tell!("warning: the GPU is used without a comparison with the CPU: {error}"),
+    }
+    let before = host_bytes_now().unwrap_or(0);
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
-    let opened = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(gpu_renderer);
-    match opened {
-        Ok(renderer) => accept_or_refuse(choice, renderer, difference_from_cpu(choice)),
-        Err(GpuError::NoHardwareGpu { .. }) => {
-            let word = "there is no hardware GPU: the CPU renders (--list-devices shows what was found)";
-            Ok((Box::new(CpuRenderer::new()), Some(word.to_string())))
-        }
-        Err(error) if *choice == DeviceChoice::Auto => {
-            let word = format!("the GPU cannot be used, so the CPU renders: {error}");
-            Ok((Box::new(CpuRenderer::new()), Some(word)))
+    let renderer = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(GpuRenderer::new);
+    match renderer {
+        Ok(renderer) => Ok(OpenedDevice {
+            renderer: Box::new(renderer),
+            word: None,
+            driver: host_bytes_now().unwrap_or(0).saturating_sub(before),
+        }),
+        Err(GpuError::NoHardwareGpu { .. }) => Ok(OpenedDevice::cpu(Some(
+            "there is no hardware GPU: the CPU renders (--list-devices shows what was found)",
+        ))),
+        Err(error) if is_auto => {
+            Ok(OpenedDevice::cpu(Some(&format!("the GPU cannot be used, so the CPU renders: {error}"))))
         }
         Err(GpuError::NoSuchDevice { wanted, found }) => {
             let problem = format!("no usable GPU matches '{wanted}'; found: {found}");
-            Err(InputError::new("--device", problem, "choose one of --list-devices, or use --device cpu"))
+            Err(InputError::new("--device", problem, "choose one of --list-devices, or use --device cpu").into())
         }
-        Err(error) => Err(InputError::new("--device", error.to_string(), "use --device cpu")),
+        Err(error) => Err(InputError::new("--device", error.to_string(), "use --device cpu").into()),
     }
 }
 
-/// The first difference between the device and the CPU, found in about a second. The device is opened for this comparison alone, so that
-/// nothing of it stays on the run's device. A software driver is compared only if `GSSCALE_CHECK_DEVICE` is set: the tests compare every
-/// stage on software drivers.
+/// In place of a device that differs from the CPU: the CPU for `auto`, with a warning.
+/// Errors: the user asked for the device.
 #[cfg(feature = "gpu")]
-fn difference_from_cpu(choice: &DeviceChoice) -> Option<String> {
-    let gpu = Gpu::open_with(choice, &GpuOptions::default()).ok()?;
-    if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
-        return None;
-    }
-    device_check::check(&mut GpuRenderer::new(gpu).ok()?).err()
-}
-
-/// The renderer of the device, if no `difference` from the CPU was found. Otherwise the CPU renders for `auto`, with a message.
-/// Errors: a difference was found on a device that the user named.
-#[cfg(feature = "gpu")]
-fn accept_or_refuse(
-    choice: &DeviceChoice,
-    renderer: Box<dyn Renderer>,
-    difference: Option<String>,
-) -> InputResult<(Box<dyn Renderer>, Option<String>)> {
-    let Some(difference) = difference else { return Ok((renderer, None)) };
+fn refused(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, TrainError> {
     let problem = format!("the GPU did not pass the comparison with the CPU: {difference}");
     if *choice == DeviceChoice::Auto {
-        return Ok((Box::new(CpuRenderer::new()), Some(format!("the CPU renders: {problem}"))));
+        crate::tell!("warning: the CPU renders: {problem}");
+        return Ok(OpenedDevice::cpu(None));
     }
     let remedy = "use --device cpu; an update of the driver may help, and gsscale-bench doctor tells more";
-    Err(InputError::new("--device", problem, remedy))
+    Err(InputError::new("--device", problem, remedy).into())
 }
 
+/// Result of a comparison.
 #[cfg(feature = "gpu")]
-fn gpu_renderer(gpu: Gpu) -> GpuResult<Box<dyn Renderer>> {
-    Ok(Box::new(GpuRenderer::new(gpu)?))
+enum Compared {
+    Agrees,
+    /// The first difference.
+    Differs(String),
+    /// A software driver is compared only if `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software
+    /// drivers. A device that cannot be opened counts as one: opening it for the run says why.
+    Software,
+}
+
+/// Compares the device with the CPU, in about a second. The device is opened for this alone and closed before the run opens
+/// it, so that nothing of the comparison stays on it.
+/// Errors: those of the device, which say nothing about its results.
+#[cfg(feature = "gpu")]
+fn compared_with_cpu(choice: &DeviceChoice) -> Result<Compared, RenderError> {
+    let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(Compared::Software) };
+    if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
+        return Ok(Compared::Software);
+    }
+    Ok(match device_check::check(&mut GpuRenderer::new(gpu)?)? {
+        DeviceVerdict::Agrees(_) => Compared::Agrees,
+        DeviceVerdict::Differs(difference) => Compared::Differs(difference),
+    })
 }
 
 /// The nearest existing folder above the spill directory, for unnamed temporary files on its drive. The spill directory
@@ -144,13 +181,10 @@ mod tests {
 
     #[test]
     fn a_gpu_that_differs_from_the_cpu_is_refused_or_with_auto_replaced() {
-        let differs = || Some("stage sh_fwd".to_string());
-        let of = |choice, wrong| accept_or_refuse(&choice, Box::new(CpuRenderer::new()), wrong);
-        assert_eq!(of(DeviceChoice::Gpu, None).unwrap().1, None);
-        let (renderer, message) = of(DeviceChoice::Auto, differs()).unwrap();
-        assert!(renderer.name() == CpuRenderer::new().name() && message.unwrap().contains("stage sh_fwd"));
+        let of = |choice| refused(&choice, "stage sh_fwd");
+        assert_eq!(of(DeviceChoice::Auto).unwrap().renderer.name(), CpuRenderer::new().name());
         for asked in [DeviceChoice::Gpu, DeviceChoice::Named("card".into())] {
-            let refusal = of(asked, differs()).err().unwrap().to_string();
+            let refusal = of(asked).err().unwrap().to_string();
             assert!(refusal.contains("stage sh_fwd") && refusal.contains("--device cpu"), "{refusal}");
         }
     }

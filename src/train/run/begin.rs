@@ -13,7 +13,7 @@ use crate::base::identity::RunId;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::config::new_run;
-use crate::config::values::{Device, Up};
+use crate::config::values::Up;
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
@@ -21,9 +21,9 @@ use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
 use crate::train::error::TrainError;
-use crate::train::inputs::machine;
+use crate::train::inputs::machine::{self, OpenedDevice};
 use crate::train::inputs::signals::StopFlag;
-use crate::train::memory::{host_budget, host_bytes_now};
+use crate::train::memory::host_budget;
 use crate::train::preflight::forecast::{Forecast, check_drive_of_results, check_first_drive, first_pages, plan_run};
 use crate::train::preflight::plan::rows_at_most;
 use crate::train::preflight::plan_text;
@@ -94,8 +94,7 @@ pub(super) fn first_trainer(
     check_first_drive(config, start.rows)?;
     let (renderer, options, driver) = begin(request.quiet, config, &start)?;
     let [pages, _] = first_pages(config, rows_at_most(config, start.rows));
-    let (mut pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
-    pager.set_transfers(config.transfers);
+    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
@@ -125,8 +124,7 @@ pub(crate) fn begin(
     if config.up == Up::Auto {
         options.up = start.up()?;
     }
-    let before = host_bytes_now().unwrap_or(0);
-    let (mut renderer, word) = machine::renderer(config)?;
+    let OpenedDevice { mut renderer, word, driver } = machine::renderer(config)?;
     // On from here, so that probing allocates what the steps need.
     renderer.weigh_rows(options.strategy.needs_weights())?;
     if options.optimizer_on == OptimizerPlace::Device && renderer.pages().is_none() {
@@ -139,11 +137,6 @@ pub(crate) fn begin(
         let remedy = "use --growth-score gradient, or --optimizer-on host";
         return Err(InputError::new("--optimizer-on device", problem, remedy).into());
     }
-    // Without a search for a device, a difference is the noise of the allocator.
-    let driver = match config.device {
-        Device::Cpu => 0,
-        Device::Gpu(_) => host_bytes_now().unwrap_or(0).saturating_sub(before),
-    };
     if let Some(word) = word.filter(|_| !quiet) {
         crate::tell!("{word}");
     }

@@ -19,7 +19,7 @@ use crate::render::{RenderOptions, Renderer};
 use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{PositionSample, file_warnings};
-use crate::train::inputs::machine;
+use crate::train::inputs::machine::{self, OpenedDevice};
 use crate::train::log::progress::Count;
 use crate::train::log::report::TestMetrics;
 use crate::train::memory::{check_evaluation_fits, check_photos_fit, host_budget};
@@ -156,7 +156,7 @@ impl<'a> Evaluator<'a> {
         check_photos_fit(&dataset, host_budget(config.host_mem.0))?;
         dataset.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
         let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-        let (renderer, word) = machine::renderer(config)?;
+        let OpenedDevice { renderer, word, .. } = machine::renderer(config)?;
         if let Some(word) = word {
             crate::tell!("{word}");
         }

@@ -271,8 +271,7 @@ fn resume_from(
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
-    let (mut pager, tiers) = Tiers::resume(stored, &config, host_mem.unwrap_or(u64::MAX))?;
-    pager.set_transfers(config.transfers);
+    let (pager, tiers) = Tiers::resume(stored, &config, host_mem.unwrap_or(u64::MAX))?;
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {

@@ -9,6 +9,7 @@
 
 use super::live::LivePage;
 use crate::base::error::{InputError, InputResult};
+use crate::base::machine::host_bytes_peak;
 use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
@@ -21,7 +22,7 @@ use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
-use crate::train::memory::{HostBudget, PLAN_BYTES, host_bytes_peak};
+use crate::train::memory::{HostBudget, PLAN_BYTES};
 use crate::train::preflight::forecast::Forecast;
 use crate::train::state::trainer::Trainer;
 use crate::train::step::device_tier::DeviceTier;

@@ -78,7 +78,8 @@ fn codec(config: &TrainConfig) -> Codec {
 
 /// Pager sizes of a run that keeps all pages in memory.
 fn in_memory(config: &TrainConfig) -> PagerConfig {
-    PagerConfig { policy: config.evict, ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree) }
+    let (policy, transfers) = (config.evict, config.transfers);
+    PagerConfig { policy, transfers, ..PagerConfig::in_memory(config.page_rows as usize, config.sh_degree) }
 }
 
 /// Pager sizes of a run within `host_mem` bytes.

@@ -8,6 +8,7 @@
 use super::{StorePlace, find_store, options_of, run_state_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageNo;
+use crate::base::machine::host_bytes_peak;
 use crate::base::math::exp32;
 use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
@@ -22,6 +23,7 @@ use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::paging::prefetch::Transfers;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::partition::GiantCut;
 use crate::scene::rotation::Rotation;
@@ -29,7 +31,6 @@ use crate::scene::select::RankSearch;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::truncate_sh;
-use crate::train::memory::host_bytes_peak;
 use crate::train::step::catch_up::evaluate_all;
 use crate::train::step::pages::PagedScene;
 use serde::Serialize;
@@ -172,6 +173,7 @@ pub(super) fn scene_at(
         policy: EvictPolicy::default(),
         prefetch_bytes: frame as usize,
         plan_bytes: 0,
+        transfers: Transfers::Overlap,
     };
     let events = state.event_log().map_err(CommitError::Contradiction)?;
     let histogram = GradHistogram::from_filled(&state.histogram);

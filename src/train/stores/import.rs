@@ -9,6 +9,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
+use crate::base::machine::host_bytes_peak;
 use crate::base::units::{MIB, format_bytes};
 use crate::base::whole_file::folder_of;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
@@ -30,7 +31,6 @@ use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter, PositionSample, file_warnings};
-use crate::train::memory::host_bytes_peak;
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::path::{Path, PathBuf};

@@ -22,6 +22,7 @@ use gsscale::page::versions::paged_store::PagedStore;
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
+use gsscale::paging::prefetch::Transfers;
 use gsscale::paging::stats::PagerStats;
 use gsscale::photos::exposure::state::AppearanceState;
 use gsscale::photos::outlier::blocks::BlockState;
@@ -180,6 +181,7 @@ const PAGES: PagerConfig = PagerConfig {
     policy: EvictPolicy::FarthestNextUse,
     prefetch_bytes: 0,
     plan_bytes: 0,
+    transfers: Transfers::Overlap,
 };
 
 /// The pages of a map over an engine without segments.

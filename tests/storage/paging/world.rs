@@ -13,6 +13,7 @@ use gsscale::paging::error::PagingError;
 use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
+use gsscale::paging::prefetch::Transfers;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes};
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
@@ -30,6 +31,7 @@ pub fn config(frames: usize) -> PagerConfig {
         policy: EvictPolicy::FarthestNextUse,
         prefetch_bytes: 8 * 8192,
         plan_bytes: 1 << 20,
+        transfers: Transfers::Overlap,
     }
 }
 
