@@ -89,8 +89,8 @@ fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainE
 fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
     match compared_with_cpu(choice) {
-        Ok(Compared::Differs(difference)) => return refused(choice, &difference),
-        Ok(Compared::Agrees | Compared::Software) => {}
+        Ok(CheckOfDevice::Differs(difference)) => return refused(choice, &difference),
+        Ok(CheckOfDevice::Agrees | CheckOfDevice::Software) => {}
         Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
         // What keeps the run from its device as well is said below.
         Err(error) => crate::tell!("warning: the GPU is used without a comparison with the CPU: {error}"),
@@ -133,7 +133,7 @@ fn refused(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, Trai
 
 /// Result of a comparison.
 #[cfg(feature = "gpu")]
-enum Compared {
+enum CheckOfDevice {
     Agrees,
     /// The first difference.
     Differs(String),
@@ -146,14 +146,14 @@ enum Compared {
 /// it, so that nothing of the comparison stays on it.
 /// Errors: those of the device, which say nothing about its results.
 #[cfg(feature = "gpu")]
-fn compared_with_cpu(choice: &DeviceChoice) -> Result<Compared, RenderError> {
-    let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(Compared::Software) };
+fn compared_with_cpu(choice: &DeviceChoice) -> Result<CheckOfDevice, RenderError> {
+    let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(CheckOfDevice::Software) };
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
-        return Ok(Compared::Software);
+        return Ok(CheckOfDevice::Software);
     }
     Ok(match device_check::check(&mut GpuRenderer::new(gpu)?)? {
-        DeviceVerdict::Agrees(_) => Compared::Agrees,
-        DeviceVerdict::Differs(difference) => Compared::Differs(difference),
+        DeviceVerdict::Agrees(_) => CheckOfDevice::Agrees,
+        DeviceVerdict::Differs(difference) => CheckOfDevice::Differs(difference),
     })
 }
 
