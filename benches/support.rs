@@ -198,6 +198,5 @@ pub fn terrain(n: usize, width: u32, height: u32) -> (Columns, Camera) {
     let h = std::f32::consts::FRAC_1_SQRT_2;
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, -h, -h, 0.0], [0.0, h, -h, 3.0]];
     let f = width as f32 * 0.9;
-    let (cx, cy) = (0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx: f, fy: f, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
+    (c, Camera::pinhole(viewmat, [f, f, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }

@@ -14,9 +14,10 @@
 #import "shared/workgroup_scan.wgsl"
 
 struct GatherUniforms {
-    /// The half-spaces of the camera (src/scene/frustum.rs): rows of the pose, slopes, reaches, depths.
+    /// The half-spaces of the camera (src/scene/frustum.rs): rows of the pose, slopes, offsets, reaches, depths.
     world_to_camera: array<vec4<f32>, 3>,
     slopes: vec4<f32>,
+    offsets: vec4<f32>,
     reach: vec2<f32>,
     depth_range: vec2<f32>,
     /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
@@ -145,10 +146,10 @@ fn may_draw(p: vec3<f32>, sigma_max: f32) -> bool {
     let reach = u.reach * sigma_max + vec2<f32>(side);
     let outside = z <= u.depth_range.x - slack
         || z >= u.depth_range.y + slack
-        || -x > u.slopes.x * z + reach.x
-        || x > u.slopes.y * z + reach.x
-        || -y > u.slopes.z * z + reach.y
-        || y > u.slopes.w * z + reach.y;
+        || -x - u.offsets.x > u.slopes.x * z + reach.x
+        || x - u.offsets.y > u.slopes.y * z + reach.x
+        || -y - u.offsets.z > u.slopes.z * z + reach.y
+        || y - u.offsets.w > u.slopes.w * z + reach.y;
     return !outside || !is_finite(x + y + z) || !is_finite(sigma_max);
 }
 

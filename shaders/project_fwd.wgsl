@@ -6,7 +6,7 @@
 #import "shared/covariance.wgsl"
 #import "shared/splat.wgsl"
 
-@group(0) @binding(0) var<uniform> view: RowsUniforms;
+@group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> means: array<f32>;
 @group(0) @binding(2) var<storage, read> quats: array<vec4<f32>>;
 /// Log of the standard deviations.

@@ -12,7 +12,7 @@
 #import "shared/splat.wgsl"
 #import "shared/sh.wgsl"
 
-@group(0) @binding(0) var<uniform> view: RowsUniforms;
+@group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> splats: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read_write> v_splats: array<vec4<f32>>;
 /// Input of densification for each row: v_mean2d.x, v_mean2d.y, radius.x, radius.y; zeros for a culled row. With WEIGHS a row
@@ -86,7 +86,7 @@ fn sh_bwd(workgroup: Group, place: Place) {
     var basis_most = SH_C0;
 #ifdef SH_DEGREE_1
     let mean = vec3<f32>(means[3u * i], means[3u * i + 1u], means[3u * i + 2u]);
-    let dir = unit_direction(mean - view.centre);
+    let dir = viewing_direction(view, mean);
     var basis1 = sh_band1(dir.unit);
     var v_basis1: array<f32, 3>;
     for (var k = 0u; k < 3u; k++) {

@@ -7,7 +7,7 @@
 #import "shared/splat.wgsl"
 #import "shared/sh.wgsl"
 
-@group(0) @binding(0) var<uniform> view: RowsUniforms;
+@group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read_write> splats: array<vec4<f32>>;
 @group(0) @binding(2) var<storage, read> sh0: array<f32>;
 #ifdef SH_DEGREE_1
@@ -33,7 +33,7 @@ fn sh_fwd(workgroup: Group, place: Place) {
     var color = vec3<f32>(0.5) + SH_C0 * vec3<f32>(sh0[3u * i], sh0[3u * i + 1u], sh0[3u * i + 2u]);
 #ifdef SH_DEGREE_1
     let mean = vec3<f32>(means[3u * i], means[3u * i + 1u], means[3u * i + 2u]);
-    let dir = unit_direction(mean - view.centre).unit;
+    let dir = viewing_direction(view, mean).unit;
     var basis1 = sh_band1(dir);
     for (var k = 0u; k < 3u; k++) {
         color += basis1[k] * coefficient(SH_WIDTH * i + 3u * k);

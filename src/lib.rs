@@ -79,12 +79,13 @@
 //! 2. The word and its help, as above: `config/values.rs` and `config/file.rs`.
 //!
 //! **A camera model**
-//! 1. `scene/camera.rs`: a field, and `scene/frustum.rs`: what such a camera can see. Nothing compiles wrongly without them, and yet rows
-//!    are culled: the frustum stands again in `gather.wgsl` and its twin (`tests/numerics/twins/gather.rs`).
-//! 2. `kernels/project_fwd.rs` and `kernels/project_bwd.rs` with `shared/covariance.wgsl` and `project_bwd.wgsl`; viewing directions in
-//!    `kernels/sh_fwd.rs`, `kernels/sh_bwd.rs` and `shared/camera.wgsl`; `photos/pose.rs` for the gradient of a pose.
-//! 3. `dataset/`: the reader that knows the model, undistortion, the focal length in metres of the world (times the scale of the frame),
-//!    `scene/init.rs` and `dataset/disturb.rs`, which ask what a camera sees, and the digest of resumes.
+//! 1. `scene/camera.rs`: a field that [`scene::camera::Camera::pinhole`] sets and `lens_words` names, so that resumes and groups of
+//!    photos tell it apart, and a constructor; `unproject`. `scene/frustum.rs`: slopes and offsets of the sides of what it can see.
+//! 2. `kernels/project_fwd.rs`: a field of `View`, which on devices is `View` in `shared/camera.wgsl`, and the projection, with
+//!    `shared/covariance.wgsl`; its gradient in `kernels/project_bwd.rs` and `project_bwd.wgsl`; `viewing_direction` in
+//!    `kernels/sh_fwd.rs` and `shared/camera.wgsl`.
+//! 3. `dataset/`: the reader that knows the model, undistortion, and `loader.rs`, which makes the camera. A focal length in metres of
+//!    the world is multiplied by the scale of the frame. `dataset/disturb.rs` and `photos/pose.rs`, if the model comes that far.
 //!
 //! **A page codec**
 //! 1. `page/format/slot_header.rs`: a [`page::format::slot_header::StoredAs`] with its number on the drive and its name, and a bit of the

@@ -44,7 +44,7 @@ fn cut(x: f32, low: f32, high: f32) -> f32 {
 }
 
 /// Projects one row; `quat` need not be unit, `scale` is after activation.
-fn geometry(view: RowsUniforms, mean: vec3<f32>, quat: vec4<f32>, scale: vec3<f32>) -> Geometry {
+fn geometry(view: View, mean: vec3<f32>, quat: vec4<f32>, scale: vec3<f32>) -> Geometry {
     let w0 = view.world_to_camera[0];
     let w1 = view.world_to_camera[1];
     let w2 = view.world_to_camera[2];

@@ -1,6 +1,5 @@
 // The real spherical harmonics of bands 0 to 3, with the signs and order of src/kernels/sh_fwd.rs. Degree 2 defines
 // SH_DEGREE_1 and SH_DEGREE_2; a switch without the lower ones has no effect in the stages.
-#import "shared/math.wgsl"
 
 const SH_C0: f32 = 0.28209479;
 const SH_C1: f32 = 0.48860251;
@@ -18,25 +17,6 @@ const SH_WIDTH: u32 = 9u;
 #endif
 const SH_BAND_2: u32 = 9u;
 const SH_BAND_3: u32 = 24u;
-/// The smallest positive normal f32.
-const LEAST_NORMAL: f32 = 1.17549435e-38;
-
-struct Direction {
-    unit: vec3<f32>,
-    /// 1 / the original length.
-    inv_len: f32,
-}
-
-/// The direction at length 1; zeros if the length is 0 or its square overflows f32.
-fn unit_direction(dir: vec3<f32>) -> Direction {
-    let len_sq = dir.x * dir.x + dir.y * dir.y + dir.z * dir.z;
-    if !(is_finite(len_sq) && len_sq >= LEAST_NORMAL) {
-        return Direction(vec3<f32>(), 0.0);
-    }
-    let inv_len = 1.0 / sqrt(len_sq);
-    return Direction(dir * inv_len, inv_len);
-}
-
 #ifdef SH_DEGREE_1
 fn sh_band1(d: vec3<f32>) -> array<f32, 3> {
     return array<f32, 3>(-SH_C1 * d.y, SH_C1 * d.z, -SH_C1 * d.x);

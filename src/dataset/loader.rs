@@ -29,9 +29,6 @@ const NAMES_LISTED: usize = 20;
 /// Masks that are decoded before a run, to say how they are read.
 const MASKS_LOOKED_AT: usize = 3;
 
-/// Far plane, local units.
-const FAR_PLANE: f32 = 1e10;
-
 #[derive(Debug, Clone, PartialEq)]
 pub struct LoadOptions {
     /// Photos are downscaled by this factor, at least 1; each side is rounded to nearest.
@@ -206,17 +203,9 @@ fn load_views(
     warn_about_extra_photos(&photos, &mut warnings);
     let view = |((raw, split), photo): ((RawView, Split), PhotoSource)| {
         let k = intrinsics_at(&photo.intrinsics, photo.target);
-        let camera = Camera {
-            viewmat: frame.viewmat(&raw.pose),
-            fx: k.fx as f32,
-            fy: k.fy as f32,
-            cx: k.cx as f32,
-            cy: k.cy as f32,
-            width: k.width,
-            height: k.height,
-            near_plane: options.near_plane as f32,
-            far_plane: FAR_PLANE,
-        };
+        let pinhole = [k.fx, k.fy, k.cx, k.cy].map(|x| x as f32);
+        let camera = Camera::pinhole(frame.viewmat(&raw.pose), pinhole, [k.width, k.height]);
+        let camera = Camera { near_plane: options.near_plane as f32, ..camera };
         View { name: raw.name, split, camera, photo }
     };
     let views: Vec<View> = present.into_iter().zip(photos).map(view).collect();

@@ -149,7 +149,7 @@ mod tests {
         let (sin, cos) = roll.sin_cos();
         let rows = [right * cos + down * sin, down * cos - right * sin, forward];
         let viewmat = rows.map(|r| [r.x as f32, r.y as f32, r.z as f32, -r.dot(centre) as f32]);
-        Camera { viewmat, fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 2, height: 2, near_plane: 0.01, far_plane: 10.0 }
+        Camera::pinhole(viewmat, [1.0, 1.0, 0.0, 0.0], [2, 2])
     }
 
     /// Degrees between the estimate and the truth, with the scene turned so that its up is `up`.

@@ -93,7 +93,7 @@ pub fn geometry_vjp(view: &View, g: &Geometry, v_mean2d: [f32; 2], v_conic: [f32
         camera[i] = g.inv_depth * v_ray;
         camera[2] -= g.inv_depth * (g.ray[i] * v_ray);
     }
-    let r = &view.rotation;
+    let r = &view.world_to_camera;
     let mean = std::array::from_fn(|j| r[0][j] * camera[0] + r[1][j] * camera[1] + r[2][j] * camera[2]);
     GeometryGradient { mean, quat, log_scale }
 }

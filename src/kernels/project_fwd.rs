@@ -49,51 +49,47 @@ impl Projected {
 /// A quaternion whose squared length is outside this range has no usable direction in f32: its row is culled.
 const QUAT_NORM_SQ: std::ops::Range<f32> = 1e-30..1e30;
 
-/// Camera constants of the projection, computed once per view.
-#[derive(Debug, Clone, Copy)]
-pub struct View {
-    /// Rows of the world-to-camera rotation.
-    pub rotation: [[f32; 3]; 3],
-    /// Its cofactors: row i is the cross product of the two rows after i.
-    pub cofactors: [[f32; 3]; 3],
-    /// World-to-camera translation.
-    pub translation: [f32; 3],
-    /// Focal lengths, pixels.
-    pub focal: [f32; 2],
-    /// Principal point, pixels.
-    pub principal: [f32; 2],
-    /// Image size, pixels.
-    pub size: [f32; 2],
-    /// Lower limit of X/Z and Y/Z inside the Jacobian: the image plus 15 % of it on each side.
-    pub slope_low: [f32; 2],
-    /// Upper limit.
-    pub slope_high: [f32; 2],
-    /// Drawn depths are strictly between these.
-    pub depth_range: [f32; 2],
-    /// Blur, px^2.
-    pub eps2d: f32,
+crate::wgsl_struct! {
+    /// Camera constants of the stages on rows, computed once per view: on a device the uniform `View` of
+    /// `shaders/shared/camera.wgsl`, which documents the fields.
+    pub struct View {
+        pub world_to_camera: [[f32; 4]; 3],
+        pub cofactors: [[f32; 4]; 3],
+        pub centre: [f32; 3],
+        pub eps2d: f32,
+        pub focal: [f32; 2],
+        pub principal: [f32; 2],
+        pub size: [f32; 2],
+        pub depth_range: [f32; 2],
+        pub slope_low: [f32; 2],
+        pub slope_high: [f32; 2],
+        pub row_count: u32,
+        pub pad: [u32; 3],
+    }
 }
 
 impl View {
-    /// The constants for a camera.
+    /// The constants for a camera; `row_count` is set for each window of rows on a device.
     pub fn new(camera: &Camera, eps2d: f32) -> View {
-        let m = &camera.viewmat;
-        let rotation: [[f32; 3]; 3] = std::array::from_fn(|i| [m[i][0], m[i][1], m[i][2]]);
+        let rotation = camera.viewmat.map(|[x, y, z, _]| [x, y, z]);
+        let cofactors: [[f32; 3]; 3] = std::array::from_fn(|i| cross(rotation[(i + 1) % 3], rotation[(i + 2) % 3]));
         let size = [camera.width as f32, camera.height as f32];
         let focal = [camera.fx, camera.fy];
         let principal = [camera.cx, camera.cy];
         let margin: [f32; 2] = std::array::from_fn(|i| 0.3 * (0.5 * size[i] / focal[i]));
         View {
-            rotation,
-            cofactors: std::array::from_fn(|i| cross(rotation[(i + 1) % 3], rotation[(i + 2) % 3])),
-            translation: std::array::from_fn(|i| m[i][3]),
+            world_to_camera: camera.viewmat,
+            cofactors: cofactors.map(|[x, y, z]| [x, y, z, 0.0]),
+            centre: camera.centre(),
+            eps2d,
             focal,
             principal,
             size,
+            depth_range: [camera.near_plane, camera.far_plane],
             slope_low: std::array::from_fn(|i| -(principal[i] / focal[i] + margin[i])),
             slope_high: std::array::from_fn(|i| (size[i] - principal[i]) / focal[i] + margin[i]),
-            depth_range: [camera.near_plane, camera.far_plane],
-            eps2d,
+            row_count: 0,
+            pad: [0; 3],
         }
     }
 }
@@ -165,7 +161,8 @@ fn rotation_columns(q: [f32; 4]) -> [[f32; 3]; 3] {
 /// minors of T R are the rotated cross product of T's rows, so nothing is subtracted.
 #[inline(always)]
 pub fn geometry(view: &View, mean: [f32; 3], quat: [f32; 4], scale: [f32; 3]) -> Geometry {
-    let p: [f32; 3] = std::array::from_fn(|i| dot(view.rotation[i], mean) + view.translation[i]);
+    let w = &view.world_to_camera.map(|[x, y, z, _]| [x, y, z]);
+    let p: [f32; 3] = std::array::from_fn(|i| dot(w[i], mean) + view.world_to_camera[i][3]);
     let inv_depth = 1.0 / p[2];
     let ray = [p[0] * inv_depth, p[1] * inv_depth];
     let slope: [f32; 2] = std::array::from_fn(|i| cut(ray[i], view.slope_low[i], view.slope_high[i]));
@@ -176,7 +173,6 @@ pub fn geometry(view: &View, mean: [f32; 3], quat: [f32; 4], scale: [f32; 3]) ->
     let columns = rotation_columns(unit);
 
     let per_unit = [view.focal[0] * inv_depth, view.focal[1] * inv_depth];
-    let w = &view.rotation;
     let t: [[f32; 3]; 2] =
         std::array::from_fn(|i| std::array::from_fn(|j| per_unit[i] * (w[i][j] - slope[i] * w[2][j])));
     let k = &view.cofactors;
@@ -367,17 +363,8 @@ pub(in crate::kernels) mod tests {
     use crate::base::rng::{Purpose, Stream};
 
     pub(in crate::kernels) fn camera() -> Camera {
-        Camera {
-            viewmat: [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]],
-            fx: 70.0,
-            fy: 60.0,
-            cx: 33.0,
-            cy: 22.0,
-            width: 64,
-            height: 48,
-            near_plane: 0.01,
-            far_plane: 1e10,
-        }
+        let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]];
+        Camera::pinhole(viewmat, [70.0, 60.0, 33.0, 22.0], [64, 48])
     }
 
     fn random_rows(n: usize) -> Columns {

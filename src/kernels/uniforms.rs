@@ -9,7 +9,6 @@
 use super::splats::Grid;
 use super::tile_range::TileRange;
 use crate::kernels::image_loss::LossPlan;
-use crate::kernels::project_fwd::View;
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, sh_n_width};
 use crate::scene::frustum::Frustum;
@@ -18,46 +17,6 @@ use crate::scene::optimizer_numbers::{RunNumbers, SplitLimits, StepNumbers};
 use crate::scene::page_layout::PageLayout;
 use crate::scene::page_meta::PageBounds;
 use bytemuck::Zeroable;
-
-crate::wgsl_struct! {
-    /// Uniform of `project_fwd`, `sh_fwd`, `sh_bwd` and `project_bwd`: `RowsUniforms` in `shaders/shared/camera.wgsl`.
-    pub struct RowsUniforms {
-        pub world_to_camera: [[f32; 4]; 3],
-        pub cofactors: [[f32; 4]; 3],
-        pub centre: [f32; 3],
-        pub eps2d: f32,
-        pub focal: [f32; 2],
-        pub principal: [f32; 2],
-        pub size: [f32; 2],
-        pub depth_range: [f32; 2],
-        pub slope_low: [f32; 2],
-        pub slope_high: [f32; 2],
-        pub row_count: u32,
-        _pad: [u32; 3],
-    }
-}
-
-impl RowsUniforms {
-    /// Uniforms for a window of `row_count` rows.
-    pub fn new(camera: &Camera, eps2d: f32, row_count: u32) -> Self {
-        let view = View::new(camera, eps2d);
-        let with_last = |row: [f32; 3], last: f32| [row[0], row[1], row[2], last];
-        RowsUniforms {
-            world_to_camera: std::array::from_fn(|i| with_last(view.rotation[i], view.translation[i])),
-            cofactors: view.cofactors.map(|row| with_last(row, 0.0)),
-            centre: camera.centre(),
-            eps2d,
-            focal: view.focal,
-            principal: view.principal,
-            size: view.size,
-            depth_range: view.depth_range,
-            slope_low: view.slope_low,
-            slope_high: view.slope_high,
-            row_count,
-            _pad: [0; 3],
-        }
-    }
-}
 
 crate::wgsl_struct! {
     /// Uniform of `image_loss`: `LossUniforms` in `shaders/image_loss.wgsl`.
@@ -231,6 +190,7 @@ crate::wgsl_struct! {
     pub struct GatherUniforms {
         pub world_to_camera: [[f32; 4]; 3],
         pub slopes: [f32; 4],
+        pub offsets: [f32; 4],
         pub reach: [f32; 2],
         pub depth_range: [f32; 2],
         pub slack: [f32; 2],
@@ -274,6 +234,7 @@ impl GatherUniforms {
         GatherUniforms {
             world_to_camera: frustum.viewmat,
             slopes: frustum.slopes,
+            offsets: frustum.offsets,
             reach: frustum.reach,
             depth_range: frustum.depth_range,
             slack: frustum.slack(),

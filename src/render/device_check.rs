@@ -100,8 +100,7 @@ pub fn scene(rows: usize, width: u32, height: u32, broken: bool) -> (Columns, Ca
         }
     }
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
-    let (fx, fy, cx, cy) = (60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
+    (c, Camera::pinhole(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }
 
 /// Draws a view, compares it with a smooth photo that has a hole in its mask, and takes the loss back to the rows.

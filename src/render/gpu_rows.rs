@@ -6,7 +6,7 @@
 //! the result has the same bits.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
-use crate::kernels::uniforms::RowsUniforms;
+use crate::kernels::project_fwd::View;
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use rayon::prelude::*;
@@ -313,7 +313,7 @@ impl RowStages {
         splats: SplatRows<'_>,
     ) -> GpuResult<()> {
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
-            let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
+            let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, eps2d) })?;
             let w = rows.window(window);
             let views = [uniform, w.means, w.quats, w.scales, w.opacities, splats.window(window)];
             recorder.dispatch("project_fwd", &self.project_fwd, &views, groups_1d(window.rows, WORKGROUP))?;
@@ -331,7 +331,7 @@ impl RowStages {
         splats: SplatRows<'_>,
     ) -> GpuResult<()> {
         for window in windows(gpu, rows.rows, rows.widest()) {
-            let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
+            let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, 0.0) })?;
             let w = rows.window(window);
             let mut views = vec![uniform, splats.window(window), w.sh0];
             // Band 0 does not depend on the view direction, so degree 0 needs no means.
@@ -360,7 +360,7 @@ impl RowStages {
     ) -> GpuResult<()> {
         let stages = self.sh_bwd_weighing.as_ref().filter(|_| into.weighs).unwrap_or(&self.sh_bwd);
         for window in windows(gpu, rows.rows, rows.widest()) {
-            let uniform = recorder.uniform(&RowsUniforms::new(camera, 0.0, window.rows))?;
+            let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, 0.0) })?;
             let (w, v) = (rows.window(window), into.columns.window(window));
             let footprints = window.of(&into.footprints, footprint_bytes(into.weighs));
             let mut views = vec![uniform, splats.window(window), v_splats.window(window), footprints, v.means, v.sh0];
@@ -389,7 +389,7 @@ impl RowStages {
         into: &RowGradients,
     ) -> GpuResult<()> {
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
-            let uniform = recorder.uniform(&RowsUniforms::new(camera, eps2d, window.rows))?;
+            let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, eps2d) })?;
             let (w, v) = (rows.window(window), into.columns.window(window));
             let (splats, v_splats) = (splats.window(window), v_splats.window(window));
             let rows = [uniform, w.means, w.quats, w.scales, w.opacities, splats, v_splats];

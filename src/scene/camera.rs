@@ -1,4 +1,4 @@
-//! Camera: pose, pinhole intrinsics and size of one view, in the trainer's local frame.
+//! Camera: pose, intrinsics and size of one view, in the trainer's local frame.
 //!
 //! OpenCV axes: x right, y down, z forward. Loading removes distortion from the photos, so cameras are pinholes. The
 //! centre of pixel (0, 0) is (0.5, 0.5).
@@ -21,10 +21,32 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// A pinhole with intrinsics `[fx, fy, cx, cy]` and size `[width, height]`, which draws depths from 0.01 on.
+    pub fn pinhole(viewmat: [[f32; 4]; 3], [fx, fy, cx, cy]: [f32; 4], [width, height]: [u32; 2]) -> Camera {
+        Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 }
+    }
+
     /// Position of the camera in the world: `-R^T t`.
     pub fn centre(&self) -> [f32; 3] {
         let m = &self.viewmat;
         std::array::from_fn(|i| -(m[0][i] * m[0][3] + m[1][i] * m[1][3] + m[2][i] * m[2][3]))
+    }
+
+    /// The point in the world that pixel position `[u, v]` shows at depth `z`.
+    pub fn unproject(&self, [u, v]: [f64; 2], z: f64) -> [f32; 3] {
+        let x = (u - f64::from(self.cx)) / f64::from(self.fx) * z;
+        let y = (v - f64::from(self.cy)) / f64::from(self.fy) * z;
+        // R^T (p - t)
+        let m = &self.viewmat;
+        let moved: [f64; 3] = std::array::from_fn(|row| [x, y, z][row] - f64::from(m[row][3]));
+        std::array::from_fn(|i| (0..3).map(|row| f64::from(m[row][i]) * moved[row]).sum::<f64>() as f32)
+    }
+
+    /// All numbers but the pose, as words: what tells cameras apart that stand at one place.
+    pub fn lens_words(&self) -> [u32; 8] {
+        let [fx, fy, cx, cy, near, far] =
+            [self.fx, self.fy, self.cx, self.cy, self.near_plane, self.far_plane].map(f32::to_bits);
+        [fx, fy, cx, cy, near, far, self.width, self.height]
     }
 
     pub fn pixels(&self) -> usize {

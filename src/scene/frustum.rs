@@ -41,8 +41,9 @@ pub struct Frustum {
     translation: f32,
     /// Near and far plane.
     pub depth_range: [f32; 2],
-    /// Slopes of the planes at x low, x high, y low, y high; positive outwards.
+    /// Slopes of the planes at x low, x high, y low, y high, and how far they lie from the axis at depth 0; positive outwards.
     pub slopes: [f32; 4],
+    pub offsets: [f32; 4],
     /// Reach of a footprint beyond its mean in x and y, in sigmas.
     pub reach: [f32; 2],
 }
@@ -67,6 +68,7 @@ impl Frustum {
             translation: m[0][3].abs() + m[1][3].abs() + m[2][3].abs(),
             depth_range: [camera.near_plane, camera.far_plane],
             slopes: [x_low, x_high, y_low, y_high],
+            offsets: [0.0; 4],
             reach: [reach_x, reach_y],
         }
     }
@@ -92,27 +94,28 @@ impl Frustum {
         let y = m[1][0] * p[0] + m[1][1] * p[1] + m[1][2] * p[2] + m[1][3];
         let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
         let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
-        let slopes = &self.slopes;
+        let Frustum { slopes, offsets, .. } = self;
         let side = slack * self.side_slack();
         let (reach_x, reach_y) = (self.reach[0] * sigma_max + side, self.reach[1] * sigma_max + side);
         let outside = (z <= self.depth_range[0] - slack)
             | (z >= self.depth_range[1] + slack)
-            | (-x > slopes[0] * z + reach_x)
-            | (x > slopes[1] * z + reach_x)
-            | (-y > slopes[2] * z + reach_y)
-            | (y > slopes[3] * z + reach_y);
+            | (-x - offsets[0] > slopes[0] * z + reach_x)
+            | (x - offsets[1] > slopes[1] * z + reach_x)
+            | (-y - offsets[2] > slopes[2] * z + reach_y)
+            | (y - offsets[3] > slopes[3] * z + reach_y);
         !outside
     }
 
     /// The same half-spaces in world coordinates, for boxes.
     pub fn planes(&self) -> PagePlanes {
         let m = &self.viewmat;
-        // A row is outside if  sign * (row `axis` of the pose) - slope * z  exceeds its reach.
-        let side = |axis: usize, sign: f32, slope: f32| {
-            let at = |i: usize| sign * m[axis][i] - slope * m[2][i];
+        // A row is outside if  sign * (row `axis` of the pose) - slope * z - offset  exceeds its reach.
+        let side = |side: usize| {
+            let (axis, sign) = (side / 2, [-1.0, 1.0][side % 2]);
+            let at = |i: usize| sign * m[axis][i] - self.slopes[side] * m[2][i];
             PagePlane {
                 normal: [at(0), at(1), at(2)],
-                offset: at(3),
+                offset: at(3) - self.offsets[side],
                 reach: self.reach[axis] * PAGE_REACH,
                 slack: PAGE_POSITION_SLACK * self.side_slack(),
             }
@@ -123,16 +126,9 @@ impl Frustum {
             reach: 0.0,
             slack: PAGE_POSITION_SLACK,
         };
-        let [x_low, x_high, y_low, y_high] = self.slopes;
+        let [near, far] = self.depth_range;
         PagePlanes {
-            planes: [
-                depth(-1.0, self.depth_range[0]),
-                depth(1.0, self.depth_range[1]),
-                side(0, -1.0, x_low),
-                side(0, 1.0, x_high),
-                side(1, -1.0, y_low),
-                side(1, 1.0, y_high),
-            ],
+            planes: [depth(-1.0, near), depth(1.0, far), side(0), side(1), side(2), side(3)],
             translation: self.translation,
         }
     }

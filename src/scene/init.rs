@@ -191,13 +191,7 @@ pub fn random_points_in_frusta(
         let u = s.range(0.0, f64::from(camera.width));
         let v = s.range(0.0, f64::from(camera.height));
         let z = s.range(f64::from(near), f64::from(far));
-        let x = (u - f64::from(camera.cx)) / f64::from(camera.fx) * z;
-        let y = (v - f64::from(camera.cy)) / f64::from(camera.fy) * z;
-        // R^T (p - t)
-        let m = &camera.viewmat;
-        let moved: [f64; 3] = std::array::from_fn(|row| [x, y, z][row] - f64::from(m[row][3]));
-        let position = |i: usize| (0..3).map(|row| f64::from(m[row][i]) * moved[row]).sum::<f64>() as f32;
-        (std::array::from_fn(position), std::array::from_fn(|_| s.below(256) as u8))
+        (camera.unproject([u, v], z), std::array::from_fn(|_| s.below(256) as u8))
     };
     (0..count).into_par_iter().map(point).unzip()
 }

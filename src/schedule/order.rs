@@ -187,20 +187,10 @@ mod tests {
 
     /// Cameras that look down on a square of side `side`.
     fn cameras(side: usize) -> Vec<Camera> {
-        let camera = |i: usize| Camera {
-            viewmat: [
-                [1.0, 0.0, 0.0, -((i % side) as f32)],
-                [0.0, -1.0, 0.0, (i / side) as f32],
-                [0.0, 0.0, -1.0, 5.0],
-            ],
-            fx: 100.0,
-            fy: 100.0,
-            cx: 50.0,
-            cy: 50.0,
-            width: 100,
-            height: 100,
-            near_plane: 0.1,
-            far_plane: 1e3,
+        let camera = |i: usize| {
+            let (x, y) = ((i % side) as f32, (i / side) as f32);
+            let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, -1.0, 0.0, y], [0.0, 0.0, -1.0, 5.0]];
+            Camera::pinhole(viewmat, [100.0, 100.0, 50.0, 50.0], [100, 100])
         };
         (0..side * side).map(camera).collect()
     }

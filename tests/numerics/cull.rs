@@ -33,17 +33,13 @@ fn camera(draws: &mut Stream) -> Camera {
     let (width, height) = (200 + draws.below(400) as u32, 100 + draws.below(400) as u32);
     // Wide to narrow views; principal points up to far outside the image.
     let f = f64::from(width) * draws.range(0.3, 2.5);
-    Camera {
-        viewmat,
-        fx: f as f32,
-        fy: (f * draws.range(0.8, 1.2)) as f32,
-        cx: (f64::from(width) * draws.range(-0.3, 1.3)) as f32,
-        cy: (f64::from(height) * draws.range(-0.3, 1.3)) as f32,
-        width,
-        height,
-        near_plane: 0.05,
-        far_plane: 12.0,
-    }
+    let [fy, cx, cy] = [
+        f * draws.range(0.8, 1.2),
+        f64::from(width) * draws.range(-0.3, 1.3),
+        f64::from(height) * draws.range(-0.3, 1.3),
+    ];
+    let pinhole = Camera::pinhole(viewmat, [f, fy, cx, cy].map(|x| x as f32), [width, height]);
+    Camera { near_plane: 0.05, far_plane: 12.0, ..pinhole }
 }
 
 /// Rows around the cameras, small and huge, some moving (moments from a few steps).

@@ -35,8 +35,7 @@ const SPLITS: SplitLimits = SplitLimits { grow_grad2d: f32::INFINITY, split_scal
 /// Sees all rows, which move some units at most.
 fn camera() -> Camera {
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1000.0]];
-    let (width, height) = (16, 16);
-    Camera { viewmat, fx: 8.0, fy: 8.0, cx: 8.0, cy: 8.0, width, height, near_plane: 0.01, far_plane: 1e10 }
+    Camera::pinhole(viewmat, [8.0; 4], [16, 16])
 }
 
 /// Gradient of an element: rows differ by size, down to where eps matters.

@@ -47,8 +47,7 @@ fn views_whose_counts_are_all_new_leave_no_memory_behind() {
     let Some(device) = gpu::open(&GpuOptions::default()) else { return };
     let (width, height) = (80, 64);
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]];
-    let camera =
-        Camera { viewmat, fx: 70.0, fy: 70.0, cx: 40.0, cy: 32.0, width, height, near_plane: 0.01, far_plane: 1e10 };
+    let camera = Camera::pinhole(viewmat, [70.0, 70.0, 40.0, 32.0], [width, height]);
     let target = Target { width, height, rgb: vec![128; 3 * 80 * 64], mask: None };
     let loss = LossOptions::default();
     let mut renderer = GpuRenderer::new(device).unwrap();

@@ -35,7 +35,7 @@ const ROW_MAX: f64 = 1e-3;
 pub(super) fn camera() -> Camera {
     // A product of two rotations by 3-4-5 angles: orthonormal up to the rounding of its entries.
     let viewmat = [[0.8, 0.0, -0.6, 0.25], [0.36, 0.8, 0.48, -0.125], [0.48, -0.6, 0.64, 4.0]];
-    crate::support::camera(viewmat, [30.0, 28.0, 16.5, 11.0], [32, 24])
+    Camera::pinhole(viewmat, [30.0, 28.0, 16.5, 11.0], [32, 24])
 }
 
 pub(super) struct Recipe {

@@ -134,7 +134,7 @@ fn too_many_points_are_thinned_the_same_way_every_time() {
 fn points_in_frusta_are_seen() {
     let turned = [[0.0, 0.0, -1.0, 2.0], [0.0, 1.0, 0.0, -3.0], [1.0, 0.0, 0.0, 5.0]];
     let straight = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-    let camera = |viewmat| crate::support::camera(viewmat, [300.0, 310.0, 200.0, 90.0], [400, 200]);
+    let camera = |viewmat| Camera::pinhole(viewmat, [300.0, 310.0, 200.0, 90.0], [400, 200]);
     let sees = |c: &Camera, p: &[f32; 3]| {
         let at = |r: usize| c.viewmat[r][0] * p[0] + c.viewmat[r][1] * p[1] + c.viewmat[r][2] * p[2] + c.viewmat[r][3];
         let (u, v, z) = (at(0) / at(2) * c.fx + c.cx, at(1) / at(2) * c.fy + c.cy, at(2));

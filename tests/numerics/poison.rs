@@ -82,7 +82,7 @@ fn renderers() -> Vec<Box<dyn Renderer>> {
 
 fn camera(width: u32, height: u32) -> Camera {
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-    crate::support::camera(viewmat, [60.0, 60.0, 0.5 * width as f32, 0.5 * height as f32], [width, height])
+    Camera::pinhole(viewmat, [60.0, 60.0, 0.5 * width as f32, 0.5 * height as f32], [width, height])
 }
 
 /// Grey Gaussians of size e^-3 at these places, of this logit opacity.

@@ -2,6 +2,7 @@
 //! struct layouts and constants equal those of the Rust side. All failures are reported at once.
 
 use gsscale::gpu::{SOURCES, STORAGE_BUFFERS_MOST, Source, StructLayout, preprocess, validate, variants};
+use gsscale::kernels::project_fwd::View;
 use gsscale::kernels::{constants, gate, uniforms};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -9,7 +10,7 @@ use wgpu::naga;
 
 /// Rust twins of the structs that shaders read as uniforms (and of others that are declared in both languages).
 const LAYOUTS: &[&[StructLayout]] = &[
-    &[uniforms::RowsUniforms::LAYOUT, uniforms::LossUniforms::LAYOUT],
+    &[View::LAYOUT, uniforms::LossUniforms::LAYOUT],
     &[
         uniforms::DevicePage::LAYOUT,
         uniforms::PageResult::LAYOUT,

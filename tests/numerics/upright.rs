@@ -43,9 +43,7 @@ fn scene() -> Columns {
 }
 
 fn picture(rows: &Columns, viewmat: [[f32; 4]; 3]) -> Vec<f32> {
-    let (width, height) = (96, 64);
-    let camera =
-        Camera { viewmat, fx: 90.0, fy: 90.0, cx: 48.0, cy: 32.0, width, height, near_plane: 0.01, far_plane: 100.0 };
+    let camera = Camera::pinhole(viewmat, [90.0, 90.0, 48.0, 32.0], [96, 64]);
     let mut renderer = CpuRenderer::new();
     renderer.begin_view(&camera, &RenderOptions::default(), RowBatches::One).unwrap();
     renderer.rows_in(rows).unwrap();

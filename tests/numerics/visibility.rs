@@ -36,17 +36,14 @@ fn camera(draws: &mut Stream) -> Camera {
     let (width, height) = (16 + draws.below(4000) as u32, 16 + draws.below(3000) as u32);
     let f = f64::from(width) * draws.range(0.2, 3.0);
     let near = libm::pow(10.0, draws.range(-3.0, 1.0));
-    Camera {
-        viewmat,
-        fx: f as f32,
-        fy: (f * draws.range(0.7, 1.4)) as f32,
-        cx: (f64::from(width) * draws.range(-0.6, 1.6)) as f32,
-        cy: (f64::from(height) * draws.range(-0.6, 1.6)) as f32,
-        width,
-        height,
-        near_plane: near as f32,
-        far_plane: if draws.below(2) == 0 { 1e10 } else { (near * draws.range(2.0, 1e4)) as f32 },
-    }
+    let [fy, cx, cy] = [
+        f * draws.range(0.7, 1.4),
+        f64::from(width) * draws.range(-0.6, 1.6),
+        f64::from(height) * draws.range(-0.6, 1.6),
+    ];
+    let far_plane = if draws.below(2) == 0 { 1e10 } else { (near * draws.range(2.0, 1e4)) as f32 };
+    let pinhole = Camera::pinhole(viewmat, [f, fy, cx, cy].map(|x| x as f32), [width, height]);
+    Camera { near_plane: near as f32, far_plane, ..pinhole }
 }
 
 /// Rows of one page: a cluster of any size anywhere around the camera, sigmas from nothing to larger than the world.

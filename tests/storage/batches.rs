@@ -50,8 +50,7 @@ fn columns() -> Columns {
 
 fn camera() -> Camera {
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 4.5]];
-    let (near_plane, far_plane) = (0.01, 1e10);
-    Camera { viewmat, fx: 50.0, fy: 50.0, cx: 40.0, cy: 30.0, width: 80, height: 60, near_plane, far_plane }
+    Camera::pinhole(viewmat, [50.0, 50.0, 40.0, 30.0], [80, 60])
 }
 
 /// The scene in frames over a store that fails by `faults`; in memory without them.

@@ -29,17 +29,7 @@ fn camera(centre: [f64; 3], heading: f64, tilt: f64) -> Camera {
     let row = |r: [f64; 3]| {
         [r[0] as f32, r[1] as f32, r[2] as f32, -(r[0] * centre[0] + r[1] * centre[1] + r[2] * centre[2]) as f32]
     };
-    Camera {
-        viewmat: [row(right), row(down), row(forward)],
-        fx: 900.0,
-        fy: 900.0,
-        cx: 500.0,
-        cy: 375.0,
-        width: 1000,
-        height: 750,
-        near_plane: 0.1,
-        far_plane: 1e10,
-    }
+    Camera::pinhole([right, down, forward].map(row), [900.0, 900.0, 500.0, 375.0], [1000, 750])
 }
 
 /// A square city of side 1 in `side` x `side` pages of ground, with strips of views across it.

@@ -160,8 +160,7 @@ mod tests {
 
     fn camera(x: f32) -> Camera {
         let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let (near_plane, far_plane) = (0.1, 100.0);
-        Camera { viewmat, fx: 100.0, fy: 100.0, cx: 50.0, cy: 50.0, width: 100, height: 100, near_plane, far_plane }
+        Camera::pinhole(viewmat, [100.0, 100.0, 50.0, 50.0], [100, 100])
     }
 
     fn page(number: u32, x: f32) -> PageMeta {

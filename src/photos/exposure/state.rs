@@ -65,14 +65,13 @@ pub struct AppearanceState {
     seen: u32,
 }
 
-/// For each camera, the number of its group: cameras of the same size and intrinsics form one.
+/// For each camera, the number of its group: cameras that differ only in their pose form one.
 pub fn camera_groups<'a>(cameras: impl Iterator<Item = &'a Camera>) -> Vec<usize> {
     let mut known = std::collections::HashMap::new();
-    let key = |c: &Camera| ([c.fx, c.fy, c.cx, c.cy].map(f32::to_bits), c.width, c.height);
     cameras
         .map(|camera| {
             let next = known.len();
-            *known.entry(key(camera)).or_insert(next)
+            *known.entry(camera.lens_words()).or_insert(next)
         })
         .collect()
 }

@@ -574,8 +574,8 @@ mod tests {
     #[test]
     fn a_step_leaves_a_clear_contradiction_out_in_the_first_epochs_alone() {
         let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let (width, height, near_plane, far_plane) = (4, 4, 0.01, 100.0);
-        let camera = Camera { viewmat, fx: 20.0, fy: 20.0, cx: 2.0, cy: 2.0, width, height, near_plane, far_plane };
+        let (width, height) = (4, 4);
+        let camera = Camera::pinhole(viewmat, [20.0, 20.0, 2.0, 2.0], [width, height]);
         // Black and white in turn; a picture with both exchanged leaves four times the variance.
         let photo =
             Target { width, height, rgb: (0..48).map(|i| if i / 3 % 2 == 0 { 0 } else { 255 }).collect(), mask: None };

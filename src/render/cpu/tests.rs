@@ -15,8 +15,7 @@ fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
     c.opacities.iter_mut().for_each(|x| *x = draws.range(-6.0, 7.0) as f32);
     c.sh0.iter_mut().chain(&mut c.sh_n).for_each(|x| *x = 0.5 * draws.normal() as f32);
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
-    let (fx, fy, cx, cy) = (60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32);
-    (c, Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 })
+    (c, Camera::pinhole(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }
 
 fn bits(values: &[f32]) -> Vec<u32> {

@@ -27,11 +27,8 @@ pub(crate) fn view_print(view: &View) -> InputResult<ViewPrint> {
     let mut pose = Xxh3::new();
     pose.update(view.name.as_bytes());
     pose.update(&[u8::from(view.split == Split::Train)]);
-    let floats = [camera.fx, camera.fy, camera.cx, camera.cy, camera.near_plane, camera.far_plane];
-    for float in camera.viewmat.iter().flatten().chain(&floats) {
-        pose.update(&float.to_bits().to_le_bytes());
-    }
-    [camera.width, camera.height].iter().for_each(|n| pose.update(&n.to_le_bytes()));
+    let placed = camera.viewmat.as_flattened().iter().map(|x| x.to_bits());
+    placed.chain(camera.lens_words()).for_each(|word| pose.update(&word.to_le_bytes()));
     let mut photo = Xxh3::new();
     add_file(&mut photo, &view.photo.image_path)?;
     if let Some(mask) = &view.photo.mask {

@@ -165,8 +165,7 @@ mod tests {
 
     fn base() -> Camera {
         let viewmat = [[1.0, 0.0, 0.0, -3.0], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, -1.0]];
-        let (near_plane, far_plane) = (0.01, 1000.0);
-        Camera { viewmat, fx: 90.0, fy: 80.0, cx: 60.0, cy: 40.0, width: 120, height: 80, near_plane, far_plane }
+        Camera::pinhole(viewmat, [90.0, 80.0, 60.0, 40.0], [120, 80])
     }
 
     /// Coordinates of a world point before the camera.

@@ -174,9 +174,7 @@ mod tests {
         let options = RunOptions::new(&TrainConfig { page_rows: 16, sh_degree: 1, ..TrainConfig::default() }, 1.0);
         let mut scene = scene(&options);
         let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 4.5]];
-        let (near_plane, far_plane) = (0.01, 1e10);
-        let camera =
-            Camera { viewmat, fx: 50.0, fy: 50.0, cx: 40.0, cy: 30.0, width: 80, height: 60, near_plane, far_plane };
+        let camera = Camera::pinhole(viewmat, [50.0, 50.0, 40.0, 30.0], [80, 60]);
         let rgb = (0..3 * camera.pixels()).map(|i| (i * 7 % 256) as u8).collect();
         let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
         let pages = scene.pager.pages_of_view(&camera).len();

@@ -143,8 +143,7 @@ mod tests {
     /// A renderer that has drawn nothing on this background.
     fn drawn(background: f32) -> CpuRenderer {
         let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let (width, height, near_plane, far_plane) = (16, 16, 0.01, 100.0);
-        let camera = Camera { viewmat, fx: 20.0, fy: 20.0, cx: 8.0, cy: 8.0, width, height, near_plane, far_plane };
+        let camera = Camera::pinhole(viewmat, [20.0, 20.0, 8.0, 8.0], [16, 16]);
         let options = RenderOptions { sh_degree: 0, background: [background; 3], ..RenderOptions::default() };
         let mut renderer = CpuRenderer::new();
         renderer.draw(&Columns::zeros(0, 0), &camera, &options).unwrap();

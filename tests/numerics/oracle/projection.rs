@@ -4,8 +4,8 @@
 //! logits and are compared with a margin for the rounding of that conversion.
 
 use crate::support::fixture::Fixture;
+use crate::support::random_rotation;
 use crate::support::reference64::{Rows64, Settings, project};
-use crate::support::{camera, random_rotation};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::project_bwd::{GeometryGradient, geometry_vjp, project_bwd};
@@ -137,7 +137,7 @@ fn random_camera(draws: &mut Stream, width: u32, height: u32) -> Camera {
     let focal = f64::from(width) * draws.range(0.7, 1.5);
     let off = |size: u32, draws: &mut Stream| (f64::from(size) * draws.range(0.4, 0.6)) as f32;
     let principal = [off(width, draws), off(height, draws)];
-    camera(viewmat, [focal as f32, (focal * 1.02) as f32, principal[0], principal[1]], [width, height])
+    Camera::pinhole(viewmat, [focal as f32, (focal * 1.02) as f32, principal[0], principal[1]], [width, height])
 }
 
 /// Rows in front of a camera, of 0.1 to 400 pixels and all shapes down to 1:20, some beyond the picture's edges.

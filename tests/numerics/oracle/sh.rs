@@ -1,10 +1,9 @@
 //! Spherical harmonics, forward and backward, against the float64 reference.
 
-use crate::support::camera;
 use crate::support::fixture::Fixture;
 use gsscale::base::simd::SimdPath;
 use gsscale::kernels::sh_bwd::sh_bwd;
-use gsscale::kernels::sh_fwd::{basis_len, sh_basis, sh_fwd, unit_direction};
+use gsscale::kernels::sh_fwd::{basis_len, sh_basis, sh_fwd, viewing_direction};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
 
@@ -13,7 +12,7 @@ const TOLERANCE: f64 = 2e-6;
 
 /// A camera at the origin, so that a row's mean is its viewing direction.
 fn camera_at_origin() -> Camera {
-    camera([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], [1.0, 1.0, 0.0, 0.0], [1, 1])
+    Camera::pinhole([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], [1.0, 1.0, 0.0, 0.0], [1, 1])
 }
 
 /// Rows of the fixture stored with `stored` bands, the bands above the fixture's own filled with a value that must
@@ -53,7 +52,7 @@ fn the_basis_agrees() {
         let dirs = file.f32("dirs");
         let k = basis_len(degree);
         let basis = dirs.as_chunks::<3>().0.iter().flat_map(|d| {
-            let b = sh_basis(degree, unit_direction(*d).0);
+            let b = sh_basis(degree, viewing_direction([0.0; 3], *d).0);
             assert!(b[k..].iter().all(|x| *x == 0.0), "bands above {degree} are zero");
             b.into_iter().take(k)
         });

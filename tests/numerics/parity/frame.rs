@@ -4,7 +4,6 @@
 //! a pixel adds up to a few hundred of them. Rarely, a rounding flips a decision (one tile more, a stop one Gaussian
 //! later). Such a pixel may differ by the threshold of that decision, at most 1/255 of a colour.
 
-use crate::support::camera;
 use crate::support::fixture::{Fixture, RASTER_FILES, split_sh};
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
@@ -32,7 +31,7 @@ pub fn scene(rows: usize, width: u32, height: u32) -> (Columns, Camera) {
     c.opacities.fill_with(|| draws.range(-6.0, 7.0) as f32);
     c.sh0.iter_mut().chain(&mut c.sh_n).for_each(|x| *x = 0.5 * draws.normal() as f32);
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 1.5]];
-    (c, camera(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
+    (c, Camera::pinhole(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }
 
 /// The rows of a table in batches that end at `ends`, the first of which is where they begin.

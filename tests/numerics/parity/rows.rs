@@ -24,7 +24,7 @@ const SIZES: [usize; 6] = [0, 1, 255, 256, 257, 5000];
 
 pub fn camera() -> Camera {
     let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 0.8, -0.6, 0.2], [0.0, 0.6, 0.8, 3.0]];
-    crate::support::camera(viewmat, [70.0, 60.0, 33.0, 22.0], [65, 47])
+    Camera::pinhole(viewmat, [70.0, 60.0, 33.0, 22.0], [65, 47])
 }
 
 fn random_rows(n: usize) -> Columns {

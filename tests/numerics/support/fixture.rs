@@ -49,7 +49,7 @@ impl Fixture {
     pub fn camera(&self) -> Camera {
         let (m, k, wh) = (self.f32("viewmat"), self.f32("K"), self.f64("wh"));
         let viewmat = std::array::from_fn(|i| std::array::from_fn(|j| m[4 * i + j]));
-        super::camera(viewmat, [k[0], k[4], k[2], k[5]], [wh[0] as u32, wh[1] as u32])
+        Camera::pinhole(viewmat, [k[0], k[4], k[2], k[5]], [wh[0] as u32, wh[1] as u32])
     }
 
     /// Rows, as they are stored, camera and options of a raster file.

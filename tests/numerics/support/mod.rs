@@ -27,11 +27,6 @@ pub fn begin_view(gpu: &Gpu, pages: &DevicePages, camera: &Camera, step: &StepNu
     view
 }
 
-/// A camera that sees from 0.01 on, without end.
-pub fn camera(viewmat: [[f32; 4]; 3], [fx, fy, cx, cy]: [f32; 4], [width, height]: [u32; 2]) -> Camera {
-    Camera { viewmat, fx, fy, cx, cy, width, height, near_plane: 0.01, far_plane: 1e10 }
-}
-
 /// Any rotation, all equally likely.
 pub fn random_rotation(draws: &mut Stream) -> [[f64; 3]; 3] {
     let q: [f64; 4] = std::array::from_fn(|_| draws.normal());

@@ -65,16 +65,17 @@ impl GatherInput<'_> {
 
     /// Whether the camera may draw a row at `p` with this largest sigma. NaN counts as drawn.
     fn may_draw(&self, p: [f32; 3], sigma_max: f32) -> bool {
-        let GatherUniforms { world_to_camera: m, slopes, reach, depth_range, slack, side_slack, .. } = *self.uniforms;
+        let GatherUniforms { world_to_camera: m, slopes, offsets, reach, depth_range, slack, side_slack, .. } =
+            *self.uniforms;
         let [x, y, z] = m.map(|r| r[0] * p[0] + r[1] * p[1] + r[2] * p[2] + r[3]);
         let slack = slack[0] + slack[1] * (p[0].abs() + p[1].abs() + p[2].abs());
         let reach = reach.map(|reach| reach * sigma_max + slack * side_slack);
         let outside = z <= depth_range[0] - slack
             || z >= depth_range[1] + slack
-            || -x > slopes[0] * z + reach[0]
-            || x > slopes[1] * z + reach[0]
-            || -y > slopes[2] * z + reach[1]
-            || y > slopes[3] * z + reach[1];
+            || -x - offsets[0] > slopes[0] * z + reach[0]
+            || x - offsets[1] > slopes[1] * z + reach[0]
+            || -y - offsets[2] > slopes[2] * z + reach[1]
+            || y - offsets[3] > slopes[3] * z + reach[1];
         !outside || !(x + y + z).is_finite() || !sigma_max.is_finite()
     }
 
