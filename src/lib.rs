@@ -89,9 +89,8 @@
 //!
 //! **A page codec**
 //! 1. `page/format/slot_header.rs`: a [`page::format::slot_header::StoredAs`] with its number on the drive and its name, and a bit of the
-//!    features, so that older programs refuse the slot. `page/format/codec.rs`: both directions, and the word in `FromStr`.
-//! 2. Counts by codec in `train/stores/` and `tools/ckpt.rs`; the word of `--spill-codec` in `config/values.rs`; the sample of
-//!    `tests/fuzz/targets/pages.rs`; the length of the list in `tests/fixtures/store_v1.json`.
+//!    features, so that older programs refuse the slot. What lists codecs follows `StoredAs::ALL`.
+//! 2. `page/format/codec.rs`: both directions, the word in `Codec::WORDS` and `FromStr`, and which codec writes the form.
 //!
 //! **A loss term** is a kind of [`photos`] that learns nothing, also where the term does not look at the photo:
 //! 1. A file in `photos/`: a [`photos::parameter::PhotoParameter`] whose `adds_loss` and `needs_picture` are true. `target` gets the corrected picture

@@ -9,6 +9,7 @@ use gsscale::config::values::ByteSize;
 use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::sink::LevelCounts;
 use gsscale::page::format::codec::Codec;
+use gsscale::page::format::slot_header::StoredAs;
 use gsscale::page::map::commit::CommitError;
 use gsscale::page::map::entries::MapError;
 use gsscale::train::error::TrainError;
@@ -213,7 +214,8 @@ fn run_inspect(args: &Inspect) -> Result<ExitCode, TrainError> {
 }
 
 fn store_text(s: &Inspected) -> String {
-    let [raw, zstd, halves] = s.pages_by_codec;
+    let counted = StoredAs::ALL.iter().zip(s.pages_by_codec).map(|(form, pages)| format!("{pages} {}", form.name()));
+    let codecs: Vec<String> = counted.collect();
     let [d0, d1, d2, d3] = s.pages_by_degree;
     let mut text = format!(
         "store       {} ({})\n\
@@ -222,7 +224,7 @@ fn store_text(s: &Inspected) -> String {
          segments    {} files, {}\n\
          map         {} transactions\n\
          generation  {}: {} pages, {} with pending events\n\
-         codec       {raw} raw, {zstd} zstd, {halves} halves; {} of payload in {}\n\
+         codec       {}; {} of payload in {}\n\
          degrees     {d0} pages with degree 0, {d1} with 1, {d2} with 2, {d3} with 3\n",
         s.identity,
         s.store.display(),
@@ -237,6 +239,7 @@ fn store_text(s: &Inspected) -> String {
         s.generation,
         s.pages,
         s.pages_behind,
+        codecs.join(", "),
         format_bytes(s.payload_bytes[0]),
         format_bytes(s.payload_bytes[1]),
     );
@@ -560,8 +563,8 @@ struct Import {
     /// Gaussians per page
     #[arg(long, default_value_t = 1024, value_name = "N", value_parser = clap::value_parser!(u32).range(16..=65_536))]
     page_rows: u32,
-    /// Codec of the pages: raw, halves, or zstd:LEVEL
     #[arg(long, default_value = "raw", value_name = "CODEC")]
+    #[arg(help = format!("Codec of the pages: {}", Codec::WORDS.join(", ")))]
     spill_codec: Codec,
     /// Print JSON
     #[arg(long)]

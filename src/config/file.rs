@@ -297,8 +297,8 @@ config_keys! {
         /// I/O engine for pages: auto, uring, mmap or pread. Never changes results. mmap reads through memory maps: if another
         /// program makes a page file shorter during a read, the system ends the run (SIGBUS), and --resume continues it
         io: IoEngine = IoEngine::Auto => Free hidden;
-        /// Codec of stored pages: raw, halves (for --moments bf16), zstd:LEVEL, or auto (halves for --moments bf16, else
-        /// raw; gsscale-iotune advises zstd for slow drives). Never changes results
+        /// Codec of stored pages. auto = halves for --moments bf16, else raw; gsscale-iotune advises zstd:LEVEL for slow
+        /// drives. Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write

@@ -310,10 +310,10 @@ reading_and_writing!(Exports);
 
 /// Implements [`Choice`] for optional choices, with their word for `None`, and lists them.
 macro_rules! open_choices {
-    ($($key:literal: $type:ident, $none:literal in [$($word:expr),+], $from:expr, $to:expr;)+) => { $(
+    ($($key:literal: $type:ident, $none:literal in $words:expr, $from:expr, $to:expr;)+) => { $(
         impl Choice for Chosen<$type> {
             const KEY: &'static str = $key;
-            const WORDS: &'static [&'static str] = &[$($word),+];
+            const WORDS: &'static [&'static str] = &$words;
 
             fn from_word(word: &str) -> Option<Self> {
                 if word == $none { Some(Chosen(None)) } else { $from(word).map(|value| Chosen(Some(value))) }
@@ -336,13 +336,16 @@ macro_rules! open_choices {
     };
 }
 
-/// The word for zstd. It says why the codec is refused where it is missing.
-const ZSTD_WORD: &str =
-    if cfg!(feature = "zstd") { "zstd:LEVEL" } else { "zstd:LEVEL (this program was built without zstd)" };
+/// The words for codecs, and `auto`.
+const CODECS: [&str; Codec::WORDS.len() + 1] = {
+    let mut words = ["auto"; Codec::WORDS.len() + 1];
+    words.split_at_mut(Codec::WORDS.len()).0.copy_from_slice(&Codec::WORDS);
+    words
+};
 
 open_choices! {
     "view-order": Order, "auto" in ["auto", "shuffle", "groups:N", "tour"], parsed, |order: Order| order.to_string();
-    "spill-codec": Codec, "auto" in ["raw", "halves", ZSTD_WORD, "auto"], parsed, |codec: Codec| codec.to_string();
+    "spill-codec": Codec, "auto" in CODECS, parsed, |codec: Codec| codec.to_string();
     "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
     "optimizer-on": OptimizerPlace, "auto" in ["auto", "device", "host"], OptimizerPlace::from_name, |place: OptimizerPlace| place.name().to_string();
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();

@@ -40,6 +40,26 @@ pub enum Codec {
     Halves,
 }
 
+impl Codec {
+    /// How people write the codecs. The word for zstd says why it is refused where it is missing.
+    pub const WORDS: [&str; 3] = [
+        "raw",
+        "halves",
+        if cfg!(feature = "zstd") { "zstd:LEVEL" } else { "zstd:LEVEL (this program was built without zstd)" },
+    ];
+}
+
+/// The codec that writes this form, where its settings are not known.
+impl From<StoredAs> for Codec {
+    fn from(form: StoredAs) -> Codec {
+        match form {
+            StoredAs::Raw => Codec::Raw,
+            StoredAs::ShuffledZstd => Codec::Zstd { level: 1 },
+            StoredAs::Halves => Codec::Halves,
+        }
+    }
+}
+
 impl std::str::FromStr for Codec {
     type Err = String;
 

@@ -44,7 +44,8 @@ pub enum StoredAs {
 }
 
 impl StoredAs {
-    const ALL: [StoredAs; 3] = [StoredAs::Raw, StoredAs::ShuffledZstd, StoredAs::Halves];
+    /// By number.
+    pub const ALL: [StoredAs; 3] = [StoredAs::Raw, StoredAs::ShuffledZstd, StoredAs::Halves];
 
     /// The name for people.
     pub fn name(self) -> &'static str {
@@ -142,7 +143,7 @@ impl SlotRef {
         };
         let lengths_agree = match slot.codec {
             StoredAs::Raw => slot.stored_bytes == slot.payload_bytes,
-            StoredAs::ShuffledZstd | StoredAs::Halves => slot.stored_bytes < slot.payload_bytes,
+            _ => slot.stored_bytes < slot.payload_bytes,
         };
         (slot.place.offset.is_multiple_of(ALIGNMENT as u64) && lengths_agree).then_some(slot)
     }

@@ -246,11 +246,11 @@ mod tests {
     #[test]
     fn newer_versions_and_impossible_sizes_are_refused() {
         let changed = |at: usize, value: u8| SpillFormat::from_bytes(&with(at, value)).expect_err("read");
-        assert_eq!(changed(8, 2), FormatError::Version { found: 2, features: 0 });
-        assert_eq!(changed(8, 0), FormatError::Version { found: 0, features: 0 });
-        assert_eq!(changed(12, 1), FormatError::Features { features: 1 });
+        assert_eq!(changed(8, 2), FormatError::Version { found: 2, features: KNOWN_FEATURES });
+        assert_eq!(changed(8, 0), FormatError::Version { found: 0, features: KNOWN_FEATURES });
+        assert_eq!(changed(15, 0x80), FormatError::Features { features: 1 << 31 | KNOWN_FEATURES });
         assert!(changed(8, 2).to_string().contains("newer") && changed(8, 0).to_string().contains("older"));
-        assert!(changed(12, 5).to_string().contains("bits 0x5"));
+        assert!(changed(15, 5).to_string().contains("bits 0x5000000"));
         assert_eq!(changed(32, 1), FormatError::Sizes);
         assert_eq!(changed(39, 0x7f), FormatError::Sizes);
         assert_eq!([changed(44, 0), changed(44, 2)], [FormatError::Sizes, FormatError::Sizes]);

@@ -12,7 +12,7 @@ use crate::page::engine::segment_files::segment_file_name;
 use crate::page::folder::protocol_files::DriveFolder;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
-use crate::page::format::slot_header::SlotRef;
+use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::map::opening::Opened;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::{Access, StoreReader, commit_config};
@@ -194,13 +194,10 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<ClonedStore, TrainEr
 
 /// The codec of most pages, for new pages.
 pub(super) fn usual_codec<'a>(slots: impl Iterator<Item = &'a SlotRef>) -> Codec {
-    let mut counts = [0u64; 3];
+    let mut counts = [0u64; StoredAs::ALL.len()];
     slots.for_each(|slot| counts[slot.codec as usize] += 1);
-    match counts {
-        [raw, zstd, halves] if zstd > raw && zstd >= halves => Codec::Zstd { level: 1 },
-        [raw, _, halves] if halves > raw => Codec::Halves,
-        _ => Codec::Raw,
-    }
+    // Of equal counts the last in this order, which is the first form.
+    StoredAs::ALL.into_iter().rev().max_by_key(|form| counts[*form as usize]).map_or(Codec::Raw, Codec::from)
 }
 
 fn damaged(place: &StorePlace, page: PageId, slot: &SlotRef, what: &str) -> InputError {

@@ -14,7 +14,7 @@ use crate::config::values::Choice;
 use crate::densify::strategy::{Effect, effect_of};
 use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::segment_file_name;
-use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_FEATURES, SlotRef};
+use crate::page::format::slot_header::{FORMAT_VERSION, KNOWN_FEATURES, SlotRef, StoredAs};
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::paging::stored::{PageLimits, check_values, layout_of, meta_from_label};
@@ -48,8 +48,8 @@ pub struct Inspected {
     pub generation: u64,
     /// Pages of the generation.
     pub pages: u64,
-    /// Pages stored raw, shuffled with zstd, as halves.
-    pub pages_by_codec: [u64; 3],
+    /// Pages by stored form, in the order of [`StoredAs::ALL`].
+    pub pages_by_codec: [u64; StoredAs::ALL.len()],
     /// Bytes of payloads, decoded and stored.
     pub payload_bytes: [u64; 2],
     /// Pages stored with each SH degree.
@@ -69,7 +69,7 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
     let (config, _) = options_of(&place.folder, &state)?;
     let pages = store.pages_at(generation)?;
     let segments = store.segments()?;
-    let (mut by_codec, mut by_degree, mut payload, mut behind) = ([0; 3], [0; 4], [0; 2], 0);
+    let (mut by_codec, mut by_degree, mut payload, mut behind) = ([0; StoredAs::ALL.len()], [0; 4], [0; 2], 0);
     for page in &pages {
         by_codec[page.slot.codec as usize] += 1;
         payload[0] += u64::from(page.slot.payload_bytes);
