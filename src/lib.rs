@@ -74,8 +74,8 @@
 //! 4. Another fate of a row: its values in `densify/ops.rs`.
 //!
 //! **A growth score**
-//! 1. `densify/long_axis.rs` ranks rows by [`densify::long_axis::GrowthScore`]; `train/step/batch.rs` gives the strategy what it reads of
-//!    the rows of a view. A score that an optimizer on the device does not know is refused in `train/run/begin.rs`.
+//! 1. `densify/long_axis.rs` ranks rows by [`densify::long_axis::GrowthScore`], from all gradients of the rows that a view has drawn.
+//!    `collects_on_device` says which scores an optimizer on the device knows; the others are refused there.
 //! 2. The word and its help, as above: `config/values.rs` and `config/file.rs`.
 //!
 //! **A camera model**

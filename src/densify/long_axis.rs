@@ -20,9 +20,9 @@
 
 use super::growth::GrowthRule;
 use super::stats::{
-    GradHistogram, WEIGHED_VIEWS, accumulate_scores, grad_norm, reaches_bin, rows_from_bin, weight_bin,
+    DrawnRows, GradHistogram, WEIGHED_VIEWS, accumulate_scores, reaches_bin, rows_from_bin, weight_bin,
 };
-use super::strategy::{DrawnRows, Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
+use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
 use crate::scene::events::{EventKind, LONG_AXIS_OFFSET, LongAxisRound};
@@ -92,10 +92,10 @@ impl LongAxisStrategy {
         }
     }
 
-    /// Score and weight of a listed row in a view whose size is twice `half`, pixels.
-    fn of_row(&self, drawn: &DrawnRows<'_>, half: [f32; 2], listed: usize) -> (f32, Option<f32>) {
-        let gradient = || grad_norm(drawn.v_means2d[listed], half);
-        let [weight, error] = drawn.weights.get(listed).copied().unwrap_or_default();
+    /// Score and weight of the row at a place in the gradients.
+    fn of_row(&self, drawn: &DrawnRows<'_>, place: usize) -> (f32, Option<f32>) {
+        let gradient = || drawn.gradient_norm(place);
+        let [weight, error] = drawn.gradients.weights.get(place).copied().unwrap_or_default();
         let score = match self.score {
             GrowthScore::Gradient => gradient(),
             GrowthScore::Error => error,
@@ -133,8 +133,7 @@ impl Strategy for LongAxisStrategy {
     }
 
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
-        let half = drawn.image_size.map(|n| n as f32 * 0.5);
-        accumulate_scores(view, drawn.rows, drawn.radii, histogram, |listed| self.of_row(drawn, half, listed))
+        accumulate_scores(view, drawn, histogram, |place| self.of_row(drawn, place))
     }
 
     fn growth(&self) -> Option<&GrowthRule> {
@@ -212,7 +211,7 @@ mod tests {
     use crate::base::math::logit;
     use crate::base::rng::{Purpose, Stream};
     use crate::densify::growth::Quality;
-    use crate::scene::columns::Columns;
+    use crate::scene::columns::{Columns, Gradients};
     use crate::scene::state::SceneState;
 
     fn strategy(score: GrowthScore, max_gaussians: u64) -> LongAxisStrategy {
@@ -235,18 +234,12 @@ mod tests {
         let numbers: Vec<u32> = (0..rows as u32).collect();
         for view in 0..views {
             let mut draws = Stream::new(5, Purpose::Test, view, 0);
-            let v_means2d: Vec<[f32; 2]> = numbers.iter().map(|_| [draws.normal() as f32, 0.5]).collect();
-            let weights: Vec<[f32; 2]> =
+            let means2d = numbers.iter().map(|_| [draws.normal() as f32, 0.5]).collect();
+            let weights =
                 numbers.iter().map(|&row| [row as f32 + draws.uniform() as f32, draws.uniform() as f32]).collect();
-            let radii = vec![[1, 1]; rows];
-            let drawn = DrawnRows {
-                step: view as u32,
-                rows: &numbers,
-                v_means2d: &v_means2d,
-                radii: &radii,
-                weights: &weights,
-                image_size: [20, 10],
-            };
+            let gradients = Gradients { means2d, radii: vec![[1, 1]; rows], weights, ..Gradients::default() };
+            let drawn =
+                DrawnRows { step: view as u32, rows: &numbers, gradients: &gradients, first: 0, image_size: [20, 10] };
             strategy.collect(&mut state.view_mut(), &drawn, &mut histogram);
         }
         (state, histogram)

@@ -20,13 +20,13 @@
 //! afterwards, contain it; 4. a split in place moves no mean and enlarges no row, so no bounds need room for a round.
 
 use super::ops::rotation;
-use super::stats::{GradHistogram, accumulate_scores, reaches_bin, rows_from_bin};
-use super::strategy::{DrawnRows, Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy, ViewGradients};
+use super::stats::{DrawnRows, GradHistogram, accumulate_scores, reaches_bin, rows_from_bin};
+use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy, ViewGradients};
 use crate::base::math::sigmoid;
 use crate::base::rng::{Purpose, Stream};
 use crate::optim::bounds::SplitLimits;
 use crate::optim::rates::Rates;
-use crate::scene::columns::Column;
+use crate::scene::columns::{Column, Gradients};
 use crate::scene::events::{EventKind, RelocationRound};
 use crate::scene::rows::{Rows, RowsMut};
 
@@ -111,14 +111,14 @@ impl Strategy for McmcStrategy {
             self.key(sigmoid(view.columns.opacities[row]), view.uid[row], drawn.step)
         };
         let keys: Vec<f32> = drawn.rows.iter().map(key).collect();
-        accumulate_scores(view, drawn.rows, drawn.radii, histogram, |listed| (keys[listed], None))
+        accumulate_scores(view, drawn, histogram, |place| (keys[place - drawn.first], None))
     }
 
     fn add_gradients(&self, view: &mut ViewGradients<'_>) {
         let of_opacity = OPACITY_WEIGHT / view.rows_of_view as f64;
         let of_scale = SCALE_WEIGHT / (3 * view.rows_of_view) as f64 / self.scene_scale;
-        let (values, gradients) = (view.columns, &mut *view.gradients);
-        for (row, radii) in view.radii.iter().enumerate() {
+        let (values, Gradients { columns: gradients, radii, .. }) = (view.columns, &mut *view.gradients);
+        for (row, radii) in radii.iter().enumerate() {
             if radii.contains(&0) {
                 continue;
             }
@@ -219,10 +219,9 @@ mod tests {
         state.columns.opacities[rows - 1] = logit(0.004);
         let mut histogram = GradHistogram::default();
         let numbers: Vec<u32> = (0..rows as u32).collect();
-        let (radii, v_means2d) = (vec![[1, 1]; rows], vec![[0.0; 2]; rows]);
+        let gradients = Gradients { radii: vec![[1, 1]; rows], ..Gradients::default() };
         for step in [step - 1, step] {
-            let (rows, image_size) = (&numbers[..], [9, 9]);
-            let drawn = DrawnRows { step, rows, v_means2d: &v_means2d, radii: &radii, weights: &[], image_size };
+            let drawn = DrawnRows { step, rows: &numbers, gradients: &gradients, first: 0, image_size: [9, 9] };
             strategy.collect(&mut state.view_mut(), &drawn, &mut histogram);
         }
         (state, histogram)
@@ -307,11 +306,11 @@ mod tests {
         let mut values = Columns::zeros(2, 0);
         values.opacities.copy_from_slice(&[0.3, -1.0]);
         values.scales.copy_from_slice(&[-2.0, -3.0, -1.0, 0.0, 0.0, 0.0]);
-        let mut gradients = Columns::zeros(2, 0);
-        let radii = [[1, 1], [0, 0]];
-        let (columns, rows_of_view) = (&values, 2);
-        let mut view = ViewGradients { columns, gradients: &mut gradients, radii: &radii, rows_of_view };
+        let (columns, radii) = (Columns::zeros(2, 0), vec![[1, 1], [0, 0]]);
+        let mut gradients = Gradients { columns, radii, ..Gradients::default() };
+        let mut view = ViewGradients { columns: &values, gradients: &mut gradients, rows_of_view: 2 };
         strategy.add_gradients(&mut view);
+        let gradients = gradients.columns;
         let loss = |change: f64| {
             let opacity = 1.0 / (1.0 + (-(f64::from(values.opacities[0]) + change)).exp());
             let sigma = (f64::from(values.scales[1]) + change).exp() / 2.0;

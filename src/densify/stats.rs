@@ -7,6 +7,7 @@
 //! not matter; 4. no counter wraps: removing a row from an empty bin, which happens only if the row was never
 //! added to this histogram, adds to [`GradHistogram::uncounted`].
 
+use crate::scene::columns::Gradients;
 pub use crate::scene::rows::mean_grad2d;
 use crate::scene::rows::{Rows, RowsMut};
 use crate::scene::sightings::{is_full, mean_weight, views, with_view};
@@ -180,46 +181,52 @@ fn bin(mean: f32) -> usize {
     if mean > 0.0 { (mean.to_bits() >> 16) as usize } else { 0 }
 }
 
-/// Adds the gradients of one view. `rows` lists rows of the table that contains `view`, ascending. `v_means2d`
-/// (gradient of the loss with respect to the projected mean, pixel units) and `radii` have one entry per listed row.
-/// Rows with a zero radius and gradients that are not finite are ignored. Returns the number of rows that changed.
-pub fn accumulate(
-    view: &mut RowsMut<'_>,
-    rows: &[u32],
-    v_means2d: &[[f32; 2]],
-    radii: &[[u32; 2]],
-    image_size: [u32; 2],
-    histogram: &mut GradHistogram,
-) -> usize {
-    assert!(rows.len() == v_means2d.len() && rows.len() == radii.len(), "one gradient and radius per listed row");
-    let half = image_size.map(|n| n as f32 * 0.5);
-    accumulate_scores(view, rows, radii, histogram, |listed| (grad_norm(v_means2d[listed], half), None))
+/// Rows of a step's working set, with their gradients and radii.
+#[derive(Debug, Clone, Copy)]
+pub struct DrawnRows<'a> {
+    /// 0-based step.
+    pub step: u32,
+    /// Row numbers in the table of the view, ascending.
+    pub rows: &'a [u32],
+    /// Gradients of the working set. Weights are empty unless [`super::strategy::Strategy::needs_weights`].
+    pub gradients: &'a Gradients,
+    /// Place of the first of `rows` in `gradients`.
+    pub first: usize,
+    /// Width and height of the picture, pixels.
+    pub image_size: [u32; 2],
 }
 
-/// Norm of a gradient of the projected mean, NDC units; `half` is half of the image size, pixels.
-#[inline(always)]
-pub fn grad_norm(v: [f32; 2], half: [f32; 2]) -> f32 {
-    let (x, y) = (v[0] * half[0], v[1] * half[1]);
-    (x * x + y * y).sqrt()
+impl DrawnRows<'_> {
+    /// Norm of the gradient of the projected mean at a place in the gradients, NDC units.
+    #[inline(always)]
+    pub fn gradient_norm(&self, place: usize) -> f32 {
+        let (v, half) = (self.gradients.means2d[place], self.image_size.map(|n| n as f32 * 0.5));
+        let (x, y) = (v[0] * half[0], v[1] * half[1]);
+        (x * x + y * y).sqrt()
+    }
+}
+
+/// Adds the gradient norms of one view, as [`accumulate_scores`] does.
+pub fn accumulate(view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
+    accumulate_scores(view, drawn, histogram, |place| (drawn.gradient_norm(place), None))
 }
 
 /// Adds a growth score and, where a strategy weighs rows, a blending weight (pixels) of one view to the statistics of
-/// the listed rows. `of_row` gives both for a position in `rows`; `radii` is as in [`accumulate`]. Rows with a zero
+/// the drawn rows of the table that contains `view`. `of_row` gives both for a place in the gradients. Rows with a zero
 /// radius, with a score that is not finite, or with as many views as a row can count are ignored. Returns the number of
 /// rows that changed.
 pub fn accumulate_scores(
     view: &mut RowsMut<'_>,
-    rows: &[u32],
-    radii: &[[u32; 2]],
+    drawn: &DrawnRows<'_>,
     histogram: &mut GradHistogram,
     of_row: impl Fn(usize) -> (f32, Option<f32>),
 ) -> usize {
     let mut changed = 0;
-    for (listed, (&row, radius)) in rows.iter().zip(radii).enumerate() {
-        if radius[0] == 0 || radius[1] == 0 {
+    for (place, &row) in (drawn.first..).zip(drawn.rows) {
+        if drawn.gradients.radii[place].contains(&0) {
             continue;
         }
-        let (score, weight) = of_row(listed);
+        let (score, weight) = of_row(place);
         let row = row as usize - view.first_row;
         let (grad2d, count) = (&mut view.grad2d[row], &mut view.count[row]);
         if !score.is_finite() || is_full(*count) {
@@ -244,10 +251,11 @@ mod tests {
     fn only_drawn_rows_count_and_the_histogram_follows() {
         let mut state = SceneState::from_columns(Columns::zeros(4, 0));
         let mut histogram = GradHistogram::default();
-        let v = [[3e-4, 4e-4], [1.0, 1.0], [f32::NAN, 0.0]];
+        let means2d = vec![[3e-4, 4e-4], [1.0, 1.0], [f32::NAN, 0.0]];
+        let gradients = Gradients { means2d, radii: vec![[2, 1], [0, 3], [1, 1]], ..Gradients::default() };
+        let drawn = DrawnRows { step: 0, rows: &[0, 2, 3], gradients: &gradients, first: 0, image_size: [20, 20] };
         for _ in 0..2 {
-            let radii = [[2, 1], [0, 3], [1, 1]];
-            accumulate(&mut state.view_mut(), &[0, 2, 3], &v, &radii, [20, 20], &mut histogram);
+            accumulate(&mut state.view_mut(), &drawn, &mut histogram);
         }
         assert_eq!(state.count, [2, 0, 0, 0]);
         // |(3e-4, 4e-4)| * 10, twice.
@@ -263,9 +271,11 @@ mod tests {
         let mut state = SceneState::from_columns(Columns::zeros(100, 0));
         let mut histogram = GradHistogram::default();
         let rows: Vec<u32> = (0..100).collect();
+        let gradients = Gradients { radii: vec![[1, 1]; 100], ..Gradients::default() };
+        let drawn = DrawnRows { step: 0, rows: &rows, gradients: &gradients, first: 0, image_size: [1, 1] };
         for view in 1..=WEIGHED_VIEWS {
             let of_row = |row: usize| (row as f32, Some(row as f32 + 1.0));
-            accumulate_scores(&mut state.view_mut(), &rows, &[[1, 1]; 100], &mut histogram, of_row);
+            accumulate_scores(&mut state.view_mut(), &drawn, &mut histogram, of_row);
             assert_eq!(histogram.weighed_rows(), if view < WEIGHED_VIEWS { 0 } else { 100 });
         }
         assert_eq!((histogram.rows(), histogram.uncounted()), (100, 0));
@@ -302,8 +312,9 @@ mod tests {
         let mut state = SceneState::from_columns(Columns::zeros(2, 0));
         (state.grad2d[1], state.count[1]) = (3.0, 2);
         let mut histogram = GradHistogram::default();
-        let v = [[1.0, 0.0], [1.0, 0.0]];
-        accumulate(&mut state.view_mut(), &[0, 1], &v, &[[1, 1]; 2], [2, 2], &mut histogram);
+        let gradients = Gradients { means2d: vec![[1.0, 0.0]; 2], radii: vec![[1, 1]; 2], ..Gradients::default() };
+        let drawn = DrawnRows { step: 0, rows: &[0, 1], gradients: &gradients, first: 0, image_size: [2, 2] };
+        accumulate(&mut state.view_mut(), &drawn, &mut histogram);
         assert_eq!((histogram.uncounted(), histogram.rows()), (1, 2));
         let mut counted = GradHistogram::default();
         counted.add_rows(&state.view());

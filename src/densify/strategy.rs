@@ -8,9 +8,9 @@
 //! the same fate whenever it is applied.
 
 use super::growth::GrowthRule;
-use super::stats::{GradHistogram, accumulate};
+use super::stats::{DrawnRows, GradHistogram, accumulate};
 use crate::optim::bounds::SplitLimits;
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Columns, Gradients};
 use crate::scene::events::EventKind;
 use crate::scene::rows::{Rows, RowsMut};
 use std::fmt;
@@ -48,33 +48,13 @@ impl RoundSteps {
     }
 }
 
-/// The rows of a step's working set, with their gradients and radii.
-#[derive(Debug, Clone, Copy)]
-pub struct DrawnRows<'a> {
-    /// 0-based step.
-    pub step: u32,
-    /// Row numbers in the table of the view, ascending.
-    pub rows: &'a [u32],
-    /// Gradient of the loss with respect to each row's projected mean, pixel units.
-    pub v_means2d: &'a [[f32; 2]],
-    /// Radii of each row's footprint, pixels; a row with a zero radius was not drawn.
-    pub radii: &'a [[u32; 2]],
-    /// Blending weight, and blending weight times squared error, of each row, summed over the pixels of the view; empty
-    /// unless [`Strategy::needs_weights`].
-    pub weights: &'a [[f32; 2]],
-    /// Width and height of the picture, pixels.
-    pub image_size: [u32; 2],
-}
-
 /// Rows of a view with their gradients, before the update.
 #[derive(Debug)]
 pub struct ViewGradients<'a> {
     /// Values of the rows at the step.
     pub columns: &'a Columns,
-    /// Gradients of the rows; one entry per row of `columns`, as is `radii`.
-    pub gradients: &'a mut Columns,
-    /// Radii of each row's footprint, pixels; a row with a zero radius was not drawn.
-    pub radii: &'a [[u32; 2]],
+    /// Gradients of the rows; one entry per row of `columns`.
+    pub gradients: &'a mut Gradients,
     /// Rows of the whole view, of which these may be a batch.
     pub rows_of_view: usize,
 }
@@ -118,7 +98,7 @@ pub trait Strategy: fmt::Debug + Send + Sync {
         self.rounds().is_some_and(|rounds| rounds.is_round(step))
     }
 
-    /// Whether [`Strategy::collect`] reads [`DrawnRows::weights`], which the renderer collects on demand only.
+    /// Whether [`Strategy::collect`] reads [`Gradients::weights`], which the renderer collects on demand only.
     fn needs_weights(&self) -> bool {
         false
     }
@@ -132,7 +112,7 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// Adds the gradients of a step to the statistics of the rows and updates the histogram, which counts every row
     /// that has statistics. Returns the number of rows that changed.
     fn collect(&self, view: &mut RowsMut<'_>, drawn: &DrawnRows<'_>, histogram: &mut GradHistogram) -> usize {
-        accumulate(view, drawn.rows, drawn.v_means2d, drawn.radii, drawn.image_size, histogram)
+        accumulate(view, drawn, histogram)
     }
 
     /// Adds gradients of the strategy's own to those of the loss. Not called where the optimizer runs on a device.

@@ -59,6 +59,7 @@ pub use crate::kernels::image_loss::{LossOptions, LossValue, SsimPadding};
 use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
+pub use crate::scene::columns::Gradients;
 use crate::scene::image::{Image, Target};
 use view_sizes::ViewSizes;
 
@@ -81,21 +82,6 @@ impl Default for RenderOptions {
     fn default() -> Self {
         RenderOptions { sh_degree: 3, max_alpha: 0.99, eps2d: 0.3, background: [0.0; 3], simd: SimdPath::best() }
     }
-}
-
-/// Gradients of one batch of a view, one entry per row.
-#[derive(Debug, Clone, Default)]
-pub struct Gradients {
-    /// Gradient with respect to the stored (pre-activation) columns.
-    pub columns: Columns,
-    /// Gradient with respect to the projected mean, signed, in pixel units.
-    pub means2d: Vec<[f32; 2]>,
-    /// Half extents of the footprint, pixels; [0, 0] for a row that was not drawn.
-    pub radii: Vec<[u32; 2]>,
-    /// If [`Renderer::weigh_rows`] asked for it: the blending weight alpha T of each row, and the weight times the
-    /// squared error of the picture (mean over channels), summed over the pixels; zeros for rows that were not drawn.
-    /// Empty otherwise.
-    pub weights: Vec<[f32; 2]>,
 }
 
 /// Gradient of a loss with respect to a picture, in host memory: the input of the backward pass.

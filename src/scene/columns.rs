@@ -70,6 +70,21 @@ pub struct ColumnSet<T> {
 /// Rows of Gaussians by column; also gradients (`v_*`), `exp_avg` and `exp_avg_sq`, which have the same shape.
 pub type Columns = ColumnSet<Vec<f32>>;
 
+/// Gradients of one batch of a view, one entry per row.
+#[derive(Debug, Clone, Default)]
+pub struct Gradients {
+    /// Gradient with respect to the stored (pre-activation) columns.
+    pub columns: Columns,
+    /// Gradient with respect to the projected mean, signed, in pixel units.
+    pub means2d: Vec<[f32; 2]>,
+    /// Half extents of the footprint, pixels; [0, 0] for a row that was not drawn.
+    pub radii: Vec<[u32; 2]>,
+    /// If the renderer was asked for it: the blending weight alpha T of each row, and the weight times the
+    /// squared error of the picture (mean over channels), summed over the pixels; zeros for rows that were not drawn.
+    /// Empty otherwise.
+    pub weights: Vec<[f32; 2]>,
+}
+
 impl<T> ColumnSet<T> {
     #[inline(always)]
     pub fn column(&self, column: Column) -> &T {

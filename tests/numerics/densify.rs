@@ -5,14 +5,14 @@ use gsscale::base::rng::{Purpose, Stream, hash64};
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::stats::{GradHistogram, accumulate};
+use gsscale::densify::stats::{DrawnRows, GradHistogram, accumulate};
 use gsscale::densify::strategy::{RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::optim::row_kernels::take_step;
-use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::columns::{Column, Columns, Gradients};
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
@@ -52,18 +52,18 @@ fn touch(
 ) {
     let rows: Vec<u32> = (0..state.rows() as u32).filter(|&r| is_drawn(state.uid[r as usize])).collect();
     let mut grads = Columns::zeros(rows.len(), state.sh_degree());
-    let mut v_means2d = Vec::new();
-    let mut radii = Vec::new();
+    let mut gradients = Gradients::default();
     for (i, &row) in rows.iter().enumerate() {
         let mut draws = Stream::new(4, Purpose::Test, state.uid[row as usize], u64::from(step));
         for column in Column::ALL {
             grads.row_mut(column, i).iter_mut().for_each(|x| *x = (draws.normal() * 1e-4) as f32);
         }
-        v_means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
-        radii.push([draws.below(8) as u32, draws.below(8) as u32]);
+        gradients.means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
+        gradients.radii.push([draws.below(8) as u32, draws.below(8) as u32]);
     }
     take_step(adam, state, &rows, &grads, step);
-    accumulate(&mut state.view_mut(), &rows, &v_means2d, &radii, [20, 30], histogram);
+    let drawn = DrawnRows { step, rows: &rows, gradients: &gradients, first: 0, image_size: [20, 30] };
+    accumulate(&mut state.view_mut(), &drawn, histogram);
 }
 
 #[test]

@@ -10,15 +10,15 @@ use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::mcmc::McmcStrategy;
 use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
-use gsscale::densify::stats::{GradHistogram, WEIGHED_VIEWS, accumulate};
-use gsscale::densify::strategy::{DrawnRows, Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
+use gsscale::densify::stats::{DrawnRows, GradHistogram, WEIGHED_VIEWS, accumulate};
+use gsscale::densify::strategy::{Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, lowest_opacity, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
 use gsscale::optim::rates::Rates;
 use gsscale::optim::row_kernels::take_step;
-use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::columns::{Column, Columns, Gradients};
 use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RelocationRound, RoundThresholds};
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, read_page, write_page};
 use gsscale::scene::partition::{first_fill, partition};
@@ -57,26 +57,20 @@ fn touch(
 ) {
     let rows: Vec<u32> = (0..state.rows() as u32).filter(|&r| is_drawn(state.uid[r as usize])).collect();
     let mut grads = Columns::zeros(rows.len(), state.sh_degree());
-    let (mut v_means2d, mut radii, mut weights) = (Vec::new(), Vec::new(), Vec::new());
+    let mut gradients = Gradients::default();
     for (i, &row) in rows.iter().enumerate() {
         let mut draws = Stream::new(4, Purpose::Test, state.uid[row as usize], u64::from(step));
         for column in Column::ALL {
             grads.row_mut(column, i).iter_mut().for_each(|x| *x = (draws.normal() * 1e-4) as f32);
         }
-        v_means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
-        radii.push([draws.below(8) as u32, draws.below(8) as u32]);
-        weights.push([(draws.uniform() * 9.0) as f32, draws.uniform() as f32]);
+        gradients.means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
+        gradients.radii.push([draws.below(8) as u32, draws.below(8) as u32]);
+        let weights = [(draws.uniform() * 9.0) as f32, draws.uniform() as f32];
+        gradients.weights.extend(strategy.needs_weights().then_some(weights));
     }
     take_step(adam, state, &rows, &grads, step);
     strategy.after_update(&mut state.view_mut(), &rows, step);
-    let drawn = DrawnRows {
-        step,
-        rows: &rows,
-        v_means2d: &v_means2d,
-        radii: &radii,
-        weights: if strategy.needs_weights() { &weights } else { &[] },
-        image_size: [20, 30],
-    };
+    let drawn = DrawnRows { step, rows: &rows, gradients: &gradients, first: 0, image_size: [20, 30] };
     strategy.collect(&mut state.view_mut(), &drawn, histogram);
 }
 
@@ -477,8 +471,10 @@ fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
             });
         }
         take_step(adam, &mut state, &listed, &grads, step);
-        let v_means2d: Vec<[f32; 2]> = listed.iter().map(|_| [(draws.normal() * 3e-5) as f32, 0.0]).collect();
-        accumulate(&mut state.view_mut(), &listed, &v_means2d, &vec![[1, 1]; listed.len()], [20, 20], &mut histogram);
+        let means2d = listed.iter().map(|_| [(draws.normal() * 3e-5) as f32, 0.0]).collect();
+        let gradients = Gradients { means2d, radii: vec![[1, 1]; listed.len()], ..Gradients::default() };
+        let drawn = DrawnRows { step, rows: &listed, gradients: &gradients, first: 0, image_size: [20, 20] };
+        accumulate(&mut state.view_mut(), &drawn, &mut histogram);
     }
     state
 }

@@ -9,10 +9,10 @@
 use super::catch_up;
 use super::pages::{PagedScene, SceneRules, WorkingSet, row_tables};
 use crate::base::ids::PageNo;
-use crate::densify::strategy::DrawnRows;
+use crate::densify::stats::DrawnRows;
 use crate::optim::row_kernels::{StepCounts, step_rows};
 use crate::paging::pinned::PinnedPage;
-use crate::render::{Gradients, Renderer};
+use crate::render::Renderer;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::rows::ColumnsRef;
@@ -198,9 +198,9 @@ impl RowBackend for RowsInHost<'_> {
         collects: bool,
     ) -> Result<UpdateCounts, TrainError> {
         let WorkingSet { row_from_working, columns, gradients } = working;
-        let size = [camera.width, camera.height];
-        let input = StepGradients { step, rows: row_from_working, columns, gradients, size };
-        let counts = update_pages(scene, pinned, &input, collects);
+        let image_size = [camera.width, camera.height];
+        let drawn = DrawnRows { step, rows: row_from_working, gradients, first: 0, image_size };
+        let counts = update_pages(scene, pinned, columns, &drawn, collects);
         let is_drawn = |radii: &&[u32; 2]| **radii != [0, 0];
         let drawn = if counts.updated == 0 { gradients.radii.iter().filter(is_drawn).count() } else { 0 };
         Ok(UpdateCounts {
@@ -211,66 +211,44 @@ impl RowBackend for RowsInHost<'_> {
     }
 }
 
-/// Input of the update.
-pub(super) struct StepGradients<'a> {
-    /// 0-based step.
-    pub step: u32,
-    /// Row numbers in the pinned pages, consecutive across pages, ascending.
-    pub rows: &'a [u32],
-    /// Values of the listed rows, as gathered at this step.
-    pub columns: &'a Columns,
-    /// One entry per listed row.
-    pub gradients: &'a Gradients,
-    /// Width and height of the view.
-    pub size: [u32; 2],
-}
-
 /// The part of a step's rows that lies in one page.
 struct PageShare<'a> {
     page: &'a mut PinnedPage,
     first_row: usize,
-    /// Positions of the page's rows in [`StepGradients::rows`].
-    listed: std::ops::Range<usize>,
-    rows: &'a [u32],
+    drawn: DrawnRows<'a>,
     values: ColumnsRef<'a>,
     grads: ColumnsRef<'a>,
     touched: bool,
 }
 
-/// Runs the optimizer step, collects statistics if `collects`, and renews the bounds of changed pages.
+/// Runs the optimizer step, collects statistics if `collects`, and renews the bounds of changed pages. The numbers of drawn rows are
+/// consecutive across pages; `columns` are their values, as gathered at this step.
 pub(super) fn update_pages(
     scene: &mut PagedScene,
     pages: &mut [PinnedPage],
-    input: &StepGradients<'_>,
+    columns: &Columns,
+    drawn: &DrawnRows<'_>,
     collects: bool,
 ) -> StepCounts {
-    let at = scene.rules.adam.at(input.step);
+    let at = scene.rules.adam.at(drawn.step);
     let strategy = &scene.rules.strategy;
-    let mut shares = shares(pages, input);
+    let mut shares = shares(pages, columns, drawn);
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
-            let counts = step_rows(&at, share.page.rows_mut(share.first_row), share.rows, share.values, share.grads);
+            let rows = share.drawn.rows;
+            let counts = step_rows(&at, share.page.rows_mut(share.first_row), rows, share.values, share.grads);
             share.touched = counts.updated > 0;
             if share.touched {
-                strategy.after_update(&mut share.page.rows_mut(share.first_row), share.rows, input.step);
+                strategy.after_update(&mut share.page.rows_mut(share.first_row), rows, drawn.step);
             }
             counts
         })
         .collect();
     if collects {
-        let Gradients { means2d, radii, weights, .. } = input.gradients;
         for share in &mut shares {
-            let drawn = DrawnRows {
-                step: input.step,
-                rows: share.rows,
-                v_means2d: &means2d[share.listed.clone()],
-                radii: &radii[share.listed.clone()],
-                weights: weights.get(share.listed.clone()).unwrap_or_default(),
-                image_size: input.size,
-            };
             let mut view = share.page.rows_mut(share.first_row);
-            share.touched |= strategy.collect(&mut view, &drawn, &mut scene.histogram) > 0;
+            share.touched |= strategy.collect(&mut view, &share.drawn, &mut scene.histogram) > 0;
         }
     }
     let rules = &scene.rules;
@@ -284,29 +262,21 @@ pub(super) fn update_pages(
     })
 }
 
-/// Splits the listed rows, their values and their gradients by page.
-fn shares<'a>(pages: &'a mut [PinnedPage], input: &StepGradients<'a>) -> Vec<PageShare<'a>> {
-    let (mut rest, mut values, mut grads) = (input.rows, input.columns.view(), input.gradients.columns.view());
-    let (mut first_row, mut first_listed) = (0, 0);
+/// Splits the drawn rows, their values and their gradients by page.
+fn shares<'a>(pages: &'a mut [PinnedPage], columns: &'a Columns, drawn: &DrawnRows<'a>) -> Vec<PageShare<'a>> {
+    let (mut rest, mut values, mut grads) = (drawn.rows, columns.view(), drawn.gradients.columns.view());
+    let (mut end_row, mut first) = (0, 0);
     let mut shares = Vec::with_capacity(pages.len());
     for page in pages {
-        let (first, listed) = (first_row, first_listed);
-        first_row += page.meta.rows as usize;
-        let count = rest.partition_point(|&row| (row as usize) < first_row);
+        let first_row = end_row;
+        end_row += page.meta.rows as usize;
+        let count = rest.partition_point(|&row| (row as usize) < end_row);
         let (rows, rest_rows) = rest.split_at(count);
         let (own_values, rest_values) = values.split_at(count);
         let (own_grads, rest_grads) = grads.split_at(count);
-        first_listed += count;
-        let listed = listed..first_listed;
-        shares.push(PageShare {
-            page,
-            first_row: first,
-            listed,
-            rows,
-            values: own_values,
-            grads: own_grads,
-            touched: false,
-        });
+        let drawn = DrawnRows { rows, first, ..*drawn };
+        first += count;
+        shares.push(PageShare { page, first_row, drawn, values: own_values, grads: own_grads, touched: false });
         (rest, values, grads) = (rest_rows, rest_values, rest_grads);
     }
     shares

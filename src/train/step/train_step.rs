@@ -19,7 +19,7 @@ use crate::densify::strategy::ViewGradients;
 use crate::paging::error::PagingError;
 use crate::paging::pinned::PinnedPage;
 use crate::paging::plan::look_ahead::UseInStep;
-use crate::render::{Gradients, LossValue, RenderOptions, RowBatches};
+use crate::render::{LossValue, RenderOptions, RowBatches};
 use crate::scene::camera::Camera;
 use crate::train::error::TrainError;
 use std::collections::VecDeque;
@@ -268,8 +268,7 @@ impl Passes<'_, '_> {
             parameters
                 .for_each(|parameter| parameter.row_gradients(columns, &gradients.columns, self.view.camera, degree));
             // After the gradients of poses, which follow from those of the loss alone.
-            let Gradients { columns: gradients, radii, .. } = gradients;
-            let mut view = ViewGradients { columns, gradients, radii, rows_of_view: self.outcome.rows };
+            let mut view = ViewGradients { columns, gradients, rows_of_view: self.outcome.rows };
             self.scene.rules.strategy.add_gradients(&mut view);
         }
         drop(span);
