@@ -19,7 +19,7 @@ fn pictures(width: u32, height: u32) -> (Image, Target) {
     let mut image = Image::new(width, height);
     image.rgb.iter_mut().for_each(|v| *v = draw.uniform() as f32);
     let rgb = (0..image.rgb.len()).map(|_| draw.below(256) as u8).collect();
-    (image, Target { width, height, rgb, mask: None })
+    (image, Target::new([width, height], rgb))
 }
 
 /// Median wall and CPU milliseconds, and the bits of the loss.

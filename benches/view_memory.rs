@@ -168,8 +168,7 @@ fn draw(renderer: &mut dyn Renderer, rows: &Columns, camera: &Camera, batches: u
     let per_batch = rows.rows().div_ceil(batches).max(1);
     let parts = || (0..rows.rows()).step_by(per_batch).map(|first| first..(first + per_batch).min(rows.rows()));
     let how = if batches == 1 { RowBatches::One } else { RowBatches::Several };
-    let photo = vec![100; 3 * camera.pixels()];
-    let target = Target { width: camera.width, height: camera.height, rgb: photo, mask: None };
+    let target = Target::new([camera.width, camera.height], vec![100; 3 * camera.pixels()]);
     let loss = LossOptions { padding: SsimPadding::Valid, ..LossOptions::default() };
     checked(renderer.begin_view(camera, &options, how));
     parts().for_each(|place| checked(renderer.rows_in(&part(rows, place))));

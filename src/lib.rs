@@ -84,7 +84,7 @@
 //! 2. `kernels/project_fwd.rs`: a field of `View`, which on devices is `View` in `shared/camera.wgsl`, and the projection, with
 //!    `shared/covariance.wgsl`; its gradient in `kernels/project_bwd.rs` and `project_bwd.wgsl`; `viewing_direction` in
 //!    `kernels/sh_fwd.rs` and `shared/camera.wgsl`.
-//! 3. `dataset/`: the reader that knows the model, undistortion, and `loader.rs`, which makes the camera. A focal length in metres of
+//! 3. `dataset/`: the reader that knows the model, undistortion, and `dataset/loader.rs`, which makes the camera. A focal length in metres of
 //!    the world is multiplied by the scale of the frame. `dataset/disturb.rs` and `photos/pose.rs`, if the model comes that far.
 //!
 //! **A page codec**
@@ -94,8 +94,8 @@
 //!
 //! **A loss term** is a kind of [`photos`] that learns nothing, also where the term does not look at the photo:
 //! 1. A file in `photos/`: a [`photos::parameter::PhotoParameter`] whose `adds_loss` and `needs_picture` are true. `target` gets the corrected picture
-//!    and the photo that the loss compares, computes value and gradient, keeps both, and returns the photo. `loss` gives the value,
-//!    `picture_back` adds the gradient, `begin_step` forgets both, because a step may show no picture. `buffer_bytes` counts the memory,
+//!    and the photo that the loss compares, computes value and gradient, keeps both, and returns the photo. `loss` gives the value, which
+//!    the log shows by the kind's name, `picture_back` adds the gradient, `begin_step` forgets both, because a step may show no picture. `buffer_bytes` counts the memory,
 //!    `free_buffers` frees it. Masked pixels do not count, nor does a term of several pixels with one of them. Sums have a fixed order,
 //!    for the same bits on any number of threads. `save` gives `Encoded::of(&())`. The test of `train/step/comparison.rs` has
 //!    a small example. `first` returns `None` where the weight is 0, so that nothing changes.

@@ -129,7 +129,7 @@ pub fn terrain_case(n: usize, width: u32, height: u32, views: usize) -> Case {
         camera.viewmat[0][3] = 0.4 * turn.cos();
         camera.viewmat[2][3] += 0.4 * turn.sin();
         checked(renderer.draw(&columns, &camera, &RenderOptions::default()));
-        (camera, Target { width, height, rgb: checked(renderer.image()).to_rgb8(), mask: None })
+        (camera, Target::new([width, height], checked(renderer.image()).to_rgb8()))
     });
     let views = views.collect();
     let mut draws = Stream::new(2, Purpose::Test, n as u64, 0);

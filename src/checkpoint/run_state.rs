@@ -270,7 +270,7 @@ mod tests {
 
     /// Three photos, the last of which was looked at: black, while its picture is black but for one white block.
     fn looked_at() -> Vec<Vec<BlockState>> {
-        let photo = Target { width: 8, height: 32, rgb: vec![0; 3 * 256], mask: None };
+        let photo = Target::new([8, 32], vec![0; 3 * 256]);
         let picture: Vec<f32> = (0..3 * 256).map(|i| f32::from(u8::from(i % 256 / 8 < 4 && i % 8 < 4))).collect();
         vec![Vec::new(), Vec::new(), look(&[], &picture, &photo).unwrap()]
     }

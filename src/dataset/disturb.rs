@@ -407,7 +407,7 @@ mod tests {
 
     fn photo() -> Target {
         let rgb = (0..3 * 40 * 30).map(|i| (i * 7 % 200) as u8).collect();
-        Target { width: 40, height: 30, rgb, mask: None }
+        Target::new([40, 30], rgb)
     }
 
     fn read(encoded: &EncodedPhoto) -> Vec<u8> {

@@ -119,7 +119,7 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
         mask = Some(kept);
     }
     let mask = mask.filter(|m| m.contains(&0));
-    Ok(Target { width: source.target.0, height: source.target.1, rgb, mask })
+    Ok(Target { mask, ..Target::new(source.target.into(), rgb) })
 }
 
 /// The photo at target size; for one that is undistorted, also the pixels of which at least half are inside the photo.

@@ -16,7 +16,7 @@ use crate::page::format::encoding::{self, EncodingError};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 use crate::scene::events::{Event, EventKind, EventLog};
-use crate::scene::image::Target;
+use crate::scene::image::{Image, PictureGradient, Target};
 use serde::de::{DeserializeOwned, Visitor};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
@@ -175,8 +175,8 @@ pub trait PhotoParameter {
         false
     }
 
-    /// The photo that the picture is compared with. `_picture` is the corrected picture, `[3][height][width]`, if a parameter needs it.
-    fn target<'a>(&'a mut self, _picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+    /// The photo that the picture is compared with. `_picture` is the corrected picture, if a parameter needs it.
+    fn target<'a>(&'a mut self, _picture: Option<&Image>, photo: &'a Target) -> &'a Target {
         photo
     }
 
@@ -190,9 +190,8 @@ pub trait PhotoParameter {
         0.0
     }
 
-    /// Turns the gradient with respect to the corrected picture into that with respect to the drawn one, both `[3][height][width]`; a term of the
-    /// loss adds its own. The last kind of the list comes first.
-    fn picture_back(&mut self, _photo: &Target, _v_rgb: &mut [f32]) {}
+    /// Turns the gradient with respect to the corrected picture into that with respect to the drawn one; a term of the loss adds its own. The last kind of the list comes first.
+    fn picture_back(&mut self, _photo: &Target, _gradient: &mut PictureGradient) {}
 
     /// Takes the gradients of the rows of a batch, drawn with bands up to `sh_degree`. Not called with rows on a device.
     fn row_gradients(&mut self, _rows: &Columns, _gradients: &Columns, _camera: &Camera, _sh_degree: u8) {}

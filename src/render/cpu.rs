@@ -461,10 +461,11 @@ impl Renderer for CpuRenderer {
 
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
         self.sequence.loss(target)?;
-        let Self { clock, image_loss, image, gradient: PictureGradient { v_rgb, v_alpha }, .. } = self;
-        *v_alpha = None;
+        let Self { clock, image_loss, image, gradient, .. } = self;
+        gradient.v_alpha = None;
         clock.reset(&["image_loss"]);
-        let value = clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, v_rgb));
+        let value =
+            clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, &mut gradient.v_rgb));
         self.loss_value = Some(value);
         if self.weighs {
             squared_errors(&ImagePair::new(&self.image, target), &mut self.errors);

@@ -114,7 +114,7 @@ pub fn view(
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
     let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
-    let target = Target { width, height, rgb, mask };
+    let target = Target { mask, ..Target::new([width, height], rgb) };
     let mut grads = Gradients::default();
     renderer.draw(columns, camera, options)?;
     renderer.loss(&target, &LossOptions::default())?;

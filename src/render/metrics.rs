@@ -90,7 +90,7 @@ mod tests {
     fn gradient_pair(width: u32, height: u32) -> (Image, Target) {
         let n = (width * height) as usize;
         let rgb: Vec<u8> = (0..3 * n).map(|i| (i * 37 % 256) as u8).collect();
-        let target = Target { width, height, rgb, mask: None };
+        let target = Target::new([width, height], rgb);
         let mut image = Image::new(width, height);
         for i in 0..n {
             for c in 0..3 {
@@ -109,7 +109,7 @@ mod tests {
             // f32 rounding of windowed sums, relative to C2 = 9e-4.
             assert!((ssim(&image, &target, variant, SimdPath::best()) - 1.0).abs() < 1e-5);
         }
-        let white = Target { width: 4, height: 3, rgb: vec![255; 36], mask: None };
+        let white = Target::new([4, 3], vec![255; 36]);
         let mut bright = Image::new(4, 3);
         bright.rgb.fill(7.5);
         assert_eq!(psnr(&bright, &white), f64::INFINITY, "clamped to white");

@@ -60,6 +60,7 @@ use crate::kernels::splats::Grid;
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
 pub use crate::scene::columns::Gradients;
+pub use crate::scene::image::PictureGradient;
 use crate::scene::image::{Image, Target};
 use view_sizes::ViewSizes;
 
@@ -81,30 +82,6 @@ pub struct RenderOptions {
 impl Default for RenderOptions {
     fn default() -> Self {
         RenderOptions { sh_degree: 3, max_alpha: 0.99, eps2d: 0.3, background: [0.0; 3], simd: SimdPath::best() }
-    }
-}
-
-/// Gradient of a loss with respect to a picture, in host memory: the input of the backward pass.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct PictureGradient {
-    /// `[3][height][width]`.
-    pub v_rgb: Vec<f32>,
-    /// `[height][width]`, with respect to the coverage 1 - T; `None` stands for zeros.
-    pub v_alpha: Option<Vec<f32>>,
-}
-
-impl PictureGradient {
-    /// Sets the gradient to zeros for a picture of `pixels` pixels; reuses the allocation.
-    fn reset(&mut self, pixels: usize) {
-        self.v_rgb.clear();
-        self.v_rgb.resize(3 * pixels, 0.0);
-        self.v_alpha = None;
-    }
-
-    /// Bytes held.
-    fn bytes(&self) -> u64 {
-        let floats = self.v_rgb.capacity() + self.v_alpha.as_ref().map_or(0, Vec::capacity);
-        (4 * floats) as u64
     }
 }
 

@@ -155,9 +155,7 @@ impl Sequence {
             _ => return out_of_order("picture_back", "loss or picture_gradient"),
         };
         let pixels = current.view.camera.pixels();
-        if let Some(PictureGradient { v_rgb, v_alpha }) = gradient
-            && (v_rgb.len() != 3 * pixels || v_alpha.as_ref().is_some_and(|v| v.len() != pixels))
-        {
+        if gradient.is_some_and(|gradient| !gradient.fits(pixels)) {
             return Err(RenderError::GradientSize { pixels });
         }
         current.progress = Progress::SplatGradients;

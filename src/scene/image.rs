@@ -19,6 +19,15 @@ pub struct Target {
     pub mask: Option<Vec<u8>>,
 }
 
+/// Gradient of a loss with respect to a picture, in host memory: the input of the backward pass.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct PictureGradient {
+    /// `[3][height][width]`.
+    pub v_rgb: Vec<f32>,
+    /// `[height][width]`, with respect to the coverage 1 - T; `None` stands for zeros.
+    pub v_alpha: Option<Vec<f32>>,
+}
+
 impl Image {
     pub fn new(width: u32, height: u32) -> Self {
         Image { width, height, rgb: vec![0.0; 3 * width as usize * height as usize] }
@@ -48,6 +57,11 @@ impl Image {
 }
 
 impl Target {
+    /// A photo of `[width, height]` pixels, all of which are used.
+    pub fn new([width, height]: [u32; 2], rgb: Vec<u8>) -> Target {
+        Target { width, height, rgb, mask: None }
+    }
+
     pub fn pixels(&self) -> usize {
         self.width as usize * self.height as usize
     }
@@ -58,5 +72,29 @@ impl Target {
 
     pub fn bytes(&self) -> u64 {
         (self.rgb.len() + self.mask.as_ref().map_or(0, Vec::len)) as u64
+    }
+}
+
+impl PictureGradient {
+    pub fn new(v_rgb: Vec<f32>, v_alpha: Vec<f32>) -> PictureGradient {
+        PictureGradient { v_rgb, v_alpha: Some(v_alpha) }
+    }
+
+    /// Whether this is the gradient of a picture of `pixels` pixels.
+    pub fn fits(&self, pixels: usize) -> bool {
+        self.v_rgb.len() == 3 * pixels && self.v_alpha.as_ref().is_none_or(|v| v.len() == pixels)
+    }
+
+    /// Sets the gradient to zeros for a picture of `pixels` pixels; reuses the allocation.
+    pub fn reset(&mut self, pixels: usize) {
+        self.v_rgb.clear();
+        self.v_rgb.resize(3 * pixels, 0.0);
+        self.v_alpha = None;
+    }
+
+    /// Bytes held.
+    pub fn bytes(&self) -> u64 {
+        let floats = self.v_rgb.capacity() + self.v_alpha.as_ref().map_or(0, Vec::capacity);
+        (4 * floats) as u64
     }
 }

@@ -25,7 +25,7 @@ fn pair() -> (Image, Target) {
             image.rgb[c * n + i] = (tinted + 0.1 * (noise(3 * i + c, 2) - 0.5)) as f32;
         }
     }
-    (image, Target { width: W, height: H, rgb, mask: None })
+    (image, Target::new([W, H], rgb))
 }
 
 /// Render (cut to 0..1) and photo of pixels that count.
@@ -147,7 +147,7 @@ fn edges_have_an_answer() {
     let n = image.pixels();
     for how in [ColorCorrect::Affine, ColorCorrect::Quadratic] {
         // A flat photo and a flat render: there is nothing to fit, and the result is a number.
-        let flat = Target { rgb: vec![128; 3 * n], mask: None, ..target.clone() };
+        let flat = Target::new([W, H], vec![128; 3 * n]);
         assert!(color_corrected_psnr(&image, &flat, how).is_finite());
         assert!(color_corrected_psnr(&Image::new(W, H), &target, how).is_finite());
         // A gray picture, whose terms are linearly dependent.

@@ -110,7 +110,7 @@ fn no_row_outside_of_the_selected_pages_changes_a_picture() {
     for step in 0..STEPS {
         let camera = small(camera(&mut draws));
         let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
-        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let target = Target::new([camera.width, camera.height], rgb);
         let (rows, comparison) = (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(&target, options.loss));
         let (camera, render) = (&camera, &options.render);
         let view = StepView { step, camera, render, collects: false, pages_most: usize::MAX };

@@ -48,7 +48,7 @@ fn views_whose_counts_are_all_new_leave_no_memory_behind() {
     let (width, height) = (80, 64);
     let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]];
     let camera = Camera::pinhole(viewmat, [70.0, 70.0, 40.0, 32.0], [width, height]);
-    let target = Target { width, height, rgb: vec![128; 3 * 80 * 64], mask: None };
+    let target = Target::new([width, height], vec![128; 3 * 80 * 64]);
     let loss = LossOptions::default();
     let mut renderer = GpuRenderer::new(device).unwrap();
     let mut grads = Gradients::default();

@@ -176,8 +176,7 @@ fn check_pipeline(recipe: &Recipe) -> Render64 {
         }
     }
     let mut grads = Gradients::default();
-    let gradient = PictureGradient { v_rgb: v_rgb.clone(), v_alpha: Some(v_alpha.clone()) };
-    *renderer.picture_gradient().unwrap() = gradient;
+    *renderer.picture_gradient().unwrap() = PictureGradient::new(v_rgb.clone(), v_alpha.clone());
     renderer.backpropagate(&rows, &mut grads).unwrap();
     let loss = |rows: &Rows64| -> f64 {
         let picture = render(rows, &camera, &settings);

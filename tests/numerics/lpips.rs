@@ -81,7 +81,7 @@ fn pictures(width: u32, height: u32) -> (Image, Target) {
     for (i, noise) in uniform(2, 3 * n).enumerate() {
         image.rgb[i % 3 * n + i / 3] = (0.7 * (f64::from(photo[i]) / 255.0) + 0.3 * noise) as f32;
     }
-    (image, Target { width, height, rgb: photo, mask: None })
+    (image, Target::new([width, height], photo))
 }
 
 #[test]

@@ -98,7 +98,7 @@ fn gaussians(means: &[[f32; 3]], opacity: f32) -> Columns {
 /// Picture and gradients against a white photo; both are finite.
 fn drawn(renderer: &mut dyn Renderer, rows: &Columns, camera: &Camera) -> (Vec<f32>, Gradients) {
     let options = RenderOptions { sh_degree: 0, simd: SimdPath::best(), ..RenderOptions::default() };
-    let photo = Target { width: camera.width, height: camera.height, rgb: vec![255; 3 * camera.pixels()], mask: None };
+    let photo = Target::new([camera.width, camera.height], vec![255; 3 * camera.pixels()]);
     let mut grads = Gradients::default();
     renderer.draw(rows, camera, &options).unwrap();
     let picture = renderer.image().unwrap().rgb.clone();

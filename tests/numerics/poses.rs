@@ -33,7 +33,7 @@ fn moved(pose: &Pose64, motion: &Motion) -> Pose64 {
 fn upstream(pixels: usize) -> PictureGradient {
     let mut rng = Stream::new(79, Purpose::Test, 4, 0);
     let mut draw = |count: usize| (0..count).map(|_| rng.normal() as f32).collect::<Vec<f32>>();
-    PictureGradient { v_rgb: draw(3 * pixels), v_alpha: Some(draw(pixels)) }
+    PictureGradient::new(draw(3 * pixels), draw(pixels))
 }
 
 fn check(recipe: &Recipe) {

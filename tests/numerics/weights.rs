@@ -17,7 +17,7 @@ fn photo(is_masked: bool) -> Target {
     let (camera, mut draws) = (camera(), Stream::new(41, Purpose::Test, 0, 0));
     let rgb = (0..3 * camera.pixels()).map(|_| draws.below(256) as u8).collect();
     let mask = is_masked.then(|| (0..camera.pixels()).map(|_| if draws.below(3) == 0 { 0 } else { 255 }).collect());
-    Target { width: camera.width, height: camera.height, rgb, mask }
+    Target { mask, ..Target::new([camera.width, camera.height], rgb) }
 }
 
 fn compare(what: &str, got: &[f64], want: &[f64]) {

@@ -80,7 +80,7 @@ fn scene(faults: Option<&Faults>) -> PagedScene {
 fn step(scene: &mut PagedScene, step: u32) -> Result<StepOutcome, TrainError> {
     let (options, camera) = (options(), camera());
     let rgb = (0..3 * camera.pixels()).map(|i| ((i * 7 + step as usize) % 256) as u8).collect();
-    let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+    let target = Target::new([camera.width, camera.height], rgb);
     let (mut working, mut renderer) = (WorkingSet::default(), CpuRenderer::new());
     let render = RenderOptions { sh_degree: scene.rules.sh_degree, ..options.render };
     let (rows, comparison) = (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(&target, options.loss));

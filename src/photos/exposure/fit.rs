@@ -225,6 +225,7 @@ mod tests {
     use super::*;
     use crate::base::rng::mix64;
     use crate::photos::exposure::picture::LensPlane;
+    use crate::scene::image::Image;
 
     const WIDTH: u32 = 64;
     const HEIGHT: u32 = 48;
@@ -237,8 +238,8 @@ mod tests {
     fn photo_of(drawn: &[f32], look: &Look) -> Target {
         let mut picture = drawn.to_vec();
         look.correct(&mut picture, WIDTH as usize, None);
-        let image = crate::scene::image::Image { width: WIDTH, height: HEIGHT, rgb: picture };
-        Target { width: WIDTH, height: HEIGHT, rgb: image.to_rgb8(), mask: None }
+        let image = Image { rgb: picture, ..Image::new(WIDTH, HEIGHT) };
+        Target::new([WIDTH, HEIGHT], image.to_rgb8())
     }
 
     fn lens() -> LensPlane {

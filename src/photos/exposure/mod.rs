@@ -26,7 +26,7 @@ use crate::base::error::InputResult;
 use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
-use crate::scene::image::Target;
+use crate::scene::image::{PictureGradient, Target};
 use fit::FittedPair;
 use model::CHANNEL_VALUES;
 use picture::Look;
@@ -196,8 +196,8 @@ impl PhotoParameter for Appearance {
         self.look.correct(picture, photo.width as usize, Some(photo));
     }
 
-    fn picture_back(&mut self, photo: &Target, v_rgb: &mut [f32]) {
-        self.look.back(&self.drawn, photo, v_rgb);
+    fn picture_back(&mut self, photo: &Target, gradient: &mut PictureGradient) {
+        self.look.back(&self.drawn, photo, &mut gradient.v_rgb);
     }
 
     /// A photo that is left out is fitted too, or the exposure of a first look, at a rough scene, would keep a right photo out.

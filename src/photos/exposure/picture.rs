@@ -109,7 +109,7 @@ mod tests {
     use super::*;
 
     fn photo(rgb: Vec<u8>) -> Target {
-        Target { width: 2, height: 1, rgb, mask: None }
+        Target::new([2, 1], rgb)
     }
 
     #[test]

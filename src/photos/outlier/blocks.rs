@@ -20,7 +20,7 @@ use super::{MAD_OF_NORMAL, median_and_deviation};
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::camera::Camera;
-use crate::scene::image::Target;
+use crate::scene::image::{Image, Target};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::cmp::Reverse;
@@ -248,7 +248,8 @@ impl PhotoParameter for MaskedBlocks {
         self.now.is_some_and(|now| !now.are_kept)
     }
 
-    fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+    fn target<'a>(&'a mut self, picture: Option<&Image>, photo: &'a Target) -> &'a Target {
+        let picture = picture.map(|picture| picture.rgb.as_slice());
         let Some(BlocksNow { view, are_kept, all_count }) = self.now else { return photo };
         let states = view.and_then(|view| self.views.get(view)).map_or(&[][..], Vec::as_slice);
         self.found = picture.filter(|_| !are_kept).and_then(|picture| look(states, picture, photo));
@@ -319,7 +320,7 @@ mod tests {
     /// the same without the square, and with errors of single pixels.
     fn scene(square: Option<(usize, usize)>) -> (Target, Vec<f32>) {
         let value = |x: usize, y: usize| 60 + x + y % 3;
-        let mut photo = Target { width: WIDTH as u32, height: HEIGHT as u32, rgb: Vec::new(), mask: None };
+        let mut photo = Target::new([WIDTH as u32, HEIGHT as u32], Vec::new());
         let mut picture = vec![0.0; 3 * WIDTH * HEIGHT];
         for (x, y) in (0..HEIGHT).flat_map(|y| (0..WIDTH).map(move |x| (x, y))) {
             let is_inside =

@@ -208,7 +208,7 @@ mod tests {
         let (width, height) = (6, 4);
         let grid = BlockGrid::of(width, height);
         assert_eq!((grid.blocks(), grid.pixels(1)), (2, (4..6, 0..4)));
-        let mut photo = Target { width, height, rgb: vec![102; 72], mask: None };
+        let mut photo = Target::new([width, height], vec![102; 72]);
         // A fine pattern about .4, which is 102 / 255, in the first block; .9 in the red of the second.
         let value = |i: usize| match (i / 24, i % 6) {
             (0, 4..) => 0.9,
@@ -225,7 +225,7 @@ mod tests {
 
     #[test]
     fn contrast_is_the_deviation_of_brightness_around_a_block() {
-        let mut photo = Target { width: 32, height: 4, rgb: vec![100; 3 * 128], mask: None };
+        let mut photo = Target::new([32, 4], vec![100; 3 * 128]);
         let grid = BlockGrid::of(32, 4);
         assert_eq!(contrasts(&photo, &grid), vec![0.0; 8]);
         // The last block is white: a third of the pixels around the one beside it.
@@ -242,7 +242,7 @@ mod tests {
 
     /// A photo of 4 x 4 blocks with a bright object of 6 x 6 pixels from (4, 4) on, and the picture of the grey scene behind it.
     fn scene() -> (Target, Vec<f32>) {
-        let mut photo = Target { width: SIZE as u32, height: SIZE as u32, rgb: vec![102; 3 * SIZE * SIZE], mask: None };
+        let mut photo = Target::new([SIZE as u32; 2], vec![102; 3 * SIZE * SIZE]);
         for pixel in object() {
             photo.rgb[3 * pixel..3 * pixel + 3].fill(230);
         }

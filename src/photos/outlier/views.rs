@@ -21,7 +21,7 @@ use super::super::parameter::{
 use super::{MAD_OF_NORMAL, is_used, median_and_deviation};
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
-use crate::scene::image::Target;
+use crate::scene::image::{Image, Target};
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
@@ -314,9 +314,9 @@ impl PhotoParameter for OutlierViews {
         self.looks
     }
 
-    fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
+    fn target<'a>(&'a mut self, picture: Option<&Image>, photo: &'a Target) -> &'a Target {
         if self.looks && !self.is_rehearsal {
-            self.is_contradicted = picture.is_some_and(|picture| self.state.contradicts(picture, photo));
+            self.is_contradicted = picture.is_some_and(|picture| self.state.contradicts(&picture.rgb, photo));
         }
         photo
     }
@@ -415,8 +415,7 @@ mod tests {
 
     /// Half of the pixels dark, half bright: variance (contrast / 2)^2 in grey levels.
     fn photo(contrast: u8) -> Target {
-        let rgb = (0..96).map(|i| if i < 48 { 10 } else { 10 + contrast }).collect();
-        Target { width: 8, height: 4, rgb, mask: None }
+        Target::new([8, 4], (0..96).map(|i| if i < 48 { 10 } else { 10 + contrast }).collect())
     }
 
     /// Epochs of twelve views, of which the last two have `wrong` times the error of the others.
@@ -574,11 +573,9 @@ mod tests {
     #[test]
     fn a_step_leaves_a_clear_contradiction_out_in_the_first_epochs_alone() {
         let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let (width, height) = (4, 4);
-        let camera = Camera::pinhole(viewmat, [20.0, 20.0, 2.0, 2.0], [width, height]);
+        let camera = Camera::pinhole(viewmat, [20.0, 20.0, 2.0, 2.0], [4, 4]);
         // Black and white in turn; a picture with both exchanged leaves four times the variance.
-        let photo =
-            Target { width, height, rgb: (0..48).map(|i| if i / 3 % 2 == 0 { 0 } else { 255 }).collect(), mask: None };
+        let photo = Target::new([4, 4], (0..48).map(|i| if i / 3 % 2 == 0 { 0 } else { 255 }).collect());
         let exchanged: Vec<f32> = (0..48).map(|i| if i % 2 == 0 { 1.0 } else { 0.0 }).collect();
         let mut outliers = outliers(&[]);
         (0..10).for_each(|view| outliers.state.measure(view, 0.02, &photo));
@@ -586,8 +583,8 @@ mod tests {
         let mut leaves_out = |step: u32, is_rehearsal: bool, picture: &[f32]| {
             let at = PhotoStep { view: 7, step, camera: &camera, events: &events, is_left_out: false, is_rehearsal };
             outliers.begin_step(&at);
-            let picture = outliers.needs_picture().then_some(picture);
-            outliers.target(picture, &photo);
+            let picture = Image { rgb: picture.to_vec(), ..Image::new(4, 4) };
+            outliers.target(outliers.needs_picture().then_some(&picture), &photo);
             outliers.leaves_out_now()
         };
         assert!(leaves_out(29, false, &exchanged), "three epochs of ten views");
@@ -597,7 +594,7 @@ mod tests {
 
     /// Ends a step on a view, whose picture has this error.
     fn end(outliers: &mut OutlierViews, step: u32, mse: f64, (ended_group, after_reset): (Option<usize>, Option<u32>)) {
-        let photo = Target { width: 4, height: 4, rgb: (0..48).map(|i| 5 * i).collect(), mask: None };
+        let photo = Target::new([4, 4], (0..48).map(|i| 5 * i).collect());
         let dataset = Dataset {
             views: Vec::new(),
             points: Vec::new(),
@@ -629,7 +626,7 @@ mod tests {
     #[test]
     fn the_views_of_a_large_group_are_not_compared_with_those_of_the_group_before() {
         let swapped: Vec<f32> = vec![1.0; 48];
-        let photo = Target { width: 4, height: 4, rgb: vec![0; 48], mask: None };
+        let photo = Target::new([4, 4], vec![0; 48]);
         let contradicts = |ended_group: Option<usize>| {
             let mut outliers = outliers(&[]);
             (0..9).for_each(|step| end(&mut outliers, step, 0.02, (None, None)));

@@ -25,7 +25,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 fn random_gradient(camera: &Camera) -> PictureGradient {
     let mut draws = Stream::new(12, Purpose::Test, 0, 0);
     let v_rgb = (0..3 * camera.pixels()).map(|_| draws.normal() as f32).collect();
-    PictureGradient { v_rgb, v_alpha: Some((0..camera.pixels()).map(|_| draws.normal() as f32).collect()) }
+    PictureGradient::new(v_rgb, (0..camera.pixels()).map(|_| draws.normal() as f32).collect())
 }
 
 /// Bits of image, alpha and all gradients for an instruction path and a number of threads.
@@ -77,7 +77,7 @@ fn bits_of_batches(renderer: &mut CpuRenderer, rows: &Columns, camera: &Camera, 
     batches.iter().for_each(|batch| renderer.rows_in(batch).unwrap());
     renderer.picture().unwrap();
     let rgb = (0..3 * camera.pixels()).map(|i| (i % 251) as u8).collect();
-    let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+    let target = Target::new([camera.width, camera.height], rgb);
     let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Valid, simd: SimdPath::best() };
     renderer.loss(&target, &loss).unwrap();
     renderer.picture_back().unwrap();

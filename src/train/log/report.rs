@@ -53,6 +53,9 @@ pub struct StepLine {
     pub step: u32,
     /// Loss of the step's view; the largest f64 when it was not finite and the step was skipped.
     pub loss: f64,
+    /// What kinds of parameters of photos add to the loss, by their names; values that are not finite are left out.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
+    pub loss_terms: BTreeMap<String, f64>,
     /// PSNR of the step's view, unclamped, dB.
     pub psnr: f64,
     /// Gaussians after the step.
@@ -342,6 +345,9 @@ impl MetricsLog {
         if let Some(events) = &mut self.events {
             let scalars = [scalars_of_step(&line), line.test.as_ref().map_or(Vec::new(), scalars_of_test)].concat();
             events.write(line.step, &scalars)?;
+            for (name, value) in &line.loss_terms {
+                events.write(line.step, &[(&format!("loss/{name}"), *value)])?;
+            }
         }
         self.last = Some(line);
         Ok(())

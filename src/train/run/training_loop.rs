@@ -123,9 +123,12 @@ impl TrainingLoop<'_> {
     fn step_line(&self, outcome: &StepOutcome, psnr: f64, before: Traffic) -> StepLine {
         let trainer = &*self.trainer;
         let traffic = trainer.renderer.traffic();
+        let terms =
+            trainer.photos.iter().filter(|kind| kind.adds_loss()).map(|kind| (kind.name().to_string(), kind.loss()));
         StepLine {
             step: trainer.steps_done(),
             loss: if outcome.loss.loss.is_finite() { outcome.loss.loss } else { f64::MAX },
+            loss_terms: terms.filter(|(_, value)| value.is_finite()).collect(),
             psnr,
             gaussians: trainer.scene.rows(),
             seconds: trainer.train_seconds(),

@@ -176,7 +176,7 @@ mod tests {
         let viewmat = [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, -0.2], [0.0, 0.0, 1.0, 4.5]];
         let camera = Camera::pinhole(viewmat, [50.0, 50.0, 40.0, 30.0], [80, 60]);
         let rgb = (0..3 * camera.pixels()).map(|i| (i * 7 % 256) as u8).collect();
-        let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+        let target = Target::new([camera.width, camera.height], rgb);
         let pages = scene.pager.pages_of_view(&camera).len();
         assert!(pages > 2 * 48, "{pages} pages");
         let render = RenderOptions { sh_degree: scene.rules.sh_degree, ..options.render };

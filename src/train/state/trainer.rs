@@ -200,8 +200,7 @@ impl Trainer {
         let (mut probed, mut seconds) = (Probed::default(), Vec::new());
         for &view in views {
             let camera = &photos::camera(&self.photos, dataset, view);
-            let rgb = vec![0; 3 * camera.pixels()];
-            let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+            let target = Target::new([camera.width, camera.height], vec![0; 3 * camera.pixels()]);
             self.begin_step_of_photo(view, camera, false, true);
             let mut comparison = Comparison { photos: &mut self.photos, ..Comparison::new(&target, self.options.loss) };
             let (scene, working, renderer) = (&mut self.scene, &mut self.working, &mut *self.renderer);

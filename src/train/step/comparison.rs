@@ -47,8 +47,8 @@ impl<'a> Comparison<'a> {
             return Ok(());
         }
         if corrects || self.photos.iter().any(|parameter| parameter.adds_loss()) {
-            let v_rgb = &mut renderer.picture_gradient()?.v_rgb;
-            self.photos.iter_mut().rev().for_each(|parameter| parameter.picture_back(self.target, v_rgb));
+            let gradient = renderer.picture_gradient()?;
+            self.photos.iter_mut().rev().for_each(|parameter| parameter.picture_back(self.target, gradient));
         }
         renderer.picture_back()
     }
@@ -69,11 +69,11 @@ fn target_of<'p>(
     target: &'p Target,
 ) -> Result<&'p Target, RenderError> {
     let picture = match photos.iter().any(|parameter| parameter.needs_picture()) {
-        true => Some(renderer.image()?.rgb.as_slice()),
+        true => Some(renderer.image()?),
         false => None,
     };
     // Otherwise the loss names the sizes that differ.
-    let picture = picture.filter(|picture| picture.len() == 3 * target.pixels());
+    let picture = picture.filter(|picture| picture.rgb.len() == 3 * target.pixels());
     Ok(photos.iter_mut().fold(target, |target, parameter| parameter.target(picture, target)))
 }
 
@@ -87,6 +87,7 @@ mod tests {
     use crate::render::cpu::CpuRenderer;
     use crate::scene::camera::Camera;
     use crate::scene::columns::Columns;
+    use crate::scene::image::{Image, PictureGradient};
     use std::cell::RefCell;
     use std::rc::Rc;
 
@@ -120,8 +121,8 @@ mod tests {
             true
         }
 
-        fn target<'a>(&'a mut self, picture: Option<&[f32]>, photo: &'a Target) -> &'a Target {
-            self.sum = picture.unwrap().iter().map(|value| f64::from(*value)).sum();
+        fn target<'a>(&'a mut self, picture: Option<&Image>, photo: &'a Target) -> &'a Target {
+            self.sum = picture.unwrap().rgb.iter().map(|value| f64::from(*value)).sum();
             self.is_black_on_white = self.sum == 0.0 && photo.rgb.iter().all(|byte| *byte == 255);
             photo
         }
@@ -134,9 +135,9 @@ mod tests {
             self.sum
         }
 
-        fn picture_back(&mut self, _: &Target, v_rgb: &mut [f32]) {
-            *self.v_rgb.borrow_mut() = v_rgb.to_vec();
-            v_rgb.iter_mut().for_each(|v| *v += 1.0);
+        fn picture_back(&mut self, _: &Target, gradient: &mut PictureGradient) {
+            *self.v_rgb.borrow_mut() = gradient.v_rgb.clone();
+            gradient.v_rgb.iter_mut().for_each(|v| *v += 1.0);
         }
     }
 
@@ -151,7 +152,7 @@ mod tests {
     }
 
     fn photo(byte: u8) -> Target {
-        Target { width: 16, height: 16, rgb: vec![byte; 3 * 256], mask: None }
+        Target::new([16, 16], vec![byte; 3 * 256])
     }
 
     #[test]

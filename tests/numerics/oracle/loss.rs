@@ -88,8 +88,8 @@ fn metrics_match_the_fixture_with_an_8_bit_photo() {
     for (byte, value) in bytes.iter().zip(fixture.f32("gt")) {
         assert_eq!(f32::from(*byte) / 255.0, value, "the fixture's photo is 8-bit");
     }
-    let target = Target { width, height, rgb: bytes, mask: None };
-    let image = Image { width, height, rgb: fixture.planar("img") };
+    let target = Target::new([width, height], bytes);
+    let image = Image { rgb: fixture.planar("img"), ..Image::new(width, height) };
     let psnr = metrics::psnr(&image, &target);
     assert!((psnr - fixture.f64("val_psnr_clamped")[0]).abs() < 1e-4, "psnr {psnr}");
     let (mut loss, mut v) = (ImageLoss::default(), Vec::new());
@@ -128,11 +128,12 @@ impl Case {
         let rgb = rgb.collect();
         let hole = |i: usize| (i % width) * 3 > width && (i % width) * 2 < width + 4 && i / width > height / 2;
         let mask = masked.then(|| (0..n).map(|i| if hole(i) || i % 23 == 0 { 0 } else { 255 }).collect());
-        Case { width, height, rgb, target: Target { width: width as u32, height: height as u32, rgb: bytes, mask } }
+        let target = Target { mask, ..Target::new([width as u32, height as u32], bytes) };
+        Case { width, height, rgb, target }
     }
 
     fn image(&self) -> Image {
-        Image { width: self.width as u32, height: self.height as u32, rgb: self.rgb.clone() }
+        Image { rgb: self.rgb.clone(), ..Image::new(self.width as u32, self.height as u32) }
     }
 
     fn counts(&self, i: usize) -> bool {

@@ -40,8 +40,8 @@ impl Scene {
         let mut renderer = CpuRenderer::new();
         renderer.draw(&self.rows, &self.camera, &self.options).unwrap();
         let mut grads = Gradients::default();
-        let (v_rgb, v_alpha) = (self.file.planar("v_rgb"), Some(self.file.f32("v_alpha").to_vec()));
-        *renderer.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
+        let (v_rgb, v_alpha) = (self.file.planar("v_rgb"), self.file.f32("v_alpha").to_vec());
+        *renderer.picture_gradient().unwrap() = PictureGradient::new(v_rgb, v_alpha);
         renderer.backpropagate(&self.rows, &mut grads).unwrap();
         grads
     }
@@ -245,7 +245,7 @@ fn a_short_training_run_follows_the_reference() {
     let camera = file.camera();
     // The file's target is quantised to k / 255.
     let rgb = file.f64("target").iter().map(|x| (x * 255.0).round() as u8).collect();
-    let target = Target { width: camera.width, height: camera.height, rgb, mask: None };
+    let target = Target::new([camera.width, camera.height], rgb);
     let options = RenderOptions { sh_degree: 1, ..RenderOptions::default() };
     let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Same, simd: options.simd };
     let mut renderer = CpuRenderer::new();

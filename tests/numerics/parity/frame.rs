@@ -52,7 +52,7 @@ pub fn photo(width: u32, height: u32, masked: bool) -> Target {
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
     let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, (2 * y + x) as u8, 90]).collect();
     let mask = masked.then(|| pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
-    Target { width, height, rgb, mask }
+    Target { mask, ..Target::new([width, height], rgb) }
 }
 
 pub struct Results {
@@ -479,8 +479,8 @@ fn views_are_those_of_the_reference() {
             assert!((f64::from(alpha[p]) - want_alpha[p]).abs() < 5e-5, "{name}: coverage of pixel {p}");
         }
         let mut grads = Gradients::default();
-        let (v_rgb, v_alpha) = (file.planar("v_rgb"), Some(file.f32("v_alpha").to_vec()));
-        *gpu.picture_gradient().unwrap() = PictureGradient { v_rgb, v_alpha };
+        let (v_rgb, v_alpha) = (file.planar("v_rgb"), file.f32("v_alpha").to_vec());
+        *gpu.picture_gradient().unwrap() = PictureGradient::new(v_rgb, v_alpha);
         gpu.backpropagate(&rows, &mut grads).unwrap();
         assert_gradients(name, &file, &grads);
     }
