@@ -39,6 +39,10 @@ impl Lens {
         }
     }
 
+    pub fn distorts(&self) -> bool {
+        !self.coefficients().is_empty()
+    }
+
     /// The same mapping without needless parameters: a radial lens of zeros is a pinhole.
     pub fn simplified(self) -> Lens {
         if self == Lens::Radial([0.0; 8]) { Lens::Pinhole } else { self }

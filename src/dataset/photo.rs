@@ -10,7 +10,7 @@
 //! area is inside the photo, at least half of it is kept by the mask, and it is at least half opaque.
 
 use super::masks::MaskSource;
-use super::model::{Intrinsics, Lens};
+use super::model::Intrinsics;
 use super::photo_header::{PhotoFormat, PhotoHeader};
 use super::resize::{AreaResizer, Size, resize_area};
 use super::undistort::Undistorter;
@@ -62,7 +62,7 @@ impl PhotoSource {
     }
 
     fn may_have_mask(&self) -> bool {
-        self.mask.is_some() || self.intrinsics.lens != Lens::Pinhole || self.is_masked_by_alpha()
+        self.mask.is_some() || self.intrinsics.lens.distorts() || self.is_masked_by_alpha()
     }
 
     pub fn is_masked_by_alpha(&self) -> bool {
@@ -125,7 +125,7 @@ pub fn decode(source: &PhotoSource) -> InputResult<Target> {
 /// The photo at target size; for one that is undistorted, also the pixels of which at least half are inside the photo.
 fn at_target_size<const C: usize>(photo: Vec<u8>, source: &PhotoSource) -> (Vec<u8>, Option<Vec<u8>>) {
     let full = (source.header.width, source.header.height);
-    if source.intrinsics.lens == Lens::Pinhole {
+    if !source.intrinsics.lens.distorts() {
         return (if full == source.target { photo } else { resize_area(&photo, C, full, source.target) }, None);
     }
     let mut shares = AreaResizer::new(1, full, source.target, 1);
@@ -154,9 +154,9 @@ fn decode_mask(mask: &MaskSource, intrinsics: &Intrinsics, target: Size) -> Inpu
         *value = if white != mask.invert { 255 } else { 0 };
     }
     let size = (mask.header.width, mask.header.height);
-    let share = match intrinsics.lens {
-        Lens::Pinhole => resize_area(&keep, 1, size, target),
-        _ => undistort::<1>(&keep, intrinsics_at(intrinsics, size), target, |_| {}),
+    let share = match intrinsics.lens.distorts() {
+        false => resize_area(&keep, 1, size, target),
+        true => undistort::<1>(&keep, intrinsics_at(intrinsics, size), target, |_| {}),
     };
     Ok(thresholded(share))
 }

@@ -64,7 +64,7 @@ crate::wgsl_struct! {
         pub slope_low: [f32; 2],
         pub slope_high: [f32; 2],
         pub row_count: u32,
-        pub pad: [u32; 3],
+        pub _pad: [u32; 3],
     }
 }
 
@@ -89,7 +89,7 @@ impl View {
             slope_low: std::array::from_fn(|i| -(principal[i] / focal[i] + margin[i])),
             slope_high: std::array::from_fn(|i| (size[i] - principal[i]) / focal[i] + margin[i]),
             row_count: 0,
-            pad: [0; 3],
+            _pad: [0; 3],
         }
     }
 }

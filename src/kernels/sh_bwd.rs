@@ -7,7 +7,7 @@
 
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, lane};
-use crate::kernels::project_fwd::dot;
+use crate::kernels::project_fwd::{View, dot};
 use crate::kernels::sh_fwd::{BASIS, C0, C1, C2, C3, ShChunk, basis_len, viewing_direction};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Columns, sh_n_width};
@@ -50,14 +50,14 @@ fn unit_direction_vjp(unit: [f32; 3], inv_len: f32, v_unit: [f32; 3]) -> [f32; 3
 
 /// The part of the gradient of a row's mean that comes through the viewing direction of its colour. `gradients` are those of
 /// the row's stored values: that of `sh0` is the gradient of the colour times the constant of band 0, with clamped channels at 0.
-pub fn direction_vjp(sh_degree: u8, rows: &Columns, gradients: &Columns, row: usize, camera: &Camera) -> [f32; 3] {
+pub fn direction_vjp(sh_degree: u8, rows: &Columns, gradients: &Columns, row: usize, view: &View) -> [f32; 3] {
     let degree = sh_degree.min(rows.sh_degree);
     if degree == 0 {
         return [0.0; 3];
     }
     let v_color: [f32; 3] = std::array::from_fn(|c| gradients.sh0[3 * row + c] / C0);
     let mean = std::array::from_fn(|i| rows.means[3 * row + i]);
-    let (unit, inv_len) = viewing_direction(camera.centre(), mean);
+    let (unit, inv_len) = viewing_direction(view, mean);
     let coefficients = &rows.sh_n[row * sh_n_width(rows.sh_degree)..][..3 * (basis_len(degree) - 1)];
     let mut v_basis = [0.0; BASIS];
     for (v, coefficient) in v_basis[1..].iter_mut().zip(coefficients.as_chunks::<3>().0) {
@@ -84,11 +84,12 @@ pub fn sh_bwd(
     assert_eq!([radii.len(), colors.len(), v_colors.len()], [rows.rows(); 3], "one entry per row");
     grads.sh_degree = rows.sh_degree;
     grads.resize(rows.rows());
+    let view = View::new(camera, 0.0);
     // rayon refuses chunks of zero floats; without higher bands `sh_n` is empty and the chunk size is unused.
     let sh_n_chunk = (sh_n_width(rows.sh_degree) * ROWS_PER_CHUNK).max(1);
     let Columns { means, sh0, sh_n, .. } = grads;
     let chunk_task = |chunk: usize, means, sh0, sh_n| {
-        let stored = ShChunk::new(rows, radii, camera, chunk);
+        let stored = ShChunk::new(rows, radii, &view, chunk);
         let colors = chunk_of(colors, chunk, 1);
         let v_colors = chunk_of(v_colors, chunk, 1);
         match sh_degree {

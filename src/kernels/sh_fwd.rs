@@ -7,7 +7,7 @@
 
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch};
 use crate::kernels::lanes::{Lanes, ROWS_PER_CHUNK, block_of, block_of_mut, chunk_of, gather, lane, set_lane};
-use crate::kernels::project_fwd::dot;
+use crate::kernels::project_fwd::{View, dot};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Columns, sh_n_width};
 use rayon::prelude::*;
@@ -24,11 +24,11 @@ pub(crate) const C2: [f32; 3] = [1.092_548_4, 0.315_391_57, 0.546_274_2];
 /// Band 3: 1/4 sqrt(35/(2 pi)), 1/2 sqrt(105/pi), 1/4 sqrt(21/(2 pi)), 1/4 sqrt(7/pi), 1/4 sqrt(105/pi).
 pub(crate) const C3: [f32; 5] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_34, 1.445_305_7];
 
-/// The direction from the camera's centre to a mean at length 1, and 1 / its original length; both zero if the length is 0
-/// or its square overflows f32.
+/// The direction in which the camera sees a mean, at length 1, and 1 / its original length; both zero if the length is 0 or
+/// its square overflows f32.
 #[inline(always)]
-pub fn viewing_direction(centre: [f32; 3], mean: [f32; 3]) -> ([f32; 3], f32) {
-    let dir: [f32; 3] = std::array::from_fn(|i| mean[i] - centre[i]);
+pub fn viewing_direction(view: &View, mean: [f32; 3]) -> ([f32; 3], f32) {
+    let dir: [f32; 3] = std::array::from_fn(|i| mean[i] - view.centre[i]);
     let len_sq = dot(dir, dir);
     let usable = (f32::MIN_POSITIVE..f32::INFINITY).contains(&len_sq);
     let inv_len = if usable { 1.0 / len_sq.sqrt() } else { 0.0 };
@@ -103,8 +103,9 @@ pub fn sh_fwd(
 ) {
     assert!(sh_degree <= rows.sh_degree, "the rows are stored with degree {}", rows.sh_degree);
     assert_eq!([radii.len(), colors.len()], [rows.rows(); 2], "one entry per row");
+    let view = View::new(camera, 0.0);
     colors.par_chunks_mut(ROWS_PER_CHUNK).enumerate().for_each(|(chunk, colors)| {
-        let stored = ShChunk::new(rows, radii, camera, chunk);
+        let stored = ShChunk::new(rows, radii, &view, chunk);
         match sh_degree {
             0 => dispatch(simd, Colors::<0> { stored, colors }),
             1 => dispatch(simd, Colors::<1> { stored, colors }),
@@ -117,7 +118,7 @@ pub fn sh_fwd(
 /// Input of the colours of one chunk of rows.
 #[derive(Clone, Copy)]
 pub(crate) struct ShChunk<'a> {
-    pub centre: [f32; 3],
+    pub view: &'a View,
     pub radii: &'a [[u32; 2]],
     pub means: &'a [f32],
     pub sh0: &'a [f32],
@@ -127,10 +128,10 @@ pub(crate) struct ShChunk<'a> {
 }
 
 impl<'a> ShChunk<'a> {
-    pub fn new(rows: &'a Columns, radii: &'a [[u32; 2]], camera: &Camera, chunk: usize) -> Self {
+    pub fn new(rows: &'a Columns, radii: &'a [[u32; 2]], view: &'a View, chunk: usize) -> Self {
         let sh_n_width = sh_n_width(rows.sh_degree);
         ShChunk {
-            centre: camera.centre(),
+            view,
             radii: chunk_of(radii, chunk, 1),
             means: chunk_of(&rows.means, chunk, 3),
             sh0: chunk_of(&rows.sh0, chunk, 3),
@@ -146,7 +147,7 @@ impl<'a> ShChunk<'a> {
         let mut dirs = [[0.0; LANES]; 3];
         let mut inv_lens = [0.0; LANES];
         for l in 0..LANES {
-            let (unit, inv_len) = viewing_direction(self.centre, lane(&means, l));
+            let (unit, inv_len) = viewing_direction(self.view, lane(&means, l));
             set_lane(&mut dirs, l, unit);
             inv_lens[l] = inv_len;
         }

@@ -21,6 +21,7 @@ use super::parameter::{
 };
 use crate::base::error::InputResult;
 use crate::dataset::loader::Dataset;
+use crate::kernels::project_fwd::View;
 use crate::kernels::sh_bwd::direction_vjp;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::camera::Camera;
@@ -78,10 +79,11 @@ pub struct MotionSum {
 impl MotionSum {
     /// Adds rows of a view with their gradients. `sh_degree` is the highest band that is drawn.
     pub fn add(&mut self, rows: &Columns, gradients: &Columns, camera: &Camera, sh_degree: u8) {
+        let view = View::new(camera, 0.0);
         let of_task = |task: usize| {
             let mut sum = MotionSum::default();
             let all = task * ROWS_PER_TASK..((task + 1) * ROWS_PER_TASK).min(rows.rows());
-            all.for_each(|row| sum.add_row(rows, gradients, row, (camera, sh_degree)));
+            all.for_each(|row| sum.add_row(rows, gradients, row, (&view, sh_degree)));
             sum
         };
         let tasks = rows.rows().div_ceil(ROWS_PER_TASK);
@@ -94,15 +96,14 @@ impl MotionSum {
     }
 
     /// Adds a row, unless its gradient is zero, or one of its numbers is not finite.
-    fn add_row(&mut self, rows: &Columns, gradients: &Columns, row: usize, (camera, degree): (&Camera, u8)) {
+    fn add_row(&mut self, rows: &Columns, gradients: &Columns, row: usize, (view, degree): (&View, u8)) {
         let of = |columns: &[f32]| -> [f64; 3] { std::array::from_fn(|i| f64::from(columns[3 * row + i])) };
         let (mean, v_mean) = (of(&rows.means), of(&gradients.means));
         if v_mean == [0.0; 3] {
             return;
         }
-        let centre = camera.centre();
-        let p: [f64; 3] = std::array::from_fn(|i| mean[i] - f64::from(centre[i]));
-        let by_colour = direction_vjp(degree, rows, gradients, row, camera);
+        let p: [f64; 3] = std::array::from_fn(|i| mean[i] - f64::from(view.centre[i]));
+        let by_colour = direction_vjp(degree, rows, gradients, row, view);
         let v_place: [f64; 3] = std::array::from_fn(|i| v_mean[i] - f64::from(by_colour[i]));
         let quat = |columns: &[f32]| -> [f64; 4] { std::array::from_fn(|i| f64::from(columns[4 * row + i])) };
         let ([w, x, y, z], [vw, vx, vy, vz]) = (quat(&rows.quats), quat(&gradients.quats));
