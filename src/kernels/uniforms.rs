@@ -238,7 +238,7 @@ impl GatherUniforms {
             reach: frustum.reach,
             depth_range: frustum.depth_range,
             slack: frustum.slack(),
-            side_slack: frustum.side_slack(),
+            side_slack: frustum.side_slack,
             now,
             page_count,
             width: 1,

@@ -46,6 +46,9 @@ pub struct Frustum {
     pub offsets: [f32; 4],
     /// Reach of a footprint beyond its mean in x and y, in sigmas.
     pub reach: [f32; 2],
+    /// Factor on the slack for the side planes, one plus the steepest slope: by it a camera coordinate's rounding error enters a
+    /// side test.
+    pub side_slack: f32,
 }
 
 impl Frustum {
@@ -63,27 +66,21 @@ impl Frustum {
         let (x_low, x_high, reach_x) = axis(camera.width, camera.fx, camera.cx);
         let (y_low, y_high, reach_y) = axis(camera.height, camera.fy, camera.cy);
         let m = &camera.viewmat;
+        let slopes = [x_low, x_high, y_low, y_high];
         Frustum {
             viewmat: camera.viewmat,
             translation: m[0][3].abs() + m[1][3].abs() + m[2][3].abs(),
             depth_range: [camera.near_plane, camera.far_plane],
-            slopes: [x_low, x_high, y_low, y_high],
+            slopes,
             offsets: [0.0; 4],
             reach: [reach_x, reach_y],
+            side_slack: 1.0 + slopes.iter().fold(0.0, |most: f32, slope| most.max(slope.abs())),
         }
     }
 
     /// Rounding slack of a camera coordinate: a constant part, and a factor on |x| + |y| + |z|.
     pub fn slack(&self) -> [f32; 2] {
         [POSITION_SLACK * self.translation, POSITION_SLACK]
-    }
-
-    /// Factor on the slack for the side planes, one plus the steepest slope: by it a camera coordinate's rounding error enters a
-    /// side test.
-    #[inline(always)]
-    pub fn side_slack(&self) -> f32 {
-        let slopes = &self.slopes;
-        1.0 + slopes[0].abs().max(slopes[1].abs()).max(slopes[2].abs()).max(slopes[3].abs())
     }
 
     /// Whether a row at `p` with this largest sigma may be drawn. NaN counts as drawn.
@@ -95,7 +92,7 @@ impl Frustum {
         let z = m[2][0] * p[0] + m[2][1] * p[1] + m[2][2] * p[2] + m[2][3];
         let slack = POSITION_SLACK * (p[0].abs() + p[1].abs() + p[2].abs() + self.translation);
         let Frustum { slopes, offsets, .. } = self;
-        let side = slack * self.side_slack();
+        let side = slack * self.side_slack;
         let (reach_x, reach_y) = (self.reach[0] * sigma_max + side, self.reach[1] * sigma_max + side);
         let outside = (z <= self.depth_range[0] - slack)
             | (z >= self.depth_range[1] + slack)
@@ -117,7 +114,7 @@ impl Frustum {
                 normal: [at(0), at(1), at(2)],
                 offset: at(3) - self.offsets[side],
                 reach: self.reach[axis] * PAGE_REACH,
-                slack: PAGE_POSITION_SLACK * self.side_slack(),
+                slack: PAGE_POSITION_SLACK * self.side_slack,
             }
         };
         let depth = |sign: f32, edge: f32| PagePlane {

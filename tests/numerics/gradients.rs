@@ -62,7 +62,7 @@ impl Recipe {
             max_alpha: self.max_alpha,
             eps2d: 0.3,
             background: [0.2, 0.5, 0.7],
-            simd: SimdPath::best(),
+            ..RenderOptions::default()
         }
     }
 
