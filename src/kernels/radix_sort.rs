@@ -34,21 +34,25 @@ impl DepthSort {
     /// Writes the rows with `radii` other than [0, 0] to `order`, by depth, ties by row. `depths` and `radii` have one
     /// entry per row; there are fewer than 2^32 rows.
     pub fn sort(&mut self, depths: &[f32], radii: &[[u32; 2]], order: &mut Vec<u32>) {
-        let visible = radii.iter().filter(|r| **r != [0, 0]).count();
+        let of_chunk = |radii: &[[u32; 2]]| radii.iter().filter(|r| **r != [0, 0]).count();
+        let counts: Vec<usize> = radii.par_chunks(ROWS_PER_CHUNK).map(of_chunk).collect();
+        let visible = counts.iter().sum();
         self.keys.resize_with(visible, AtomicU64::default);
         self.other.resize_with(visible, AtomicU64::default);
-        let mut at = 0;
-        for (row, radius) in radii.iter().enumerate() {
-            if *radius != [0, 0] {
-                *self.keys[at].get_mut() = u64::from(depths[row].to_bits()) << 32 | row as u64;
-                at += 1;
+        let mut rest = &mut self.keys[..];
+        let places = counts.into_iter().map(|count| rest.split_off_mut(..count).unwrap_or_default());
+        let chunks: Vec<(usize, &mut [AtomicU64])> = places.enumerate().collect();
+        chunks.into_par_iter().for_each(|(chunk, keys)| {
+            let rows = chunk * ROWS_PER_CHUNK..radii.len().min((chunk + 1) * ROWS_PER_CHUNK);
+            let drawn = rows.filter(|&row| radii[row] != [0, 0]);
+            for (key, row) in keys.iter_mut().zip(drawn) {
+                *key.get_mut() = u64::from(depths[row].to_bits()) << 32 | row as u64;
             }
-        }
+        });
         for shift in [32, 32 + DIGIT_BITS, 32 + 2 * DIGIT_BITS] {
             self.pass(shift);
         }
-        order.clear();
-        order.extend(self.keys.iter_mut().map(|key| *key.get_mut() as u32));
+        self.keys.par_iter().with_min_len(ROWS_PER_CHUNK).map(|key| key.load(Relaxed) as u32).collect_into_vec(order);
     }
 
     /// One stable pass by the digit at `shift`; skipped when all keys share it.
