@@ -18,7 +18,7 @@ use super::profile::{Profiler, StageTime};
 use super::readback::Staging;
 use super::shader::{Pipeline, Pipelines};
 use super::sources::{Defines, SOURCES, Source};
-use super::{DeviceChoice, Traffic};
+use super::{DeviceChoice, Traffic, Work};
 
 /// Smallest and largest memory block under a budget, bytes: the API raises smaller ones to 4 MiB.
 const BLOCK_MIN: u64 = 4 << 20;
@@ -124,6 +124,7 @@ pub struct Gpu {
     pub(super) profiler: Mutex<Profiler>,
     pub(super) injector: Injector,
     pub(super) uploaded: AtomicU64,
+    pub(super) work: Mutex<Work>,
     /// Every open recording holds a reference.
     pub(super) recordings: Arc<()>,
     pub(super) serial: bool,
@@ -187,6 +188,7 @@ impl Gpu {
             profiler: Mutex::new(profiler),
             injector: Injector::default(),
             uploaded: AtomicU64::new(0),
+            work: Mutex::default(),
             recordings: Arc::default(),
             serial: options.serial,
             pipelines: Pipelines::new(Arc::clone(&driver), subgroup_defines, uniform_blocks),
@@ -268,6 +270,7 @@ impl Gpu {
             device_bytes_peak: pool.peak,
             device_allocations: pool.allocations,
             staging_bytes: pool.kept + self.pool.read_back_bytes(),
+            work: *lock(&self.work),
         }
     }
 

@@ -94,7 +94,7 @@ pub enum DeviceChoice {
     Named(String),
 }
 
-/// Traffic over the bus since the device was opened, and memory, for reports; zeros in programs without GPU support.
+/// Traffic over the bus and work since the device was opened, and memory, for reports; zeros in programs without GPU support.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Traffic {
     /// Bytes from the host to the device: uploads and uniforms.
@@ -109,6 +109,18 @@ pub struct Traffic {
     pub device_allocations: u64,
     /// The part of this memory that stages uploads, uniforms and read-backs, bytes. It may lie in host memory.
     pub staging_bytes: u64,
+    /// Work recorded so far.
+    pub work: Work,
+}
+
+/// Work of a device, as it was recorded.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Work {
+    pub dispatches: u64,
+    /// Workgroups of all dispatches.
+    pub workgroups: u64,
+    /// Bytes of all storage bindings of all dispatches. Most stages read or write each byte of a binding once.
+    pub bytes_bound: u64,
 }
 
 /// No adapter: this program was built without the feature `gpu`.

@@ -220,6 +220,11 @@ impl Recorder<'_> {
             return Err(GpuError::bindings(stage, problem));
         }
         self.bind(stage, pipeline, views)?.dispatch_workgroups(groups[0], groups[1], groups[2]);
+        let storage = pipeline.reflection.bindings.iter().zip(views).filter(|(b, _)| b.kind != BindingKind::Uniform);
+        let mut work = lock(&self.gpu.work);
+        work.dispatches += 1;
+        work.workgroups += groups.map(u64::from).iter().product::<u64>();
+        work.bytes_bound += storage.map(|(_, view)| view.size).sum::<u64>();
         self.gpu.driver.faults.check()
     }
 

@@ -1,0 +1,188 @@
+//! What a training step costs a device: dispatches, and bytes of their storage bindings, as functions of rows, intersections and
+//! pixels. The recorder counts the same for steps of both forms.
+
+use super::frame::{photo, renderer, results_with, scene};
+use gsscale::base::simd::SimdPath;
+use gsscale::gpu::{GpuOptions, Work};
+use gsscale::kernels::deferred::DeferredTables;
+use gsscale::optim::adam::AdamConfig;
+use gsscale::optim::deferred::DeferredAdam;
+use gsscale::optim::rates::Rates;
+use gsscale::render::gpu::GpuRenderer;
+use gsscale::render::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepJob};
+use gsscale::render::{LossOptions, RenderOptions, Renderer};
+use gsscale::scene::camera::Camera;
+use gsscale::scene::columns::{Columns, sh_n_width};
+use gsscale::scene::optimizer_numbers::SplitLimits;
+use gsscale::scene::page_layout::{capacity_bytes, write_page};
+use gsscale::scene::state::SceneState;
+
+/// Pages of a step on the device form, with bytes of their slab and of the optimizer's tables.
+#[derive(Clone, Copy)]
+struct Pages {
+    count: u64,
+    slab: u64,
+    tables: u64,
+    recent: u64,
+}
+
+/// Sizes of a step on all rows, whose lists fit one dispatch of each rasterizer.
+#[derive(Clone, Copy)]
+struct Step {
+    rows: u64,
+    /// Room of the lists; in the device form also of the sums.
+    room: u64,
+    isects: u64,
+    width: u64,
+    height: u64,
+    sh_degree: u8,
+    pages: Option<Pages>,
+}
+
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Cost {
+    dispatches: u64,
+    bytes: u64,
+}
+
+impl Cost {
+    fn add(&mut self, dispatches: u64, bytes_each: u64) {
+        self.dispatches += dispatches;
+        self.bytes += dispatches * bytes_each;
+    }
+
+    fn scan(&mut self, n: u64) {
+        let blocks = n.div_ceil(2048);
+        if blocks <= 1 {
+            return self.add(1, 8 * n + 4 * (n + 1));
+        }
+        self.add(1, 4 * (n + blocks));
+        self.scan(blocks);
+        self.add(1, 4 * (n + blocks + 1 + n + 1));
+    }
+
+    fn sort(&mut self, live: u64, capacity: u64, bits: u32) {
+        let digits = 256 * capacity.div_ceil(1024);
+        for _ in 0..bits.div_ceil(8) {
+            self.add(1, live + 4 * (capacity + digits));
+            self.scan(digits);
+            self.add(1, live + 16 * capacity + 4 * (digits + 1));
+        }
+    }
+}
+
+fn cost(step: &Step) -> Cost {
+    let Step { rows: n, room, isects, width, height, sh_degree, pages } = *step;
+    let (pixels, tiles) = (width * height, width.div_ceil(16) * height.div_ceil(16));
+    let (geometry, sh_n) = (44 * n, 4 * sh_n_width(sh_degree) as u64 * n);
+    let (splats, offsets, summed) = (48 * n, 4 * (n + 1), if pages.is_some() { room } else { isects });
+    let mut cost = Cost::default();
+    if let Some(Pages { count, slab, tables, recent }) = pages {
+        let (table, counts, found, listed, results) = (32 * count, 4 * (count + 1), 4 * n, 8 * n, 48 * count);
+        cost.add(1, table + slab + tables + recent + counts + found); // cull
+        cost.add(1, counts + table); // place
+        cost.add(1, counts + listed); // pad
+        cost.add(1, table + counts + found + listed); // list
+        for column in [12 * n, 16 * n, 12 * n, 4 * n, 12 * n, sh_n] {
+            cost.add(1, table + slab + tables + recent + listed + column); // gather
+            cost.add(1, table + slab + tables + listed + 2 * column + splats + 4); // step
+        }
+        cost.add(1, table + slab + listed + splats + 16 * n + results + (4 << 15) + 4); // finish
+        cost.add(1, table + slab + tables + recent + results); // bounds
+        cost.add(1, counts + offsets + 4 + 4 + 16 + 4 + 48); // gate
+    }
+    cost.add(1, geometry + splats); // project_fwd
+    cost.add(1, splats + 8 * n); // depth_keys
+    cost.sort(4, n, 32);
+    cost.add(1, splats + 8 * n); // isect_count
+    cost.scan(n);
+    cost.add(1, splats + 12 * n + 12 * n + sh_n); // sh_fwd
+    cost.add(1, splats + 4 * n + offsets + 12 * room); // isect_emit
+    cost.sort(offsets, room, 64 - tiles.leading_zeros());
+    cost.add(1, offsets + 4 * room + 4 * (tiles + 1) + 4); // isect_offsets
+    cost.add(1, splats + 8 * room + 4 * (tiles + 1) + 20 * pixels); // rasterize_fwd
+    cost.add(3, (12 + 4 + 12) * pixels + 48 * tiles); // ssim_map
+    cost.add(3, (12 + 4 + 12 + 12) * pixels + 48 * tiles); // gradient
+    let mut sums = 3 * tiles;
+    while sums > 1 {
+        cost.add(1, 16 * (sums + sums.div_ceil(4096))); // sum_partials
+        sums = sums.div_ceil(4096);
+    }
+    cost.add(1, splats + 8 * room + 4 * (tiles + 1) + 20 * pixels + 36 * summed + 8); // rasterize_bwd
+    cost.add(1, splats + 4 * room + 36 * summed + 4 * n + offsets + splats); // fold_rows
+    cost.add(1, splats + 4); // count_unusable
+    cost.add(1, 2 * splats + (16 + 12 + 12 + 12) * n + 2 * sh_n); // sh_bwd
+    cost.add(1, 2 * geometry + 2 * splats); // project_bwd
+    cost
+}
+
+fn counted(renderer: &mut GpuRenderer, step: impl FnOnce(&mut GpuRenderer)) -> Cost {
+    let Work { dispatches, bytes_bound, .. } = renderer.traffic().work;
+    step(renderer);
+    let work = renderer.traffic().work;
+    Cost { dispatches: work.dispatches - dispatches, bytes: work.bytes_bound - bytes_bound }
+}
+
+/// One step on the device form, recorded without waiting: all rows in one page, of which the list has room for all.
+fn on_pages(gpu: &mut GpuRenderer, (rows, camera): &(Columns, Camera), host: Step) -> (Cost, Step) {
+    let sh_degree = host.sh_degree;
+    let columns = Columns { sh_degree, sh_n: take(&rows.sh_n, rows.rows(), sh_n_width(sh_degree)), ..rows.clone() };
+    let mut words = vec![0u64; capacity_bytes(columns.rows(), sh_degree).div_ceil(8)];
+    let layout = write_page(&SceneState::from_columns(columns), bytemuck::cast_slice_mut(&mut words));
+    let adam = DeferredAdam::new(Rates::new(1.0, 100), AdamConfig::default(), SimdPath::best());
+    let (numbers, of_step) = (adam.numbers(100).unwrap(), adam.at(0).numbers());
+    let tables = 4 * DeferredTables::new(&numbers).words().len() as u64;
+    let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
+    gpu.prepare_page_storage(&PageRules { payload_bytes: layout.bytes(), numbers, splits, weighs: false }).unwrap();
+    assert_eq!(gpu.add_slots(1).unwrap(), 1);
+    let page = SlotPage { slot: DeviceSlot(0), layout };
+    gpu.write_slots(&[(page.slot, &bytemuck::cast_slice(&words)[..layout.bytes()])]).unwrap();
+    let (options, loss) = (RenderOptions { sh_degree, ..RenderOptions::default() }, LossOptions::default());
+    let (pages, rows_room, isects_most) = (&[page][..], rows.rows() as u32, u32::MAX);
+    let job = StepJob { pages, numbers: &of_step, camera, options: &options, rows_room, isects_most };
+    let target = photo(camera.width, camera.height, false);
+    let update =
+        RecordedUpdate { target: &target, loss: &loss, collects: true, rows_per_unusable: 1000, closes: false };
+    let cost = counted(gpu, |gpu| {
+        assert!(gpu.record_picture(&job).unwrap() && gpu.record_update(&update).unwrap());
+        assert_eq!(gpu.finish_step().unwrap().closed, 0);
+    });
+    let recent = size_of_val(&of_step.recent[..]) as u64;
+    let pages = Some(Pages { count: 1, slab: gpu.slot_bytes(), tables, recent });
+    let room = (host.isects + host.isects / 4).next_multiple_of(1024);
+    (cost, Step { room, pages, ..host })
+}
+
+/// The first `width` of 45 floats of each row.
+fn take(sh_n: &[f32], rows: usize, width: usize) -> Vec<f32> {
+    (0..rows).flat_map(|row| sh_n[45 * row..][..width].to_vec()).collect()
+}
+
+/// Few and many rows, few and many tiles: scans of one and of two levels, sorts of one and of two digits.
+#[test]
+fn a_step_costs_what_the_model_says() {
+    for (rows, width, height, sh_degree) in [(900, 64, 48, 3), (9000, 336, 304, 1)] {
+        let Some(mut gpu) = renderer(&GpuOptions { uniform_blocks: Some(true), ..GpuOptions::default() }) else {
+            return;
+        };
+        let (mut view, target) = (scene(rows, width, height), photo(width, height, false));
+        view.0.scales.iter_mut().for_each(|scale| *scale -= 1.0);
+        let options = RenderOptions { sh_degree, ..RenderOptions::default() };
+        let room = 1 << 20;
+        gpu.set_capacity(room);
+        let of_host = counted(&mut gpu, |gpu| {
+            results_with(gpu, &view, &options, &target, &LossOptions::default()).unwrap();
+        });
+        let (n, isects) = (rows as u64, u64::from(gpu.isects()));
+        let (width, height) = (u64::from(width), u64::from(height));
+        let step = Step { rows: n, room: u64::from(room), isects, width, height, sh_degree, pages: None };
+        assert_eq!(of_host, cost(&step), "the host form of {rows} rows");
+        let (of_device, step) = on_pages(&mut gpu, &view, step);
+        assert_eq!(of_device, cost(&step), "the device form of {rows} rows");
+    }
+    let pages = Pages { count: 500, slab: 800 << 20, tables: 100 << 10, recent: 6400 };
+    let large =
+        Step { rows: 1 << 20, room: 5 << 20, isects: 5 << 20, width: 1024, height: 1024, sh_degree: 3, pages: None };
+    println!("1 M rows, 5 M intersections, 1 M pixels: {:?}", cost(&large));
+    println!("with pages on the device: {:?}", cost(&Step { pages: Some(pages), ..large }));
+}
