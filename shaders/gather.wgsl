@@ -1,8 +1,9 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
-// camera may draw, `list` packs the lists in the order of the pages, `gather` evaluates a column of the listed rows, and
-// `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score, the lowest opacity and the
-// least mean weight of a page, from which the host decides whether a round edits rows. Where the host does not wait for the numbers of rows, `place` finds where
-// the list of each page begins, and `pad` fills the room behind the last row. The twin of tests/numerics/twins/gather.rs.
+// camera may draw, `list` packs the lists in the order of the pages, `gather_geometry` and `gather_colors` evaluate the columns of the
+// listed rows, and `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score, the lowest opacity
+// and the least mean weight of a page, from which the host decides whether a round edits rows. Where the host does not wait for the
+// numbers of rows, `place` finds where the list of each page begins, and `list` also fills the room behind the last row. The twin of
+// tests/numerics/twins/gather.rs.
 //
 // A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
 // file, so that one compiled formula decides what is seen, drawn, updated and bounded.
@@ -29,16 +30,12 @@ struct GatherUniforms {
     /// The slab that is bound.
     slab: u32,
     page_count: u32,
-    /// Listed rows of this dispatch.
+    /// Listed rows of this dispatch; in `list` the room of a list that is to be filled, else 0.
     row_count: u32,
-    /// Column to evaluate, and floats per row of the output.
-    column: u32,
-    width: u32,
-    /// Base rate of the column.
-    rate: f32,
-    /// Base rates for bounds.
-    means_rate: f32,
-    scales_rate: f32,
+    /// Floats per row of the higher SH bands of the output.
+    sh_n_width: u32,
+    /// Base rates of the columns.
+    rates: array<vec4<f32>, 2>,
     /// Limits within which rows may split.
     grow_grad2d: f32,
     split_scale: f32,
@@ -58,12 +55,17 @@ struct GatherUniforms {
 @group(0) @binding(6) var<storage, read_write> found: array<u32>;
 /// Listed rows of the batch: number of the page, or UNLISTED, and number of the row in it.
 @group(0) @binding(7) var<storage, read_write> rows: array<vec2<u32>>;
-@group(0) @binding(8) var<storage, read_write> out: array<f32>;
-@group(0) @binding(9) var<storage, read_write> results: array<PageResult>;
+/// Columns of the listed rows.
+@group(0) @binding(8) var<storage, read_write> means: array<f32>;
+@group(0) @binding(9) var<storage, read_write> quats: array<f32>;
+@group(0) @binding(10) var<storage, read_write> scales: array<f32>;
+@group(0) @binding(11) var<storage, read_write> opacities: array<f32>;
+@group(0) @binding(12) var<storage, read_write> sh0: array<f32>;
+@group(0) @binding(13) var<storage, read_write> sh_n: array<f32>;
+@group(0) @binding(14) var<storage, read_write> results: array<PageResult>;
 /// The pages, for `place`.
-@group(0) @binding(10) var<storage, read_write> placed: array<DevicePage>;
-
-@group(0) @binding(11) var<storage, read_write> surveys: array<PageSurvey>;
+@group(0) @binding(15) var<storage, read_write> placed: array<DevicePage>;
+@group(0) @binding(16) var<storage, read_write> surveys: array<PageSurvey>;
 
 /// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
 /// is twice the CPU's, for devices that divide and take roots less exactly.
@@ -126,13 +128,13 @@ fn evaluate(value: f32, m: f32, v: f32, stamp: u32, end: u32, of_means: bool, ra
 }
 
 /// The value of one element of a row of a page after `end` steps.
-fn element(page: DevicePage, column: u32, row: u32, e: u32, end: u32, rate: f32) -> f32 {
+fn element(page: DevicePage, column: u32, row: u32, e: u32, end: u32) -> f32 {
     let at = column_at(page, column) + row * column_width(column, page.sh_n_width) + e;
     let words = table_words(page, column);
     let value = bitcast<f32>(slab[at]);
     let m = bitcast<f32>(slab[at + words]);
     let v = bitcast<f32>(slab[at + 2u * words]);
-    return evaluate(value, m, v, slab[stamps_at(page) + row], end, column == MEANS, rate);
+    return evaluate(value, m, v, slab[stamps_at(page) + row], end, column == MEANS, u.rates[column / 4u][column % 4u]);
 }
 
 /// Whether the camera may draw a row at `p` with this largest sigma. NaN counts as drawn.
@@ -157,8 +159,8 @@ fn is_seen(page: DevicePage, row: u32) -> bool {
     var mean: vec3<f32>;
     var scale: vec3<f32>;
     for (var c = 0u; c < 3u; c++) {
-        mean[c] = element(page, MEANS, row, c, u.now, u.means_rate);
-        scale[c] = element(page, SCALES, row, c, u.now, u.scales_rate);
+        mean[c] = element(page, MEANS, row, c, u.now);
+        scale[c] = element(page, SCALES, row, c, u.now);
     }
     return may_draw(mean, exp32(max(max(scale.x, scale.y), scale.z)));
 }
@@ -213,20 +215,15 @@ fn place(workgroup: Group, place: SubgroupPlace) {
     }
 }
 
-/// One invocation for each row that the list has room for.
-@compute @workgroup_size(256)
-fn pad(workgroup: Group, place: Place) {
-    let i = linear_index(workgroup, place, 256u);
-    if i < u.row_count && i >= counts[u.page_count] {
-        rows[i] = vec2<u32>(UNLISTED, 0u);
-    }
-}
-
-/// One workgroup for each page, of any slab.
+/// One workgroup for each page, of any slab; behind them one for each 256 rows of a list that is to be filled.
 @compute @workgroup_size(256)
 fn list(workgroup: Group, place: Place) {
     let p = linear_group(workgroup);
     if p >= u.page_count {
+        let i = 256u * (p - u.page_count) + place.lane;
+        if i < u.row_count && i >= counts[u.page_count] {
+            rows[i] = vec2<u32>(UNLISTED, 0u);
+        }
         return;
     }
     // The list may have less room than rows; the gate of the step is closed then.
@@ -236,30 +233,64 @@ fn list(workgroup: Group, place: Place) {
     }
 }
 
-/// One invocation for each float of the output.
-@compute @workgroup_size(256)
-fn gather(workgroup: Group, place: Place) {
-    let i = linear_index(workgroup, place, 256u);
-    if i >= u.row_count * u.width {
-        return;
+struct Gathered {
+    value: f32,
+    /// Whether the row lies in this slab, or nowhere.
+    is_here: bool,
+}
+
+fn gathered(f: Float) -> Gathered {
+    if !f.exists {
+        return Gathered(0.0, false);
     }
-    let row = i / u.width;
+    let row = f.at / f.width;
     let listed = rows[row];
     if listed.x == UNLISTED {
         // Transparent, so no stage draws it.
-        out[i] = select(0.0, HIDDEN_LOGIT, u.column == OPACITIES);
-        return;
+        return Gathered(select(0.0, HIDDEN_LOGIT, f.column == OPACITIES), true);
     }
     let page = pages[listed.x];
-    if page.slab == u.slab {
-        out[i] = element(page, u.column, listed.y, i - row * u.width, u.now, u.rate);
+    if page.slab != u.slab {
+        return Gathered(0.0, false);
+    }
+    return Gathered(element(page, f.column, listed.y, f.at - row * f.width, u.now), true);
+}
+
+/// One invocation for each float of means, quats, scales and opacities.
+@compute @workgroup_size(256)
+fn gather_geometry(workgroup: Group, place: Place) {
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, MEANS, SH0, 0u);
+    let g = gathered(f);
+    if !g.is_here {
+        return;
+    }
+    switch f.column {
+        case MEANS: { means[f.at] = g.value; }
+        case QUATS: { quats[f.at] = g.value; }
+        case SCALES: { scales[f.at] = g.value; }
+        default: { opacities[f.at] = g.value; }
+    }
+}
+
+/// One invocation for each float of the colours.
+@compute @workgroup_size(256)
+fn gather_colors(workgroup: Group, place: Place) {
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, SH0, SH_N + 1u, u.sh_n_width);
+    let g = gathered(f);
+    if !g.is_here {
+        return;
+    }
+    if f.column == SH0 {
+        sh0[f.at] = g.value;
+    } else {
+        sh_n[f.at] = g.value;
     }
 }
 
 /// The range that a value passes through on its way to its limit.
-fn hull(page: DevicePage, column: u32, row: u32, e: u32, rate: f32) -> vec2<f32> {
+fn hull(page: DevicePage, column: u32, row: u32, e: u32) -> vec2<f32> {
     let value = bitcast<f32>(slab[column_at(page, column) + row * column_width(column, page.sh_n_width) + e]);
-    let limit = element(page, column, row, e, FOR_EVER, rate);
+    let limit = element(page, column, row, e, FOR_EVER);
     let low = min(value, limit);
     let high = max(value, limit);
     let slack = MOVEMENT_SLACK * (high - low) + VALUE_SLACK * max(abs(low), abs(high)) + FLUSH_SLACK;
@@ -293,12 +324,12 @@ fn bounds(workgroup: Group, place: Place) {
     for (var row = place.lane; row < page.rows; row += 256u) {
         var log_scale = -3.4e38;
         for (var c = 0u; c < 3u; c++) {
-            log_scale = max(log_scale, hull(page, SCALES, row, c, u.scales_rate).y);
+            log_scale = max(log_scale, hull(page, SCALES, row, c).y);
         }
         let sigma = min(exp32(log_scale) * (1.0 + SIGMA_SLACK), SIGMA_MOST);
         let reach = split_reach(page, row, sigma);
         for (var c = 0u; c < 3u; c++) {
-            let range = hull(page, MEANS, row, c, u.means_rate);
+            let range = hull(page, MEANS, row, c);
             let below = range.x - reach;
             let above = range.y + reach;
             let slack = select(0.0, EPSILON, reach > 0.0);
@@ -331,7 +362,7 @@ fn bounds(workgroup: Group, place: Place) {
     }
 }
 
-/// One workgroup for each page. The uniform names the column of the opacities.
+/// One workgroup for each page.
 @compute @workgroup_size(256)
 fn survey(workgroup: Group, place: Place) {
     let p = linear_group(workgroup);
@@ -343,7 +374,7 @@ fn survey(workgroup: Group, place: Place) {
     var mean = 0.0;
     var weight = 3.4e38;
     for (var row = place.lane; row < page.rows; row += 256u) {
-        lowest = min(lowest, hull(page, OPACITIES, row, 0u, u.rate).x);
+        lowest = min(lowest, hull(page, OPACITIES, row, 0u).x);
         let word = slab[count_at(page) + row];
         if is_weighed(word) {
             weight = min(weight, mean_weight(word));

@@ -7,6 +7,7 @@
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/footprint.wgsl"
+#import "shared/workgroup_scan.wgsl"
 
 struct IsectUniforms {
     grid: Grid,
@@ -31,6 +32,8 @@ struct IsectUniforms {
 @group(0) @binding(6) var<storage, read_write> row_from_isect: array<u32>;
 /// By rank: number of tiles of the range that the row can reach, from which the scan computes the offsets.
 @group(0) @binding(7) var<storage, read_write> counts: array<u32>;
+/// The sum of the counts of each workgroup, with which the scan begins.
+@group(0) @binding(8) var<storage, read_write> sums: array<u32>;
 
 const NO_ROW: u32 = 0xffffffffu;
 
@@ -48,20 +51,24 @@ fn rows_in_range(reach: Reach, tile_x: u32) -> vec2<u32> {
 
 /// Counts intersections before any is emitted.
 @compute @workgroup_size(256)
-fn isect_count(workgroup: Group, place: Place) {
-    let rank = linear_index(workgroup, place, 256u);
-    if rank >= view.row_count {
-        return;
-    }
-    let at = SPLAT_STRIDE * order[rank];
-    let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
+fn isect_count(workgroup: Group, place: SubgroupPlace) {
+    let group = linear_group(workgroup);
+    let rank = 256u * group + place.lane;
     var count = 0u;
-    let columns = columns_in_range(reach);
-    for (var tile_x = columns.x; tile_x < columns.y; tile_x++) {
-        let rows = rows_in_range(reach, tile_x);
-        count += rows.y - rows.x;
+    if rank < view.row_count {
+        let at = SPLAT_STRIDE * order[rank];
+        let reach = reach_of(splat_unpack(splats[at], splats[at + 1u], splats[at + 2u]), view.grid);
+        let columns = columns_in_range(reach);
+        for (var tile_x = columns.x; tile_x < columns.y; tile_x++) {
+            let rows = rows_in_range(reach, tile_x);
+            count += rows.y - rows.x;
+        }
+        counts[rank] = count;
     }
-    counts[rank] = count;
+    let scanned = workgroup_scan(count, place);
+    if place.lane == 0u && 256u * group < view.row_count {
+        sums[group] = scanned.total;
+    }
 }
 
 /// The last rank whose intersections start at or before this one.

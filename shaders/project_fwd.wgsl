@@ -14,6 +14,11 @@
 /// Logits.
 @group(0) @binding(4) var<storage, read> opacities: array<f32>;
 @group(0) @binding(5) var<storage, read_write> splats: array<vec4<f32>>;
+#ifdef KEYS
+/// Keys and values of the sort by depth, as depth_keys of radix_sort.wgsl writes them.
+@group(0) @binding(6) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(7) var<storage, read_write> values: array<u32>;
+#endif
 
 /// Natural logarithm for x in [1, 256), within 3e-7 + 2e-7 ln x; unspecified outside.
 fn ln_1_to_256(x: f32) -> f32 {
@@ -57,6 +62,10 @@ fn project_fwd(workgroup: Group, place: Place) {
         && on_screen(mean2d.x, radii.x, view.size.x) && on_screen(mean2d.y, radii.y, view.size.y)
         && is_finite(conic.x) && is_finite(conic.y) && is_finite(conic.z);
     let at = SPLAT_STRIDE * i;
+#ifdef KEYS
+    keys[i] = select(0xffffffffu, bitcast<u32>(g.depth), visible);
+    values[i] = view.first_row + i;
+#endif
     if visible {
         splats[at] = vec4<f32>(mean2d, g.depth, opacity);
         splats[at + 1u] = vec4<f32>(conic, radii.x);

@@ -31,7 +31,7 @@
 /// First intersection of each rank; row_count + 1 entries.
 @group(0) @binding(11) var<storage, read> offsets: array<u32>;
 @group(0) @binding(12) var<storage, read_write> v_splats: array<vec4<f32>>;
-/// Rows that count_unusable found.
+/// Rows with a gradient that is too large for the optimizer, or not finite.
 @group(0) @binding(13) var<storage, read_write> unusable: atomic<u32>;
 
 #ifdef WEIGHS
@@ -388,7 +388,7 @@ fn isects_at(rank: u32) -> vec2<u32> {
 /// Folds the sums of each row over its intersections, in emit order (tiles column by column), and converts them to
 /// gradients. As many invocations process a row as there are sums. A row that ends beyond the window, or may have intersections
 /// in a later range of tiles, stores its sums in place of its gradients, in the order of the sums, and the next window
-/// or range continues from there.
+/// or range continues from there. Counts the rows whose gradients are unusable.
 @compute @workgroup_size(256)
 fn fold_rows(workgroup: Group, place: Place) {
     let group = linear_group(workgroup);
@@ -462,22 +462,14 @@ fn fold_rows(workgroup: Group, place: Place) {
 #else
     let weights = vec2<f32>();
 #endif
-    v_splats[at] = vec4<f32>(v_mean, weights.x, v_opacity);
-    v_splats[at + 1u] = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], weights.y);
-    v_splats[at + 2u] = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
-}
-
-/// Counts the rows with a gradient that is too large for the optimizer, or not finite.
-@compute @workgroup_size(256)
-fn count_unusable(workgroup: Group, place: Place) {
-    let row = linear_index(workgroup, place, 256u);
-    if row >= view.row_count {
-        return;
-    }
-    let at = SPLAT_STRIDE * row;
-    let color = vec4<f32>(v_splats[at + 2u].xyz, 0.0);
-    let largest = max(largest_magnitude(v_splats[at]), largest_magnitude(v_splats[at + 1u]));
-    if max(largest, largest_magnitude(color)) > LARGEST_SPLAT_GRAD_BITS {
+    let of_mean = vec4<f32>(v_mean, weights.x, v_opacity);
+    let of_conic = vec4<f32>(-0.5 * row_sums[s + 3u], -row_sums[s + 4u], -0.5 * row_sums[s + 5u], weights.y);
+    let of_color = vec4<f32>(row_sums[s + 6u], row_sums[s + 7u], row_sums[s + 8u], 0.0);
+    v_splats[at] = of_mean;
+    v_splats[at + 1u] = of_conic;
+    v_splats[at + 2u] = of_color;
+    let most = max(largest_magnitude(of_mean), max(largest_magnitude(of_conic), largest_magnitude(of_color)));
+    if most > LARGEST_SPLAT_GRAD_BITS {
         atomicAdd(&unusable, 1u);
     }
 }

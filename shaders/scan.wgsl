@@ -1,24 +1,26 @@
 // Exclusive prefix sum, the twin of src/kernels/scan.rs: blocks of 2048 values, each starting from the sum of the
 // earlier blocks.
 //
-// Reduce, then scan: scan_reduce sums blocks, level by level until one block is left; then every level is scanned from
-// the top down with the scanned sums as bases. No workgroup waits for another. Offsets are 32-bit and saturate: a last
-// entry of 0xffffffff means that the true total is that or more.
+// Reduce, then scan: scan_reduce, or the stage that makes the values, sums them in groups; then every block of the scan adds up the
+// sums before it. Ten million values have 5,000 sums, so a block reads as much of them as of its values, and one dispatch does where
+// levels of scans would take as many as there are levels. No workgroup waits for another. Offsets are 32-bit and saturate: a last entry of
+// 0xffffffff means that the true total is that or more.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/workgroup_scan.wgsl"
 
 struct ScanUniforms {
-    /// Number of values of this level.
+    /// Number of values.
     count: u32,
-    /// 1: `bases` holds the sum before each block; 0: there is a single block with base 0.
-    has_bases: u32,
+    /// Number of sums of a block of values.
+    sums_of_block: u32,
     pad: vec2<u32>,
 }
 
 @group(0) @binding(0) var<uniform> level: ScanUniforms;
 @group(0) @binding(1) var<storage, read> values: array<u32>;
-@group(0) @binding(2) var<storage, read> bases: array<u32>;
+/// Sums of groups of values; not read where there is a single block.
+@group(0) @binding(2) var<storage, read> sums: array<u32>;
 /// One more entry than values: the last is the total. For scan_reduce: the sums of blocks.
 @group(0) @binding(3) var<storage, read_write> offsets: array<u32>;
 
@@ -60,11 +62,13 @@ fn scan(workgroup: Group, place: SubgroupPlace) {
             sum = saturating_add(sum, values[first + i]);
         }
     }
-    let scanned = workgroup_scan(sum, place);
-    var base = scanned.before;
-    if level.has_bases != 0u {
-        base = saturating_add(bases[block], base);
+    var earlier = 0u;
+    for (var k = place.lane; k < block * level.sums_of_block; k += 256u) {
+        earlier = saturating_add(earlier, sums[k]);
     }
+    let before_block = workgroup_scan(earlier, place).total;
+    workgroupBarrier();
+    let base = saturating_add(before_block, workgroup_scan(sum, place).before);
     for (var i = 0u; i < ITEMS; i++) {
         if first + i < level.count {
             offsets[first + i] = saturating_add(base, before[i]);

@@ -1,7 +1,7 @@
 // Stage "sh", backward: gradients of colours to gradients of sh0, the higher bands and, through the viewing
 // direction, means. The twin of src/kernels/sh_bwd.rs. Runs before project_bwd.
 // Every entry of v_means, v_sh0 and of the bands in use is written, with zeros for culled rows. The gradients of unused
-// bands are zero and not stored.
+// bands are zero and not stored. With UPDATES those of all coefficients are left to the stage "update".
 //
 // The stage also writes the row's input of densification. The last word of the row's record receives the largest magnitude of the
 // gradients of colours.
@@ -19,19 +19,27 @@
 /// has a second entry: weight, and weight times error.
 @group(0) @binding(3) var<storage, read_write> footprints: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read_write> v_means: array<f32>;
-@group(0) @binding(5) var<storage, read_write> v_sh0: array<f32>;
 #ifdef SH_DEGREE_1
-@group(0) @binding(6) var<storage, read> means: array<f32>;
-@group(0) @binding(7) var<storage, read> sh_n: array<f32>;
+@group(0) @binding(5) var<storage, read> means: array<f32>;
+@group(0) @binding(6) var<storage, read> sh_n: array<f32>;
+#ifndef UPDATES
+@group(0) @binding(7) var<storage, read_write> v_sh0: array<f32>;
 @group(0) @binding(8) var<storage, read_write> v_sh_n: array<f32>;
+#endif
 
 /// Writes the gradient of the three coefficients from `at` on, and returns that of their basis function.
 fn coefficients_vjp(at: u32, basis: f32, v: vec3<f32>) -> f32 {
+#ifndef UPDATES
     for (var c = 0u; c < 3u; c++) {
         v_sh_n[at + c] = basis * v[c];
     }
+#endif
     return dot3(vec3<f32>(sh_n[at], sh_n[at + 1u], sh_n[at + 2u]), v);
 }
+#else
+#ifndef UPDATES
+@group(0) @binding(5) var<storage, read_write> v_sh0: array<f32>;
+#endif
 #endif
 
 fn dot3(a: vec3<f32>, b: vec3<f32>) -> f32 {
@@ -53,12 +61,16 @@ fn clear_row(i: u32) {
     v_splats[SPLAT_STRIDE * i + 2u].w = 0.0;
     for (var c = 0u; c < 3u; c++) {
         v_means[3u * i + c] = 0.0;
+    }
+#ifndef UPDATES
+    for (var c = 0u; c < 3u; c++) {
         v_sh0[3u * i + c] = 0.0;
     }
 #ifdef SH_DEGREE_1
     for (var c = 0u; c < SH_WIDTH; c++) {
         v_sh_n[SH_WIDTH * i + c] = 0.0;
     }
+#endif
 #endif
 }
 
@@ -79,14 +91,16 @@ fn sh_bwd(workgroup: Group, place: Place) {
     write_footprint(i, vec4<f32>(v_mean.xy, radius, drawn.w), vec2<f32>(v_mean.z, v_splats[at + 1u].w));
     // A channel clamped at 0 passes no gradient.
     let v = select(vec3<f32>(), v_splats[at + 2u].xyz, drawn.xyz > vec3<f32>());
+#ifndef UPDATES
     for (var c = 0u; c < 3u; c++) {
         v_sh0[3u * i + c] = SH_C0 * v[c];
     }
+#endif
     var v_dir = vec3<f32>();
     var basis_most = SH_C0;
 #ifdef SH_DEGREE_1
     let mean = vec3<f32>(means[3u * i], means[3u * i + 1u], means[3u * i + 2u]);
-    let dir = viewing_direction(view, mean);
+    let dir = viewing_direction(view.centre, mean);
     var basis1 = sh_band1(dir.unit);
     var v_basis1: array<f32, 3>;
     for (var k = 0u; k < 3u; k++) {

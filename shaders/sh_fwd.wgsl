@@ -33,7 +33,7 @@ fn sh_fwd(workgroup: Group, place: Place) {
     var color = vec3<f32>(0.5) + SH_C0 * vec3<f32>(sh0[3u * i], sh0[3u * i + 1u], sh0[3u * i + 2u]);
 #ifdef SH_DEGREE_1
     let mean = vec3<f32>(means[3u * i], means[3u * i + 1u], means[3u * i + 2u]);
-    let dir = viewing_direction(view, mean).unit;
+    let dir = viewing_direction(view.centre, mean).unit;
     var basis1 = sh_band1(dir);
     for (var k = 0u; k < 3u; k++) {
         color += basis1[k] * coefficient(SH_WIDTH * i + 3u * k);

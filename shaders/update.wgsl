@@ -1,5 +1,5 @@
-// Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `step` rewrites a
-// column of the rows whose gradients all are usable; `finish` counts, stamps and collects statistics. The twin of
+// Stage "update": one step of Adam on the listed rows of pages that lie on the device, and their statistics. `step_geometry` and
+// `step_colors` rewrite columns of the rows whose gradients all are usable; `finish` counts, stamps and collects statistics. The twin of
 // tests/numerics/twins/update.rs.
 //
 // `clear_statistics` takes the place of a round that edits no row.
@@ -12,28 +12,30 @@
 #import "shared/page.wgsl"
 #import "shared/quotient.wgsl"
 #import "shared/splat.wgsl"
+#import "shared/camera.wgsl"
+#import "shared/sh.wgsl"
 
 struct UpdateUniforms {
     /// The slab that is bound.
     slab: u32,
     /// Listed rows of this dispatch; pages, in `clear_statistics`.
     row_count: u32,
-    /// Column to rewrite, and floats per row of its values and gradients.
+    /// In `step_geometry` the first of the two columns.
     column: u32,
-    width: u32,
     /// Steps done.
     now: u32,
-    /// Rate of the column over the bias of the first moment.
-    step_size: f32,
     /// Half of the image size, pixels.
     half_size: vec2<f32>,
     /// 1 / sqrt(1 - beta2^t).
     inv_root_correction: f32,
     /// 1: this step collects statistics.
     collects: u32,
-    /// 1: blending weights are among them, and a row has two footprints.
+    /// Position of the camera in the world.
+    centre: vec3<f32>,
+    /// 1: blending weights are among the statistics, and a row has two footprints.
     weighs: u32,
-    pad: u32,
+    /// Rates of the columns over the bias of the first moment.
+    step_sizes: array<vec4<f32>, 2>,
 }
 
 @group(0) @binding(0) var<uniform> u: UpdateUniforms;
@@ -42,20 +44,29 @@ struct UpdateUniforms {
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
 /// Number of the page, or UNLISTED, and number of the row in it.
 @group(0) @binding(4) var<storage, read> rows: array<vec2<u32>>;
-@group(0) @binding(5) var<storage, read> values: array<f32>;
-/// Gradients of a column.
-@group(0) @binding(6) var<storage, read> grads: array<f32>;
-/// `[listed row]`: the records of shared/splat.wgsl, of which the last word is read: the largest magnitude of a gradient.
-@group(0) @binding(7) var<storage, read> v_splats: array<u32>;
+/// `[listed row]`: words of the records of shared/splat.wgsl. The last word of a record is the largest magnitude of a gradient.
+@group(0) @binding(5) var<storage, read> v_splats: array<u32>;
+/// One word: 0 while the gate is open.
+@group(0) @binding(6) var<storage, read> gate: array<u32>;
+/// Values and gradients of the first and of the second column.
+@group(0) @binding(7) var<storage, read> values: array<f32>;
+@group(0) @binding(8) var<storage, read> grads: array<f32>;
+@group(0) @binding(9) var<storage, read> second_values: array<f32>;
+@group(0) @binding(10) var<storage, read> second_grads: array<f32>;
 /// Gradient of the projected mean, radii; where rows are weighed, each is followed by the weight and three words of no use here.
-@group(0) @binding(8) var<storage, read> footprints: array<vec4<f32>>;
+@group(0) @binding(11) var<storage, read> footprints: array<vec4<f32>>;
 /// `[page]`: the words of a PageResult.
-@group(0) @binding(9) var<storage, read_write> results: array<atomic<u32>>;
+@group(0) @binding(12) var<storage, read_write> results: array<atomic<u32>>;
 /// Change of the number of rows by bin of the mean growth score and, behind these where rows are weighed, of the mean blending weight;
 /// modulo 2^32.
-@group(0) @binding(10) var<storage, read_write> bins: array<atomic<u32>>;
-/// One word: 0 while the gate is open.
-@group(0) @binding(11) var<storage, read> gate: array<u32>;
+@group(0) @binding(13) var<storage, read_write> bins: array<atomic<u32>>;
+@group(0) @binding(14) var<storage, read> splats: array<vec4<f32>>;
+/// Values of columns.
+@group(0) @binding(15) var<storage, read> sh0: array<f32>;
+#ifdef SH_DEGREE_1
+@group(0) @binding(16) var<storage, read> means: array<f32>;
+@group(0) @binding(17) var<storage, read> sh_n: array<f32>;
+#endif
 
 /// Bits of 1e18, the largest usable gradient (src/base/math.rs).
 const LARGEST_GRAD: u32 = 0x5d5e0b6bu;
@@ -86,14 +97,50 @@ fn decay_at(steps: u32) -> u32 {
     return tables[DECAYS] + 3u * min(steps, tables[DECAYS_LENGTH] - 1u);
 }
 
-/// One invocation for each float of the column.
+/// What the moments of a row keep over the steps that it missed.
+struct Decays {
+    first: f32,
+    kept: f32,
+    lost: f32,
+}
+
+fn decays_of(page: DevicePage, row: u32) -> Decays {
+    let missed = u.now - slab[stamps_at(page) + row];
+    let second = decay_at(missed + 1u) + 1u;
+    return Decays(
+        bitcast<f32>(tables[decay_at(missed)]),
+        bitcast<f32>(tables[second]),
+        bitcast<f32>(tables[second + 1u]),
+    );
+}
+
+/// One step on the float at word `at`, whose moments follow after `words` and again `words` words.
+fn step_float(column: u32, at: u32, words: u32, d: Decays, value: f32, g: f32) {
+    let m_at = at + words;
+    let v_at = m_at + words;
+    let decayed = flush(bitcast<f32>(slab[m_at]) * d.first);
+    let m = flush(decayed + (g - decayed) * bitcast<f32>(tables[ONE_MINUS_BETA1]));
+    let gained = g * g * bitcast<f32>(tables[ONE_MINUS_BETA2]);
+    let old_v = bitcast<f32>(slab[v_at]);
+    let v = max(flush(old_v * d.kept + (gained - old_v * d.lost)), 0.0);
+    let root = sqrt(v) * u.inv_root_correction + bitcast<f32>(tables[EPS]);
+    var moved = flush(value - u.step_sizes[column / 4u][column % 4u] * (m / root));
+    if column == SCALES {
+        moved = max(min(moved, bitcast<f32>(tables[LOG_SCALE_HIGH])), bitcast<f32>(tables[LOG_SCALE_LOW]));
+    }
+    slab[at] = bitcast<u32>(moved);
+    slab[m_at] = bitcast<u32>(m);
+    slab[v_at] = bitcast<u32>(v);
+}
+
+/// One invocation for each float of two columns of the geometry.
 @compute @workgroup_size(256)
-fn step(workgroup: Group, place: Place) {
-    let i = linear_index(workgroup, place, 256u);
-    if i >= u.row_count * u.width || gate[0] != 0u {
+fn step_geometry(workgroup: Group, place: Place) {
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, u.column, u.column + 2u, 0u);
+    if !f.exists || gate[0] != 0u {
         return;
     }
-    let row = i / u.width;
+    let row = f.at / f.width;
     let listed = rows[row];
     if listed.x == UNLISTED {
         return;
@@ -102,29 +149,120 @@ fn step(workgroup: Group, place: Place) {
     if page.slab != u.slab || !is_usable(largest(row)) {
         return;
     }
-    let at = listed.y * column_width(u.column, page.sh_n_width) + i - row * u.width;
-    let value_at = column_at(page, u.column) + at;
-    let m_at = value_at + table_words(page, u.column);
-    let v_at = m_at + table_words(page, u.column);
-    let missed = u.now - slab[stamps_at(page) + listed.y];
-    let first = bitcast<f32>(tables[decay_at(missed)]);
-    let second = decay_at(missed + 1u) + 1u;
-    let kept = bitcast<f32>(tables[second]);
-    let lost = bitcast<f32>(tables[second + 1u]);
-    let g = grads[i];
-    let decayed = flush(bitcast<f32>(slab[m_at]) * first);
-    let m = flush(decayed + (g - decayed) * bitcast<f32>(tables[ONE_MINUS_BETA1]));
-    let gained = g * g * bitcast<f32>(tables[ONE_MINUS_BETA2]);
-    let old_v = bitcast<f32>(slab[v_at]);
-    let v = max(flush(old_v * kept + (gained - old_v * lost)), 0.0);
-    let root = sqrt(v) * u.inv_root_correction + bitcast<f32>(tables[EPS]);
-    var value = flush(values[i] - u.step_size * (m / root));
-    if u.column == SCALES {
-        value = max(min(value, bitcast<f32>(tables[LOG_SCALE_HIGH])), bitcast<f32>(tables[LOG_SCALE_LOW]));
+    var value: f32;
+    var g: f32;
+    if f.column == u.column {
+        value = values[f.at];
+        g = grads[f.at];
+    } else {
+        value = second_values[f.at];
+        g = second_grads[f.at];
     }
-    slab[value_at] = bitcast<u32>(value);
-    slab[m_at] = bitcast<u32>(m);
-    slab[v_at] = bitcast<u32>(v);
+    let at = column_at(page, f.column) + listed.y * f.width + f.at - row * f.width;
+    step_float(f.column, at, table_words(page, f.column), decays_of(page, listed.y), value, g);
+}
+
+/// Rows of a workgroup of `step_colors`.
+const COLOR_ROWS: u32 = 64u;
+/// Basis functions, and floats of a row.
+#ifdef SH_DEGREE_1
+const BASIS: u32 = 1u + SH_WIDTH / 3u;
+#else
+const BASIS: u32 = 1u;
+#endif
+const COLOR_FLOATS: u32 = 3u * BASIS;
+
+/// What the floats of a row share.
+struct ColorRow {
+    /// First word of sh0 and of the higher bands, and words of their tables; the last is 0 for a row that is not updated.
+    sh_n_at: u32,
+    sh_n_words: u32,
+    sh0_at: u32,
+    sh0_words: u32,
+    decays: Decays,
+    /// Gradient of the colour.
+    v: vec3<f32>,
+}
+
+var<workgroup> color_rows: array<ColorRow, COLOR_ROWS>;
+var<workgroup> bases: array<f32, COLOR_ROWS * BASIS>;
+
+/// Finds what the floats of listed row `i` share, the row of this number in the workgroup.
+fn share_color(i: u32, own: u32) {
+    color_rows[own].sh0_words = 0u;
+    if i >= u.row_count {
+        return;
+    }
+    let listed = rows[i];
+    if listed.x == UNLISTED || !is_usable(largest(i)) {
+        return;
+    }
+    let page = pages[listed.x];
+    if page.slab != u.slab {
+        return;
+    }
+    let at = 4u * SPLAT_STRIDE * i + 8u;
+    let v = vec3<f32>(bitcast<f32>(v_splats[at]), bitcast<f32>(v_splats[at + 1u]), bitcast<f32>(v_splats[at + 2u]));
+    color_rows[own] = ColorRow(
+        column_at(page, SH_N) + listed.y * page.sh_n_width,
+        table_words(page, SH_N),
+        column_at(page, SH0) + listed.y * 3u,
+        table_words(page, SH0),
+        decays_of(page, listed.y),
+        // A channel clamped at 0 passes no gradient.
+        select(vec3<f32>(), v, splats[SPLAT_STRIDE * i + 2u].xyz > vec3<f32>()),
+    );
+    bases[BASIS * own] = SH_C0;
+#ifdef SH_DEGREE_1
+    let dir = viewing_direction(u.centre, vec3<f32>(means[3u * i], means[3u * i + 1u], means[3u * i + 2u])).unit;
+    let basis1 = sh_band1(dir);
+#repeat K 0u 1u 2u
+    bases[BASIS * own + 1u + K] = basis1[K];
+#end
+#ifdef SH_DEGREE_2
+    let basis2 = sh_band2(dir);
+#repeat K 0u 1u 2u 3u 4u
+    bases[BASIS * own + 4u + K] = basis2[K];
+#end
+#ifdef SH_DEGREE_3
+    let basis3 = sh_band3(dir);
+#repeat K 0u 1u 2u 3u 4u 5u 6u
+    bases[BASIS * own + 9u + K] = basis3[K];
+#end
+#endif
+#endif
+#endif
+}
+
+/// One workgroup for each 64 rows. Makes the gradients of the coefficients, as sh_bwd does where the host wants them, and takes the step
+/// at once: the gradients, four fifths of a row's, are never stored.
+@compute @workgroup_size(256)
+fn step_colors(workgroup: Group, place: Place) {
+    let first = COLOR_ROWS * linear_group(workgroup);
+    if gate[0] != 0u {
+        return;
+    }
+    if place.lane < COLOR_ROWS {
+        share_color(first + place.lane, place.lane);
+    }
+    workgroupBarrier();
+    for (var k = place.lane; k < COLOR_ROWS * COLOR_FLOATS; k += 256u) {
+        let own = k / COLOR_FLOATS;
+        let e = k % COLOR_FLOATS;
+        let row = color_rows[own];
+        if row.sh0_words == 0u {
+            continue;
+        }
+        let g = bases[BASIS * own + e / 3u] * row.v[e % 3u];
+#ifdef SH_DEGREE_1
+        if e >= 3u {
+            let value = sh_n[SH_WIDTH * (first + own) + e - 3u];
+            step_float(SH_N, row.sh_n_at + e - 3u, row.sh_n_words, row.decays, value, g);
+            continue;
+        }
+#endif
+        step_float(SH0, row.sh0_at + e, row.sh0_words, row.decays, sh0[3u * (first + own) + e], g);
+    }
 }
 
 /// Bin of a mean growth score, as in src/densify/stats.rs.

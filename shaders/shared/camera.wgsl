@@ -25,8 +25,9 @@ struct View {
     /// Limits of X/Z and Y/Z inside the Jacobian: the image plus 15 % of it on each side.
     slope_low: vec2<f32>,
     slope_high: vec2<f32>,
-    /// Number of rows of this window.
+    /// Number of rows of this window, and number of its first row.
     row_count: u32,
+    first_row: u32,
 }
 
 /// The smallest positive normal f32.
@@ -38,9 +39,9 @@ struct Direction {
     inv_len: f32,
 }
 
-/// The direction in which the camera sees a mean, at length 1; zeros if the length is 0 or its square overflows f32.
-fn viewing_direction(view: View, mean: vec3<f32>) -> Direction {
-    let dir = mean - view.centre;
+/// The direction in which a camera at `centre` sees a mean, at length 1; zeros if the length is 0 or its square overflows f32.
+fn viewing_direction(centre: vec3<f32>, mean: vec3<f32>) -> Direction {
+    let dir = mean - centre;
     let len_sq = dir.x * dir.x + dir.y * dir.y + dir.z * dir.z;
     if !(is_finite(len_sq) && len_sq >= LEAST_NORMAL) {
         return Direction(vec3<f32>(), 0.0);

@@ -84,6 +84,29 @@ fn column_width(column: u32, sh_n_width: u32) -> u32 {
     }
 }
 
+/// A float of a column of rows.
+struct Float {
+    column: u32,
+    /// Floats per row of the column.
+    width: u32,
+    /// Number of the float in the column.
+    at: u32,
+    exists: bool,
+}
+
+/// The i-th float of the columns from `first` on and before `end`, of so many rows, one column behind the other.
+fn float_of(i: u32, row_count: u32, first: u32, end: u32, sh_n_width: u32) -> Float {
+    var at = i;
+    for (var column = first; column < end; column++) {
+        let width = column_width(column, sh_n_width);
+        if at < row_count * width {
+            return Float(column, width, at, true);
+        }
+        at -= row_count * width;
+    }
+    return Float(first, 1u, 0u, false);
+}
+
 /// Words of the table of values of a column, which are those of its moments.
 fn table_words(page: DevicePage, column: u32) -> u32 {
     return padded(page.rows * column_width(column, page.sh_n_width));

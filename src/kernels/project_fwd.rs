@@ -64,12 +64,13 @@ crate::wgsl_struct! {
         pub slope_low: [f32; 2],
         pub slope_high: [f32; 2],
         pub row_count: u32,
-        pub _pad: [u32; 3],
+        pub first_row: u32,
+        pub _pad: [u32; 2],
     }
 }
 
 impl View {
-    /// The constants for a camera; `row_count` is set for each window of rows on a device.
+    /// The constants for a camera; `row_count` and `first_row` are set for each window of rows on a device.
     pub fn new(camera: &Camera, eps2d: f32) -> View {
         let rotation = camera.viewmat.map(|[x, y, z, _]| [x, y, z]);
         let cofactors: [[f32; 3]; 3] = std::array::from_fn(|i| cross(rotation[(i + 1) % 3], rotation[(i + 2) % 3]));
@@ -89,7 +90,8 @@ impl View {
             slope_low: std::array::from_fn(|i| -(principal[i] / focal[i] + margin[i])),
             slope_high: std::array::from_fn(|i| (size[i] - principal[i]) / focal[i] + margin[i]),
             row_count: 0,
-            _pad: [0; 3],
+            first_row: 0,
+            _pad: [0; 2],
         }
     }
 }

@@ -113,7 +113,7 @@ crate::wgsl_struct! {
     /// Uniform of `scan.wgsl`.
     pub struct ScanUniforms {
         pub count: u32,
-        pub has_bases: u32,
+        pub sums_of_block: u32,
         pub pad: [u32; 2],
     }
 
@@ -199,11 +199,8 @@ crate::wgsl_struct! {
         pub slab: u32,
         pub page_count: u32,
         pub row_count: u32,
-        pub column: u32,
-        pub width: u32,
-        pub rate: f32,
-        pub means_rate: f32,
-        pub scales_rate: f32,
+        pub sh_n_width: u32,
+        pub rates: [[f32; 4]; 2],
         pub grow_grad2d: f32,
         pub split_scale: f32,
         pub split_reach: f32,
@@ -215,22 +212,20 @@ crate::wgsl_struct! {
         pub slab: u32,
         pub row_count: u32,
         pub column: u32,
-        pub width: u32,
         pub now: u32,
-        pub step_size: f32,
         pub half_size: [f32; 2],
         pub inv_root_correction: f32,
         pub collects: u32,
+        pub centre: [f32; 3],
         pub weighs: u32,
-        pub pad: u32,
+        pub step_sizes: [[f32; 4]; 2],
     }
 }
 
 impl GatherUniforms {
-    /// Uniforms of a step on the pages of a batch; slab, rows and column are set for each dispatch.
+    /// Uniforms of a step on the pages of a batch; slab and rows are set for each dispatch.
     pub fn new(camera: &Camera, run: &RunNumbers, now: u32, splits: &SplitLimits, page_count: u32) -> GatherUniforms {
         let frustum = Frustum::new(camera);
-        let rate = |column: Column| run.base_rates[column as usize];
         GatherUniforms {
             world_to_camera: frustum.viewmat,
             slopes: frustum.slopes,
@@ -241,43 +236,33 @@ impl GatherUniforms {
             side_slack: frustum.side_slack,
             now,
             page_count,
-            width: 1,
-            means_rate: rate(Column::Means),
-            scales_rate: rate(Column::Scales),
+            rates: of_columns(&run.base_rates),
             grow_grad2d: splits.grow_grad2d,
             split_scale: splits.split_scale,
             split_reach: splits.reach,
             ..GatherUniforms::zeroed()
         }
     }
+}
 
-    /// The same for the first `width` floats of each row of a column.
-    pub fn of_column(&self, run: &RunNumbers, column: Column, width: usize) -> GatherUniforms {
-        GatherUniforms { column: column as u32, width: width as u32, rate: run.base_rates[column as usize], ..*self }
-    }
+/// A number for each column, in the order of [`Column::ALL`], as shaders index them.
+pub fn of_columns(numbers: &[f32; Column::ALL.len()]) -> [[f32; 4]; 2] {
+    let [a, b, c, d, e, f] = *numbers;
+    [[a, b, c, d], [e, f, 0.0, 0.0]]
 }
 
 impl UpdateUniforms {
     /// Uniforms of a step; slab, rows and column are set for each dispatch.
     pub fn new(camera: &Camera, step: &StepNumbers, collects: bool, weighs: bool) -> UpdateUniforms {
         UpdateUniforms {
-            width: 1,
             now: step.now,
             inv_root_correction: step.inv_root_correction,
             half_size: [camera.width, camera.height].map(|n| n as f32 * 0.5),
             collects: u32::from(collects),
+            centre: camera.centre(),
             weighs: u32::from(weighs),
+            step_sizes: of_columns(&step.step_sizes),
             ..UpdateUniforms::zeroed()
-        }
-    }
-
-    /// The same for the first `width` floats of each row of a column, as [`GatherUniforms::of_column`].
-    pub fn of_column(&self, step: &StepNumbers, column: Column, width: usize) -> UpdateUniforms {
-        UpdateUniforms {
-            column: column as u32,
-            width: width as u32,
-            step_size: step.step_sizes[column as usize],
-            ..*self
         }
     }
 }

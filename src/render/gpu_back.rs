@@ -55,6 +55,7 @@ pub(super) fn record_picture_back(
     let errors = view.loss.as_ref().and_then(|loss| loss.errors.as_ref()).or(no_errors.as_ref()).map(Buffer::view);
     let gradient = PictureGradientBuffers { v_rgb: &v_rgb, has_v_alpha, errors: errors.as_ref() };
     (view.tiles_back, view.unusable) = (None, Unusable::Uncounted);
+    let unusable = recorder.buffer_zeroed("unusable rows", 4)?;
     match &mut view.lists {
         Lists::Whole(lists) => {
             let (WholeLists { ranks, frame, .. }, DemandState::Known(demand)) = (&**lists, &lists.demand) else {
@@ -65,8 +66,8 @@ pub(super) fn record_picture_back(
                 let v_splats = gpu.buffer("v_splats", splat_bytes(ranks.rows))?;
                 let (splats, out) = (segment.splats.view(), v_splats.view());
                 let (into, pixels) = (&mut recorder, &view.pixels);
-                let fold = Fold::Whole;
-                stages.tiles.back.backward(gpu, into, &splats, ranks, frame, pixels, *demand, gradient, &out, fold)?;
+                let (out, fold) = ((&out, &unusable), Fold::Whole);
+                stages.tiles.back.backward(gpu, into, &splats, ranks, frame, pixels, *demand, gradient, out, fold)?;
                 segment.v_splats = Some(v_splats);
             }
             view.tiles_back = Some(recorder.set_aside());
@@ -74,9 +75,10 @@ pub(super) fn record_picture_back(
         Lists::Ranges(planned) => {
             gpu.submit(recorder)?; // the uploads
             let ranges = Ranges { gpu, tiles: &stages.tiles, stages: &stages.ranges, blend, pixels: &view.pixels };
-            ranges.back(&mut view.segments, planned, gradient)?;
+            ranges.back(&mut view.segments, planned, gradient, &unusable)?;
         }
     }
+    view.unusable = Unusable::OnDevice(unusable);
     if view.columns.is_none() {
         // The caller changes rows as soon as the first batch is out, so the pass out must not fail for want of memory.
         if let Some(tiles) = view.tiles_back.take() {
@@ -110,38 +112,37 @@ pub(super) fn rows_out(
     out.prepare(place.len(), rows.sh_degree, grads);
     if let Some(count) = view.columns.as_ref().map(|columns| columns.rows) {
         let room = RowGradients::new(&stages.gpu, count, of.options.sh_degree, weighs)?;
-        let recorder = count_unusable(stages, view)?;
+        let recorder = with_unusable(stages, view)?;
         if let (Some(columns), Some(segment)) = (&view.columns, view.segments.first()) {
             return out.whole(recorder, columns, &room, segment, grads, scratch);
         }
     }
-    count_unusable_once(stages, view)?;
+    submit_tiles_back(stages, view)?;
     let of_batch = view.segments.iter().filter(|segment| place.contains(&segment.first));
     out.in_chunks(rows, place.start, of_batch, grads, scratch)
 }
 
-/// Records the count of the rows with unusable gradients behind the tile stages of the backward pass.
-fn count_unusable<'g>(stages: &'g ViewStages, view: &mut View) -> GpuResult<Recorder<'g>> {
+/// The tile stages of the backward pass, if they are not submitted yet, with the read-back of the number of rows with unusable gradients.
+fn with_unusable<'g>(stages: &'g ViewStages, view: &mut View) -> GpuResult<Recorder<'g>> {
     let gpu = &stages.gpu;
     let mut recorder = view.tiles_back.take().map_or_else(|| gpu.begin("backward"), |tiles| gpu.resume(tiles));
-    let counted = stages.tiles.back.unusable(&mut recorder, &view.segments, view.blend());
-    match counted.and_then(|unusable| recorder.read_back("rasterize_bwd", &unusable.view())) {
-        Ok(unusable) => {
-            view.unusable = Unusable::Pending(unusable);
-            Ok(recorder)
-        }
-        Err(error) => {
-            // The work that the recorder brings along goes on even if the count lacks memory.
-            gpu.submit(recorder)?;
-            Err(error)
+    if let Unusable::OnDevice(unusable) = &view.unusable {
+        match recorder.read_back("rasterize_bwd", &unusable.view()) {
+            Ok(unusable) => view.unusable = Unusable::Pending(unusable),
+            Err(error) => {
+                // The work that the recorder brings along goes on even if the read-back lacks memory.
+                gpu.submit(recorder)?;
+                return Err(error);
+            }
         }
     }
+    Ok(recorder)
 }
 
-/// Submits the tile stages of the backward pass and the count of the rows with unusable gradients, if no batch did so before.
-pub(super) fn count_unusable_once(stages: &ViewStages, view: &mut View) -> GpuResult<()> {
-    if view.tiles_back.is_some() || matches!(view.unusable, Unusable::Uncounted) {
-        let recorder = count_unusable(stages, view)?;
+/// Submits the tile stages of the backward pass and the read-back of the number of rows with unusable gradients, if no batch did so before.
+pub(super) fn submit_tiles_back(stages: &ViewStages, view: &mut View) -> GpuResult<()> {
+    if view.tiles_back.is_some() || matches!(view.unusable, Unusable::OnDevice(_)) {
+        let recorder = with_unusable(stages, view)?;
         stages.gpu.submit(recorder)?;
     }
     Ok(())
@@ -156,7 +157,7 @@ pub(super) fn read_unusable(view: &mut View) -> GpuResult<u64> {
             u64::from(count[0])
         }
         Unusable::Known(count) => count,
-        Unusable::Uncounted => 0,
+        Unusable::Uncounted | Unusable::OnDevice(_) => 0,
     };
     view.unusable = Unusable::Known(unusable);
     Ok(unusable)

@@ -59,7 +59,7 @@ pub(super) struct RowsOut<'a> {
 
 /// Pending readbacks of the gradients of rows.
 struct Readbacks {
-    sh0: Readback,
+    sh0: Option<Readback>,
     sh_n: Option<Readback>,
     footprints: Readback,
     /// means, quats, scales, opacities.
@@ -161,7 +161,8 @@ impl RowsOut<'_> {
         let grads = &room.columns;
         let colors = self.stages.sh_bwd(gpu, &mut recorder, camera, columns, splats, v_splats, room).and_then(|()| {
             let mut read = |buffer: &Buffer| recorder.read_back("sh_bwd", &buffer.view());
-            Ok((read(&grads.sh0)?, grads.sh_n.as_ref().map(&mut read).transpose()?, read(&room.footprints)?))
+            let sh0 = grads.sh0.as_ref().map(&mut read).transpose()?;
+            Ok((sh0, grads.sh_n.as_ref().map(&mut read).transpose()?, read(&room.footprints)?))
         });
         gpu.submit(recorder)?;
         let (sh0, sh_n, footprints) = colors?;
@@ -183,7 +184,9 @@ impl RowsOut<'_> {
         Scratch { bands, footprints }: &mut Scratch,
     ) -> GpuResult<()> {
         let out = &mut grads.columns;
-        readbacks.sh0.copy_to(&mut out.sh0[3 * part.start..3 * part.end])?;
+        if let Some(bytes) = readbacks.sh0 {
+            bytes.copy_to(&mut out.sh0[3 * part.start..3 * part.end])?;
+        }
         if let Some(bytes) = readbacks.sh_n {
             let (width, row_width) = (sh_n_width(self.view.options.sh_degree), sh_n_width(out.sh_degree));
             let of_part = &mut out.sh_n[row_width * part.start..row_width * part.end];

@@ -1,13 +1,16 @@
 //! Records the image loss on a device: value and gradient of a picture against an 8-bit photo. The host reads only the
 //! four sums from which the value follows.
 //!
-//! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. one channel's
-//! derivative maps exist at a time.
+//! Invariants: 1. sums are trees in a fixed order: the same bits on every run of one device; 2. where memory is short or bindings are
+//! small, one channel's derivative maps exist at a time.
 
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, WORKGROUP, groups_1d};
 use crate::kernels::image_loss::{LossPlan, LossValue};
 use crate::kernels::uniforms::LossUniforms;
 use std::sync::Arc;
+
+/// The derivatives of all channels at once take at most this part of the memory that is left.
+const ROOM_SHARE: u64 = 8;
 
 #[derive(Debug)]
 pub struct LossStage {
@@ -68,12 +71,15 @@ impl LossStage {
         if tiles == 0 {
             return Ok(None);
         }
-        let derivatives = gpu.buffer("derivatives", 12 * u64::from(width) * u64::from(height))?;
+        let bytes = 12 * u64::from(width) * u64::from(height);
+        let fits = |channels: u64| channels * bytes <= gpu.max_binding_bytes().min(gpu.room() / ROOM_SHARE);
+        let at_once = if fits(3) { 3 } else { 1 };
+        let derivatives = gpu.buffer("derivatives", u64::from(at_once) * bytes)?;
         let mut partials = gpu.buffer("partials", 16 * 3 * u64::from(tiles))?;
         let mut uniforms = LossUniforms::new(width, height, plan);
-        let groups = groups_1d(tiles, 1);
-        for channel in 0..3 {
-            (uniforms.first_channel, uniforms.channel_count) = (channel, 1);
+        let groups = groups_1d(at_once * tiles, 1);
+        for channel in (0..3).step_by(at_once as usize) {
+            (uniforms.first_channel, uniforms.channel_count) = (channel, at_once);
             let uniform = recorder.uniform(&uniforms)?;
             let (map, sums) = (derivatives.view(), partials.view());
             let views = [uniform.clone(), rgb.clone(), target_pixels.clone(), map.clone(), sums.clone()];

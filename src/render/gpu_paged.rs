@@ -6,7 +6,7 @@
 //! Not here: the recording of the stages (`gpu_pages`), slots (`gpu_slots`), the update (`gpu_update`).
 
 use super::gpu::GpuRenderer;
-use super::gpu_back::count_unusable_once;
+use super::gpu_back::submit_tiles_back;
 use super::gpu_pages::DevicePages;
 use super::gpu_recorded::{back_and_update, finish, rows_and_picture};
 use super::gpu_update::update_batch;
@@ -100,7 +100,7 @@ impl PageRenderer for GpuRenderer {
     fn pages_out(&mut self, batch: usize) -> Result<(), RenderError> {
         let rows = self.pages_view.as_ref().and_then(|view| view.batches.get(batch)).map_or(0, |batch| batch.rows);
         self.sequence.rows_out(batch, rows as usize)?;
-        self.with_view("pages_out", |renderer, view| Ok(count_unusable_once(&renderer.stages, view)?))
+        self.with_view("pages_out", |renderer, view| Ok(submit_tiles_back(&renderer.stages, view)?))
     }
 
     fn begin_update(&mut self, batch: usize, pages: &[SlotPage], collects: bool) -> Result<(), RenderError> {

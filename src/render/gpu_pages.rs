@@ -1,22 +1,24 @@
 //! Records the stages on pages on a device: gather and update. Owns the slots, the optimizer's tables and the bins of
 //! growth scores and weights.
 //!
-//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. Columns
-//! are gathered and updated one by one: an invocation for each float, and few bindings.
+//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. An invocation gathers
+//! or updates a float, of as many columns as bindings allow.
 //!
 //! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`), steps that are recorded without waiting (`gpu_recorded`).
 //!
 //! Invariants: 1. a dispatch binds windows of columns, so no binding is too large; floats are independent, so the result has the
 //! same bits for any windows; 2. an update of a chunk is submitted at once, so a chunk is updated as a whole or not at all.
 
-use super::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows, Window, footprint_bytes, windows};
+use super::gpu_rows::{
+    DeviceColumns, OfDegree, RowGradients, RowSource, SplatRows, Window, footprint_bytes, of_degrees, windows,
+};
 use super::gpu_slots::Slots;
 use super::pages::{PageRules, SlotPage};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Readback, Recorder, groups_1d};
 use crate::kernels::deferred::DeferredTables;
-use crate::kernels::uniforms::{DevicePage, GatherUniforms, PageSurvey, UpdateUniforms};
+use crate::kernels::uniforms::{DevicePage, GatherUniforms, PageSurvey, UpdateUniforms, of_columns};
 use crate::scene::camera::Camera;
-use crate::scene::columns::Column;
+use crate::scene::columns::{Column, sh_n_width};
 use crate::scene::optimizer_numbers::StepNumbers;
 use bytemuck::Zeroable;
 use std::collections::BTreeSet;
@@ -29,17 +31,21 @@ pub(super) const WORKGROUP: u32 = 256;
 const BINS: u64 = 1 << 15;
 /// Bytes of a listed row: number of the page, number of the row.
 const LISTED_BYTES: u64 = 8;
+/// Rows of a workgroup that updates colours.
+const COLOR_ROWS: u32 = 64;
+
 #[derive(Debug)]
 pub(super) struct Stages {
     pub(super) cull: Arc<Pipeline>,
     pub(super) place: Arc<Pipeline>,
-    pub(super) pad: Arc<Pipeline>,
     pub(super) list: Arc<Pipeline>,
-    gather: Arc<Pipeline>,
+    gather_geometry: Arc<Pipeline>,
+    gather_colors: Arc<Pipeline>,
     bounds: Arc<Pipeline>,
     survey: Arc<Pipeline>,
     clear: Arc<Pipeline>,
-    step: Arc<Pipeline>,
+    step_geometry: Arc<Pipeline>,
+    step_colors: OfDegree,
     finish: Arc<Pipeline>,
     pub(super) decide: Arc<Pipeline>,
 }
@@ -102,13 +108,14 @@ impl DevicePages {
         let stages = Stages {
             cull: of("gather.wgsl", "cull")?,
             place: of("gather.wgsl", "place")?,
-            pad: of("gather.wgsl", "pad")?,
             list: of("gather.wgsl", "list")?,
-            gather: of("gather.wgsl", "gather")?,
+            gather_geometry: of("gather.wgsl", "gather_geometry")?,
+            gather_colors: of("gather.wgsl", "gather_colors")?,
             bounds: of("gather.wgsl", "bounds")?,
             survey: of("gather.wgsl", "survey")?,
             clear: of("update.wgsl", "clear_statistics")?,
-            step: of("update.wgsl", "step")?,
+            step_geometry: of("update.wgsl", "step_geometry")?,
+            step_colors: of_degrees(gpu, "update.wgsl", "step_colors", &[])?,
             finish: of("update.wgsl", "finish")?,
             decide: of("gate.wgsl", "decide")?,
         };
@@ -207,10 +214,8 @@ impl DevicePages {
         let uniform = recorder.uniform(&uniforms)?;
         let views = [uniform.clone(), counts.view(), table.on_device.view()];
         recorder.dispatch("gather", &self.stages.place, &views, groups_1d(1, 1))?;
-        let views = [uniform.clone(), counts.view(), listed.view()];
-        recorder.dispatch("gather", &self.stages.pad, &views, groups_1d(rows, WORKGROUP))?;
         let views = [uniform, table.on_device.view(), counts.view(), found.view(), listed.view()];
-        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
+        let groups = groups_1d(pages.len() as u32 + rows.div_ceil(WORKGROUP), 1);
         recorder.dispatch("gather", &self.stages.list, &views, groups)?;
         Ok((PageBatch { first_listed: Vec::new(), rows, listed }, table, counts))
     }
@@ -230,28 +235,44 @@ impl DevicePages {
         buffers: &UpdateBuffers<'_>,
     ) -> GpuResult<()> {
         let PageRows { view, batch, table, .. } = *source;
-        let UpdateBuffers { values, grads, v_splats, results, collects } = *buffers;
+        let UpdateBuffers { values, grads, splats: [splats, v_splats], results, collects } = *buffers;
         let uniforms = UpdateUniforms::new(&view.camera, &view.step, collects, grads.weighs);
+        let (stages, gate) = (&self.stages, self.gate.view());
         for window in windows(gpu, values.rows, values.widest()) {
             let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
-            let v_splats = v_splats.window(window);
+            let (splats, v_splats) = (splats.window(window), v_splats.window(window));
             for slab in table.slabs() {
                 let uniforms = UpdateUniforms { slab, row_count: window.rows, ..uniforms };
-                let of_slab = [table.on_device.view(), self.slots.slab(slab)?, self.tables.view(), rows.clone()];
-                for ((column, values, width), (_, grads, _)) in values.columns().zip(grads.columns.columns()) {
-                    let uniform = recorder.uniform(&uniforms.of_column(&view.step, column, width))?;
-                    let [values, grads] = [values, grads].map(|buffer| window.of(buffer, 4 * width as u64));
-                    let own = [values, grads, v_splats.clone(), self.gate.view()];
+                let [pages, slab] = [table.on_device.view(), self.slots.slab(slab)?];
+                let of_slab =
+                    [pages.clone(), slab.clone(), self.tables.view(), rows.clone(), v_splats.clone(), gate.clone()];
+                let (w, g) = (values.window(window), grads.columns.window(window));
+                let pairs = [
+                    (Column::Means, 7, [&w.means, &g.means, &w.quats, &g.quats]),
+                    (Column::Scales, 4, [&w.scales, &g.scales, &w.opacities, &g.opacities]),
+                ];
+                for (column, width, own) in pairs {
+                    let uniform = recorder.uniform(&UpdateUniforms { column: column as u32, ..uniforms })?;
+                    let own = own.map(BufferView::clone);
                     let views: Vec<BufferView> = [uniform].into_iter().chain(of_slab.clone()).chain(own).collect();
-                    let groups = groups_1d(window.rows * width as u32, WORKGROUP);
-                    recorder.dispatch("update", &self.stages.step, &views, groups)?;
+                    recorder.dispatch(
+                        "update",
+                        &stages.step_geometry,
+                        &views,
+                        groups_1d(window.rows * width, WORKGROUP),
+                    )?;
                 }
-                let [pages, slab, _, rows] = of_slab;
+                let uniform = recorder.uniform(&uniforms)?;
+                let mut views: Vec<BufferView> = [uniform.clone()].into_iter().chain(of_slab).collect();
+                views.extend([splats.clone()].into_iter().chain(w.sh0));
+                views.extend(w.sh_n.into_iter().flat_map(|sh_n| [w.means.clone(), sh_n]));
+                let step_colors = &stages.step_colors[usize::from(values.sh_degree)];
+                recorder.dispatch("update", step_colors, &views, groups_1d(window.rows, COLOR_ROWS))?;
                 let footprints = window.of(&grads.footprints, footprint_bytes(grads.weighs));
-                let own = [v_splats.clone(), footprints, results.view(), self.bins.view(), self.gate.view()];
-                let views: Vec<BufferView> =
-                    [recorder.uniform(&uniforms)?, pages, slab, rows].into_iter().chain(own).collect();
-                recorder.dispatch("update", &self.stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
+                let of_rows = [pages, slab, rows.clone(), v_splats.clone(), gate.clone()];
+                let own = [footprints, results.view(), self.bins.view()];
+                let views: Vec<BufferView> = [uniform].into_iter().chain(of_rows).chain(own).collect();
+                recorder.dispatch("update", &stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
             }
         }
         Ok(())
@@ -285,8 +306,8 @@ impl DevicePages {
         let mut recorder = gpu.begin("survey");
         let table = self.table(&mut recorder, pages, &[])?;
         let surveys = recorder.buffer_zeroed("surveys", (size_of::<PageSurvey>() * pages.len()) as u64)?;
-        let uniforms = GatherUniforms { page_count: pages.len() as u32, ..GatherUniforms::zeroed() };
-        let uniforms = uniforms.of_column(&self.rules.numbers, Column::Opacities, 1);
+        let rates = of_columns(&self.rules.numbers.base_rates);
+        let uniforms = GatherUniforms { page_count: pages.len() as u32, rates, ..GatherUniforms::zeroed() };
         let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
         for slab in table.slabs() {
             let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
@@ -329,8 +350,8 @@ pub struct UpdateBuffers<'a> {
     pub values: &'a DeviceColumns,
     /// Their gradients; rows are weighed only if the run's rules allow it.
     pub grads: &'a RowGradients,
-    /// The gradients of their splats, whose last words hold the largest gradient of each row.
-    pub v_splats: SplatRows<'a>,
+    /// Their splats, and the gradients of these, whose last words hold the largest gradient of each row.
+    pub splats: [SplatRows<'a>; 2],
     /// `[page of the batch]`: what the update did.
     pub results: &'a Buffer,
     /// Whether statistics are collected.
@@ -361,19 +382,27 @@ impl RowSource for PageRows<'_> {
         part: &Range<usize>,
     ) -> GpuResult<()> {
         let PageRows { pages, view, batch, table } = *self;
+        let sh_n_width = sh_n_width(columns.sh_degree) as u32;
         let uniforms = pages.uniforms(view, table.pages.len());
         for window in windows(gpu, columns.rows, columns.widest()) {
             let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
             for slab in table.slabs() {
-                let uniforms = GatherUniforms { slab, row_count: window.rows, ..uniforms };
+                let uniforms = GatherUniforms { slab, row_count: window.rows, sh_n_width, ..uniforms };
                 let [slab, tables, recent] = [pages.slots.slab(slab)?, pages.tables.view(), view.recent.view()];
                 let buffers = [table.on_device.view(), slab, tables, recent, rows.clone()];
-                for (column, buffer, width) in columns.columns() {
-                    let uniforms = uniforms.of_column(&pages.rules.numbers, column, width);
-                    let (uniform, out) = (recorder.uniform(&uniforms)?, window.of(buffer, 4 * width as u64));
-                    let views: Vec<BufferView> = [uniform].into_iter().chain(buffers.clone()).chain([out]).collect();
-                    let groups = groups_1d(window.rows * width as u32, WORKGROUP);
-                    recorder.dispatch("gather", &pages.stages.gather, &views, groups)?;
+                let w = columns.window(window);
+                // Bound in place of bands that no invocation has.
+                let no_bands = gpu.buffer("no bands", 4)?;
+                let sh_n = w.sh_n.unwrap_or_else(|| no_bands.view());
+                let geometry = vec![w.means, w.quats, w.scales, w.opacities];
+                let colors = w.sh0.into_iter().chain([sh_n]).collect();
+                let stages = &pages.stages;
+                for (stage, width, out) in
+                    [(&stages.gather_geometry, 11, geometry), (&stages.gather_colors, 3 + sh_n_width, colors)]
+                {
+                    let uniform = recorder.uniform(&uniforms)?;
+                    let views: Vec<BufferView> = [uniform].into_iter().chain(buffers.clone()).chain(out).collect();
+                    recorder.dispatch("gather", stage, &views, groups_1d(window.rows * width, WORKGROUP))?;
                 }
             }
         }

@@ -54,9 +54,11 @@ impl ViewStages {
         let mut recorder = gpu.begin("forward");
         rows.geometry(gpu, &mut recorder, &columns, &all)?;
         let into = SplatRows::from(&splats);
-        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into)?;
+        let keys = TileStages::keys(gpu, count)?;
+        self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into, Some(&keys))?;
         let grid = Grid::new(camera.width, camera.height);
-        let ranks = self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
+        let ranks =
+            self.tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid), Some(keys))?;
         gpu.submit(recorder)?;
         // The device projects and sorts during the upload of the colours, four fifths of a row.
         let mut recorder = gpu.begin("forward");

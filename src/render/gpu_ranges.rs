@@ -98,18 +98,19 @@ impl Ranges<'_> {
         }
     }
 
-    /// Propagates the gradient of the picture back to the splats of `segments`, which get gradients. `planned` is what
-    /// [`Ranges::draw`] returned; ranges that lack memory now are cut again.
+    /// Propagates the gradient of the picture back to the splats of `segments`, which get gradients, and counts in `unusable` as
+    /// [`super::gpu_tiles_bwd::BackStages::backward`]. `planned` is what [`Ranges::draw`] returned; ranges that lack memory now are cut again.
     pub fn back(
         &self,
         segments: &mut [Segment],
         planned: &mut Vec<PlannedRange>,
         picture: PictureGradientBuffers<'_>,
+        unusable: &Buffer,
     ) -> GpuResult<()> {
         let mut bytes = self.gpu.room();
         loop {
             zero_gradients(self.gpu, segments)?;
-            match self.back_all(segments, planned, picture) {
+            match self.back_all(segments, planned, picture, unusable) {
                 Err(error) if error.is_out_of_memory() && planned.iter().any(|range| range.can_be_cut) => {
                     bytes = (bytes / 2).min(self.gpu.room() / 2);
                     *planned = self.draw(segments, bytes)?;
@@ -120,17 +121,8 @@ impl Ranges<'_> {
         }
         let mut recorder = self.gpu.begin("backward");
         for segment in segments.iter() {
-            let (splats, v_splats) = (segment.splats.view(), gradients_of(segment)?.view());
             let weighs = picture.errors.is_some();
-            self.tiles.back.finish_sums(
-                self.gpu,
-                &mut recorder,
-                &splats,
-                &v_splats,
-                segment.rows,
-                self.blend,
-                weighs,
-            )?;
+            self.tiles.back.finish_sums(self.gpu, &mut recorder, segment, unusable, self.blend, weighs)?;
         }
         self.gpu.submit(recorder).map(|_| ())
     }
@@ -141,6 +133,7 @@ impl Ranges<'_> {
         segments: &[Segment],
         planned: &[PlannedRange],
         picture: PictureGradientBuffers<'_>,
+        unusable: &Buffer,
     ) -> GpuResult<()> {
         let carry = planned.iter().any(PlannedRange::is_part).then(|| {
             let bytes = carry_bytes(self.pixels);
@@ -148,7 +141,9 @@ impl Ranges<'_> {
         });
         let carry = carry.transpose()?;
         for of_range in planned.chunk_by(|a, b| a.range == b.range) {
-            of_range.iter().rev().try_for_each(|part| self.back_range(segments, part, picture, carry.as_ref()))?;
+            for part in of_range.iter().rev() {
+                self.back_range(segments, part, picture, (carry.as_ref(), unusable))?;
+            }
         }
         Ok(())
     }
@@ -234,7 +229,7 @@ impl Ranges<'_> {
         let splats = recorder.buffer_zeroed("splats of a range", splat_bytes(planned.rows))?;
         self.gather(recorder, segments, planned, &places, |segment| Ok(&segment.splats), &splats)?;
         let grid = self.blend.grid;
-        let ranks = self.tiles.order(self.gpu, recorder, &splats.view(), planned.rows, grid, planned.range)?;
+        let ranks = self.tiles.order(self.gpu, recorder, &splats.view(), planned.rows, grid, planned.range, None)?;
         Ok(Copied { splats, places, ranks })
     }
 
@@ -320,7 +315,7 @@ impl Ranges<'_> {
         segments: &[Segment],
         planned: &PlannedRange,
         picture: PictureGradientBuffers<'_>,
-        carry: Option<&Buffer>,
+        (carry, unusable): (Option<&Buffer>, &Buffer),
     ) -> GpuResult<()> {
         let (gpu, mut recorder) = (self.gpu, self.gpu.begin("backward"));
         let copied = self.copy(&mut recorder, segments, planned)?;
@@ -338,7 +333,7 @@ impl Ranges<'_> {
             self.pixels,
             planned.demand,
             picture,
-            &of_sums,
+            (&of_sums, unusable),
             carry.filter(|_| planned.is_part()).map_or(Fold::Range, Fold::Part),
         )?;
         for (i, (segment, in_segment)) in segments.iter().zip(&places.in_segment).enumerate() {

@@ -24,7 +24,7 @@ use super::gpu_rows::{DeviceColumns, RowSource, SplatRows};
 use super::gpu_segments::Segment;
 use super::gpu_tiles::TileStages;
 use super::gpu_update::Update;
-use super::gpu_view::{DemandState, InFlight, Lists, LossSums, Recorded, View, WholeLists, blend_of};
+use super::gpu_view::{DemandState, InFlight, Lists, LossSums, Recorded, Unusable, View, WholeLists, blend_of};
 use super::pages::{RecordedUpdate, StepDone, StepJob};
 use super::sequence::ViewOptions;
 use crate::gpu::{Buffer, GpuResult, Readback, Recorder, groups_1d};
@@ -51,9 +51,10 @@ pub(super) fn rows_and_picture(
     let splats = gpu.buffer("splats", splat_bytes(count))?;
     held.source(&of_view, &batch, &table).geometry(gpu, &mut recorder, &columns, &(0..count as usize))?;
     let into = SplatRows::from(&splats);
-    rows.project_fwd(gpu, &mut recorder, camera, of.options.eps2d, &columns, into)?;
+    let keys = TileStages::keys(gpu, count)?;
+    rows.project_fwd(gpu, &mut recorder, camera, of.options.eps2d, &columns, into, Some(&keys))?;
     let grid = Grid::new(camera.width, camera.height);
-    let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid))?;
+    let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid), Some(keys))?;
     rows.sh_fwd(gpu, &mut recorder, camera, &columns, into)?;
     let pixels = Pixels::new(gpu, blend.grid)?;
     let frame = tiles.frame_of(gpu, &mut recorder, &splats.view(), &ranks, (blend, room), &pixels)?;
@@ -76,8 +77,7 @@ pub(super) fn back_and_update(
     let needs = || RenderError::OutOfOrder { call: "record_update", needs: "record_picture" };
     let (tiles_back, columns) = (view.tiles_back.take().ok_or_else(needs)?, view.columns.take().ok_or_else(needs)?);
     let mut recorder = stages.gpu.resume(tiles_back);
-    let unusable = stages.tiles.back.unusable(&mut recorder, &view.segments, view.blend())?;
-    let verdict = decide(&mut recorder, (held, records), &view, &unusable, update)?;
+    let verdict = decide(&mut recorder, (held, records), &view, update)?;
     let (batch, segment) = (of_view.batches.first().ok_or_else(needs)?, view.segments.first().ok_or_else(needs)?);
     let source = held.source(of_view, batch, &records.table);
     let pages = records.table.pages.len();
@@ -97,11 +97,13 @@ fn decide(
     recorder: &mut Recorder<'_>,
     (held, records): (&DevicePages, &Recorded),
     view: &View,
-    unusable: &Buffer,
     update: &RecordedUpdate<'_>,
 ) -> Result<Readback, RenderError> {
-    let needs = || RenderError::OutOfOrder { call: "record_update", needs: "loss" };
-    let (Lists::Whole(lists), Some(loss)) = (&view.lists, &view.loss) else { return Err(needs()) };
+    let needs = RenderError::OutOfOrder { call: "record_update", needs: "loss" };
+    let (Lists::Whole(lists), Some(loss), Unusable::OnDevice(unusable)) = (&view.lists, &view.loss, &view.unusable)
+    else {
+        return Err(needs);
+    };
     let verdict = recorder.buffer_zeroed("verdict", size_of::<StepVerdict>() as u64)?;
     // Bound in place of the sums of a picture without pixels.
     let no_sums = recorder.buffer_zeroed("no sums", 16)?;

@@ -5,6 +5,7 @@
 //! Invariant: no binding exceeds the device's limit: longer columns are bound in windows of rows, and because rows are independent
 //! the result has the same bits.
 
+use super::gpu_frame::Pairs;
 use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_1d};
 use crate::kernels::project_fwd::View;
 use crate::scene::camera::Camera;
@@ -42,8 +43,8 @@ pub struct DeviceColumns {
     pub scales: Buffer,
     /// `[rows]`.
     pub opacities: Buffer,
-    /// `[rows][3]`.
-    pub sh0: Buffer,
+    /// `[rows][3]`; `None` where colours have no gradients.
+    pub sh0: Option<Buffer>,
     /// `[rows][(degree + 1)^2 - 1][3]`: the bands in use above 0; `None` if there are none.
     pub sh_n: Option<Buffer>,
     /// The highest band.
@@ -55,15 +56,22 @@ impl DeviceColumns {
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8) -> GpuResult<Self> {
         let column = |label, width: usize| gpu.buffer(label, 4 * width as u64 * u64::from(rows));
         let (sh_degree, sh_n_width) = (sh_degree.min(3), sh_n_width(sh_degree.min(3)));
+        let sh_n = if sh_n_width > 0 { Some(column("sh_n", sh_n_width)?) } else { None };
+        Ok(DeviceColumns { sh0: Some(column("sh0", 3)?), sh_n, sh_degree, ..DeviceColumns::geometry(gpu, rows)? })
+    }
+
+    /// As [`DeviceColumns::new`], without colours.
+    fn geometry(gpu: &Gpu, rows: u32) -> GpuResult<Self> {
+        let column = |label, width: u64| gpu.buffer(label, 4 * width * u64::from(rows));
         Ok(DeviceColumns {
             rows,
             means: column("means", 3)?,
             quats: column("quats", 4)?,
             scales: column("scales", 3)?,
             opacities: column("opacities", 1)?,
-            sh0: column("sh0", 3)?,
-            sh_n: if sh_n_width > 0 { Some(column("sh_n", sh_n_width)?) } else { None },
-            sh_degree,
+            sh0: None,
+            sh_n: None,
+            sh_degree: 0,
         })
     }
 
@@ -74,7 +82,7 @@ impl DeviceColumns {
 
     /// Each column that has entries, in the order of [`Column::ALL`], with its floats per row.
     pub fn columns(&self) -> impl Iterator<Item = (Column, &Buffer, usize)> {
-        let narrow = [&self.means, &self.quats, &self.scales, &self.opacities, &self.sh0];
+        let narrow = [&self.means, &self.quats, &self.scales, &self.opacities].into_iter().chain(&self.sh0);
         let narrow = Column::ALL.into_iter().zip(narrow).map(|(column, buffer)| (column, buffer, column.width(0)));
         narrow.chain(self.sh_n.as_ref().map(|buffer| (Column::ShN, buffer, sh_n_width(self.sh_degree))))
     }
@@ -96,7 +104,9 @@ impl DeviceColumns {
         part: &Range<usize>,
         scratch: &mut Vec<f32>,
     ) -> GpuResult<()> {
-        recorder.upload(&self.sh0.view(), &rows.sh0[3 * part.start..3 * part.end])?;
+        if let Some(sh0) = &self.sh0 {
+            recorder.upload(&sh0.view(), &rows.sh0[3 * part.start..3 * part.end])?;
+        }
         let Some(sh_n) = &self.sh_n else { return Ok(()) };
         let width = rows.sh_n.len() / rows.rows().max(1);
         let of_part = &rows.sh_n[width * part.start..width * part.end];
@@ -113,14 +123,14 @@ impl DeviceColumns {
     }
 
     /// The part of each column inside `window`.
-    fn window(&self, window: Window) -> WindowViews {
+    pub(super) fn window(&self, window: Window) -> WindowViews {
         let view = |buffer: &Buffer, width: usize| window.of(buffer, 4 * width as u64);
         WindowViews {
             means: view(&self.means, 3),
             quats: view(&self.quats, 4),
             scales: view(&self.scales, 3),
             opacities: view(&self.opacities, 1),
-            sh0: view(&self.sh0, 3),
+            sh0: self.sh0.as_ref().map(|buffer| view(buffer, 3)),
             sh_n: self.sh_n.as_ref().map(|buffer| view(buffer, sh_n_width(self.sh_degree))),
         }
     }
@@ -226,19 +236,20 @@ impl Window {
     }
 }
 
-struct WindowViews {
-    means: BufferView,
-    quats: BufferView,
-    scales: BufferView,
-    opacities: BufferView,
-    sh0: BufferView,
-    sh_n: Option<BufferView>,
+/// The columns inside a window.
+pub(super) struct WindowViews {
+    pub means: BufferView,
+    pub quats: BufferView,
+    pub scales: BufferView,
+    pub opacities: BufferView,
+    pub sh0: Option<BufferView>,
+    pub sh_n: Option<BufferView>,
 }
 
 /// Device memory of the gradients of rows.
 #[derive(Debug)]
 pub struct RowGradients {
-    /// Gradients of the columns.
+    /// Gradients of the columns; those of colours only where the host updates.
     pub columns: DeviceColumns,
     /// Gradient of the projected mean, and radii ([`footprint_bytes`] a row).
     pub footprints: Buffer,
@@ -250,6 +261,12 @@ impl RowGradients {
     /// Allocates the gradients of `rows` rows, with weights if `weighs`.
     pub fn new(gpu: &Gpu, rows: u32, sh_degree: u8, weighs: bool) -> GpuResult<Self> {
         let columns = DeviceColumns::new(gpu, rows, sh_degree)?;
+        Ok(RowGradients { columns, ..RowGradients::for_update(gpu, rows, weighs)? })
+    }
+
+    /// Allocates what an update on the device reads, which makes the gradients of colours itself.
+    pub fn for_update(gpu: &Gpu, rows: u32, weighs: bool) -> GpuResult<Self> {
+        let columns = DeviceColumns::geometry(gpu, rows)?;
         let footprints = gpu.buffer("footprints", footprint_bytes(weighs) * u64::from(rows))?;
         Ok(RowGradients { columns, footprints, weighs })
     }
@@ -267,18 +284,34 @@ pub(super) fn windows(gpu: &Gpu, rows: u32, row_bytes: u64) -> impl Iterator<Ite
 #[derive(Debug)]
 pub struct RowStages {
     project_fwd: Arc<Pipeline>,
+    /// With the keys of the depth sort.
+    project_fwd_keys: Arc<Pipeline>,
     project_bwd: Arc<Pipeline>,
     sh_fwd: OfDegree,
-    sh_bwd: OfDegree,
+    sh_bwd: ShBwd,
     /// `None` before [`RowStages::weigh_rows`].
-    sh_bwd_weighing: Option<OfDegree>,
+    sh_bwd_weighing: Option<ShBwd>,
 }
 
 /// A stage for each SH degree.
-type OfDegree = [Arc<Pipeline>; 4];
+pub(super) type OfDegree = [Arc<Pipeline>; 4];
+
+/// The backward stage of colours, for gradients that the host updates with and for an update on the device.
+#[derive(Debug)]
+struct ShBwd {
+    for_host: OfDegree,
+    for_update: OfDegree,
+}
+
+impl ShBwd {
+    fn new(gpu: &Gpu, more: &[(&str, &str)]) -> GpuResult<ShBwd> {
+        let of = |more: &[(&str, &str)]| of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", more);
+        Ok(ShBwd { for_host: of(more)?, for_update: of(&[more, &[("UPDATES", "")]].concat())? })
+    }
+}
 
 /// Compiles a stage for each SH degree.
-fn of_degrees(gpu: &Gpu, shader: &str, entry: &str, more: &[(&str, &str)]) -> GpuResult<OfDegree> {
+pub(super) fn of_degrees(gpu: &Gpu, shader: &str, entry: &str, more: &[(&str, &str)]) -> GpuResult<OfDegree> {
     let defines = [("SH_DEGREE_1", ""), ("SH_DEGREE_2", ""), ("SH_DEGREE_3", "")];
     let of = |degree: usize| gpu.pipeline(shader, entry, &[&defines[..degree], more].concat());
     Ok([of(0)?, of(1)?, of(2)?, of(3)?])
@@ -289,20 +322,21 @@ impl RowStages {
     pub fn new(gpu: &Gpu) -> GpuResult<Self> {
         Ok(RowStages {
             project_fwd: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[])?,
+            project_fwd_keys: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[("KEYS", "")])?,
             project_bwd: gpu.pipeline("project_bwd.wgsl", "project_bwd", &[])?,
             sh_fwd: of_degrees(gpu, "sh_fwd.wgsl", "sh_fwd", &[])?,
-            sh_bwd: of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", &[])?,
+            sh_bwd: ShBwd::new(gpu, &[])?,
             sh_bwd_weighing: None,
         })
     }
 
     /// Compiles what [`RowStages::sh_bwd`] needs to pass weights on.
     pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
-        self.sh_bwd_weighing = Some(of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", &WEIGHS)?);
+        self.sh_bwd_weighing = Some(ShBwd::new(gpu, &WEIGHS)?);
         Ok(())
     }
 
-    /// Records the footprints of all rows into `splats`, with colours 0.
+    /// Records the footprints of all rows into `splats`, with colours 0, and the keys of their sort by depth into `keys`.
     pub fn project_fwd(
         &self,
         gpu: &Gpu,
@@ -311,12 +345,16 @@ impl RowStages {
         eps2d: f32,
         rows: &DeviceColumns,
         splats: SplatRows<'_>,
+        keys: Option<&Pairs>,
     ) -> GpuResult<()> {
+        let stage = if keys.is_some() { &self.project_fwd_keys } else { &self.project_fwd };
         for window in windows(gpu, rows.rows, SPLAT_BYTES) {
-            let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, eps2d) })?;
+            let (row_count, first_row) = (window.rows, window.first as u32);
+            let uniform = recorder.uniform(&View { row_count, first_row, ..View::new(camera, eps2d) })?;
             let w = rows.window(window);
-            let views = [uniform, w.means, w.quats, w.scales, w.opacities, splats.window(window)];
-            recorder.dispatch("project_fwd", &self.project_fwd, &views, groups_1d(window.rows, WORKGROUP))?;
+            let mut views = vec![uniform, w.means, w.quats, w.scales, w.opacities, splats.window(window)];
+            views.extend(keys.into_iter().flat_map(|of| [&of.keys, &of.values].map(|words| window.of(words, 4))));
+            recorder.dispatch("project_fwd", stage, &views, groups_1d(window.rows, WORKGROUP))?;
         }
         Ok(())
     }
@@ -333,7 +371,8 @@ impl RowStages {
         for window in windows(gpu, rows.rows, rows.widest()) {
             let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, 0.0) })?;
             let w = rows.window(window);
-            let mut views = vec![uniform, splats.window(window), w.sh0];
+            let mut views = vec![uniform, splats.window(window)];
+            views.extend(w.sh0);
             // Band 0 does not depend on the view direction, so degree 0 needs no means.
             views.extend(w.sh_n.into_iter().flat_map(|sh_n| [w.means.clone(), sh_n]));
             recorder.dispatch(
@@ -346,8 +385,8 @@ impl RowStages {
         Ok(())
     }
 
-    /// Records the gradients of sh0, of the bands in use, and the colour's part of the gradients of means; what densification reads
-    /// of the rows, where weights need [`RowStages::weigh_rows`]; and the largest gradient of each row.
+    /// Records the gradients of sh0 and of the bands in use, if `into` has room for them, and the colour's part of the gradients of means;
+    /// what densification reads of the rows, where weights need [`RowStages::weigh_rows`]; and the largest gradient of each row.
     pub fn sh_bwd(
         &self,
         gpu: &Gpu,
@@ -359,12 +398,14 @@ impl RowStages {
         into: &RowGradients,
     ) -> GpuResult<()> {
         let stages = self.sh_bwd_weighing.as_ref().filter(|_| into.weighs).unwrap_or(&self.sh_bwd);
+        let stages = if into.columns.sh0.is_some() { &stages.for_host } else { &stages.for_update };
         for window in windows(gpu, rows.rows, rows.widest()) {
             let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, 0.0) })?;
             let (w, v) = (rows.window(window), into.columns.window(window));
             let footprints = window.of(&into.footprints, footprint_bytes(into.weighs));
-            let mut views = vec![uniform, splats.window(window), v_splats.window(window), footprints, v.means, v.sh0];
-            views.extend(w.sh_n.zip(v.sh_n).into_iter().flat_map(|(sh_n, v_sh_n)| [w.means.clone(), sh_n, v_sh_n]));
+            let mut views = vec![uniform, splats.window(window), v_splats.window(window), footprints, v.means];
+            views.extend(w.sh_n.into_iter().flat_map(|sh_n| [w.means.clone(), sh_n]));
+            views.extend(v.sh0.into_iter().chain(v.sh_n));
             recorder.dispatch(
                 "sh_bwd",
                 &stages[usize::from(rows.sh_degree)],

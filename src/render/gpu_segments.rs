@@ -82,7 +82,7 @@ fn submit_chunk(
     let columns = DeviceColumns::new(gpu, part.len() as u32, options.sh_degree)?;
     let mut recorder = gpu.begin("forward");
     rows.geometry(gpu, &mut recorder, &columns, part)?;
-    stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, splats)?;
+    stages.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, splats, None)?;
     rows.colors(&mut recorder, &columns, part)?;
     stages.sh_fwd(gpu, &mut recorder, camera, &columns, splats)?;
     gpu.submit(recorder).map(|_| ())

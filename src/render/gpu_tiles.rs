@@ -38,6 +38,7 @@ struct Pipelines {
     scan_reduce: Arc<Pipeline>,
     scan: Arc<Pipeline>,
     radix_histogram: Arc<Pipeline>,
+    scan_digits: Arc<Pipeline>,
     radix_sort: Arc<Pipeline>,
     depth_keys: Arc<Pipeline>,
     isect_count: Arc<Pipeline>,
@@ -68,6 +69,7 @@ impl TileStages {
             scan_reduce: get("scan", "scan_reduce")?,
             scan: get("scan", "scan")?,
             radix_histogram: get("radix_sort", "radix_histogram")?,
+            scan_digits: get("radix_sort", "scan_digits")?,
             radix_sort: get("radix_sort", "radix_sort")?,
             depth_keys: get("radix_sort", "depth_keys")?,
             isect_count: get("isect_emit", "isect_count")?,
@@ -126,21 +128,28 @@ impl TileStages {
         count: u32,
         offsets: &BufferView,
     ) -> GpuResult<()> {
-        let groups = groups_1d(count.max(1), SCAN_BLOCK);
         let blocks = count.div_ceil(SCAN_BLOCK);
         if blocks <= 1 {
-            let level = recorder.uniform(&ScanUniforms { count, has_bases: 0, pad: [0; 2] })?;
-            let views = [level, values.clone(), values.clone(), offsets.clone()];
-            return recorder.dispatch("scan", &self.pipelines.scan, &views, groups);
+            return self.scan_summed(recorder, (values, values, 1), count, offsets);
         }
-        let level = recorder.uniform(&ScanUniforms { count, has_bases: 1, pad: [0; 2] })?;
+        let level = recorder.uniform(&ScanUniforms { count, sums_of_block: 1, pad: [0; 2] })?;
         let sums = gpu.buffer("sums of scan blocks", words(blocks))?;
-        let bases = gpu.buffer("bases of scan blocks", words(blocks + 1))?;
-        let views = [level.clone(), values.clone(), sums.view()];
-        recorder.dispatch("scan", &self.pipelines.scan_reduce, &views, groups)?;
-        self.scan(gpu, recorder, &sums.view(), blocks, &bases.view())?;
-        let views = [level, values.clone(), bases.view(), offsets.clone()];
-        recorder.dispatch("scan", &self.pipelines.scan, &views, groups)
+        let views = [level, values.clone(), sums.view()];
+        recorder.dispatch("scan", &self.pipelines.scan_reduce, &views, groups_1d(count, SCAN_BLOCK))?;
+        self.scan_summed(recorder, (values, &sums.view(), 1), count, offsets)
+    }
+
+    /// As [`TileStages::scan`], for values that are summed already, so many sums a block of the scan.
+    fn scan_summed(
+        &self,
+        recorder: &mut Recorder<'_>,
+        (values, sums, sums_of_block): (&BufferView, &BufferView, u32),
+        count: u32,
+        offsets: &BufferView,
+    ) -> GpuResult<()> {
+        let level = recorder.uniform(&ScanUniforms { count, sums_of_block, pad: [0; 2] })?;
+        let views = [level, values.clone(), sums.clone(), offsets.clone()];
+        recorder.dispatch("scan", &self.pipelines.scan, &views, groups_1d(count.max(1), SCAN_BLOCK))
     }
 
     /// Records a stable radix sort of `pairs` by the low `bits` bits of the keys. Word `live_at` of the buffer `live`
@@ -159,17 +168,21 @@ impl TileStages {
         let groups = groups_1d(capacity, SORT_BLOCK);
         let entries = DIGITS * blocks;
         let histogram = gpu.buffer("digits of sort blocks", words(entries))?;
-        let places = gpu.buffer("places of sort blocks", words(entries + 1))?;
+        let places = gpu.buffer("places of sort blocks", words(entries))?;
+        let totals = recorder.buffer_zeroed("digits", words(DIGITS * bits.div_ceil(DIGIT_BITS)))?;
         let mut from = pairs;
         let mut to = Pairs {
             keys: gpu.buffer("sort keys", words(capacity))?,
             values: gpu.buffer("sort values", words(capacity))?,
         };
-        for shift in (0..bits).step_by(DIGIT_BITS as usize) {
+        for (pass, shift) in (0..bits).step_by(DIGIT_BITS as usize).enumerate() {
+            let totals = totals.slice(words(DIGITS) * pass as u64, words(DIGITS));
             let pass = recorder.uniform(&SortUniforms { capacity, live_at, blocks, shift })?;
-            let views = [pass.clone(), live.clone(), from.keys.view(), histogram.view()];
+            let views = [pass.clone(), live.clone(), from.keys.view(), histogram.view(), totals.clone()];
             recorder.dispatch("radix_sort", &self.pipelines.radix_histogram, &views, groups)?;
-            self.scan(gpu, recorder, &histogram.view(), entries, &places.view())?;
+            let views = [pass.clone(), totals, histogram.view(), places.view()];
+            let groups_of_digits = groups_1d(if blocks > 0 { DIGITS } else { 0 }, 1);
+            recorder.dispatch("radix_sort", &self.pipelines.scan_digits, &views, groups_of_digits)?;
             let views = [
                 pass,
                 live.clone(),
@@ -185,8 +198,13 @@ impl TileStages {
         Ok(from)
     }
 
+    /// Buffers for the keys of the rows of a view.
+    pub fn keys(gpu: &Gpu, rows: u32) -> GpuResult<Pairs> {
+        Ok(Pairs { keys: gpu.buffer("sort keys", words(rows))?, values: gpu.buffer("sort values", words(rows))? })
+    }
+
     /// Records the depth sort of the rows and the offsets of their intersections with the tiles of `range`. `splats` holds
-    /// `rows` records.
+    /// `rows` records. `keys` are those that the projection wrote; `None` if it wrote none.
     pub fn order(
         &self,
         gpu: &Gpu,
@@ -195,13 +213,19 @@ impl TileStages {
         rows: u32,
         grid: Grid,
         range: TileRange,
+        keys: Option<Pairs>,
     ) -> GpuResult<Ranks> {
         let groups = groups_1d(rows, WORKGROUP);
-        let pairs =
-            Pairs { keys: gpu.buffer("sort keys", words(rows))?, values: gpu.buffer("sort values", words(rows))? };
-        let depth = recorder.uniform(&SortUniforms { capacity: rows, live_at: 0, blocks: 0, shift: 0 })?;
-        let views = [depth, pairs.keys.view(), pairs.values.view(), splats.clone()];
-        recorder.dispatch("radix_sort", &self.pipelines.depth_keys, &views, groups)?;
+        let pairs = match keys {
+            Some(pairs) => pairs,
+            None => {
+                let pairs = TileStages::keys(gpu, rows)?;
+                let depth = recorder.uniform(&SortUniforms { capacity: rows, live_at: 0, blocks: 0, shift: 0 })?;
+                let views = [depth, pairs.keys.view(), pairs.values.view(), splats.clone()];
+                recorder.dispatch("radix_sort", &self.pipelines.depth_keys, &views, groups)?;
+                pairs
+            }
+        };
         let live = recorder.buffer_with("rows of the view", &[rows])?;
         let sorted = self.sort(gpu, recorder, &live.view(), 0, rows, 32, pairs)?;
         let counts = gpu.buffer("intersections of rows", words(rows))?;
@@ -212,10 +236,12 @@ impl TileStages {
             pad: [0; 2],
             range: range_words(range),
         })?;
-        let views = [view, splats.clone(), sorted.values.view(), counts.view()];
+        let sums = gpu.buffer("intersections of workgroups", words(rows.div_ceil(WORKGROUP)))?;
+        let views = [view, splats.clone(), sorted.values.view(), counts.view(), sums.view()];
         recorder.dispatch("isect_emit", &self.pipelines.isect_count, &views, groups)?;
         let offsets = gpu.buffer("intersection offsets", words(rows + 1))?;
-        self.scan(gpu, recorder, &counts.view(), rows, &offsets.view())?;
+        let summed = (&counts.view(), &sums.view(), SCAN_BLOCK / WORKGROUP);
+        self.scan_summed(recorder, summed, rows, &offsets.view())?;
         Ok(Ranks { rows, order: sorted.values, offsets })
     }
 

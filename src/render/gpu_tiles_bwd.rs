@@ -80,7 +80,6 @@ pub struct BackStages {
     plain: Sums,
     /// `None` before [`BackStages::weigh_rows`].
     weighing: Option<Sums>,
-    count_unusable: Arc<Pipeline>,
 }
 
 impl BackStages {
@@ -89,7 +88,7 @@ impl BackStages {
         let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &[]);
         let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
         let plain = Sums { rasterize_bwd, fold_rows, count: SUMS, rows_per_group: FOLD_ROWS };
-        Ok(BackStages { plain, weighing: None, count_unusable: get("count_unusable")? })
+        Ok(BackStages { plain, weighing: None })
     }
 
     /// Compiles what the backward pass needs to collect weights.
@@ -104,8 +103,9 @@ impl BackStages {
         self.weighing.as_ref().filter(|_| weighs).unwrap_or(&self.plain)
     }
 
-    /// Records the gradients of the splats into `v_splats`, one record per row. [`super::gpu_tiles::TileStages::fits`] must be true for
-    /// `frame` and `demand`.
+    /// Records the gradients of the splats into `v_splats`, one record per row, and adds the number of rows with unusable gradients, as
+    /// [`crate::render::Renderer::unusable_splats`] defines them, to the u32 `unusable`.
+    /// [`super::gpu_tiles::TileStages::fits`] must be true for `frame` and `demand`.
     pub fn backward(
         &self,
         gpu: &Gpu,
@@ -116,7 +116,7 @@ impl BackStages {
         pixels: &Pixels,
         demand: Demand,
         picture: PictureGradientBuffers<'_>,
-        v_splats: &BufferView,
+        (v_splats, unusable): (&BufferView, &Buffer),
         fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
@@ -154,6 +154,7 @@ impl BackStages {
                 ranks.order.view(),
                 ranks.offsets.view(),
                 v_splats.clone(),
+                unusable.view(),
             ];
             let groups = groups_1d(ranks.rows, stages.rows_per_group);
             recorder.dispatch("rasterize_bwd", &stages.fold_rows, &views, groups)?;
@@ -198,17 +199,18 @@ impl BackStages {
         Ok(())
     }
 
-    /// Records the conversion of the sums of `rows` rows to gradients, after the last range of tiles.
-    pub fn finish_sums(
+    /// Records the conversion of the sums of `rows` rows to gradients, after the last range of tiles, and counts as
+    /// [`BackStages::backward`].
+    pub(super) fn finish_sums(
         &self,
         gpu: &Gpu,
         recorder: &mut Recorder<'_>,
-        splats: &BufferView,
-        v_splats: &BufferView,
-        rows: u32,
+        segment: &Segment,
+        unusable: &Buffer,
         blend: Blend,
         weighs: bool,
     ) -> GpuResult<()> {
+        let (rows, splats, v_splats) = (segment.rows, segment.splats.view(), gradients_of(segment)?.view());
         let stages = self.stages(weighs);
         // Bound in place of the lists that the stage does not read.
         let (no_list, no_sums) = (gpu.buffer("no list", 4)?.view(), gpu.buffer("no sums", 4)?.view());
@@ -216,27 +218,9 @@ impl BackStages {
         let mut fold = raster_uniforms(&blend, TileRange::all(blend.grid), 0, SEGMENT_BWD, flags);
         fold.row_count = rows;
         let uniform = recorder.uniform(&fold)?;
-        let views = [uniform, splats.clone(), no_list.clone(), no_sums, no_list.clone(), no_list, v_splats.clone()];
+        let lists = [no_list.clone(), no_sums, no_list.clone(), no_list];
+        let views: Vec<_> = [uniform, splats].into_iter().chain(lists).chain([v_splats, unusable.view()]).collect();
         recorder.dispatch("rasterize_bwd", &stages.fold_rows, &views, groups_1d(rows, stages.rows_per_group))
-    }
-
-    /// Records the count of the rows of all segments with unusable gradients, as
-    /// [`crate::render::Renderer::unusable_splats`] defines them, into one u32.
-    pub(super) fn unusable(
-        &self,
-        recorder: &mut Recorder<'_>,
-        segments: &[Segment],
-        blend: Blend,
-    ) -> GpuResult<Buffer> {
-        let unusable = recorder.buffer_zeroed("unusable rows", 4)?;
-        for segment in segments {
-            let mut uniform = raster_uniforms(&blend, TileRange::all(blend.grid), 0, SEGMENT_BWD, 0);
-            uniform.row_count = segment.rows;
-            let views = [recorder.uniform(&uniform)?, gradients_of(segment)?.view(), unusable.view()];
-            let groups = groups_1d(segment.rows, crate::gpu::WORKGROUP);
-            recorder.dispatch("rasterize_bwd", &self.count_unusable, &views, groups)?;
-        }
-        Ok(unusable)
     }
 }
 

@@ -98,7 +98,7 @@ impl Update<'_> {
 
     /// Memory of the gradients of `rows` rows.
     pub fn room(&self, rows: u32) -> GpuResult<RowGradients> {
-        RowGradients::new(&self.stages.gpu, rows, self.of.options.sh_degree, self.weighs)
+        RowGradients::for_update(&self.stages.gpu, rows, self.weighs)
     }
 
     /// Records the gradients and the update of gathered rows, which begin at row `at` of the segment and are `part` of the batch.
@@ -114,7 +114,7 @@ impl Update<'_> {
         let out = RowsOut { gpu, stages: &stages.rows, view: of, weighs: *weighs };
         let splats = [&segment.splats, gradients_of(segment)?].map(|buffer| SplatRows::from_row(buffer, at as u64));
         out.record(recorder, values, splats, grads)?;
-        let buffers = UpdateBuffers { values, grads, v_splats: splats[1], results, collects: *collects };
+        let buffers = UpdateBuffers { values, grads, splats, results, collects: *collects };
         source.pages.update(gpu, recorder, source, part, &buffers)
     }
 }

@@ -76,7 +76,7 @@ pub(super) struct View {
     pub loss: Option<Loss>,
     /// The tile stages of the backward pass, not submitted yet: the first `rows_out` appends the stages on rows.
     pub tiles_back: Option<Recording>,
-    /// Rows with unusable gradients; [`Unusable::Uncounted`] until the first `rows_out`.
+    /// Rows with unusable gradients; [`Unusable::Uncounted`] until `picture_back`.
     pub unusable: Unusable,
 }
 
@@ -85,6 +85,8 @@ pub(super) struct View {
 pub(super) enum Unusable {
     /// No stage counts them yet.
     Uncounted,
+    /// One u32 on the device, until the first `rows_out`.
+    OnDevice(Buffer),
     Pending(Readback),
     /// The host has read the number.
     Known(u64),

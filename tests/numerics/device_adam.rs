@@ -16,10 +16,11 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
 use gsscale::render::gpu_pages::{DevicePages, PageBatch, PageTable, UpdateBuffers};
-use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SPLAT_BYTES};
+use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::init::SH_C0;
 use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
@@ -76,22 +77,27 @@ impl Dense {
         (Dense { adam, columns, draws, updates: [0; ROWS] }, words, layout)
     }
 
-    /// Takes step `now`. Returns the rows that have a gradient, and by column the gradients of all rows.
-    fn step(&mut self, now: u32) -> (Vec<usize>, Vec<Vec<f32>>) {
+    /// Takes step `now`. Returns the rows that have a gradient, by column the gradients of all rows, and those of their colours, from which
+    /// those of sh0 follow.
+    fn step(&mut self, now: u32) -> (Vec<usize>, Vec<Vec<f32>>, Vec<[f32; 3]>) {
         let rows: Vec<usize> = (0..ROWS).filter(|row| now.is_multiple_of(PERIODS[*row])).collect();
-        let mut of_columns = Vec::new();
+        let (mut of_columns, mut of_colors) = (Vec::new(), Vec::new());
         for column in columns() {
             let width = column.width(0);
             let mut grads = vec![0.0; ROWS * width];
             for row in &rows {
                 grads[row * width..][..width].fill_with(|| gradient(*row, &mut self.draws));
             }
+            if column == Column::Sh0 {
+                of_colors = grads.as_chunks::<3>().0.to_vec();
+                grads.iter_mut().for_each(|g| *g *= SH_C0 as f32);
+            }
             let exact: Vec<f64> = grads.iter().map(|g| f64::from(*g)).collect();
             self.columns[column as usize].step(&exact, self.adam.rates().at(column, now));
             of_columns.push(grads);
         }
         rows.iter().for_each(|row| self.updates[*row] += 1);
-        (rows, of_columns)
+        (rows, of_columns, of_colors)
     }
 
     /// Compares the values after `now` steps, `got(column, row, element)`.
@@ -129,7 +135,7 @@ fn gpu_adam_matches_dense_adam() {
         let mut slab: Vec<u32> = bytemuck::cast_slice(&words).to_vec();
         let pages = [DevicePage::new(layout, 0, 0, 0)];
         for now in 0..STEPS {
-            let (with_gradient, of_columns) = dense.step(now);
+            let (with_gradient, of_columns, _) = dense.step(now);
             let rows: Vec<[u32; 2]> = with_gradient.iter().map(|row| [0, *row as u32]).collect();
             let numbers_now = adam.at(now).numbers();
             let gathers = GatherUniforms::new(&camera(), &numbers, now, &SPLITS, 1);
@@ -138,25 +144,18 @@ fn gpu_adam_matches_dense_adam() {
             let mut parts = Vec::new();
             for (column, of_column) in columns().zip(of_columns) {
                 let width = column.width(0);
-                let uniforms = gathers.of_column(&numbers, column, width);
-                let input = GatherInput {
-                    uniforms: &uniforms,
-                    pages: &pages,
-                    slab: &slab,
-                    tables,
-                    recent: &numbers_now.recent,
-                };
+                let input =
+                    GatherInput { uniforms: &gathers, pages: &pages, slab: &slab, tables, recent: &numbers_now.recent };
                 let mut values = vec![0.0; rows.len() * width];
-                gather(&input, &rows, &mut values);
+                gather(&input, (column, width), &rows, &mut values);
                 let grads: Vec<f32> =
                     with_gradient.iter().flat_map(|row| &of_column[row * width..][..width]).copied().collect();
                 judge(width, &grads, &mut largest);
                 parts.push((column, values, grads));
             }
             for (column, values, grads) in parts {
-                let uniforms = of_step.of_column(&numbers_now, column, column.width(0));
-                let input = UpdateInput { uniforms: &uniforms, pages: &pages, rows: &rows, tables, largest: &largest };
-                step(&input, &values, &grads, &mut slab);
+                let input = UpdateInput { uniforms: &of_step, pages: &pages, rows: &rows, tables, largest: &largest };
+                step(&input, (column, column.width(0)), &values, &grads, &mut slab);
             }
             let input = UpdateInput { uniforms: &of_step, pages: &pages, rows: &rows, tables, largest: &largest };
             let mut results = [<PageResult as bytemuck::Zeroable>::zeroed()];
@@ -184,7 +183,7 @@ struct OnDevice {
     values: DeviceColumns,
     /// Of rows that are not drawn.
     grads: RowGradients,
-    v_splats: Buffer,
+    splats: [Buffer; 2],
 }
 
 impl OnDevice {
@@ -199,29 +198,39 @@ impl OnDevice {
         let listed = pages.list(&gpu, &view, &[slot]).unwrap();
         assert_eq!(listed.0.rows as usize, ROWS, "a row is out of view");
         let values = DeviceColumns::new(&gpu, ROWS as u32, 0).unwrap();
-        let grads = RowGradients::new(&gpu, ROWS as u32, 0, false).unwrap();
+        let grads = RowGradients::for_update(&gpu, ROWS as u32, false).unwrap();
         let mut recorder = gpu.begin("adam");
         recorder.clear(&grads.footprints.view()).unwrap();
+        let splats = recorder.buffer_with("splats", &[[1.0f32; 12]; ROWS]).unwrap();
         gpu.submit(recorder).unwrap();
-        let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * ROWS as u64).unwrap();
-        OnDevice { pages, slot, listed, values, grads, v_splats, gpu }
+        let v_splats = gpu.buffer("v_splats", splats.size()).unwrap();
+        OnDevice { pages, slot, listed, values, grads, splats: [splats, v_splats], gpu }
     }
 
     /// Takes a step; with `is_checked` returns what it did to the page.
-    fn step(&self, adam: &DeferredAdam, now: u32, of_columns: &[Vec<f32>], is_checked: bool) -> Option<PageResult> {
-        let OnDevice { gpu, pages, values, grads, v_splats, .. } = self;
+    fn step(
+        &self,
+        adam: &DeferredAdam,
+        now: u32,
+        (of_columns, of_colors): (&[Vec<f32>], &[[f32; 3]]),
+        is_checked: bool,
+    ) -> Option<PageResult> {
+        let OnDevice { gpu, pages, values, grads, splats, .. } = self;
         let view = begin_view(gpu, pages, &camera(), &adam.at(now).numbers());
         let mut source = pages.source(&view, &self.listed.0, &self.listed.1);
         let mut recorder = gpu.begin("adam");
         source.geometry(gpu, &mut recorder, values, &(0..ROWS)).unwrap();
         let mut largest = vec![0; ROWS];
-        for ((_, buffer, width), of_column) in grads.columns.columns().zip(of_columns) {
-            recorder.upload(&buffer.view(), of_column).unwrap();
-            judge(width, of_column, &mut largest);
+        for (column, of_column) in columns().zip(of_columns) {
+            judge(column.width(0), of_column, &mut largest);
         }
-        recorder.upload(&v_splats.view(), &records(&largest)).unwrap();
+        for ((_, buffer, _), of_column) in grads.columns.columns().zip(of_columns) {
+            recorder.upload(&buffer.view(), of_column).unwrap();
+        }
+        recorder.upload(&splats[1].view(), &records(of_colors, &largest)).unwrap();
         let results = recorder.buffer_zeroed("results", size_of::<PageResult>() as u64).unwrap();
-        let buffers = UpdateBuffers { values, grads, v_splats: v_splats.into(), results: &results, collects: false };
+        let splats = splats.each_ref().map(SplatRows::from);
+        let buffers = UpdateBuffers { values, grads, splats, results: &results, collects: false };
         pages.update(gpu, &mut recorder, &source, &(0..ROWS), &buffers).unwrap();
         gpu.submit(recorder).unwrap();
         is_checked.then(|| pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap()[0])
@@ -246,9 +255,9 @@ fn follows_on_a_device(eps: f64, steps: u32) {
     let (mut dense, words, layout) = Dense::new(eps, steps);
     let on = OnDevice::new(gpu, &dense, &words, layout, steps);
     for now in 0..steps {
-        let (rows, of_columns) = dense.step(now);
+        let (rows, of_columns, of_colors) = dense.step(now);
         let is_checked = (now + 1) % CHECKED == 0 || now + 1 == steps;
-        if let Some(result) = on.step(&dense.adam, now, &of_columns, is_checked) {
+        if let Some(result) = on.step(&dense.adam, now, (&of_columns, &of_colors), is_checked) {
             assert_eq!((result.updated as usize, result.skipped), (rows.len(), 0));
             let values = on.values(&dense.adam, now + 1);
             let of = |column| columns().position(|other| other == column).unwrap();

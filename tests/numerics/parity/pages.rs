@@ -14,13 +14,14 @@ use gsscale::base::simd::SimdPath;
 use gsscale::densify::stats::{GradHistogram, WEIGHED_VIEWS};
 use gsscale::gpu::{Buffer, Gpu, GpuOptions, Source, groups_1d};
 use gsscale::kernels::deferred::DeferredTables;
+use gsscale::kernels::sh_bwd::sh_bwd;
 use gsscale::kernels::uniforms::{DevicePage, GatherUniforms, PageResult, PageSurvey, UpdateUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;
 use gsscale::render::gpu_pages::{DevicePages, UpdateBuffers};
-use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SPLAT_BYTES};
+use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::optimizer_numbers::SplitLimits;
@@ -137,9 +138,8 @@ fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
     let mut values = Vec::new();
     for (column, width) in columns_of(world.layouts[0].sh_degree) {
         let mut out = vec![f32::NAN; listed as usize * width];
-        let uniforms = uniforms.of_column(&numbers, column, width);
         let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables, recent };
-        gather::gather(&input, &list, &mut out);
+        gather::gather(&input, (column, width), &list, &mut out);
         values.push(out);
     }
     (list, values)
@@ -240,26 +240,46 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
     }
 }
 
-/// Gradients of listed rows by column, and footprints: a tenth of the rows have none, and `poison` of them are not finite or too
-/// large in one element. With weights every footprint is followed by a second one, some of which are extreme.
-fn random_gradients(rows: usize, sh_degree: u8, (poison, weighs): (f64, bool)) -> (Vec<Vec<f32>>, Vec<[f32; 4]>) {
+/// Gradients of listed rows.
+struct Drawn {
+    /// By column.
+    grads: Vec<Vec<f32>>,
+    /// Those of colours, from which the columns of colours follow, and splats, of which a ninth of the channels is clamped at 0.
+    v_colors: Vec<[f32; 3]>,
+    splats: Vec<[f32; 12]>,
+    footprints: Vec<[f32; 4]>,
+}
+
+/// Gradients of listed rows with these means: a tenth of the rows have none, and `poison` of them are not finite or too large in one
+/// element. With weights every footprint is followed by a second one, some of which are extreme.
+fn random_gradients(means: &[f32], sh_degree: u8, (poison, weighs): (f64, bool)) -> Drawn {
+    let rows = means.len() / 3;
     let mut draws = Stream::new(5, Purpose::Test, rows as u64, 3);
     let kinds: Vec<[f64; 2]> = (0..rows).map(|_| [draws.uniform(), draws.uniform()]).collect();
-    let columns = columns_of(sh_degree);
-    let bad = [f32::NAN, f32::INFINITY, -2e18];
+    let bad = [f32::NAN, f32::INFINITY, -2e19];
+    let widths = [3, 4, 3, 1, 3]; // of the geometry, and of the gradients of colours
     let mut grads = Vec::new();
-    for (p, (_, width)) in columns.iter().enumerate() {
+    for (p, width) in widths.into_iter().enumerate() {
         let mut of_column = Vec::new();
         for (row, kind) in kinds.iter().enumerate() {
             let is_zero = kind[0] > 0.9;
             let size = libm::pow(10.0, -draws.range(0.0, 9.0));
-            of_column.extend((0..*width).map(|_| if is_zero { 0.0 } else { (draws.normal() * size) as f32 }));
-            if kind[1] < poison && row % columns.len() == p {
+            of_column.extend((0..width).map(|_| if is_zero { 0.0 } else { (draws.normal() * size) as f32 }));
+            if kind[1] < poison && row % widths.len() == p {
                 of_column[row * width + row % width] = bad[row % 3];
             }
         }
         grads.push(of_column);
     }
+    let v_colors = grads.pop().unwrap().as_chunks::<3>().0.to_vec();
+    let clamped = |i: usize| if i % 9 == 5 { 0.0 } else { 0.5 };
+    let colors: Vec<[f32; 3]> = (0..rows).map(|row| [0, 1, 2].map(|c| clamped(3 * row + c))).collect();
+    let splats = colors.iter().map(|[r, g, b]| [0.0, 0.0, 1.0, 0.5, 1.0, 0.0, 1.0, 4.0, *r, *g, *b, 4.0]).collect();
+    let (mut of_rows, mut of_colors) = (Columns::zeros(rows, sh_degree), Columns::default());
+    of_rows.means.copy_from_slice(means);
+    let radii = vec![[4; 2]; rows];
+    sh_bwd(&of_rows, &camera(), sh_degree, &radii, &colors, &v_colors, SimdPath::best(), &mut of_colors);
+    grads.extend([of_colors.sh0, of_colors.sh_n]);
     let mut footprints = Vec::new();
     for kind in &kinds {
         let radius = if kind[0] > 0.95 { 0.0 } else { 4.0 };
@@ -271,7 +291,7 @@ fn random_gradients(rows: usize, sh_degree: u8, (poison, weighs): (f64, bool)) -
             footprints.push([weight, 7.0, 7.0, 7.0]);
         }
     }
-    (grads, footprints)
+    Drawn { grads, v_colors, splats, footprints }
 }
 
 /// What an update leaves: payloads, results of pages, change of the bins.
@@ -281,7 +301,7 @@ fn updated_by_twin(
     world: &World,
     list: &[[u32; 2]],
     values: &[Vec<f32>],
-    (grads, footprints): (&[Vec<f32>], &[[f32; 4]]),
+    Drawn { grads, footprints, .. }: &Drawn,
 ) -> Updated {
     let numbers = world.adam.numbers(STEPS).unwrap();
     let (tables, step) = (DeferredTables::new(&numbers), world.adam.at(world.now).numbers());
@@ -293,9 +313,8 @@ fn updated_by_twin(
     columns.iter().zip(grads).for_each(|((_, width), grads)| update::judge(*width, grads, &mut largest));
     let (pages, rows, tables, largest) = (&pages[..], list, (&tables).into(), &largest[..]);
     for (((column, width), values), grads) in columns.into_iter().zip(values).zip(grads) {
-        let uniforms = uniforms.of_column(&step, column, width);
         let input = UpdateInput { uniforms: &uniforms, pages, rows, tables, largest };
-        update::step(&input, values, grads, &mut slab);
+        update::step(&input, (column, width), values, grads, &mut slab);
     }
     let mut results = vec![<PageResult as bytemuck::Zeroable>::zeroed(); pages.len()];
     let mut bins = vec![0; 2 << 15];
@@ -320,22 +339,26 @@ fn updated_by_device(
     let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
     let rows = batch.rows as usize;
     let values = DeviceColumns::new(gpu, batch.rows, sh_degree).unwrap();
-    let grads = RowGradients::new(gpu, batch.rows, sh_degree, weighs).unwrap();
-    let (of_rows, footprints) = random_gradients(rows, sh_degree, (poison, weighs));
+    let grads = RowGradients::for_update(gpu, batch.rows, weighs).unwrap();
     let mut source = on.pages.source(&view, &batch, &table);
     let mut recorder = gpu.begin("parity");
     source.geometry(gpu, &mut recorder, &values, &(0..rows)).unwrap();
+    gpu.submit(recorder).unwrap();
+    let drawn = random_gradients(&read::<f32>(gpu, &values.means, 3 * rows), sh_degree, (poison, weighs));
+    let mut recorder = gpu.begin("parity");
     let mut largest = vec![0; rows];
-    for ((_, buffer, width), of_rows) in grads.columns.columns().zip(&of_rows) {
-        recorder.upload(&buffer.view(), of_rows).unwrap();
+    for ((_, width), of_rows) in columns_of(sh_degree).into_iter().zip(&drawn.grads) {
         update::judge(width, of_rows, &mut largest);
     }
-    recorder.upload(&grads.footprints.view(), &footprints).unwrap();
-    let v_splats = gpu.buffer("v_splats", SPLAT_BYTES * rows as u64).unwrap();
-    recorder.upload(&v_splats.view(), &update::records(&largest)).unwrap();
+    for ((_, buffer, _), of_rows) in grads.columns.columns().zip(&drawn.grads) {
+        recorder.upload(&buffer.view(), of_rows).unwrap();
+    }
+    recorder.upload(&grads.footprints.view(), &drawn.footprints).unwrap();
+    let splats = recorder.buffer_with("splats", &drawn.splats).unwrap();
+    let v_splats = recorder.buffer_with("v_splats", &update::records(&drawn.v_colors, &largest)).unwrap();
     let results = recorder.buffer_zeroed("results", (size_of::<PageResult>() * on.slots.len()) as u64).unwrap();
-    let (values_of, v_splats) = (&values, (&v_splats).into());
-    let buffers = UpdateBuffers { values: values_of, grads: &grads, v_splats, results: &results, collects: true };
+    let splats = [&splats, &v_splats].map(SplatRows::from);
+    let buffers = UpdateBuffers { values: &values, grads: &grads, splats, results: &results, collects: true };
     on.pages.update(gpu, &mut recorder, &source, &(0..rows), &buffers).unwrap();
     gpu.submit(recorder).unwrap();
     let results = on.pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap();
@@ -357,8 +380,8 @@ fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
         let Some(gpu) = device(&world) else { return };
         let on = OnDevice::new(&gpu, &world);
         let ((payloads, results, bins), list, values) = updated_by_device(&on, &world, (poison, weighs));
-        let (grads, footprints) = random_gradients(list.len(), sh_degree, (poison, weighs));
-        let twin = updated_by_twin(&world, &list, &values, (&grads, &footprints));
+        let drawn = random_gradients(&values[0], sh_degree, (poison, weighs));
+        let twin = updated_by_twin(&world, &list, &values, &drawn);
         let (_, of_slab) = world.slab();
         let counts = |of: &[PageResult]| -> Vec<[u32; 4]> {
             of.iter().map(|r| [r.updated, r.skipped, r.drawn, r.collected]).collect()
@@ -456,7 +479,6 @@ fn surveys_hold_all_rows_and_only_statistics_are_cleared() {
     let tables = DeferredTables::new(&numbers);
     let (mut slab, pages) = world.slab();
     let uniforms = GatherUniforms::new(&camera(), &numbers, 700, &SPLITS, pages.len() as u32);
-    let uniforms = uniforms.of_column(&numbers, Column::Opacities, 1);
     let input = GatherInput { uniforms: &uniforms, pages: &pages, slab: &slab, tables: (&tables).into(), recent: &[] };
     let mut twin = vec![<PageSurvey as bytemuck::Zeroable>::zeroed(); pages.len()];
     gather::survey(&input, &mut twin);

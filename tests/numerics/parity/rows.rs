@@ -105,7 +105,7 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
         }
         r.upload(&splats.view(), &vec![f32::NAN; 12 * n]).unwrap();
         r.upload(&v_splats.view(), v).unwrap();
-        stages.project_fwd(gpu, r, camera, EPS2D, &columns, (&splats).into()).unwrap();
+        stages.project_fwd(gpu, r, camera, EPS2D, &columns, (&splats).into(), None).unwrap();
     });
     let colored = read(gpu, &splats, |r| {
         r.upload(&splats.view(), &cpu.projected).unwrap();
@@ -127,7 +127,7 @@ fn on_gpu(gpu: &Gpu, rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]
     out.means = read(gpu, &grads.means, |_| {});
     out.quats = read(gpu, &grads.quats, |_| {});
     out.scales = read(gpu, &grads.scales, |_| {});
-    out.sh0 = read(gpu, &grads.sh0, |_| {});
+    out.sh0 = read(gpu, grads.sh0.as_ref().unwrap(), |_| {});
     if let Some(sh_n) = &grads.sh_n {
         put_bands(&read(gpu, sh_n, |_| {}), sh_n_width(degree), &mut out.sh_n, sh_n_width(3));
     }

@@ -260,7 +260,7 @@ fn forward(
 ) -> (Ranks, Frame, Pixels, Demand) {
     let mut recorder = gpu.begin("tiles");
     let pixels = Pixels::new(gpu, blend.grid).unwrap();
-    let ranks = stages.order(gpu, &mut recorder, splats, rows, blend.grid, TileRange::all(blend.grid)).unwrap();
+    let ranks = stages.order(gpu, &mut recorder, splats, rows, blend.grid, TileRange::all(blend.grid), None).unwrap();
     loop {
         let (frame, demand) = stages.frame(gpu, &mut recorder, splats, &ranks, blend, &pixels).unwrap();
         gpu.submit(recorder).unwrap();
@@ -284,8 +284,9 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let mut recorder = gpu.begin("backward");
     let (from, to) = (splats.view(), v_splats.view());
     let picture = PictureGradientBuffers { v_rgb: &v_rgb.view(), has_v_alpha: v_alpha.is_some(), errors: None };
-    let (into, fold) = (&mut recorder, Fold::Whole);
-    stages.back.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, &to, fold).unwrap();
+    let unusable = recorder.buffer_zeroed("unusable", 4).unwrap();
+    let (into, to, fold) = (&mut recorder, (&to, &unusable), Fold::Whole);
+    stages.back.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, to, fold).unwrap();
     let read = [
         &ranks.order,
         &frame.row_from_isect,

@@ -2,7 +2,7 @@
 //! `shaders/gather.wgsl`, in which the functions are entry points.
 //!
 //! [`cull`] lists the rows of each page that the camera may draw, [`list`] packs the lists in the order of the pages,
-//! [`gather`] evaluates a column of the listed rows, and [`bounds`] finds the bounds of a page after its update. Where the
+//! [`gather`] evaluates a column of the listed rows (a device takes several at once), and [`bounds`] finds the bounds of a page after its update. Where the
 //! host does not wait for the numbers of rows, [`place`] finds where the list of each page begins. The list then has spare
 //! room, and entries without a row ([`UNLISTED`]) are transparent.
 //!
@@ -56,7 +56,8 @@ pub struct GatherInput<'a> {
 
 impl GatherInput<'_> {
     /// The value of element `e` of a row after `end` steps.
-    fn element(&self, page: &DevicePage, column: Column, row: usize, e: usize, end: u32, rate: f32) -> f32 {
+    fn element(&self, page: &DevicePage, column: Column, row: usize, e: usize, end: u32) -> f32 {
+        let rate = self.uniforms.rates.as_flattened()[column as usize];
         let of = |table| f32::from_bits(self.slab[row_at(page, column, table, row) + e]);
         let state = [of(Table::Values), of(Table::ExpAvg), of(Table::ExpAvgSq)];
         let stamp = self.slab[stamp_at(page, row)];
@@ -80,15 +81,15 @@ impl GatherInput<'_> {
     }
 
     fn is_seen(&self, page: &DevicePage, row: usize) -> bool {
-        let GatherUniforms { now, means_rate, scales_rate, .. } = *self.uniforms;
-        let mean = [0, 1, 2].map(|c| self.element(page, Column::Means, row, c, now, means_rate));
-        let scale = [0, 1, 2].map(|c| self.element(page, Column::Scales, row, c, now, scales_rate));
+        let now = self.uniforms.now;
+        let mean = [0, 1, 2].map(|c| self.element(page, Column::Means, row, c, now));
+        let scale = [0, 1, 2].map(|c| self.element(page, Column::Scales, row, c, now));
         self.may_draw(mean, exp32(scale[0].max(scale[1]).max(scale[2])))
     }
 
-    fn hull(&self, page: &DevicePage, column: Column, row: usize, e: usize, rate: f32) -> [f32; 2] {
+    fn hull(&self, page: &DevicePage, column: Column, row: usize, e: usize) -> [f32; 2] {
         let value = f32::from_bits(self.slab[row_at(page, column, Table::Values, row) + e]);
-        let limit = self.element(page, column, row, e, FOR_EVER, rate);
+        let limit = self.element(page, column, row, e, FOR_EVER);
         let (low, high) = (value.min(limit), value.max(limit));
         let slack = MOVEMENT_SLACK * (high - low) + VALUE_SLACK * low.abs().max(high.abs()) + FLUSH_SLACK;
         [low - slack, high + slack]
@@ -140,10 +141,9 @@ pub fn list(pages: &[DevicePage], counts: &[u32], found: &[u32], rows: &mut [[u3
 }
 
 /// Evaluates a column of the listed rows whose pages are in the slab.
-pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
-    let GatherUniforms { column, width, now, rate, .. } = *input.uniforms;
-    let column = Column::ALL[column as usize];
-    for (listed, out) in rows.iter().zip(out.chunks_exact_mut(width as usize)) {
+pub fn gather(input: &GatherInput<'_>, (column, width): (Column, usize), rows: &[[u32; 2]], out: &mut [f32]) {
+    let now = input.uniforms.now;
+    for (listed, out) in rows.iter().zip(out.chunks_exact_mut(width)) {
         if listed[0] == UNLISTED {
             out.fill(if column == Column::Opacities { HIDDEN_LOGIT } else { 0.0 });
             continue;
@@ -151,22 +151,21 @@ pub fn gather(input: &GatherInput<'_>, rows: &[[u32; 2]], out: &mut [f32]) {
         let page = &input.pages[listed[0] as usize];
         if input.is_bound(page) {
             for (e, out) in out.iter_mut().enumerate() {
-                *out = input.element(page, column, listed[1] as usize, e, now, rate);
+                *out = input.element(page, column, listed[1] as usize, e, now);
             }
         }
     }
 }
 
 pub fn bounds(input: &GatherInput<'_>, results: &mut [PageResult]) {
-    let GatherUniforms { means_rate, scales_rate, .. } = *input.uniforms;
     for (page, result) in input.pages.iter().zip(results).filter(|(page, _)| input.is_bound(page)) {
         let (mut low, mut high, mut sigma_max) = ([3.4e38f32; 3], [-3.4e38f32; 3], 0.0f32);
         for row in 0..page.rows as usize {
-            let tops = [0, 1, 2].map(|c| input.hull(page, Column::Scales, row, c, scales_rate)[1]);
+            let tops = [0, 1, 2].map(|c| input.hull(page, Column::Scales, row, c)[1]);
             let sigma = (exp32(tops[0].max(tops[1]).max(tops[2])) * (1.0 + SIGMA_SLACK)).min(SIGMA_MOST);
             let reach = input.split_reach(page, row, sigma);
             for c in 0..3 {
-                let [from, to] = input.hull(page, Column::Means, row, c, means_rate);
+                let [from, to] = input.hull(page, Column::Means, row, c);
                 let (from, to) = (from - reach, to + reach);
                 let slack = if reach > 0.0 { f32::EPSILON } else { 0.0 };
                 low[c] = low[c].min(from - slack * from.abs());
@@ -179,7 +178,7 @@ pub fn bounds(input: &GatherInput<'_>, results: &mut [PageResult]) {
     }
 }
 
-/// Finds what decides whether a round edits rows of the pages in the slab. The uniform names the column of the opacities.
+/// Finds what decides whether a round edits rows of the pages in the slab.
 pub fn survey(input: &GatherInput<'_>, surveys: &mut [PageSurvey]) {
     for (page, survey) in input.pages.iter().zip(surveys).filter(|(page, _)| input.is_bound(page)) {
         let (mut lowest, mut largest, mut weight) = (3.4e38f32, 0.0f32, 3.4e38f32);
@@ -188,7 +187,7 @@ pub fn survey(input: &GatherInput<'_>, surveys: &mut [PageSurvey]) {
             if views(word) >= WEIGHED_VIEWS {
                 weight = mean_weight(word).map_or(weight, |mean| mean.min(weight));
             }
-            lowest = lowest.min(input.hull(page, Column::Opacities, row, 0, input.uniforms.rate)[0]);
+            lowest = lowest.min(input.hull(page, Column::Opacities, row, 0)[0]);
             let score = input.mean_score(page, row);
             largest = largest.max(if score > 0.0 { score.max(SMALLEST_MEAN) } else { score });
         }

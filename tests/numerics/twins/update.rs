@@ -35,9 +35,11 @@ pub struct UpdateInput<'a> {
     pub largest: &'a [u32],
 }
 
-/// The records of gradients of splats with the largest magnitudes in their last words, as the stages that make gradients leave them.
-pub fn records(largest: &[u32]) -> Vec<[u32; 12]> {
-    largest.iter().map(|bits| [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, *bits]).collect()
+/// The records of gradients of splats with gradients of colours, and the largest magnitudes in their last words, as the stages that make
+/// gradients leave them.
+pub fn records(v_colors: &[[f32; 3]], largest: &[u32]) -> Vec<[u32; 12]> {
+    let record = |([r, g, b], largest): ([u32; 3], u32)| [0, 0, 0, 0, 0, 0, 0, 0, r, g, b, largest];
+    v_colors.iter().map(|v| v.map(f32::to_bits)).zip(largest.iter().copied()).map(record).collect()
 }
 
 /// Bins of mean scores; those of mean weights follow.
@@ -56,9 +58,15 @@ pub fn judge(width: usize, grads: &[f32], largest: &mut [u32]) {
 }
 
 /// Rewrites a column of the listed rows in the slab whose gradients are usable, from the values of stage "gather".
-pub fn step(input: &UpdateInput<'_>, values: &[f32], grads: &[f32], slab: &mut [u32]) {
-    let UpdateUniforms { column, width, now, step_size, inv_root_correction, .. } = *input.uniforms;
-    let (column, width, tables) = (Column::ALL[column as usize], width as usize, input.tables);
+pub fn step(
+    input: &UpdateInput<'_>,
+    (column, width): (Column, usize),
+    values: &[f32],
+    grads: &[f32],
+    slab: &mut [u32],
+) {
+    let UpdateUniforms { now, inv_root_correction, step_sizes, .. } = *input.uniforms;
+    let (step_size, tables) = (step_sizes.as_flattened()[column as usize], input.tables);
     let [one_minus_beta1, one_minus_beta2] = tables.one_minus_betas();
     for (i, &[p, row]) in input.rows.iter().enumerate() {
         let page = &input.pages[p as usize];
