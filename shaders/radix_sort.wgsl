@@ -1,5 +1,5 @@
 // One pass of a stable sort of 32-bit keys with 32-bit values, by a digit of 8 bits of the key: radix_histogram counts the digits of every
-// block of 1024 keys, scan_digits turns the counts into places, and in radix_sort every block sorts its keys in workgroup memory, by one
+// block of 1024 keys, scan.wgsl turns the counts into places, and in radix_sort every block sorts its keys in workgroup memory, by one
 // half of the digit and then by the other, and moves them to its places, keys of a digit side by side. Used twice: for rows by the bits of their depth (the
 // twin of src/kernels/radix_sort.rs), and for intersections by tile.
 //
@@ -8,7 +8,6 @@
 #import "shared/dispatch.wgsl"
 #import "shared/subgroups.wgsl"
 #import "shared/splat.wgsl"
-#import "shared/workgroup_scan.wgsl"
 
 struct SortUniforms {
     /// The number of keys is live[live_at], limited to this.
@@ -24,20 +23,15 @@ struct SortUniforms {
 @group(0) @binding(1) var<storage, read> live: array<u32>;
 @group(0) @binding(2) var<storage, read> keys: array<u32>;
 @group(0) @binding(3) var<storage, read> values: array<u32>;
-/// [digits][blocks]: where the keys of a digit of a block go.
+/// [digits][blocks]: exclusive prefix sum of the histogram.
 @group(0) @binding(4) var<storage, read> places: array<u32>;
 @group(0) @binding(5) var<storage, read_write> keys_out: array<u32>;
 @group(0) @binding(6) var<storage, read_write> values_out: array<u32>;
 /// [digits][blocks]: number of keys of each digit in every block; every entry is written, even for blocks without keys.
 @group(0) @binding(7) var<storage, read_write> histogram: array<u32>;
 @group(0) @binding(8) var<storage, read> splats: array<vec4<f32>>;
-/// Number of keys of each digit, zero before radix_histogram.
+/// Number of keys of each digit, with which the scan of the histogram begins; zero before radix_histogram.
 @group(0) @binding(9) var<storage, read_write> totals: array<atomic<u32>>;
-/// The same, for scan_digits.
-@group(0) @binding(10) var<storage, read> digit_totals: array<u32>;
-/// The histogram and its places, for scan_digits.
-@group(0) @binding(11) var<storage, read> counted: array<u32>;
-@group(0) @binding(12) var<storage, read_write> places_out: array<u32>;
 
 /// Keys per invocation; they are adjacent, so that the order within a block is that of the invocations.
 const KEYS: u32 = 8u;
@@ -132,30 +126,6 @@ fn radix_histogram(workgroup: Group, place: Place) {
         if count > 0u {
             atomicAdd(&totals[digit], count);
         }
-    }
-}
-
-/// One workgroup for each digit: the places of its keys, block by block, behind those of all lower digits.
-@compute @workgroup_size(256)
-fn scan_digits(workgroup: Group, place: SubgroupPlace) {
-    let digit = linear_group(workgroup);
-    var lower = 0u;
-    if place.lane < digit {
-        lower = digit_totals[place.lane];
-    }
-    var before = workgroup_scan(lower, place).total;
-    for (var first = 0u; first < sort.blocks; first += 256u) {
-        let block = first + place.lane;
-        var count = 0u;
-        if block < sort.blocks {
-            count = counted[digit * sort.blocks + block];
-        }
-        workgroupBarrier();
-        let scanned = workgroup_scan(count, place);
-        if block < sort.blocks {
-            places_out[digit * sort.blocks + block] = before + scanned.before;
-        }
-        before += scanned.total;
     }
 }
 

@@ -2,9 +2,9 @@
 // earlier blocks.
 //
 // Reduce, then scan: scan_reduce, or the stage that makes the values, sums them in groups; then every block of the scan adds up the
-// sums before it. Ten million values have 5,000 sums, so a block reads as much of them as of its values, and one dispatch does where
-// levels of scans would take as many as there are levels. No workgroup waits for another. Offsets are 32-bit and saturate: a last entry of
-// 0xffffffff means that the true total is that or more.
+// sums before it, and the values before it in a group that it shares with another block. A million values have 500 sums, so a block reads
+// fewer of them than values, and one dispatch replaces levels of scans. No workgroup waits for another. Offsets are 32-bit and saturate: a
+// last entry of 0xffffffff means that the true total is that or more.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/workgroup_scan.wgsl"
@@ -12,8 +12,8 @@
 struct ScanUniforms {
     /// Number of values.
     count: u32,
-    /// Number of sums of a block of values.
-    sums_of_block: u32,
+    /// Number of values of a sum.
+    values_of_sum: u32,
     pad: vec2<u32>,
 }
 
@@ -63,8 +63,13 @@ fn scan(workgroup: Group, place: SubgroupPlace) {
         }
     }
     var earlier = 0u;
-    for (var k = place.lane; k < block * level.sums_of_block; k += 256u) {
+    let start = block * (256u * ITEMS);
+    let whole = start / max(level.values_of_sum, 1u);
+    for (var k = place.lane; k < whole; k += 256u) {
         earlier = saturating_add(earlier, sums[k]);
+    }
+    for (var k = whole * level.values_of_sum + place.lane; k < start; k += 256u) {
+        earlier = saturating_add(earlier, values[k]);
     }
     let before_block = workgroup_scan(earlier, place).total;
     workgroupBarrier();

@@ -113,7 +113,7 @@ crate::wgsl_struct! {
     /// Uniform of `scan.wgsl`.
     pub struct ScanUniforms {
         pub count: u32,
-        pub sums_of_block: u32,
+        pub values_of_sum: u32,
         pub pad: [u32; 2],
     }
 

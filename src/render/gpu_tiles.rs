@@ -38,7 +38,6 @@ struct Pipelines {
     scan_reduce: Arc<Pipeline>,
     scan: Arc<Pipeline>,
     radix_histogram: Arc<Pipeline>,
-    scan_digits: Arc<Pipeline>,
     radix_sort: Arc<Pipeline>,
     depth_keys: Arc<Pipeline>,
     isect_count: Arc<Pipeline>,
@@ -69,7 +68,6 @@ impl TileStages {
             scan_reduce: get("scan", "scan_reduce")?,
             scan: get("scan", "scan")?,
             radix_histogram: get("radix_sort", "radix_histogram")?,
-            scan_digits: get("radix_sort", "scan_digits")?,
             radix_sort: get("radix_sort", "radix_sort")?,
             depth_keys: get("radix_sort", "depth_keys")?,
             isect_count: get("isect_emit", "isect_count")?,
@@ -130,24 +128,24 @@ impl TileStages {
     ) -> GpuResult<()> {
         let blocks = count.div_ceil(SCAN_BLOCK);
         if blocks <= 1 {
-            return self.scan_summed(recorder, (values, values, 1), count, offsets);
+            return self.scan_summed(recorder, (values, values, SCAN_BLOCK), count, offsets);
         }
-        let level = recorder.uniform(&ScanUniforms { count, sums_of_block: 1, pad: [0; 2] })?;
+        let level = recorder.uniform(&ScanUniforms { count, values_of_sum: SCAN_BLOCK, pad: [0; 2] })?;
         let sums = gpu.buffer("sums of scan blocks", words(blocks))?;
         let views = [level, values.clone(), sums.view()];
         recorder.dispatch("scan", &self.pipelines.scan_reduce, &views, groups_1d(count, SCAN_BLOCK))?;
-        self.scan_summed(recorder, (values, &sums.view(), 1), count, offsets)
+        self.scan_summed(recorder, (values, &sums.view(), SCAN_BLOCK), count, offsets)
     }
 
-    /// As [`TileStages::scan`], for values that are summed already, so many sums a block of the scan.
+    /// As [`TileStages::scan`], for values that are summed already, so many values to a sum.
     fn scan_summed(
         &self,
         recorder: &mut Recorder<'_>,
-        (values, sums, sums_of_block): (&BufferView, &BufferView, u32),
+        (values, sums, values_of_sum): (&BufferView, &BufferView, u32),
         count: u32,
         offsets: &BufferView,
     ) -> GpuResult<()> {
-        let level = recorder.uniform(&ScanUniforms { count, sums_of_block, pad: [0; 2] })?;
+        let level = recorder.uniform(&ScanUniforms { count, values_of_sum, pad: [0; 2] })?;
         let views = [level, values.clone(), sums.clone(), offsets.clone()];
         recorder.dispatch("scan", &self.pipelines.scan, &views, groups_1d(count.max(1), SCAN_BLOCK))
     }
@@ -168,7 +166,7 @@ impl TileStages {
         let groups = groups_1d(capacity, SORT_BLOCK);
         let entries = DIGITS * blocks;
         let histogram = gpu.buffer("digits of sort blocks", words(entries))?;
-        let places = gpu.buffer("places of sort blocks", words(entries))?;
+        let places = gpu.buffer("places of sort blocks", words(entries + 1))?;
         let totals = recorder.buffer_zeroed("digits", words(DIGITS * bits.div_ceil(DIGIT_BITS)))?;
         let mut from = pairs;
         let mut to = Pairs {
@@ -180,9 +178,7 @@ impl TileStages {
             let pass = recorder.uniform(&SortUniforms { capacity, live_at, blocks, shift })?;
             let views = [pass.clone(), live.clone(), from.keys.view(), histogram.view(), totals.clone()];
             recorder.dispatch("radix_sort", &self.pipelines.radix_histogram, &views, groups)?;
-            let views = [pass.clone(), totals, histogram.view(), places.view()];
-            let groups_of_digits = groups_1d(if blocks > 0 { DIGITS } else { 0 }, 1);
-            recorder.dispatch("radix_sort", &self.pipelines.scan_digits, &views, groups_of_digits)?;
+            self.scan_summed(recorder, (&histogram.view(), &totals, blocks), entries, &places.view())?;
             let views = [
                 pass,
                 live.clone(),
@@ -240,7 +236,7 @@ impl TileStages {
         let views = [view, splats.clone(), sorted.values.view(), counts.view(), sums.view()];
         recorder.dispatch("isect_emit", &self.pipelines.isect_count, &views, groups)?;
         let offsets = gpu.buffer("intersection offsets", words(rows + 1))?;
-        let summed = (&counts.view(), &sums.view(), SCAN_BLOCK / WORKGROUP);
+        let summed = (&counts.view(), &sums.view(), WORKGROUP);
         self.scan_summed(recorder, summed, rows, &offsets.view())?;
         Ok(Ranks { rows, order: sorted.values, offsets })
     }

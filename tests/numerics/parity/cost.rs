@@ -54,8 +54,8 @@ impl Cost {
     fn sort(&mut self, live: u64, capacity: u64, bits: u32) {
         let counts = 4 * 256 * capacity.div_ceil(1024);
         self.add(bits.div_ceil(8).into(), live + 4 * capacity + counts + 1024); // radix_histogram
-        self.add(bits.div_ceil(8).into(), 1024 + 2 * counts); // scan_digits
-        self.add(bits.div_ceil(8).into(), live + 16 * capacity + counts); // radix_sort
+        self.add(bits.div_ceil(8).into(), 1024 + 2 * counts + 4); // scan
+        self.add(bits.div_ceil(8).into(), live + 16 * capacity + counts + 4); // radix_sort
     }
 }
 
