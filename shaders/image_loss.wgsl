@@ -4,8 +4,9 @@
 // Three entry points, run in this order (a fourth, squared_errors, is the twin of src/kernels/squared_error.rs):
 //   ssim_map     one workgroup per tile and channel: SSIM's three derivative maps, and the tile's sum of SSIM;
 //   gradient     likewise: v_rgb, and the tile's sums of absolute and squared differences.
-//                In both an invocation takes four places side by side, whose windows share most of what they read:
-//                first four of a row of the patch, then four pixels of a column;
+//                In both an invocation takes places side by side, whose windows share most of what they read: first four of
+//                a row of the patch, then two pixels of a column. 128 invocations share the memory of a patch, of which a
+//                device holds few: twice as many as with four pixels hide twice the waits;
 //   sum_partials one workgroup per 4,096 partial sums: adds them up in a fixed order. Run again until one is left.
 // ssim_map and gradient cover `channel_count` channels from `first_channel` on, so that the derivative maps, 12 bytes
 // per pixel and channel, can be stored for one channel at a time.
@@ -47,8 +48,8 @@ struct LossUniforms {
 /// Output of squared_errors, [height][width].
 @group(0) @binding(7) var<storage, read_write> errors: array<f32>;
 
-/// Invocations per workgroup of ssim_map and gradient: one per four pixels of a tile.
-const LANES: u32 = 64u;
+/// Invocations per workgroup of ssim_map and gradient: one per two pixels of a tile.
+const LANES: u32 = 128u;
 /// Invocations per workgroup of sum_partials.
 const WORKGROUP: u32 = 256u;
 const RADIUS: u32 = 5u;
@@ -148,13 +149,17 @@ fn windowed_4(v: array<vec4<f32>, SPAN>) -> array<vec4<f32>, 4> {
     );
 }
 
-/// The window down a column of the row-filtered values, at four pixels from place t on.
-fn down_4(t: u32) -> array<vec4<f32>, 4> {
-    var v: array<vec4<f32>, SPAN>;
-#repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u 12u 13u
+/// The window down a column of the row-filtered values, at two pixels from place t on.
+fn down_2(t: u32) -> array<vec4<f32>, 2> {
+    var v: array<vec4<f32>, 12>;
+#repeat K 0u 1u 2u 3u 4u 5u 6u 7u 8u 9u 10u 11u
     v[K] = filtered[t + TILE * K];
 #end
-    return windowed_4(v);
+    return array<vec4<f32>, 2>(
+#repeat K 0u 1u
+        windowed(v[K + 5u], v[K + 4u] + v[K + 6u], v[K + 3u] + v[K + 7u], v[K + 2u] + v[K + 8u], v[K + 1u] + v[K + 9u], v[K] + v[K + 10u]),
+#end
+    );
 }
 
 /// Adds the lanes' sums in the memory of the patch, which is no longer needed; the first lane gets the result.
@@ -218,7 +223,7 @@ fn ssim_point(mx: f32, my: f32, squares: f32, products: f32) -> vec4<f32> {
     return vec4<f32>(ssim, v_mean, -ssim * b1 * inverse, 2.0 * a1 * inverse);
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(128)
 fn ssim_map(workgroup: Group, place: SubgroupPlace) {
     let j = job(linear_group(workgroup));
     for (var at = place.lane; at < PATCH_LEN; at += LANES) {
@@ -243,12 +248,12 @@ fn ssim_map(workgroup: Group, place: SubgroupPlace) {
     }
     workgroupBarrier();
     let column = place.lane % TILE;
-    let row = place.lane / TILE * 4u;
-    let means = down_4(row * TILE + column);
+    let row = place.lane / TILE * 2u;
+    let means = down_2(row * TILE + column);
     let x = j.x0 + column;
     let pixels = loss.width * loss.height;
     var sum = vec3<f32>();
-#repeat K 0u 1u 2u 3u
+#repeat K 0u 1u
     {
         let y = j.y0 + row + K;
         if j.exists && x < loss.width && y < loss.height {
@@ -271,7 +276,7 @@ fn ssim_map(workgroup: Group, place: SubgroupPlace) {
     }
 }
 
-@compute @workgroup_size(64)
+@compute @workgroup_size(128)
 fn gradient(workgroup: Group, place: SubgroupPlace) {
     let j = job(linear_group(workgroup));
     let pixels = loss.width * loss.height;
@@ -303,11 +308,11 @@ fn gradient(workgroup: Group, place: SubgroupPlace) {
     }
     workgroupBarrier();
     let column = place.lane % TILE;
-    let row = place.lane / TILE * 4u;
-    let d = down_4(row * TILE + column);
+    let row = place.lane / TILE * 2u;
+    let d = down_2(row * TILE + column);
     let x = j.x0 + column;
     var sum = vec3<f32>();
-#repeat K 0u 1u 2u 3u
+#repeat K 0u 1u
     {
         let y = j.y0 + row + K;
         if j.exists && x < loss.width && y < loss.height {

@@ -235,7 +235,9 @@ fn share_color(i: u32, own: u32) {
 }
 
 /// One workgroup for each 64 rows. Makes the gradients of the coefficients, as sh_bwd does where the host wants them, and takes the step
-/// at once: the gradients, four fifths of a row's, are never stored.
+/// at once: the gradients, four fifths of a row's, are never stored. A compiler may order the products of a basis function otherwise
+/// than in sh_bwd, which moves the last bit of a gradient (Mesa does for one of the sixteen), never whether a row is updated: that is
+/// judged by what sh_bwd found.
 @compute @workgroup_size(256)
 fn step_colors(workgroup: Group, place: Place) {
     let first = COLOR_ROWS * linear_group(workgroup);

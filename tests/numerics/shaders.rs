@@ -39,8 +39,8 @@ const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
         [128, 1, 1],
         "a block of keys and their counts fill the memory that every device has",
     ),
-    ("image_loss.wgsl", "ssim_map", [64, 1, 1], "four pixels of a tile to an invocation"),
-    ("image_loss.wgsl", "gradient", [64, 1, 1], "four pixels of a tile to an invocation"),
+    ("image_loss.wgsl", "ssim_map", [128, 1, 1], "two pixels of a tile to an invocation"),
+    ("image_loss.wgsl", "gradient", [128, 1, 1], "two pixels of a tile to an invocation"),
     ("rasterize_fwd.wgsl", "rasterize_fwd", [64, 1, 1], "four pixels of a tile to an invocation"),
     ("rasterize_bwd.wgsl", "rasterize_bwd", [64, 1, 1], "four pixels of a tile to an invocation"),
 ];

@@ -12,31 +12,21 @@ use gsscale::render::gpu::GpuRenderer;
 use gsscale::render::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepJob};
 use gsscale::render::{LossOptions, RenderOptions, Renderer};
 use gsscale::scene::camera::Camera;
-use gsscale::scene::columns::{Columns, sh_n_width};
+use gsscale::scene::columns::Columns;
 use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
 
-/// Pages of a step on the device form, with bytes of their slab and of the optimizer's tables.
-#[derive(Clone, Copy)]
-struct Pages {
-    count: u64,
-    slab: u64,
-    tables: u64,
-    recent: u64,
-}
-
-/// Sizes of a step on all rows, whose lists fit one dispatch of each rasterizer.
+/// A step on all rows with all colour bands, whose lists fit one dispatch of each rasterizer.
 #[derive(Clone, Copy)]
 struct Step {
     rows: u64,
-    /// Room of the lists; in the device form also of the sums.
+    /// Room of the lists; in the device form also of the sums of intersections.
     room: u64,
     isects: u64,
-    width: u64,
-    height: u64,
-    sh_degree: u8,
-    pages: Option<Pages>,
+    size: [u64; 2],
+    /// In the device form: number of pages, bytes of their slab, and of the optimizer's tables and sums of the step.
+    pages: Option<[u64; 4]>,
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -52,20 +42,19 @@ impl Cost {
     }
 
     fn sort(&mut self, live: u64, capacity: u64, bits: u32) {
-        let counts = 4 * 256 * capacity.div_ceil(1024);
-        self.add(bits.div_ceil(8).into(), live + 4 * capacity + counts + 1024); // radix_histogram
-        self.add(bits.div_ceil(8).into(), 1024 + 2 * counts + 4); // scan
-        self.add(bits.div_ceil(8).into(), live + 16 * capacity + counts + 4); // radix_sort
+        let (passes, counts) = (bits.div_ceil(8).into(), 4 * 256 * capacity.div_ceil(1024));
+        self.add(passes, live + 4 * capacity + counts + 1024); // radix_histogram
+        self.add(passes, 1024 + 2 * counts + 4); // scan
+        self.add(passes, live + 16 * capacity + counts + 4); // radix_sort
     }
 }
 
-fn cost(step: &Step) -> Cost {
-    let Step { rows: n, room, isects, width, height, sh_degree, pages } = *step;
-    let (pixels, tiles) = (width * height, width.div_ceil(16) * height.div_ceil(16));
-    let (geometry, colors) = (44 * n, 4 * (3 + sh_n_width(sh_degree)) as u64 * n);
-    let (splats, offsets, summed) = (48 * n, 4 * (n + 1), if pages.is_some() { room } else { isects });
+fn cost(&Step { rows: n, room, isects, size, pages }: &Step) -> Cost {
+    let (pixels, tiles) = (size[0] * size[1], size[0].div_ceil(16) * size[1].div_ceil(16));
+    let (geometry, colors, splats, offsets) = (44 * n, 192 * n, 48 * n, 4 * (n + 1));
+    let (summed, v_colors) = if pages.is_some() { (room, 0) } else { (isects, colors) };
     let mut cost = Cost::default();
-    if let Some(Pages { count, slab, tables, recent }) = pages {
+    if let Some([count, slab, tables, recent]) = pages {
         let (table, counts, found, listed, results) = (32 * count, 4 * (count + 1), 4 * n, 8 * n, 48 * count);
         cost.add(1, table + slab + tables + recent + counts + found); // cull
         cost.add(1, counts + table); // place
@@ -96,7 +85,6 @@ fn cost(step: &Step) -> Cost {
     }
     cost.add(1, splats + 8 * room + 4 * (tiles + 1) + 20 * pixels + 36 * summed + 8); // rasterize_bwd
     cost.add(1, splats + 4 * room + 36 * summed + 4 * n + offsets + splats + 4); // fold_rows
-    let v_colors = if pages.is_some() { 0 } else { colors };
     cost.add(1, 2 * splats + (16 + 12) * n + colors + v_colors); // sh_bwd
     cost.add(1, 2 * geometry + 2 * splats); // project_bwd
     cost
@@ -109,68 +97,52 @@ fn counted(renderer: &mut GpuRenderer, step: impl FnOnce(&mut GpuRenderer)) -> C
     Cost { dispatches: work.dispatches - dispatches, bytes: work.bytes_bound - bytes_bound }
 }
 
-/// One step on the device form, recorded without waiting: all rows in one page, of which the list has room for all.
+/// One step on the device form, recorded without waiting: all rows in one page.
 fn on_pages(gpu: &mut GpuRenderer, (rows, camera): &(Columns, Camera), host: Step) -> (Cost, Step) {
-    let sh_degree = host.sh_degree;
-    let columns = Columns { sh_degree, sh_n: take(&rows.sh_n, rows.rows(), sh_n_width(sh_degree)), ..rows.clone() };
-    let mut words = vec![0u64; capacity_bytes(columns.rows(), sh_degree).div_ceil(8)];
-    let layout = write_page(&SceneState::from_columns(columns), bytemuck::cast_slice_mut(&mut words));
+    let mut words = vec![0u64; capacity_bytes(rows.rows(), 3).div_ceil(8)];
+    let layout = write_page(&SceneState::from_columns(rows.clone()), bytemuck::cast_slice_mut(&mut words));
     let adam = DeferredAdam::new(Rates::new(1.0, 100), AdamConfig::default(), SimdPath::best());
     let (numbers, of_step) = (adam.numbers(100).unwrap(), adam.at(0).numbers());
-    let tables = 4 * DeferredTables::new(&numbers).words().len() as u64;
+    let (tables, recent) = (DeferredTables::new(&numbers).words().len(), of_step.recent.as_flattened().len());
     let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
     gpu.prepare_page_storage(&PageRules { payload_bytes: layout.bytes(), numbers, splits, weighs: false }).unwrap();
     assert_eq!(gpu.add_slots(1).unwrap(), 1);
     let page = SlotPage { slot: DeviceSlot(0), layout };
     gpu.write_slots(&[(page.slot, &bytemuck::cast_slice(&words)[..layout.bytes()])]).unwrap();
-    let (options, loss) = (RenderOptions { sh_degree, ..RenderOptions::default() }, LossOptions::default());
+    let (options, loss) = (RenderOptions::default(), LossOptions::default());
     let (pages, rows_room, isects_most) = (&[page][..], rows.rows() as u32, u32::MAX);
     let job = StepJob { pages, numbers: &of_step, camera, options: &options, rows_room, isects_most };
-    let target = photo(camera.width, camera.height, false);
-    let update =
-        RecordedUpdate { target: &target, loss: &loss, collects: true, rows_per_unusable: 1000, closes: false };
+    let (target, rows_per_unusable) = (photo(camera.width, camera.height, false), 1000);
+    let update = RecordedUpdate { target: &target, loss: &loss, collects: true, rows_per_unusable, closes: false };
     let cost = counted(gpu, |gpu| {
         assert!(gpu.record_picture(&job).unwrap() && gpu.record_update(&update).unwrap());
         assert_eq!(gpu.finish_step().unwrap().closed, 0);
     });
-    let recent = size_of_val(&of_step.recent[..]) as u64;
-    let pages = Some(Pages { count: 1, slab: gpu.slot_bytes(), tables, recent });
     let room = (host.isects + host.isects / 4).next_multiple_of(1024);
-    (cost, Step { room, pages, ..host })
+    (cost, Step { room, pages: Some([1, gpu.slot_bytes(), 4 * tables as u64, 4 * recent as u64]), ..host })
 }
 
-/// The first `width` of 45 floats of each row.
-fn take(sh_n: &[f32], rows: usize, width: usize) -> Vec<f32> {
-    (0..rows).flat_map(|row| sh_n[45 * row..][..width].to_vec()).collect()
-}
-
-/// Few and many rows, few and many tiles: scans of one and of two levels, sorts of one and of two digits.
+/// Few and many rows, few and many tiles: scans of one and of several blocks, sorts of one and of two digits.
 #[test]
 fn a_step_costs_what_the_model_says() {
-    for (rows, width, height, sh_degree) in [(900, 64, 48, 3), (9000, 336, 304, 1)] {
-        let Some(mut gpu) = renderer(&GpuOptions { uniform_blocks: Some(true), ..GpuOptions::default() }) else {
-            return;
-        };
+    for (rows, width, height) in [(900, 64, 48), (9000, 336, 304)] {
+        let options = GpuOptions { uniform_blocks: Some(true), ..GpuOptions::default() };
+        let Some(mut gpu) = renderer(&options) else { return };
         let (mut view, target) = (scene(rows, width, height), photo(width, height, false));
         view.0.scales.iter_mut().for_each(|scale| *scale -= 1.0);
-        let options = RenderOptions { sh_degree, ..RenderOptions::default() };
-        let room = 1 << 20;
-        gpu.set_capacity(room);
+        gpu.set_capacity(1 << 20);
         let of_host = counted(&mut gpu, |gpu| {
-            results_with(gpu, &view, &options, &target, &LossOptions::default()).unwrap();
+            results_with(gpu, &view, &RenderOptions::default(), &target, &LossOptions::default()).unwrap();
         });
-        let (n, isects) = (rows as u64, u64::from(gpu.isects()));
-        let (width, height) = (u64::from(width), u64::from(height));
-        let step = Step { rows: n, room: u64::from(room), isects, width, height, sh_degree, pages: None };
+        let (isects, size) = (u64::from(gpu.isects()), [width, height].map(u64::from));
+        let step = Step { rows: rows as u64, room: 1 << 20, isects, size, pages: None };
         assert_eq!(of_host, cost(&step), "the host form of {rows} rows");
         let (of_device, step) = on_pages(&mut gpu, &view, step);
         assert_eq!(of_device, cost(&step), "the device form of {rows} rows");
     }
     // Without the slab, of which a stage reads what the view needs.
-    let pages = Some(Pages { count: 500, slab: 0, tables: 100 << 10, recent: 6400 });
-    let (rows, room, side) = (1 << 20, 5 << 20, 1024);
-    let large = Step { rows, room, isects: room, width: side, height: side, sh_degree: 3, pages: None };
-    let costs = [large, Step { pages, ..large }].map(|step| cost(&step));
+    let large = Step { rows: 1 << 20, room: 5 << 20, isects: 5 << 20, size: [1024; 2], pages: None };
+    let costs = [large, Step { pages: Some([500, 0, 100 << 10, 6400]), ..large }].map(|step| cost(&step));
     println!("1 M rows, 5 M intersections, 1 M pixels, on the host and on the device: {costs:?}");
     assert!(costs.iter().all(|cost| cost.dispatches <= 45));
 }
