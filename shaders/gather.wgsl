@@ -259,7 +259,7 @@ fn gathered(f: Float) -> Gathered {
 /// One invocation for each float of means, quats, scales and opacities.
 @compute @workgroup_size(256)
 fn gather_geometry(workgroup: Group, place: Place) {
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, MEANS, SH0, 0u);
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, MEANS, vec4<u32>(3u, 4u, 3u, 1u));
     let g = gathered(f);
     if !g.is_here {
         return;
@@ -275,7 +275,7 @@ fn gather_geometry(workgroup: Group, place: Place) {
 /// One invocation for each float of the colours.
 @compute @workgroup_size(256)
 fn gather_colors(workgroup: Group, place: Place) {
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, SH0, SH_N + 1u, u.sh_n_width);
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, SH0, vec4<u32>(3u, u.sh_n_width, 0u, 0u));
     let g = gathered(f);
     if !g.is_here {
         return;

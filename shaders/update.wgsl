@@ -136,7 +136,8 @@ fn step_float(column: u32, at: u32, words: u32, d: Decays, value: f32, g: f32) {
 /// One invocation for each float of two columns of the geometry.
 @compute @workgroup_size(256)
 fn step_geometry(workgroup: Group, place: Place) {
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, u.column, u.column + 2u, 0u);
+    let widths = vec4<u32>(3u, column_width(u.column + 1u, 0u), 0u, 0u);
+    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, u.column, widths);
     if !f.exists || gate[0] != 0u {
         return;
     }

@@ -94,17 +94,20 @@ struct Float {
     exists: bool,
 }
 
-/// The i-th float of the columns from `first` on and before `end`, of so many rows, one column behind the other.
-fn float_of(i: u32, row_count: u32, first: u32, end: u32, sh_n_width: u32) -> Float {
-    var at = i;
-    for (var column = first; column < end; column++) {
-        let width = column_width(column, sh_n_width);
-        if at < row_count * width {
-            return Float(column, width, at, true);
-        }
-        at -= row_count * width;
+/// The i-th float of so many rows of at most four columns from `first` on, of these widths, one column behind the other.
+fn float_of(i: u32, row_count: u32, first: u32, widths: vec4<u32>) -> Float {
+    let two = widths.x + widths.y;
+    let ends = row_count * vec4<u32>(widths.x, two, two + widths.z, two + widths.z + widths.w);
+    if i < ends.x {
+        return Float(first, widths.x, i, true);
     }
-    return Float(first, 1u, 0u, false);
+    if i < ends.y {
+        return Float(first + 1u, widths.y, i - ends.x, true);
+    }
+    if i < ends.z {
+        return Float(first + 2u, widths.z, i - ends.y, true);
+    }
+    return Float(first + 3u, max(widths.w, 1u), i - ends.z, i < ends.w);
 }
 
 /// Words of the table of values of a column, which are those of its moments.
