@@ -19,7 +19,7 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 9;
+pub const VERSION: u32 = 10;
 
 /// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -259,7 +259,7 @@ impl RunState {
 mod tests {
     use super::*;
     use crate::base::rng::mix64;
-    use crate::densify::growth::GrowthCheck;
+    use crate::densify::growth::{GrowthCheck, GrowthDecision};
     use crate::photos::exposure::state::AppearanceState;
     use crate::photos::outlier::blocks::{BlockState, look};
     use crate::photos::outlier::views::ViewState;
@@ -283,17 +283,18 @@ mod tests {
     }
 
     fn growth() -> GrowthState {
-        let check = |step, gaussians, psnr, lost, pays_from| GrowthCheck {
+        let check = |step, gaussians, psnr, decision| GrowthCheck {
             step,
             gaussians,
             psnr,
             trained_psnr: psnr,
-            lost,
-            pays_from,
-            is_trial: false,
+            decision,
             allowed: 10,
         };
-        GrowthState { first: 7, checks: vec![check(5, 7, 20.0, 0.5, 0.25), check(8, 10, 21.0, -0.5, 0.5)] }
+        GrowthState {
+            first: 7,
+            checks: vec![check(5, 7, 20.0, GrowthDecision::Waits), check(8, 10, 21.0, GrowthDecision::Ends)],
+        }
     }
 
     /// Values of every kind.
@@ -404,7 +405,7 @@ mod tests {
         refused(|s| s.photos = [("of a later program".to_string(), Encoded::default())].into());
         refused(|s| s.trainer.growth.checks.reverse());
         refused(|s| s.trainer.growth.checks[1].step = 10);
-        refused(|s| s.trainer.growth.checks[0].lost = f64::NAN);
+        refused(|s| s.trainer.growth.checks[0].psnr = f64::NAN);
         refused(|s| s.origin.dataset.scale = 0.0);
         refused(|s| s.origin.dataset.origin[1] = f64::INFINITY);
     }

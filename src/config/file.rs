@@ -234,7 +234,7 @@ config_keys! {
         /// With --strategy long-axis, the share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers hidden;
         /// draft (few Gaussians), normal or archive (many); with --strategy long-axis and no --max-gaussians. The run holds out
-        /// some training photos during its first half (at most 1,700 steps). The scene grows as long as more Gaussians bring
+        /// some training photos during two thirds of it (at most 2,000 steps). The scene grows as long as more Gaussians bring
         /// these photos enough decibels
         quality: Quality = Quality::Normal => Numbers common;
         /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)

@@ -140,9 +140,9 @@ impl Strategy for LongAxisStrategy {
         self.growth.as_ref()
     }
 
-    fn growth_check(&self, step: u32) -> Option<usize> {
+    fn is_growth_checked(&self, step: u32) -> bool {
         let before = step.checked_sub(self.checks.every).filter(|before| self.checks.is_round(*before));
-        self.growth.filter(|_| self.checks.is_round(step))?.due(before, step)
+        self.checks.is_round(step) && self.growth.is_some_and(|rule| rule.is_due(before, step))
     }
 
     fn may_check_growth(&self, step: u32) -> bool {
@@ -330,10 +330,9 @@ mod tests {
         assert_eq!(rounds(&*by_epochs), (4..16).map(|epoch| 150 * epoch).collect::<Vec<u32>>());
         assert_eq!(rounds(&*by_steps.for_regions(799).unwrap()), [799, 1598, 2397]);
         // The checks of growth come as before.
-        let checks = |strategy: &dyn Strategy| {
-            (0..4000).filter_map(|step| strategy.growth_check(step).map(|n| (step, n))).collect::<Vec<_>>()
-        };
-        assert_eq!(checks(&*by_epochs), [(1000, 0), (1200, 1), (1400, 2), (1600, 3)]);
+        let checks =
+            |strategy: &dyn Strategy| (0..4000).filter(|step| strategy.is_growth_checked(*step)).collect::<Vec<_>>();
+        assert_eq!(checks(&*by_epochs), [800, 1000, 1200, 1400, 1600, 1800, 2000]);
         assert_eq!(checks(&by_steps), checks(&*by_epochs));
         // Two rounds do not fit: the rounds stay.
         for epoch in [1300, 2400, 50_000, u32::MAX] {

@@ -128,9 +128,9 @@ pub trait Strategy: fmt::Debug + Send + Sync {
         None
     }
 
-    /// The number of the [`GrowthRule::check`] before the events of this step, if one is due.
-    fn growth_check(&self, _step: u32) -> Option<usize> {
-        None
+    /// Whether a [`GrowthRule::check`] is due before the events of this step.
+    fn is_growth_checked(&self, _step: u32) -> bool {
+        false
     }
 
     /// Whether such a check may come at this step or a later one.

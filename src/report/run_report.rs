@@ -246,32 +246,24 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     drawn.map(|(chart, caption)| (chart.svg(), caption.to_string())).collect()
 }
 
-/// Of a run whose scene doubled on trial.
-const TRIALS: &str = " This loss did not pay. But the photos trained on were hardly better than those held out, so the scene doubled on \
-    trial. Each further check doubled it again if that was still so, or if the held-out photos had gained. Otherwise it undid the last doubling.";
-
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {
     let checks = summary["growth"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
     page.heading("Number of Gaussians");
+    let undone = " More Gaussians fitted noise: the run undid the last doubling.";
     page.paragraph(&format!(
-        "The run decided that up to {} Gaussians pay (--quality). The chart shows what training photos that were held out lost, in \
-         each check, without the quarter of the Gaussians that weighs least in them. The scene grows if that loss exceeds the \
-         threshold from which growth pays.{}",
+        "The run decided that up to {} Gaussians pay (--quality). It held some training photos out. The scene doubled as long as they \
+         gained a good share of what the photos gained that it trained on.{}",
         short(allowed),
-        if checks.iter().any(|check| check["is_trial"] == true) { TRIALS } else { "" }
+        if checks.iter().any(|check| check["decision"] == "undoes") { undone } else { "" }
     ));
     let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();
-    let chart =
-        Chart::new("Loss without the faintest quarter", "step", "dB").with("lost", of("lost"), Mark::LineAndDots);
-    let chart = chart.with("growth pays from", of("pays_from"), Mark::Line).zero_based();
     let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
-    let caption = "Mean over the held-out training photos at each check.".to_string();
     let psnr = Chart::new("PSNR of training photos", "step", "dB").with("held out", of("psnr"), Mark::LineAndDots);
     let psnr = psnr.with("trained on", of("trained_psnr"), Mark::LineAndDots);
-    let allowed = (rows.svg(), "What each check allowed.".to_string());
-    page.charts(&[(chart.svg(), caption.clone()), (psnr.svg(), caption), allowed]);
+    let measured = (psnr.svg(), "Means over as many photos of each kind at each check.".to_string());
+    page.charts(&[measured, (rows.svg(), "What each check allowed.".to_string())]);
 }
 
 /// What lies in a file for viewers.

@@ -9,7 +9,9 @@ use serde_json::Value;
 const PLAN: &str = env!("CARGO_BIN_EXE_gsscale-plan");
 
 fn planned(work: &Workdir, flags: &str) -> (Value, String) {
-    let flags = format!("scene --schedule classic {flags}");
+    // As `Workdir::run`.
+    let strategy = if flags.contains("--strategy") { "" } else { "--strategy default" };
+    let flags = format!("scene --schedule classic {strategy} {flags}");
     let output = work.output(PLAN, &flags);
     assert!(output.status.success(), "{flags}: {}", stderr(&output));
     (work.json_of(PLAN, &format!("{flags} --json")), String::from_utf8(output.stdout).unwrap())

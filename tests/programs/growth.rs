@@ -20,28 +20,28 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     let said = run("--quality archive");
     let growth = work.summary("out")["growth"].clone();
     let checks = growth.as_array().unwrap();
-    assert_eq!(checks.len(), 3, "{growth}");
-    let of = |check: &Value, name: &str| check[name].as_f64().unwrap();
+    assert!(checks.len() > 1, "{growth}");
+    let of = |check: &Value, name: &str| check[name].as_u64().unwrap();
     for check in checks {
         let line = format!("step {}: Gaussians ", check["step"]);
         let line = said.lines().find(|l| l.starts_with(&line)).unwrap_or_else(|| panic!("no {line} in {said}"));
-        assert!(line.len() <= 80 && line.contains(&check["allowed"].to_string()), "{line}");
-        let grows = check["is_trial"] == true || of(check, "lost") > of(check, "pays_from");
-        assert_eq!((line.contains("up to"), line.contains("on trial")), (grows, check["is_trial"] == true), "{line}");
+        assert!(line.len() <= 100 && line.contains(&check["allowed"].to_string()), "{line}");
+        assert_eq!(line.contains("up to"), check["decision"] == "doubles", "{line}");
     }
     // The check that changes the count says what the run takes from then on.
     assert!(said.contains("\n  which takes about ") && said.contains(" of the drive\n"), "{said}");
-    let may_follow = |pair: &[Value]| of(&pair[0], "allowed") <= of(&pair[1], "allowed") || pair[0]["is_trial"] == true;
-    assert!(checks.windows(2).all(may_follow), "{growth}");
+    let last = checks.last().unwrap();
+    assert!(of(last, "allowed") > 500 && last["decision"] == "ends", "{growth}");
     let lines = work.metrics("out");
-    assert_eq!((&lines[0]["growth"], &lines.last().unwrap()["growth"]), (&Value::Null, &checks[2]));
+    assert_eq!((&lines[0]["growth"], &lines.last().unwrap()["growth"]), (&Value::Null, last));
     let report = work.text("out/report.html");
-    assert!(report.contains("Number of Gaussians") && report.contains("growth pays from"));
-    // A higher price allows fewer, and the last check cannot come after the last round.
+    assert!(report.contains("Number of Gaussians") && report.contains("held out"));
+    // Draft asks for more of a doubling, and the last check cannot come after the last round.
     run("--quality draft --refine-stop 40");
     let draft = work.summary("out")["growth"].clone();
-    let last = draft.as_array().unwrap().last().unwrap();
-    assert!(draft.as_array().unwrap().len() < 3 && of(last, "allowed") < of(&checks[2], "allowed"), "{draft}");
+    let of_draft = draft.as_array().unwrap();
+    assert!(of_draft.iter().all(|check| of(check, "step") < 40), "{draft}");
+    assert!(of(of_draft.last().unwrap(), "allowed") <= of(last, "allowed"), "{draft}");
     // A cap that is given is the user's decision.
     run("--max-gaussians 600");
     assert_eq!(work.summary("out")["growth"], Value::Null);

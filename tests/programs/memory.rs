@@ -90,7 +90,7 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
     for (flags, decides) in [(&all, false), (&decides, true)] {
         let flags = format!("scene --out limited --overwrite --spill-dir spill --quiet {flags}");
         let is_limited = succeeds_within_the_least(&work, TRAIN, &flags);
-        assert!(!is_limited || work.text("limited/metrics.jsonl").contains("pays_from") == decides, "{flags}");
+        assert!(!is_limited || work.text("limited/metrics.jsonl").contains("trained_psnr") == decides, "{flags}");
         work.remove("spill");
     }
     // The evaluation of a file on the same photos.

@@ -56,9 +56,6 @@ const ROUND_POWER: f64 = 0.4;
 /// Most Gaussians that a round adds, as a share of the existing ones: the share that the first rounds of a scene with few
 /// points add.
 const ADDED_MOST: f64 = 0.6;
-/// Most Gaussians that a run decides, over its first number: 1.0 on seneca and brighton, 2.3 on sheffield_cross, 8 on cities,
-/// see "A count that the program decides" in `benches/RESULTS.md`.
-const DECIDED_MOST: f64 = 8.0;
 /// With twice the Gaussians a step takes 1.45 times as long (`gsscale-bench sweep pareto`): step time grows with this power of
 /// their number.
 pub const STEP_GROWTH: f64 = 0.54;
@@ -107,7 +104,7 @@ pub fn reach(config: &TrainConfig, rows: u64, pixels: u64, steps_done: u32, chec
     let guess = guess(rows, rounds, every).min(pixels.max(rows));
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess, Reach::Guess),
-        (Some(_), None) => (guess.min((DECIDED_MOST * rows as f64) as u64), Reach::Decided),
+        (Some(rule), None) => (guess.min(rule.most(pixels).max(rows)), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
 }
@@ -632,6 +629,7 @@ mod tests {
     use crate::base::units::GIB;
     use crate::config::file::TrainOverrides;
     use crate::config::new_run::of_new_run;
+    use crate::densify::growth::GrowthDecision;
 
     /// Pixels of photos that limit no guess.
     const PIXELS: u64 = 1 << 40;
@@ -663,16 +661,14 @@ mod tests {
     #[test]
     fn a_run_that_decides_its_count_forecasts_the_most_until_it_has_decided() {
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
-        assert_eq!(reach(&decides, 41_321, PIXELS, 0, &[]), (330_568, Reach::Decided));
-        assert_eq!(reach(&decides, 41_321, 50_000, 0, &[]), (50_000, Reach::Decided), "no more than pixels");
+        assert_eq!(reach(&decides, 41_321, 9_600_000, 0, &[]), (300_000, Reach::Decided), "one for 32 pixels");
+        assert_eq!(reach(&decides, 41_321, 9600, 0, &[]), (41_321, Reach::Decided), "no fewer than at first");
         let check = GrowthCheck {
             step: 1001,
             gaussians: 41_000,
             psnr: 20.0,
             trained_psnr: 20.0,
-            lost: 0.4,
-            pays_from: 0.1,
-            is_trial: false,
+            decision: GrowthDecision::Doubles,
             allowed: 165_284,
         };
         assert_eq!(reach(&decides, 60_000, PIXELS, 1001, &[check]), (165_284, Reach::Decided));
@@ -730,14 +726,14 @@ mod tests {
         assert!((of(3.0, 1.0) - (500.0 + 2000.0 * 2.0 + 500.0 * 3.0) / 3000.0).abs() < 1e-12);
         let of_later = GrowingSteps::new(&config(), 2600, 3.0);
         assert!((of_later.mean(3.0, 1.0) - 3.0).abs() < 1e-12);
-        // Two rounds of doublings make room for a cap of three times the scene; checks decide between 1,000 and 1,600 steps.
+        // Two rounds of doublings make room for a cap of three times the scene; checks decide between 800 and 2,000 steps.
         let steps_of = |config: &TrainConfig| {
             let GrowingSteps { before, growing, after } = GrowingSteps::new(config, 0, 3.0);
             [before, growing, after]
         };
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
         assert_eq!(steps_of(&TrainConfig { max_gaussians: 9, ..decides.clone() }), [500.0, 200.0, 2300.0]);
-        assert_eq!(steps_of(&decides), [1000.0, 600.0, 1400.0]);
+        assert_eq!(steps_of(&decides), [800.0, 1200.0, 1000.0]);
     }
 
     #[test]

@@ -9,7 +9,7 @@
 //! the run with the result of the last good step; 3. the events of a step are logged once.
 
 use super::eval::{EvalRequest, evaluate};
-use super::growth_checks::{Comparing, growth_values};
+use super::growth_checks::{Comparing, mean_psnr};
 use super::run_memory::{MemoryState, RunMemory};
 use super::turns::Turns;
 use crate::base::trace;
@@ -434,7 +434,7 @@ impl Trainer {
     /// Whether no event follows 0-based `step`, and no outcome of the step can end the run.
     fn has_no_event_or_end_after(&self, step: u32) -> bool {
         let strategy = &self.options.strategy;
-        let reads = strategy.reads_histogram(step) || strategy.growth_check(step).is_some();
+        let reads = strategy.reads_histogram(step) || strategy.is_growth_checked(step);
         let is_steady = self.state.steps_skipped_in_a_row == 0 && self.idle.is_busy();
         if reads || !is_steady || self.options.sh_degree_at(step + 1) > self.scene.rules.sh_degree {
             return false;
@@ -582,10 +582,11 @@ impl Trainer {
     /// Errors: a photo cannot be decoded, pages could not be had, or the renderer failed. The decision is still due then.
     fn check_growth(&mut self, step: u32, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let strategy = self.options.strategy.clone();
-        let (Some(rule), Some(number)) = (strategy.growth(), strategy.growth_check(step)) else { return Ok(()) };
+        let Some(rule) = strategy.growth().filter(|_| strategy.is_growth_checked(step)) else { return Ok(()) };
         let positions = &self.turns.held_out.positions;
+        let is_done = self.state.growth.checks.last().is_some_and(|last| last.step > step);
         // Without held-out views the count stays as it is.
-        if positions.is_empty() || self.state.growth.checks.last().is_some_and(|last| last.step > step) {
+        if positions.is_empty() || is_done || self.state.growth.is_decided() {
             return Ok(());
         }
         let started = Instant::now();
@@ -601,14 +602,17 @@ impl Trainer {
         let compared = Comparing {
             targets,
             render: &self.render_options(),
-            loss: &self.options.loss.clone(),
             pages_most: self.memory.pages_most,
             // A photo that was never trained on has no exposure yet.
             correct: self.photos.iter().any(|parameter| parameter.corrects()).then_some(ColorCorrect::Affine),
         };
         // Without a view that counts the count stays as it is, too.
-        if let Some(values) = growth_values(&mut self.now(), &compared, &held_out, &trained)? {
-            let check = rule.check((number, step), self.scene.rows_bound(), values, &self.state.growth);
+        let measured = [&held_out, &trained].map(|views| mean_psnr(&mut self.now(), &compared, views));
+        let [held_out, trained] = measured;
+        if let (Some(psnr), Some(trained_psnr)) = (held_out?, trained?) {
+            let pixels = self.turns.views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
+            let counts = [self.scene.rows_bound(), pixels];
+            let check = rule.check(step, counts, [psnr, trained_psnr], &self.state.growth);
             self.state.growth.checks.push(check);
         }
         self.state.train_seconds += started.elapsed().as_secs_f64();

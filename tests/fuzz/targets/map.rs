@@ -5,7 +5,7 @@ use super::with_mode;
 use crate::Target;
 use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
-use gsscale::densify::growth::{GrowthCheck, GrowthState};
+use gsscale::densify::growth::{GrowthCheck, GrowthDecision, GrowthState};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::engine::memory::MemoryEngine;
 use gsscale::page::engine::page_engine::Place;
@@ -253,9 +253,7 @@ fn sample() -> RunState {
                     gaussians: 7,
                     psnr: 20.0,
                     trained_psnr: 20.0,
-                    lost: 0.5,
-                    pays_from: 0.25,
-                    is_trial: true,
+                    decision: GrowthDecision::Doubles,
                     allowed: 10,
                 }],
             },
