@@ -2,6 +2,7 @@
 //! the drives of its paths.
 
 use crate::base::error::{InputError, InputResult};
+#[cfg(feature = "gpu")]
 use crate::base::machine::host_bytes_now;
 use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
