@@ -2,9 +2,10 @@
 // earlier blocks.
 //
 // Reduce, then scan: scan_reduce, or the stage that makes the values, sums them in groups; then every block of the scan adds up the
-// sums before it, and the values before it in a group that it shares with another block. A million values have 500 sums, so a block reads
-// fewer of them than values, and one dispatch replaces levels of scans. No workgroup waits for another. Offsets are 32-bit and saturate: a
-// last entry of 0xffffffff means that the true total is that or more.
+// sums before it, and the values before it in a group that it shares with another block. One dispatch replaces levels of scans, but what
+// it reads grows with the square of the number of sums: where a block would read more than a few sums for each of its values,
+// scan_reduce sums whole blocks, and where these are too many as well, their sums are scanned first. No workgroup waits for another.
+// Offsets are 32-bit and saturate: a last entry of 0xffffffff means that the true total is that or more.
 #import "shared/constants.wgsl"
 #import "shared/dispatch.wgsl"
 #import "shared/workgroup_scan.wgsl"
@@ -14,7 +15,9 @@ struct ScanUniforms {
     count: u32,
     /// Number of values of a sum.
     values_of_sum: u32,
-    pad: vec2<u32>,
+    /// 1 if the sums are those of blocks, scanned already; else 0.
+    are_sums_scanned: u32,
+    pad: u32,
 }
 
 @group(0) @binding(0) var<uniform> level: ScanUniforms;
@@ -64,12 +67,18 @@ fn scan(workgroup: Group, place: SubgroupPlace) {
     }
     var earlier = 0u;
     let start = block * (256u * ITEMS);
-    let whole = start / max(level.values_of_sum, 1u);
-    for (var k = place.lane; k < whole; k += 256u) {
-        earlier = saturating_add(earlier, sums[k]);
-    }
-    for (var k = whole * level.values_of_sum + place.lane; k < start; k += 256u) {
-        earlier = saturating_add(earlier, values[k]);
+    if level.are_sums_scanned == 1u {
+        if place.lane == 0u && start < level.count {
+            earlier = sums[block];
+        }
+    } else {
+        let whole = start / max(level.values_of_sum, 1u);
+        for (var k = place.lane; k < whole; k += 256u) {
+            earlier = saturating_add(earlier, sums[k]);
+        }
+        for (var k = whole * level.values_of_sum + place.lane; k < start; k += 256u) {
+            earlier = saturating_add(earlier, values[k]);
+        }
     }
     let before_block = workgroup_scan(earlier, place).total;
     workgroupBarrier();

@@ -75,6 +75,9 @@ pub const SUMS: u32 = 9;
 pub const WEIGHED_SUMS: u32 = 11;
 /// Values per workgroup of the scan.
 pub const SCAN_BLOCK: u32 = 2048;
+/// Most sums and values before it that a workgroup of the scan reads: on average two for each of its own values, which costs no more
+/// than another dispatch.
+pub const SCAN_SUMS: u32 = 4 * SCAN_BLOCK;
 /// Keys per workgroup of the sort.
 pub const SORT_BLOCK: u32 = 1024;
 /// Bits per pass of the sort.
@@ -114,7 +117,8 @@ crate::wgsl_struct! {
     pub struct ScanUniforms {
         pub count: u32,
         pub values_of_sum: u32,
-        pub pad: [u32; 2],
+        pub are_sums_scanned: u32,
+        pub pad: u32,
     }
 
     /// Uniform of `radix_sort.wgsl`.

@@ -17,8 +17,8 @@ use crate::gpu::{BufferView, Gpu, GpuError, GpuResult, Pipeline, Recorder, group
 use crate::kernels::splats::Grid;
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms::{
-    DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SEGMENT_BWD, SEGMENT_FIRST,
-    SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, ScanUniforms, SortUniforms, grid_words, range_words,
+    DIGIT_BITS, DIGITS, IsectUniforms, OffsetsUniforms, RasterUniforms, SCAN_BLOCK, SCAN_SUMS, SEGMENT_BWD,
+    SEGMENT_FIRST, SEGMENT_FWD, SEGMENT_LAST, SORT_BLOCK, ScanUniforms, SortUniforms, grid_words, range_words,
 };
 use std::sync::Arc;
 
@@ -52,6 +52,8 @@ pub struct TileStages {
     pipelines: Pipelines,
     /// The backward pass.
     pub back: BackStages,
+    /// [`SCAN_SUMS`]; tests lower it. It changes no result.
+    pub scan_sums: u32,
     /// Sizes of the next frame.
     room: FrameRoom,
     /// The most that a frame has needed so far; `None` before the first.
@@ -79,6 +81,7 @@ impl TileStages {
         Ok(TileStages {
             pipelines,
             back: BackStages::new(gpu)?,
+            scan_sums: SCAN_SUMS,
             room: FrameRoom { capacity: CAPACITY_MIN, list_max: SEGMENT_FWD },
             seen: None,
             binding_words,
@@ -128,25 +131,41 @@ impl TileStages {
     ) -> GpuResult<()> {
         let blocks = count.div_ceil(SCAN_BLOCK);
         if blocks <= 1 {
-            return self.scan_summed(recorder, (values, values, SCAN_BLOCK), count, offsets);
+            return self.scan_summed(gpu, recorder, (values, values, SCAN_BLOCK), count, offsets);
         }
-        let level = recorder.uniform(&ScanUniforms { count, values_of_sum: SCAN_BLOCK, pad: [0; 2] })?;
+        let level =
+            recorder.uniform(&ScanUniforms { count, values_of_sum: SCAN_BLOCK, are_sums_scanned: 0, pad: 0 })?;
         let sums = gpu.buffer("sums of scan blocks", words(blocks))?;
         let views = [level, values.clone(), sums.view()];
         recorder.dispatch("scan", &self.pipelines.scan_reduce, &views, groups_1d(count, SCAN_BLOCK))?;
-        self.scan_summed(recorder, (values, &sums.view(), SCAN_BLOCK), count, offsets)
+        self.scan_summed(gpu, recorder, (values, &sums.view(), SCAN_BLOCK), count, offsets)
     }
 
-    /// As [`TileStages::scan`], for values that are summed already, so many values to a sum.
+    /// As [`TileStages::scan`], for values that are summed already, so many values to a sum. Where a block would read more than
+    /// [`SCAN_SUMS`] of them, the values are summed by blocks; where it would read too many of these, they are scanned first.
     fn scan_summed(
         &self,
+        gpu: &Gpu,
         recorder: &mut Recorder<'_>,
         (values, sums, values_of_sum): (&BufferView, &BufferView, u32),
         count: u32,
         offsets: &BufferView,
     ) -> GpuResult<()> {
-        let level = recorder.uniform(&ScanUniforms { count, values_of_sum, pad: [0; 2] })?;
-        let views = [level, values.clone(), sums.clone(), offsets.clone()];
+        let blocks = count.div_ceil(SCAN_BLOCK);
+        // Values before a block in a group that it shares with another.
+        let shared = if SCAN_BLOCK.is_multiple_of(values_of_sum) { 0 } else { values_of_sum.min(count) };
+        let is_too_much = blocks > 1 && count / values_of_sum.max(1) + shared > self.scan_sums;
+        if is_too_much && values_of_sum != SCAN_BLOCK {
+            return self.scan(gpu, recorder, values, count, offsets);
+        }
+        let scanned = is_too_much.then(|| gpu.buffer("scanned sums of blocks", words(blocks + 1))).transpose()?;
+        if let Some(scanned) = &scanned {
+            self.scan(gpu, recorder, sums, blocks, &scanned.view())?;
+        }
+        let are_sums_scanned = u32::from(is_too_much);
+        let level = recorder.uniform(&ScanUniforms { count, values_of_sum, are_sums_scanned, pad: 0 })?;
+        let sums = scanned.map_or_else(|| sums.clone(), |scanned| scanned.view());
+        let views = [level, values.clone(), sums, offsets.clone()];
         recorder.dispatch("scan", &self.pipelines.scan, &views, groups_1d(count.max(1), SCAN_BLOCK))
     }
 
@@ -178,7 +197,7 @@ impl TileStages {
             let pass = recorder.uniform(&SortUniforms { capacity, live_at, blocks, shift })?;
             let views = [pass.clone(), live.clone(), from.keys.view(), histogram.view(), totals.clone()];
             recorder.dispatch("radix_sort", &self.pipelines.radix_histogram, &views, groups)?;
-            self.scan_summed(recorder, (&histogram.view(), &totals, blocks), entries, &places.view())?;
+            self.scan_summed(gpu, recorder, (&histogram.view(), &totals, blocks), entries, &places.view())?;
             let views = [
                 pass,
                 live.clone(),
@@ -237,7 +256,7 @@ impl TileStages {
         recorder.dispatch("isect_emit", &self.pipelines.isect_count, &views, groups)?;
         let offsets = gpu.buffer("intersection offsets", words(rows + 1))?;
         let summed = (&counts.view(), &sums.view(), WORKGROUP);
-        self.scan_summed(recorder, summed, rows, &offsets.view())?;
+        self.scan_summed(gpu, recorder, summed, rows, &offsets.view())?;
         Ok(Ranks { rows, order: sorted.values, offsets })
     }
 

@@ -5,6 +5,7 @@ use super::frame::{photo, renderer, results_with, scene};
 use gsscale::base::simd::SimdPath;
 use gsscale::gpu::{GpuOptions, Work};
 use gsscale::kernels::deferred::DeferredTables;
+use gsscale::kernels::uniforms::{SCAN_BLOCK, SCAN_SUMS};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
@@ -16,6 +17,10 @@ use gsscale::scene::columns::Columns;
 use gsscale::scene::optimizer_numbers::SplitLimits;
 use gsscale::scene::page_layout::{capacity_bytes, write_page};
 use gsscale::scene::state::SceneState;
+
+/// Values of a block of the scan, and the most sums that one reads.
+const BLOCK: u64 = SCAN_BLOCK as u64;
+const MOST: u64 = SCAN_SUMS as u64;
 
 /// A step on all rows with all colour bands, whose lists fit one dispatch of each rasterizer.
 #[derive(Clone, Copy)]
@@ -30,8 +35,8 @@ struct Step {
 }
 
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-struct Cost {
-    dispatches: u64,
+pub struct Cost {
+    pub dispatches: u64,
     bytes: u64,
 }
 
@@ -41,11 +46,39 @@ impl Cost {
         self.bytes += dispatches * bytes_each;
     }
 
-    fn sort(&mut self, live: u64, capacity: u64, bits: u32) {
-        let (passes, counts) = (bits.div_ceil(8).into(), 4 * 256 * capacity.div_ceil(1024));
-        self.add(passes, live + 4 * capacity + counts + 1024); // radix_histogram
-        self.add(passes, 1024 + 2 * counts + 4); // scan
-        self.add(passes, live + 16 * capacity + counts + 4); // radix_sort
+    /// A scan of values without sums. Returns the sums and values that blocks read besides their own values, `most` each.
+    pub fn scan(&mut self, count: u64, most: u64) -> u64 {
+        let blocks = count.div_ceil(BLOCK);
+        if blocks <= 1 {
+            return self.scan_summed(count, [count, BLOCK], most);
+        }
+        self.add(1, 4 * (count + blocks)); // scan_reduce
+        count + self.scan_summed(count, [blocks, BLOCK], most)
+    }
+
+    /// As [`Cost::scan`], with so many sums of so many values each.
+    fn scan_summed(&mut self, count: u64, [sums, of_sum]: [u64; 2], most: u64) -> u64 {
+        let blocks = count.div_ceil(BLOCK);
+        let of_block = |block: u64| (block * BLOCK / of_sum, block * BLOCK % of_sum);
+        let shared = if BLOCK.is_multiple_of(of_sum) { 0 } else { of_sum.min(count) };
+        let is_too_much = blocks > 1 && count / of_sum + shared > most;
+        if is_too_much && of_sum != BLOCK {
+            return self.scan(count, most);
+        }
+        let (read, sums) = match is_too_much {
+            true => (self.scan(blocks, most) + 2 * blocks, blocks + 1),
+            false => ((0..blocks).map(of_block).map(|(sums, values)| sums + values).sum(), sums),
+        };
+        self.add(1, 4 * (count + sums + count + 1));
+        read
+    }
+
+    /// Returns what [`Cost::scan`] returns, of a pass.
+    fn sort(&mut self, live: u64, capacity: u64, bits: u32) -> u64 {
+        let (passes, blocks) = (u64::from(bits.div_ceil(8)), capacity.div_ceil(1024));
+        self.add(passes, live + 4 * capacity + 4 * 256 * blocks + 1024); // radix_histogram
+        self.add(passes, live + 16 * capacity + 4 * (256 * blocks + 1)); // radix_sort
+        (0..passes).map(|_| self.scan_summed(256 * blocks, [256, blocks], MOST)).max().unwrap_or(0)
     }
 }
 
@@ -68,9 +101,8 @@ fn cost(&Step { rows: n, room, isects, size, pages }: &Step) -> Cost {
     }
     cost.add(1, geometry + splats + 8 * n); // project_fwd
     cost.sort(4, n, 32);
-    let sums = 4 * n.div_ceil(256);
-    cost.add(1, splats + 8 * n + sums); // isect_count
-    cost.add(1, 4 * n + sums + offsets); // scan
+    cost.add(1, splats + 8 * n + 4 * n.div_ceil(256)); // isect_count
+    cost.scan_summed(n, [n.div_ceil(256), 256], MOST);
     cost.add(1, splats + 12 * n + colors); // sh_fwd
     cost.add(1, splats + 4 * n + offsets + 12 * room); // isect_emit
     cost.sort(offsets, room, 64 - tiles.leading_zeros());
@@ -145,4 +177,18 @@ fn a_step_costs_what_the_model_says() {
     let costs = [large, Step { pages: Some([500, 0, 100 << 10, 6400]), ..large }].map(|step| cost(&step));
     println!("1 M rows, 5 M intersections, 1 M pixels, on the host and on the device: {costs:?}");
     assert!(costs.iter().all(|cost| cost.dispatches <= 45));
+}
+
+/// A block reads all sums before it where these are few; where they are many, sums of sums. So much reading is linear.
+#[test]
+fn scans_read_at_most_three_sums_for_each_value() {
+    for keys in (10..30).flat_map(|bits| [1u64 << bits, 3 << (bits - 1)]) {
+        let counts = 256 * keys.div_ceil(1024);
+        let mut cost = Cost::default();
+        let of_sort = cost.sort(4, keys, 8);
+        let of_offsets = cost.scan_summed(keys, [keys.div_ceil(256), 256], MOST);
+        assert!(of_sort <= 3 * counts, "{of_sort} for {counts} counts of {keys} keys");
+        assert!(of_offsets <= 3 * keys, "{of_offsets} for {keys} offsets");
+        assert!(cost.dispatches <= 10);
+    }
 }

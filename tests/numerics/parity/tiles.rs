@@ -1,5 +1,6 @@
 //! The tile stages on the device against their twins on the CPU.
 
+use super::cost::Cost;
 use crate::support::gpu;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -15,6 +16,7 @@ use gsscale::kernels::rasterize_fwd::{Raster, rasterize_fwd, untile};
 use gsscale::kernels::scan::scan;
 use gsscale::kernels::splats::{Grid, Packed, pack};
 use gsscale::kernels::tile_range::TileRange;
+use gsscale::kernels::uniforms::SCAN_SUMS;
 use gsscale::render::gpu_frame::{Blend, Demand, Frame, Pairs, Pixels, Ranks, splat_bytes};
 use gsscale::render::gpu_tiles::TileStages;
 use gsscale::render::gpu_tiles_bwd::{Fold, PictureGradientBuffers};
@@ -36,9 +38,9 @@ fn devices_and_emulated() -> Vec<(Gpu, usize)> {
 #[test]
 fn sums_are_those_of_the_cpu() {
     for (gpu, most) in devices_and_emulated() {
-        let stages = TileStages::new(&gpu).unwrap();
+        let mut stages = TileStages::new(&gpu).unwrap();
         let mut draws = Stream::new(31, Purpose::Test, 0, 0);
-        // One block, its borders, two levels, three levels; the last beyond 2^24 values.
+        // One block, its borders, more sums than a block's, more than a block reads; the last beyond 2^24 values.
         for n in [0, 1, 7, 2047, 2048, 2049, 100_001, 5_000_000, 20_000_000u32] {
             if n as usize > most {
                 continue;
@@ -46,10 +48,19 @@ fn sums_are_those_of_the_cpu() {
             let values: Vec<u32> = (0..n).map(|i| if n > 1 << 24 { i & 31 } else { draws.below(800) as u32 }).collect();
             let mut want = Vec::new();
             scan(&values.iter().map(|&x| u64::from(x)).collect::<Vec<_>>(), &mut want);
-            assert!(gpu_scan(&gpu, &stages, &values).iter().map(|&x| u64::from(x)).eq(want), "{n} values");
+            for scan_sums in [SCAN_SUMS, 1] {
+                stages.scan_sums = scan_sums;
+                let before = gpu.traffic().work.dispatches;
+                let sums = gpu_scan(&gpu, &stages, &values);
+                assert!(sums.iter().map(|&x| u64::from(x)).eq(want.iter().copied()), "{n} values, {scan_sums} sums");
+                let mut cost = Cost::default();
+                cost.scan(n.into(), scan_sums.into());
+                assert_eq!(gpu.traffic().work.dispatches - before, cost.dispatches, "{n} values, {scan_sums} sums");
+            }
         }
         // Sums beyond 32 bits saturate, at any position.
-        for big in [0, 2048, 99_999] {
+        for (big, scan_sums) in [0, 2048, 99_999].into_iter().flat_map(|big| [(big, SCAN_SUMS), (big, 1)]) {
+            stages.scan_sums = scan_sums;
             let mut values = vec![1u32; 100_000];
             values[big] = u32::MAX - 3;
             let got = gpu_scan(&gpu, &stages, &values);
@@ -74,7 +85,7 @@ fn gpu_scan(gpu: &Gpu, stages: &TileStages, values: &[u32]) -> Vec<u32> {
 #[test]
 fn sorted_pairs_are_those_of_a_stable_sort() {
     for (gpu, most) in devices_and_emulated() {
-        let stages = TileStages::new(&gpu).unwrap();
+        let mut stages = TileStages::new(&gpu).unwrap();
         let mut draws = Stream::new(32, Purpose::Test, 0, 0);
         for (n, bits, distinct) in [
             (0, 32, 1),
@@ -97,9 +108,12 @@ fn sorted_pairs_are_those_of_a_stable_sort() {
             let capacity = n as u32 + n as u32 / 3;
             let mut padded = keys.clone();
             padded.resize(capacity as usize, 3);
-            let (keys, values) = gpu_sort(&gpu, &stages, &padded, n as u32, bits);
-            let got = keys.into_iter().zip(values).take(n);
-            assert!(got.eq(want), "{n} keys of {bits} bits");
+            for scan_sums in [SCAN_SUMS, 1] {
+                stages.scan_sums = scan_sums;
+                let (keys, values) = gpu_sort(&gpu, &stages, &padded, n as u32, bits);
+                let got = keys.into_iter().zip(values).take(n);
+                assert!(got.eq(want.iter().copied()), "{n} keys of {bits} bits, {scan_sums} sums");
+            }
         }
     }
 }
