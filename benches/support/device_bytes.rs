@@ -37,7 +37,7 @@ const GEOMETRY: f64 = 44.0;
 const SH0: f64 = 12.0;
 const BANDS: f64 = 180.0;
 /// Key bits per pass of the sort.
-const DIGIT_BITS: f64 = 4.0;
+const DIGIT_BITS: f64 = 8.0;
 
 /// Bytes of a stage in a step; 0 for a stage without an entry.
 pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
@@ -46,11 +46,12 @@ pub fn stage_bytes(stage: &str, counts: &Counts) -> f64 {
     let sort = |n: f64, bits: f64| (bits / DIGIT_BITS).ceil() * 20.0 * n;
     let tile_bits = (tiles + 1.0).log2().ceil();
     match stage {
-        "project_fwd" => rows * (GEOMETRY + SPLAT),
+        // With the keys and values of the sort by depth.
+        "project_fwd" => rows * (GEOMETRY + SPLAT + 8.0),
         // Reads the radius, the mean for the direction, and the coefficients; writes the colour.
         "sh_fwd" => rows * (16.0 + 12.0 + SH0 + BANDS + 16.0),
-        // Depth keys: 32 bits from the splats; then the sort by tile.
-        "radix_sort" => rows * (SPLAT + 8.0) + sort(rows, 32.0) + sort(isects, tile_bits),
+        // By 32 bits of depth, then by tile.
+        "radix_sort" => sort(rows, 32.0) + sort(isects, tile_bits),
         "scan" => 8.0 * rows,
         "isect_emit" => rows * (4.0 + SPLAT + 4.0) + isects * (SPLAT + 12.0),
         "isect_offsets" => 4.0 * isects + 4.0 * tiles,
