@@ -371,7 +371,7 @@ impl Renderer for GpuRenderer {
 
     fn unusable_splats(&mut self) -> Result<u64, RenderError> {
         self.sequence.splat_gradients("unusable_splats")?;
-        self.with_view("unusable_splats", |_, view| Ok(read_unusable(view)?))
+        self.with_view("unusable_splats", |_, view| read_unusable(view))
     }
 
     fn loss_value(&mut self) -> Result<LossValue, RenderError> {

@@ -149,7 +149,7 @@ pub(super) fn submit_tiles_back(stages: &ViewStages, view: &mut View) -> GpuResu
 }
 
 /// Waits for the number of rows with unusable gradients.
-pub(super) fn read_unusable(view: &mut View) -> GpuResult<u64> {
+pub(super) fn read_unusable(view: &mut View) -> Result<u64, RenderError> {
     let unusable = match std::mem::replace(&mut view.unusable, Unusable::Uncounted) {
         Unusable::Pending(readback) => {
             let mut count = [0u32];
@@ -157,7 +157,10 @@ pub(super) fn read_unusable(view: &mut View) -> GpuResult<u64> {
             u64::from(count[0])
         }
         Unusable::Known(count) => count,
-        Unusable::Uncounted | Unusable::OnDevice(_) => 0,
+        // `rows_out` and `pages_out` begin to read it.
+        Unusable::Uncounted | Unusable::OnDevice(_) => {
+            return Err(RenderError::OutOfOrder { call: "unusable_splats", needs: "rows_out of a batch" });
+        }
     };
     view.unusable = Unusable::Known(unusable);
     Ok(unusable)
