@@ -1,7 +1,7 @@
 //! Device memory: buffers from a pool of size classes, charged to one budget. Staging and uniforms are charged to it as well.
 //!
-//! Invariants: (1) allocated bytes, in use or free in the pool, never exceed the budget; once the device refused a buffer,
-//! the budget is what it had granted until then; (2) a buffer is reused only
+//! Invariants: (1) allocated bytes, in use or free in the pool, never exceed the budget; once the device refused a buffer that
+//! is needed, the budget is what it had granted until then; (2) a buffer is reused only
 //! within its class, which is at most a quarter larger than the requested size; (3) a dropped buffer returns to the
 //! pool, and commands recorded later may use it; this is safe because commands run in the order recorded, and a buffer for
 //! read-backs returns only after the host has unmapped it.
@@ -151,6 +151,24 @@ impl Pool {
 
     /// A buffer of `size` bytes with arbitrary contents.
     pub(super) fn take(self: &Arc<Self>, label: &'static str, size: u64, purpose: Purpose) -> GpuResult<Buffer> {
+        self.take_as(label, size, purpose, true)
+    }
+
+    /// A buffer for shaders that the caller can do without: a refusal by the device leaves pool and budget as they are.
+    pub(super) fn take_optional(self: &Arc<Self>, label: &'static str, size: u64) -> GpuResult<Option<Buffer>> {
+        match self.take_as(label, size, Purpose::Work, false) {
+            Err(error) if error.is_out_of_memory() => Ok(None),
+            taken => taken.map(Some),
+        }
+    }
+
+    fn take_as(
+        self: &Arc<Self>,
+        label: &'static str,
+        size: u64,
+        purpose: Purpose,
+        is_needed: bool,
+    ) -> GpuResult<Buffer> {
         let limit = self.buffer_max / 4 * 4;
         if size > limit {
             return Err(GpuError::BufferTooLarge { what: label.into(), need: size, limit });
@@ -162,7 +180,7 @@ impl Pool {
             Some(raw) => raw,
             None => {
                 self.make_room(&mut state, label, class)?;
-                let raw = self.allocate(&mut state, label, class, purpose.usages())?;
+                let raw = self.allocate(&mut state, label, class, purpose.usages(), is_needed)?;
                 state.usage.allocations += 1;
                 raw
             }
@@ -175,20 +193,21 @@ impl Pool {
     pub(super) fn keep(&self, label: &'static str, size: u64, usages: wgpu::BufferUsages) -> GpuResult<wgpu::Buffer> {
         let mut state = lock(&self.state);
         self.make_room(&mut state, label, size)?;
-        let raw = self.allocate(&mut state, label, size, usages)?;
+        let raw = self.allocate(&mut state, label, size, usages, true)?;
         state.usage.in_use += size;
         state.usage.kept += size;
         Ok(raw)
     }
 
-    /// Asks the driver for a buffer and counts it. After a refusal all free buffers go back to the device, once it has finished
-    /// with them; a second refusal lowers the budget to what is allocated.
+    /// Asks the driver for a buffer and counts it. After a refusal of a needed buffer all free buffers go back to the device, once it
+    /// has finished with them; a second refusal lowers the budget to what is allocated.
     fn allocate(
         &self,
         state: &mut PoolState,
         label: &'static str,
         size: u64,
         usages: wgpu::BufferUsages,
+        is_needed: bool,
     ) -> GpuResult<wgpu::Buffer> {
         let ask = || {
             self.driver.faults.set_stage(label);
@@ -196,7 +215,7 @@ impl Pool {
             self.driver.faults.check().map(|()| raw)
         };
         let mut asked = ask();
-        if matches!(asked, Err(GpuError::OutOfMemory { .. })) {
+        if is_needed && matches!(asked, Err(GpuError::OutOfMemory { .. })) {
             state.usage.allocated = state.usage.in_use;
             state.free.clear();
             self.driver.wait(label, None)?;
@@ -204,7 +223,9 @@ impl Pool {
         }
         let raw = asked.map_err(|error| match error {
             GpuError::OutOfMemory { .. } => {
-                state.budget = state.usage.allocated;
+                if is_needed {
+                    state.budget = state.usage.allocated;
+                }
                 GpuError::DeviceFull { what: label.into(), need: size, in_use: state.usage.in_use }
             }
             other => other,

@@ -255,6 +255,11 @@ impl Gpu {
         self.pool.take(label, size, Purpose::Work)
     }
 
+    /// As [`Gpu::buffer`], for a buffer that the caller can do without; `None` if there is no memory for it.
+    pub fn optional_buffer(&self, label: &'static str, size: u64) -> GpuResult<Option<Buffer>> {
+        self.pool.take_optional(label, size)
+    }
+
     /// Device memory that buffers can still take, bytes; 2^64 - 1 less what is in use without a budget.
     pub fn room(&self) -> u64 {
         self.pool.room()
@@ -292,14 +297,33 @@ impl Gpu {
 mod tests {
     use super::*;
 
+    fn open() -> Option<Gpu> {
+        match Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions::default()) {
+            Ok(gpu) => Some(gpu),
+            Err(GpuError::NoSuchDevice { .. }) if std::env::var_os("CI").is_none() => None,
+            Err(error) => panic!("{error}"),
+        }
+    }
+
+    #[test]
+    #[allow(clippy::unwrap_used)] // a panic is a failed test
+    fn a_refused_optional_buffer_leaves_the_budget() {
+        let Some(gpu) = open() else { return };
+        let room = gpu.room();
+        let refuse = || gpu.driver.faults.report(&wgpu::Error::OutOfMemory { source: "refused by the test".into() });
+        refuse();
+        assert!(gpu.optional_buffer("refused", 1 << 20).unwrap().is_none());
+        assert_eq!(gpu.room(), room);
+        assert!(gpu.optional_buffer("granted", 1 << 20).unwrap().is_some_and(|buffer| buffer.size() == 1 << 20));
+        refuse();
+        assert!(gpu.buffer("asked for twice", 1 << 21).is_ok_and(|buffer| buffer.size() == 1 << 21));
+        assert_eq!(gpu.room(), room);
+    }
+
     #[test]
     #[allow(clippy::unwrap_used)] // a panic is a failed test
     fn a_lost_device_is_reported_by_every_later_call() {
-        let gpu = match Gpu::open_with(&DeviceChoice::Gpu, &GpuOptions::default()) {
-            Ok(gpu) => gpu,
-            Err(GpuError::NoSuchDevice { .. }) if std::env::var_os("CI").is_none() => return,
-            Err(error) => panic!("{error}"),
-        };
+        let Some(gpu) = open() else { return };
         let mut recorder = gpu.begin("step 12");
         let buffer = recorder.buffer_zeroed("zeros", 64).unwrap();
         let readback = recorder.read_back("zeros", &buffer.view()).unwrap();

@@ -72,9 +72,15 @@ impl LossStage {
             return Ok(None);
         }
         let bytes = 12 * u64::from(width) * u64::from(height);
-        let fits = |channels: u64| channels * bytes <= gpu.max_binding_bytes().min(gpu.room() / ROOM_SHARE);
-        let at_once = if fits(3) { 3 } else { 1 };
-        let derivatives = gpu.buffer("derivatives", u64::from(at_once) * bytes)?;
+        let of_all = if 3 * bytes <= gpu.max_binding_bytes().min(gpu.room() / ROOM_SHARE) {
+            gpu.optional_buffer("derivatives", 3 * bytes)?
+        } else {
+            None
+        };
+        let (derivatives, at_once) = match of_all {
+            Some(derivatives) => (derivatives, 3),
+            None => (gpu.buffer("derivatives", bytes)?, 1),
+        };
         let mut partials = gpu.buffer("partials", 16 * 3 * u64::from(tiles))?;
         let mut uniforms = LossUniforms::new(width, height, plan);
         let groups = groups_1d(at_once * tiles, 1);
