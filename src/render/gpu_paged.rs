@@ -30,6 +30,7 @@ impl PageRenderer for GpuRenderer {
     fn prepare_page_storage(&mut self, rules: &PageRules) -> Result<(), RenderError> {
         self.drop_view();
         self.pages = None; // frees the slots
+        self.stages.rows.update_rows(&self.stages.gpu)?;
         self.pages = Some(Box::new(DevicePages::new(&self.stages.gpu, rules)?));
         Ok(())
     }

@@ -300,13 +300,15 @@ pub(super) type OfDegree = [Arc<Pipeline>; 4];
 #[derive(Debug)]
 struct ShBwd {
     for_host: OfDegree,
-    for_update: OfDegree,
+    /// `None` before [`RowStages::update_rows`].
+    for_update: Option<OfDegree>,
 }
 
 impl ShBwd {
-    fn new(gpu: &Gpu, more: &[(&str, &str)]) -> GpuResult<ShBwd> {
+    fn new(gpu: &Gpu, updates: bool, more: &[(&str, &str)]) -> GpuResult<ShBwd> {
         let of = |more: &[(&str, &str)]| of_degrees(gpu, "sh_bwd.wgsl", "sh_bwd", more);
-        Ok(ShBwd { for_host: of(more)?, for_update: of(&[more, &[("UPDATES", "")]].concat())? })
+        let for_update = updates.then(|| of(&[more, &[("UPDATES", "")]].concat())).transpose()?;
+        Ok(ShBwd { for_host: of(more)?, for_update })
     }
 }
 
@@ -325,14 +327,23 @@ impl RowStages {
             project_fwd_keys: gpu.pipeline("project_fwd.wgsl", "project_fwd", &[("KEYS", "")])?,
             project_bwd: gpu.pipeline("project_bwd.wgsl", "project_bwd", &[])?,
             sh_fwd: of_degrees(gpu, "sh_fwd.wgsl", "sh_fwd", &[])?,
-            sh_bwd: ShBwd::new(gpu, &[])?,
+            sh_bwd: ShBwd::new(gpu, false, &[])?,
             sh_bwd_weighing: None,
         })
     }
 
     /// Compiles what [`RowStages::sh_bwd`] needs to pass weights on.
     pub fn weigh_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
-        self.sh_bwd_weighing = Some(ShBwd::new(gpu, &WEIGHS)?);
+        self.sh_bwd_weighing = Some(ShBwd::new(gpu, self.sh_bwd.for_update.is_some(), &WEIGHS)?);
+        Ok(())
+    }
+
+    /// Compiles what [`RowStages::sh_bwd`] needs for an update on the device.
+    pub fn update_rows(&mut self, gpu: &Gpu) -> GpuResult<()> {
+        self.sh_bwd = ShBwd::new(gpu, true, &[])?;
+        if self.sh_bwd_weighing.is_some() {
+            self.weigh_rows(gpu)?;
+        }
         Ok(())
     }
 
@@ -386,7 +397,8 @@ impl RowStages {
     }
 
     /// Records the gradients of sh0 and of the bands in use, if `into` has room for them, and the colour's part of the gradients of means;
-    /// what densification reads of the rows, where weights need [`RowStages::weigh_rows`]; and the largest gradient of each row.
+    /// what densification reads of the rows; and the largest gradient of each row. Weights need [`RowStages::weigh_rows`], and gradients
+    /// without room for colours [`RowStages::update_rows`].
     pub fn sh_bwd(
         &self,
         gpu: &Gpu,
@@ -398,7 +410,8 @@ impl RowStages {
         into: &RowGradients,
     ) -> GpuResult<()> {
         let stages = self.sh_bwd_weighing.as_ref().filter(|_| into.weighs).unwrap_or(&self.sh_bwd);
-        let stages = if into.columns.sh0.is_some() { &stages.for_host } else { &stages.for_update };
+        let for_update = stages.for_update.as_ref().filter(|_| into.columns.sh0.is_none());
+        let stages = for_update.unwrap_or(&stages.for_host);
         for window in windows(gpu, rows.rows, rows.widest()) {
             let uniform = recorder.uniform(&View { row_count: window.rows, ..View::new(camera, 0.0) })?;
             let (w, v) = (rows.window(window), into.columns.window(window));
