@@ -2,7 +2,6 @@
 //! the drives of its paths.
 
 use crate::base::error::{InputError, InputResult};
-#[cfg(feature = "gpu")]
 use crate::base::machine::host_bytes_now;
 use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
@@ -54,13 +53,12 @@ pub struct OpenedDevice {
     pub renderer: Box<dyn Renderer>,
     /// A message about the choice.
     pub word: Option<String>,
-    /// Host memory that the driver took, bytes.
+    /// Host memory that drivers took, bytes.
     pub driver: u64,
 }
 
 impl OpenedDevice {
     fn cpu(word: Option<&str>) -> OpenedDevice {
-        // Without a search for a device, a difference of memory is the noise of the allocator.
         OpenedDevice { renderer: Box::new(CpuRenderer::new()), word: word.map(str::to_string), driver: 0 }
     }
 }
@@ -71,7 +69,12 @@ impl OpenedDevice {
 pub fn renderer(config: &TrainConfig) -> Result<OpenedDevice, TrainError> {
     match &config.device {
         Device::Cpu => Ok(OpenedDevice::cpu(None)),
-        Device::Gpu(choice) => of_gpu(config, choice),
+        // A search for a device leaves drivers in the process, whatever comes of it.
+        Device::Gpu(choice) => {
+            let before = host_bytes_now().unwrap_or(0);
+            let opened = of_gpu(config, choice)?;
+            Ok(OpenedDevice { driver: host_bytes_now().unwrap_or(0).saturating_sub(before), ..opened })
+        }
     }
 }
 
@@ -96,15 +99,10 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, T
         // What keeps the run from its device as well is said below.
         Err(error) => crate::tell!("warning: the GPU is used without a comparison with the CPU: {error}"),
     }
-    let before = host_bytes_now().unwrap_or(0);
     let budget = (config.device_mem.0 > 0).then_some(config.device_mem.0);
     let renderer = Gpu::open_with(choice, &GpuOptions { budget, ..GpuOptions::default() }).and_then(GpuRenderer::new);
     match renderer {
-        Ok(renderer) => Ok(OpenedDevice {
-            renderer: Box::new(renderer),
-            word: None,
-            driver: host_bytes_now().unwrap_or(0).saturating_sub(before),
-        }),
+        Ok(renderer) => Ok(OpenedDevice { renderer: Box::new(renderer), ..OpenedDevice::cpu(None) }),
         Err(GpuError::NoHardwareGpu { .. }) => Ok(OpenedDevice::cpu(Some(
             "there is no hardware GPU: the CPU renders (--list-devices shows what was found)",
         ))),
