@@ -169,7 +169,10 @@ impl BackTile<'_> {
         let Tile { rows, row_stop, block, sums, weights, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
         let (x0, y0) = ((tx * TILE) as f32 + 0.5, (ty * TILE) as f32 + 0.5);
-        let x: Lane = std::array::from_fn(|lane| x0 + lane as f32);
+        let mut x = [0.0; LANES];
+        for lane in 0..LANES {
+            x[lane] = x0 + lane as f32;
+        }
         let last_stop = row_stop.iter().fold(0, |m, s| m.max(*s));
         let all = lists.tile(tile);
         for (number, list) in all.chunks(BLOCK).enumerate().rev() {
@@ -214,7 +217,10 @@ impl BackTile<'_> {
                 }
                 if WEIGHS {
                     for (out, lanes) in weight_partials[at].iter().zip(&weights[i]) {
-                        let half: [f32; 8] = std::array::from_fn(|lane| lanes[lane] + lanes[lane + 8]);
+                        let mut half = [0.0; 8];
+                        for lane in 0..8 {
+                            half[lane] = lanes[lane] + lanes[lane + 8];
+                        }
                         out.store(sum_of_half(&half).to_bits(), Relaxed);
                     }
                 }
@@ -238,7 +244,10 @@ fn index_of(chunk_offsets: &[u64], local: &Local) -> usize {
 /// The last steps of the sum over lanes, pairwise.
 #[inline(always)]
 fn sum_of_half(half: &[f32; 8]) -> f32 {
-    let four: [f32; 4] = std::array::from_fn(|lane| half[lane] + half[lane + 4]);
+    let mut four = [0.0; 4];
+    for lane in 0..4 {
+        four[lane] = half[lane] + half[lane + 4];
+    }
     (four[0] + four[2]) + (four[1] + four[3])
 }
 
@@ -269,18 +278,22 @@ struct Sums {
 struct Halves([[f32; 8]; SUMS]);
 
 impl Sums {
+    /// The nine sums of one lane. No closure: one that is not inlined is compiled without vector instructions.
+    #[inline(always)]
+    fn of_lane(&self, x: &Lane, mean_x: f32, lane: usize) -> [f32; SUMS] {
+        let (dx, h, hy) = (x[lane] - mean_x, self.h[lane], self.hy[lane]);
+        let hx = h * dx;
+        let [red, green, blue] = &self.rgb;
+        [h, hx, hy, hx * dx, hy * dx, self.hyy[lane], red[lane], green[lane], blue[lane]]
+    }
+
     /// First step of the sum over lanes (pairwise halving, in the same order on every path). dx is constant in a lane,
     /// so its moments are formed here.
     #[inline(always)]
     fn halves(&self, x: &Lane, mean_x: f32) -> Halves {
         let mut out = Halves::default();
         for i in 0..8 {
-            let [left, right] = [i, i + 8].map(|lane| {
-                let (dx, h, hy) = (x[lane] - mean_x, self.h[lane], self.hy[lane]);
-                let hx = h * dx;
-                let [red, green, blue] = [self.rgb[0][lane], self.rgb[1][lane], self.rgb[2][lane]];
-                [h, hx, hy, hx * dx, hy * dx, self.hyy[lane], red, green, blue]
-            });
+            let (left, right) = (self.of_lane(x, mean_x, i), self.of_lane(x, mean_x, i + 8));
             for s in 0..SUMS {
                 out.0[s][i] = left[s] + right[s];
             }
