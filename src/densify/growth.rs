@@ -2,9 +2,9 @@
 //!
 //! A few training views are held out while the scene may grow. Each check draws them, and as many views that are trained on. What the
 //! trained views gained since the last check may be the scene or noise; what the held-out views gained can only be the scene. As long as
-//! they gain a good share of what the trained views gain, and are not far behind them, the scene doubles. Where they gain next to nothing of it, more Gaussians fit
-//! noise, and the last doubling is undone: the rows of least weight go ([`super::long_axis`]). `benches/RESULTS.md` has the measurements,
-//! `benches/TRIED.md` what failed.
+//! the held-out views gain a good share of what the trained views gain, and are not far behind them, the scene doubles. Where the held-out
+//! views gain next to nothing of it, more Gaussians fit noise, and the last doubling is undone: the rows of least weight go
+//! ([`super::long_axis`]). `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
 //!
 //! Photos bound the count, too: a Gaussian beyond one for each few dozen of their pixels costs time and brings next to nothing
 //! ([`GrowthRule::most`]).
@@ -34,8 +34,8 @@ pub enum Quality {
 struct DoublingDemand {
     /// Decibels that the held-out views gain from a check to the next one. Training alone brings some tenths.
     gain: f64,
-    /// Their share of the decibels that the trained views gain. Measured with every doubling: .5 to 1.1 in scenes where doublings pay,
-    /// less than .1 where they fit noise.
+    /// Their share of the decibels that the trained views gain. Measured: .4 to 1.1 where doublings pay, less than .1 where they fit
+    /// noise.
     share: f64,
     /// Fewest pixels of training photos for a Gaussian.
     pixels: u64,

@@ -1,7 +1,7 @@
 //! Bounds of the rows of a page, valid from now until the page is next touched.
 //!
 //! An untouched value moves by its momentum, monotonically, towards a limit ([`super::drift`]): value and limit bound
-//! it for all later steps. An opacity reset may rewrite a row in between, which changes only roundings. A densification
+//! it for all later steps. Where eps matters, the limit without eps stands for it: it lies farther away and needs no sum. An opacity reset may rewrite a row in between, which changes only roundings. A densification
 //! round may split it. That happens at most once, because the round clears the statistics that made the row grow. The
 //! children then lie around it. The children are included in the box, rather than in a larger sigma (1.63 times for random splits: 3.33 +
 //! 3.33 / 1.6 of 3.33), for two reasons: a row must not be missed if its parent is before the near plane, and the margin

@@ -92,9 +92,9 @@ fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainE
 #[cfg(feature = "gpu")]
 fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
-    match compared_with_cpu(choice) {
-        Ok(CheckOfDevice::Differs(difference)) => return refused(choice, &difference),
-        Ok(CheckOfDevice::Agrees | CheckOfDevice::Software) => {}
+    match difference_from_cpu(choice) {
+        Ok(Some(difference)) => return refused(choice, &difference),
+        Ok(None) => {}
         Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
         // What keeps the run from its device as well is said below.
         Err(error) => crate::tell!("warning: the GPU is used without a comparison with the CPU: {error}"),
@@ -130,29 +130,20 @@ fn refused(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, Trai
     Err(InputError::new("--device", problem, remedy).into())
 }
 
-/// Result of a comparison.
-#[cfg(feature = "gpu")]
-enum CheckOfDevice {
-    Agrees,
-    /// The first difference.
-    Differs(String),
-    /// A software driver is compared only if `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software
-    /// drivers. A device that cannot be opened counts as one: opening it for the run says why.
-    Software,
-}
-
-/// Compares the device with the CPU, in about a second. The device is opened for this alone and closed before the run opens
-/// it, so that nothing of the comparison stays on it.
+/// The first difference between the device and the CPU, found in about a second. The device is opened for this alone and closed
+/// before the run opens it, so that nothing of the comparison stays on it. A software driver is compared only if
+/// `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software drivers. A device that cannot be opened is not
+/// compared: opening it for the run says why.
 /// Errors: those of the device, which say nothing about its results.
 #[cfg(feature = "gpu")]
-fn compared_with_cpu(choice: &DeviceChoice) -> Result<CheckOfDevice, RenderError> {
-    let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(CheckOfDevice::Software) };
+fn difference_from_cpu(choice: &DeviceChoice) -> Result<Option<String>, RenderError> {
+    let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(None) };
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
-        return Ok(CheckOfDevice::Software);
+        return Ok(None);
     }
     Ok(match device_check::check(&mut GpuRenderer::new(gpu)?)? {
-        DeviceVerdict::Agrees(_) => CheckOfDevice::Agrees,
-        DeviceVerdict::Differs(difference) => CheckOfDevice::Differs(difference),
+        DeviceVerdict::Agrees(_) => None,
+        DeviceVerdict::Differs(difference) => Some(difference),
     })
 }
 

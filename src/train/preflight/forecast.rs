@@ -4,10 +4,10 @@
 //! The dry run, `gsscale-plan` and the run itself make one forecast, here, from the same measurements: views rendered with
 //! the first Gaussians, and a simulation of the pages of some epochs.
 //!
-//! Not here: which budgets are refused ([`super::plan`]), the words (`plan_text`), a drive that is full during a run
+//! Not here: how budgets become frames ([`super::plan`]), the words (`plan_text`), a drive that is full during a run
 //! ([`crate::train::commits::checkpoint`]).
 //!
-//! Invariants: 1. the run does not depend on its forecast; 2. bytes of memory depend on no clock, and
+//! Invariants: 1. the run does not depend on its [`Forecast`], though planning sets its frames, batches and view order; 2. bytes of memory depend on no clock, and
 //! those of the drive only through the number of commits in the time of the run.
 
 use super::device_memory;
