@@ -250,11 +250,21 @@ mod tests {
                     // Some second moments are so small that eps matters, some rows have both moments zero.
                     let size = libm::pow(10.0, -draws.range(0.0, if row % 16 == 3 { 18.0 } else { 9.0 }));
                     (m[c], v[c]) = ((draws.normal() * size) as f32, (size * size) as f32);
+                    if row % 16 == 5 {
+                        // Flushed: the quotient has no bound, and the limit needs the direct sum.
+                        (m[c], v[c]) = (1e-19, 0.0);
+                    }
                 }
             }
+            let (m, v) = (&mut state.exp_avg.opacities, &mut state.exp_avg_sq.opacities);
+            (m[row], v[row]) = if row % 16 == 5 { (1e-19, 0.0) } else { (draws.normal() as f32, 1.0) };
+            state.columns.opacities[row] = draws.normal() as f32;
             state.stamp[row] = draws.below(600) as u32;
             (state.grad2d[row], state.count[row]) = (draws.uniform() as f32, draws.below(3) as u32);
         }
+        // The box ends at a row whose limit needs the direct sum, which moves it by more than the slack.
+        state.columns.means[15..18].fill(50.0);
+        state.exp_avg.means[15..18].fill(-3e-19);
         let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
         let of = |simd: SimdPath, rows: &Rows<'_>| {
             page_bounds(&DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd), rows, &splits)
@@ -262,8 +272,14 @@ mod tests {
         let adam = DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), SimdPath::Baseline);
         let mut want = PageBounds::EMPTY;
         (0..rows).for_each(|row| add_row(&mut want, &adam, &state.view(), &splits, row));
+        // The lowest opacity is that of a row whose limit needs the direct sum.
+        state.columns.opacities[5] = -9.0;
+        let lowest = |simd: SimdPath| {
+            lowest_opacity(&DeferredAdam::new(Rates::new(100.0, 500), AdamConfig::default(), simd), &state.view())
+        };
+        assert!((-9.1..-9.0).contains(&lowest(SimdPath::Baseline)), "{}", lowest(SimdPath::Baseline));
         for simd in SimdPath::ALL.into_iter().filter(|p| p.is_supported()) {
-            assert_eq!(of(simd, &state.view()), want, "{}", simd.name());
+            assert_eq!((of(simd, &state.view()), lowest(simd)), (want, lowest(SimdPath::Baseline)), "{}", simd.name());
         }
         assert!(of(SimdPath::best(), &SceneState::default().view()).is_empty());
     }
