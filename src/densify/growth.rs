@@ -210,11 +210,11 @@ impl GrowthRule {
         let has_room = more as f64 >= LEAST_STAGE * before.allowed() as f64;
         let is_last = self.is_past(LAST_PART, step);
         let doubled = before.before_doubling();
-        let is_near = trained_psnr - psnr < GAP_MOST;
+        let is_close = trained_psnr - psnr < GAP_MOST;
         let has_grown = gaussians as f64 >= GROWN * before.allowed() as f64;
         let decision = match before.checks.last() {
             None if is_last || !has_room => GrowthDecision::Ends,
-            None if is_near => GrowthDecision::Doubles,
+            None if is_close => GrowthDecision::Doubles,
             None => GrowthDecision::Waits,
             Some(last) => {
                 let (gain, trained_gain) = (psnr - last.psnr, trained_psnr - last.trained_psnr);
@@ -224,7 +224,7 @@ impl GrowthRule {
                     GrowthDecision::Undoes
                 } else if is_last || !has_room || lags_by(share_least) {
                     GrowthDecision::Ends
-                } else if is_near && has_grown && gain >= gain_least {
+                } else if is_close && has_grown && gain >= gain_least {
                     GrowthDecision::Doubles
                 } else {
                     GrowthDecision::Waits

@@ -41,7 +41,7 @@ impl Lists<'_> {
 
     /// The same, empty beyond the last tile.
     #[inline(always)]
-    pub fn tile_or_none(&self, tile: usize) -> &[AtomicU64] {
+    pub fn tile_or_empty(&self, tile: usize) -> &[AtomicU64] {
         if tile + 1 < self.tile_offsets.len() { self.tile(tile) } else { &[] }
     }
 }

@@ -183,7 +183,7 @@ impl BackTile<'_> {
             block.fill::<FMA>(list, lists.splats, y0, cap);
             // The entries of the block after next are loaded, and with the entries of the next block its splats. After the
             // last block comes the last of the next tile: the same thread most likely goes on there.
-            let of_next_tile = last_block(lists.tile_or_none(tile + 1));
+            let of_next_tile = last_block(lists.tile_or_empty(tile + 1));
             prefetch_list(match number {
                 0 => &[],
                 1 => of_next_tile,

@@ -165,7 +165,7 @@ impl Kernel for BlendTile<'_> {
             let coming = match (number + 1) * BLOCK {
                 at if at < all.len() => &all[at..],
                 // The same thread most likely goes on with the next tile.
-                _ => lists.tile_or_none(tile + 1),
+                _ => lists.tile_or_empty(tile + 1),
             };
             prefetch_splats(&coming[..coming.len().min(BLOCK)], lists.splats);
             let mut alive = false;

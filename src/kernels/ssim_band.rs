@@ -65,7 +65,7 @@ impl PixelRow {
 
     /// Sixteen values from column `at` on.
     #[inline(always)]
-    fn from(&self, at: usize) -> Lane {
+    fn lane_at(&self, at: usize) -> Lane {
         let mut lane = [0.0; LANES];
         lane.copy_from_slice(&self.0.as_flattened()[at..at + LANES]);
         lane
@@ -311,7 +311,7 @@ impl BandKernel<'_> {
                 let at = v * LANES;
                 let [mx, my] = [across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at)];
                 let [squares, products] = [across::<FMA>(&columns[2], at), across::<FMA>(&columns[3], at)];
-                let weight = multiply(weights.from(at + RADIUS), in_domain.0[v]);
+                let weight = multiply(weights.lane_at(at + RADIUS), in_domain.0[v]);
                 let [mut ssim, mut v_mean, mut v_square, mut v_product] = [weight; 4];
                 for l in 0..LANES {
                     let point = ssim_point::<FMA>(mx[l], my[l], squares[l], products[l]);
@@ -370,8 +370,8 @@ impl BandKernel<'_> {
                 let at = v * LANES;
                 let (v_mean, v_square) = (across::<FMA>(&columns[0], at), across::<FMA>(&columns[1], at));
                 let v_product = across::<FMA>(&columns[2], at);
-                let (x, y) = (centre.maps[0].from(at + HALO), centre.maps[1].from(at + HALO));
-                let weight = centre.weight.from(at + HALO);
+                let (x, y) = (centre.maps[0].lane_at(at + HALO), centre.maps[1].lane_at(at + HALO));
+                let weight = centre.weight.lane_at(at + HALO);
                 let [mut v_pixel, mut difference] = [[0.0; LANES]; 2];
                 for l in 0..LANES {
                     difference[l] = x[l] - y[l];

@@ -10,7 +10,7 @@
 use super::adam::AdamConfig;
 use super::decay::Decay;
 use super::drift::{
-    Drift, DriftTables, EpsFloor, RECENT, drifted, flush, is_without_quotient, needs_direct_sum, of_column,
+    Drift, DriftTables, EpsFloor, RECENT, drifted, flush, has_infinite_ratio, needs_direct_sum, of_column,
 };
 use super::moments::Moments;
 use super::rates::Rates;
@@ -131,8 +131,8 @@ impl DeferredAdam {
     /// A value that bounds, together with `value`, all later values without further gradients: the limit to which the
     /// value moves monotonically, or, where eps matters, the limit without eps, which lies farther away.
     pub(crate) fn limit(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32) -> f32 {
-        if is_without_quotient(m, v) {
-            return self.moved_directly(column, value, m, v, stamp, u32::MAX);
+        if has_infinite_ratio(m, v) {
+            return self.value_by_direct_sum(column, value, m, v, stamp, u32::MAX);
         }
         let sums = of_column(self.tables.limit(stamp), column);
         drifted(value, m, v, sums, self.base_rate(column), self.eps.of_limit(v))
@@ -149,13 +149,13 @@ impl DeferredAdam {
             return value;
         }
         if needs_direct_sum(m, v, self.eps.floor) {
-            return self.moved_directly(column, value, m, v, stamp, now);
+            return self.value_by_direct_sum(column, value, m, v, stamp, now);
         }
         drifted(value, m, v, of_column(drift, column), self.base_rate(column), self.eps.eps)
     }
 
     /// A value after its movement by the direct sum.
-    fn moved_directly(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
+    fn value_by_direct_sum(&self, column: Column, value: f32, m: f32, v: f32, stamp: u32, now: u32) -> f32 {
         let [sum] = self.tables.direct_sums(&[m], &[v], stamp, now, usize::from(column == Column::Means));
         flush(value - sum * self.base_rate(column))
     }

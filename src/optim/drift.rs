@@ -266,7 +266,7 @@ impl EpsFloor {
         EpsFloor { eps, floor }
     }
 
-    /// The eps of a limit: none where it matters, for a bound.
+    /// Eps for a limit that bounds later values: 0 where eps matters, since the limit without eps lies farther away.
     #[inline(always)]
     pub(crate) fn of_limit(self, v: f32) -> f32 {
         if v <= self.floor { 0.0 } else { self.eps }
@@ -297,9 +297,9 @@ pub(crate) fn needs_direct_sum(m: f32, v: f32, floor: f32) -> bool {
     (m != 0.0) & (v <= floor)
 }
 
-/// Whether m / sqrt(v) is infinite.
+/// Whether m / sqrt(v), the ratio of the series, is infinite.
 #[inline(always)]
-pub(crate) fn is_without_quotient(m: f32, v: f32) -> bool {
+pub(crate) fn has_infinite_ratio(m: f32, v: f32) -> bool {
     (m != 0.0) & (v == 0.0)
 }
 

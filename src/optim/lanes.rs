@@ -6,7 +6,7 @@
 //! Invariant: the bits are those of `RowsNow` on every instruction path.
 
 use super::deferred::{AdamNow, DeferredAdam};
-use super::drift::{Drift, drifted, is_without_quotient, needs_direct_sum};
+use super::drift::{Drift, drifted, has_infinite_ratio, needs_direct_sum};
 use crate::base::simd::Kernel;
 pub(crate) use crate::base::simd::LANES;
 use crate::scene::columns::Column;
@@ -46,7 +46,7 @@ pub(crate) fn tables_of<'a>(rows: &Rows<'a>, column: Column) -> [&'a [f32]; 3] {
 }
 
 /// The `W` elements of rows `first..` in a column after their drift, and the rows that need the direct sum instead, whose
-/// elements in need stay as stored. As a limit (`IS_LIMIT`, [`DeferredAdam::limit`]) only rows without a quotient need it.
+/// elements in need stay as stored. As a limit (`IS_LIMIT`, [`DeferredAdam::limit`]) only rows with an infinite ratio need it.
 #[inline(always)]
 pub(crate) fn drifted_lanes<const W: usize, const IS_LIMIT: bool>(
     adam: &DeferredAdam,
@@ -69,7 +69,7 @@ pub(crate) fn drifted_lanes<const W: usize, const IS_LIMIT: bool>(
         for l in 0..LANES {
             let (value, m, v) = (value[c][l], m[c][l], v[c][l]);
             let eps = if IS_LIMIT { adam.eps.of_limit(v) } else { adam.eps.eps };
-            let is_direct = if IS_LIMIT { is_without_quotient(m, v) } else { needs_direct_sum(m, v, adam.eps.floor) };
+            let is_direct = if IS_LIMIT { has_infinite_ratio(m, v) } else { needs_direct_sum(m, v, adam.eps.floor) };
             let moved = drifted(value, m, v, [sums[0][l], sums[1][l], sums[2][l]], rate, eps);
             out[c][l] = if is_direct { value } else { moved };
             direct[l] |= is_direct;
@@ -78,7 +78,7 @@ pub(crate) fn drifted_lanes<const W: usize, const IS_LIMIT: bool>(
     (out, direct)
 }
 
-/// The marked rows of [`LANES`] rows from `first` on.
+/// The rows, counted from `first` on, whose lanes `a` or `b` mark; ascending.
 #[inline(always)]
 pub(crate) fn marked_rows(first: usize, a: [bool; LANES], b: [bool; LANES]) -> impl Iterator<Item = usize> {
     let mut marks = 0u32;

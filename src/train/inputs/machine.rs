@@ -93,7 +93,7 @@ fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainE
 fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
     match difference_from_cpu(choice) {
-        Ok(Some(difference)) => return refused(choice, &difference),
+        Ok(Some(difference)) => return without_device(choice, &difference),
         Ok(None) => {}
         Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
         // What keeps the run from its device as well is said below.
@@ -120,7 +120,7 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, T
 /// In place of a device that differs from the CPU: the CPU for `auto`, with a warning.
 /// Errors: the user asked for the device.
 #[cfg(feature = "gpu")]
-fn refused(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, TrainError> {
+fn without_device(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, TrainError> {
     let problem = format!("the GPU did not pass the comparison with the CPU: {difference}");
     if *choice == DeviceChoice::Auto {
         crate::tell!("warning: the CPU renders: {problem}");
@@ -171,7 +171,7 @@ mod tests {
 
     #[test]
     fn a_gpu_that_differs_from_the_cpu_is_refused_or_with_auto_replaced() {
-        let of = |choice| refused(&choice, "stage sh_fwd");
+        let of = |choice| without_device(&choice, "stage sh_fwd");
         assert_eq!(of(DeviceChoice::Auto).unwrap().renderer.name(), CpuRenderer::new().name());
         for asked in [DeviceChoice::Gpu, DeviceChoice::Named("card".into())] {
             let refusal = of(asked).err().unwrap().to_string();
