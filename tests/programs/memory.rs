@@ -68,7 +68,7 @@ fn succeeds_within_the_least(work: &Workdir, program: &str, flags: &str) -> bool
     true
 }
 
-/// Every option that looks at whole photos, with photos of 8.3 million pixels: the run stays within exactly the memory that it says is
+/// Every option that looks at whole photos, with photos of 3.7 million pixels: the run stays within exactly the memory that it says is
 /// the least, and the announced peak is right within a tenth.
 #[test]
 #[cfg(target_os = "linux")]
@@ -78,7 +78,7 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
     // A photo may be larger than its camera states.
     for path in work.photos() {
         let small = image::open(&path).unwrap().into_rgb8();
-        image::imageops::resize(&small, 3840, 2160, image::imageops::FilterType::Nearest).save(&path).unwrap();
+        image::imageops::resize(&small, 2560, 1440, image::imageops::FilterType::Nearest).save(&path).unwrap();
     }
     let fixed = "--threads 2 --steps 5 --device cpu --image-cache 1MiB --appearance full";
     let decides = format!("{fixed} --strategy long-axis --refine-start 1 --refine-every 1 --refine-stop 5");
