@@ -196,29 +196,32 @@ config_keys! {
         /// Initial size, times the distance to the three nearest neighbours
         init_scale: f64 = 1.0 => Numbers;
         /// For few or random first points: --growth-score mixed, --recycle 0.05, --init-scale 2 and 6.7 times the --means-lr of
-        /// --schedule, where they are not given. Photos that overlap little lose by it: compare with a run without. A resumed
-        /// run keeps its values
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] poor_points: bool = false => Free;
+        /// --schedule, where they are not given. Photos that overlap little lose by it. auto is on where the first points have
+        /// not the colours that photos show there, and photos overlap much. A resumed run keeps its values
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers hidden;
         /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo) or full (also eight
-        /// numbers for its colours, and the vignetting of each camera). For photos whose exposure or colours change. Exposures
+        /// numbers for its colours, and the vignetting of each camera). auto is exposure where the exposures of photos differ by
+        /// .2 stops or more, measured at the first points, full where their colours do, else off. Exposures
         /// start from the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
-        appearance: AppearanceMode = AppearanceMode::Off => Numbers;
+        appearance: Chosen<AppearanceMode> = Chosen(None) => Numbers;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
-        /// The log and the report name such views with and without this key
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_views: bool = false => Numbers;
+        /// auto is on where the first points contradict a photo before training. The log and the report name such views with and
+        /// without this key
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_views: Chosen<bool> = Chosen(None) => Numbers;
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
         /// side of a masked block is a 64th of the photo's longer side. Pixels beside a masked block that have its colour are
         /// masked too. At most a quarter of the blocks of a photo is masked, from a tenth of the run on (step 500 at the
-        /// latest). Masks of your own work better: see --masks
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] robust_pixels: bool = false => Numbers;
+        /// latest). Masks of your own work better: see --masks. auto is off
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_pixels: Chosen<bool> = Chosen(None) => Numbers;
         /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
-        /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. poses.json has the
-        /// refined ones. Not with --optimizer-on device
-        [num_args = 0..=1, default_missing_value = "true", require_equals = true] refine_poses: bool = false => Numbers;
+        /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. auto is on where photos
+        /// agree better with the first points when they are moved by some pixels. poses.json has the refined ones. Not with
+        /// --optimizer-on device
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] refine_poses: Chosen<bool> = Chosen(None) => Numbers;
         /// Background colour, RGB in 0..1
         [value_name = "R,G,B"] background: RgbColor = RgbColor([0.0; 3]) => Numbers;
     }
@@ -234,7 +237,7 @@ config_keys! {
         /// With --strategy long-axis, the share of the Gaussians seen that a round at the cap removes; 0 = none
         recycle: f64 = 0.02 => Numbers hidden;
         /// draft (few Gaussians), normal or archive (many); with --strategy long-axis and no --max-gaussians. The run holds out
-        /// some training photos during two thirds of it (at most 2,000 steps). The scene grows as long as more Gaussians bring
+        /// some training photos during three quarters of it (at most 2,200 steps). The scene grows as long as more Gaussians bring
         /// these photos enough decibels
         quality: Quality = Quality::Normal => Numbers common;
         /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)
@@ -440,7 +443,7 @@ impl TrainConfig {
         let needs = [
             (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
             (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
-            (!self.refine_poses, "it leaves the gradients of poses on the device", "leave out --refine-poses"),
+            (!self.refine_poses.is_on(), "it leaves the gradients of poses on the device", "leave out --refine-poses"),
             (self.strategy != StrategyName::Mcmc, "it adds no noise to means", "leave out --strategy mcmc"),
             (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
         ];

@@ -27,9 +27,11 @@
 
 use super::file::{TrainConfig, TrainOverrides};
 use crate::base::error::InputResult;
-use crate::config::values::Schedule;
+use crate::config::values::{Chosen, Schedule};
 use crate::densify::long_axis::GrowthScore;
 use crate::densify::strategy::StrategyName;
+use crate::optim::method::OptimizerPlace;
+use crate::photos::diagnosis::Remedies;
 use std::collections::BTreeSet;
 use std::path::Path;
 
@@ -111,10 +113,13 @@ fn set_open_keys(config: &mut TrainConfig, given: &BTreeSet<String>) {
     let mut of_length = with_lengths(config, config.steps);
     set_keys(&STEP_KEYS, config, &mut of_length, |(field, _), _| !given.contains(*field));
     set_keys(&RATE_KEYS, config, &mut of_length, |(field, _), _| !given.contains(*field));
-    if !config.poor_points {
-        return;
+    if config.poor_points.is_on() {
+        set_poor_keys(config, |field| !given.contains(field));
     }
-    let is_open = |field: &str| !given.contains(field);
+}
+
+/// Sets those of the keys of `poor-points` that are open, by the names of their fields.
+fn set_poor_keys(config: &mut TrainConfig, is_open: impl Fn(&str) -> bool) {
     if is_open("means_lr") {
         config.means_lr *= POOR_MEANS_LR;
     }
@@ -194,6 +199,30 @@ pub fn adapt_schedule(config: &mut TrainConfig, photos: usize) -> Option<u32> {
     Some(config.schedule_steps)
 }
 
+/// Switches on what the photos ask for and the config leaves open, and switches the rest of what it leaves open off.
+pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
+    let is_on_host = config.optimizer_on != Chosen(Some(OptimizerPlace::Device));
+    let grows_by_score = config.strategy == StrategyName::LongAxis && is_on_host;
+    if config.poor_points.0.is_none() && asked.poor_points && grows_by_score {
+        // As if no key was given.
+        let mut usual = config.clone();
+        set_open_keys(&mut usual, &BTreeSet::new());
+        let given = config.clone();
+        set_poor_keys(config, |field| match field {
+            "means_lr" => given.means_lr == usual.means_lr,
+            "init_scale" => given.init_scale == usual.init_scale,
+            "recycle" => given.recycle == usual.recycle,
+            _ => given.growth_score == usual.growth_score,
+        });
+        config.poor_points = Chosen::ON;
+    }
+    config.poor_points.0.get_or_insert(false);
+    config.appearance.0.get_or_insert(asked.appearance);
+    config.robust_views.0.get_or_insert(asked.robust_views);
+    config.robust_pixels.0.get_or_insert(false);
+    config.refine_poses.0.get_or_insert(asked.refine_poses && is_on_host);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -246,7 +275,7 @@ mod tests {
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
         assert_eq!(config.others_lr_final, 0.01);
         // Few photos and poor points: both factors of the rate of positions hold.
-        let poor = TrainOverrides { poor_points: Some(true), ..TrainOverrides::default() };
+        let poor = TrainOverrides { poor_points: Some(Chosen::ON), ..TrainOverrides::default() };
         let mut of_both = of_flags(&poor);
         assert_eq!(adapt_schedule(&mut of_both, 28), Some(4200));
         assert!((of_both.means_lr / (short.means_lr * POOR_MEANS_LR) - 1.0).abs() < 1e-12, "{}", of_both.means_lr);
@@ -263,7 +292,7 @@ mod tests {
 
     #[test]
     fn poor_points_set_what_is_not_given() {
-        let poor = TrainOverrides { steps: Some(3000), poor_points: Some(true), ..TrainOverrides::default() };
+        let poor = TrainOverrides { steps: Some(3000), poor_points: Some(Chosen::ON), ..TrainOverrides::default() };
         let config = of_flags(&poor);
         assert!((config.means_lr - 3.2e-3).abs() < 1e-9, "{}", config.means_lr);
         assert_eq!((config.init_scale, config.recycle, config.growth_score), (2.0, 0.05, GrowthScore::Mixed));

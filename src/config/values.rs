@@ -181,7 +181,8 @@ pub fn parse_choice<T: Choice>(word: &str) -> Result<T, String> {
 
 fn unknown<T: Choice>(flag: &str, word: &str) -> String {
     let (last, first) = T::WORDS.split_last().unwrap_or((&"", &[]));
-    format!("unknown --{flag} '{word}': use {} or {last}", first.join(", "))
+    let key = if flag.is_empty() { String::from("word") } else { format!("--{flag}") };
+    format!("unknown {key} '{word}': use {} or {last}", first.join(", "))
 }
 
 /// An optional choice. `None` is written `auto`, or `off` for a feature.
@@ -205,9 +206,21 @@ pub enum Schedule {
     Classic,
 }
 
+impl Chosen<bool> {
+    pub const ON: Chosen<bool> = Chosen(Some(true));
+
+    pub fn is_on(self) -> bool {
+        self == Chosen::ON
+    }
+}
+
+/// The keys of remedies that a run may switch on by itself.
+const REMEDIES: [&str; 4] = ["poor-points", "robust-views", "robust-pixels", "refine-poses"];
+
 /// Every key whose value is a word, with the words that a user may write.
 pub fn choices() -> impl Iterator<Item = (&'static str, &'static [&'static str])> {
-    CHOICES.iter().chain(OPEN_CHOICES).chain(&[(Exports::KEY, Exports::WORDS)]).copied()
+    let remedies = REMEDIES.map(|key| (key, <Chosen<bool> as Choice>::WORDS));
+    CHOICES.iter().chain(OPEN_CHOICES).chain(&[(Exports::KEY, Exports::WORDS)]).copied().chain(remedies)
 }
 
 /// Implements [`Choice`], reading and writing for enums whose values have one word each, and lists them. Values after
@@ -276,7 +289,6 @@ choices! {
     "schedule": Schedule { RunLength = "run-length", Classic = "classic" }
     "quality": Quality { Draft = "draft", Normal = "normal", Archive = "archive" }
     "growth-score": GrowthScore { Gradient = "gradient", Error = "error", Mixed = "mixed" }
-    "appearance": AppearanceMode { Off = "off", Exposure = "exposure", Full = "full" }
     "log": LogFormat { Json = "json", Tensorboard = "tensorboard" }
     "ssim-variant": SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" }
     "export-frame": ExportFrame { Dataset = "dataset", Local = "local" }
@@ -348,24 +360,49 @@ open_choices! {
     "spill-codec": Codec, "auto" in CODECS, parsed, |codec: Codec| codec.to_string();
     "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
     "optimizer-on": OptimizerPlace, "auto" in ["auto", "device", "host"], OptimizerPlace::from_name, |place: OptimizerPlace| place.name().to_string();
+    "appearance": AppearanceMode, "auto" in ["auto", "off", "exposure", "full"], AppearanceMode::from_name, |mode: AppearanceMode| mode.name().to_string();
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
 }
+
+/// A remedy that a run may switch on by itself. Several keys have values of this type, so a message about a file names none: it shows the
+/// line.
+impl Choice for Chosen<bool> {
+    const KEY: &'static str = "";
+    const WORDS: &'static [&'static str] = &["auto", "on", "off"];
+
+    fn from_word(word: &str) -> Option<Self> {
+        match word {
+            "auto" => Some(Chosen(None)),
+            "on" | "true" => Some(Chosen(Some(true))),
+            "off" | "false" => Some(Chosen(Some(false))),
+            _ => None,
+        }
+    }
+
+    fn word(&self) -> Cow<'static, str> {
+        Cow::Borrowed(self.0.map_or("auto", |is_on| if is_on { "on" } else { "off" }))
+    }
+}
+
+reading_and_writing!(Chosen<bool>);
 
 fn parsed<T: std::str::FromStr>(word: &str) -> Option<T> {
     word.parse().ok()
 }
 
 fn deserialize_choice<'de, T: Choice, D: Deserializer<'de>>(d: D) -> Result<T, D::Error> {
-    /// A word, or a list of words as TOML writes it.
+    /// A word, a list of words as TOML writes it, or a switch.
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "expected a word")]
     enum Words {
         One(String),
         List(Vec<String>),
+        Switch(bool),
     }
     let word = match Words::deserialize(d)? {
         Words::One(word) => word,
         Words::List(words) => words.join(","),
+        Words::Switch(is_on) => is_on.to_string(),
     };
     parse_choice(&word).map_err(serde::de::Error::custom)
 }
@@ -467,6 +504,12 @@ mod tests {
         check_choices();
         check_open_choices();
         check::<Exports>();
+        for key in REMEDIES {
+            for (value, word) in [("true", "on"), ("false", "off"), ("\"on\"", "on"), ("\"auto\"", "auto")] {
+                let config = TrainConfig::parse(&format!("{key} = {value}")).unwrap();
+                assert!(toml::to_string(&config).unwrap().contains(&format!("{key} = \"{word}\"")), "{key} {value}");
+            }
+        }
         for list in ["\"sog, spz\"", "[\"spz\", \"sog\", \"ply\"]"] {
             let config = TrainConfig::parse(&format!("export = {list}")).unwrap();
             assert_eq!((config.export.word().as_ref(), config.export), ("spz,sog", Exports { spz: true, sog: true }));

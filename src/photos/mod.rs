@@ -14,6 +14,7 @@
 //! before all looks at it; 4. a kind that adds to the loss stands behind the kinds that correct, and behind masks, so that it
 //! compares what the loss compares, and its gradient is taken back through the corrections.
 
+pub mod diagnosis;
 pub mod exposure;
 pub mod outlier;
 pub mod parameter;

@@ -27,6 +27,8 @@ pub const VIEWS_FILE: &str = "renders/test/views.json";
 /// Output of `gsscale-eval --json`, in place of the figures of the summary.
 pub const EVALUATED_FILE: &str = "evaluated.json";
 /// Config of that evaluation.
+/// What the photos said before training.
+pub const DIAGNOSIS_FILE: &str = "diagnosis.json";
 pub const EVALUATED_AS_FILE: &str = "evaluated-as.toml";
 
 /// What stands under a name in the output folder.
@@ -57,8 +59,9 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 15] = [
+pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
+    (RunFile::File(DIAGNOSIS_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
     (RunFile::Events(EVENTS_FOLDER), Tells::Steps),
     (RunFile::File(SUMMARY_FILE), Tells::Result),

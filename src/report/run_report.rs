@@ -7,11 +7,14 @@ use super::chart::{Chart, Mark, short, smoothed};
 use super::html::{Cell, Page, slider};
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
 use super::picture::view_pictures;
-use super::run_files::{CONFIG_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE};
+use super::run_files::{
+    CONFIG_FILE, DIAGNOSIS_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
+};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
 use crate::photos::KINDS;
+use crate::photos::diagnosis;
 use crate::photos::parameter::Finding;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -49,6 +52,8 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         page.heading("Memory and disk");
         page.charts(&tiers);
     }
+    let diagnosis = read_json(&folder.join(DIAGNOSIS_FILE)).unwrap_or(Value::Null);
+    diagnosis::finding(&diagnosis).into_iter().for_each(|finding| add_finding(&mut page, finding));
     for kind in KINDS {
         let file = kind.file.and_then(|name| read_json(&folder.join(name))).unwrap_or(Value::Null);
         (kind.finding)(&file, &summary).into_iter().for_each(|finding| add_finding(&mut page, finding));

@@ -60,7 +60,9 @@ fn mean(values: &[f64]) -> f64 {
 #[test]
 fn exposures_that_change_are_found_and_cost_little() {
     let (work, changed) = flickering_city();
-    for (out, more) in [("plain", ""), ("exposure", "--appearance exposure"), ("full", "--appearance full")] {
+    for (out, more) in
+        [("plain", "--appearance off"), ("exposure", "--appearance exposure"), ("full", "--appearance full")]
+    {
         run(&work, out, &format!("--steps 300 {more}"));
     }
     let [plain, remedied, full] = ["plain", "exposure", "full"].map(|out| work.psnr(out));
@@ -145,17 +147,16 @@ fn exposures_start_from_exif_data() {
 #[test]
 fn exif_data_of_too_few_photos_and_of_runs_without_appearance_change_no_byte() {
     let (work, changed) = flickering_city();
-    let steps = "--steps 21";
-    let on = format!("{steps} --appearance exposure");
+    let [on, off] = ["exposure", "off"].map(|mode| format!("--steps 21 --appearance {mode}"));
     run(&work, "without", &on);
-    run(&work, "off", steps);
+    run(&work, "off", &off);
     add_settings(&work, &changed, |i| i < 10);
     let said = said(&work, "few", &on);
     assert!(said.contains("warning: only 10 of 21 training photos state their exposure in EXIF data"), "{said}");
     let results = |out: &str| [work.ply(out), work.bytes(&format!("{out}/appearance.json"))];
     assert!(results("few") == results("without"));
     add_settings(&work, &changed, |i| i >= 10);
-    run(&work, "off_with", steps);
+    run(&work, "off_with", &off);
     assert!(work.ply("off") == work.ply("off_with"));
 }
 

@@ -11,6 +11,7 @@ mod bombs;
 mod ckpt;
 mod cli;
 mod clients;
+mod diagnosis;
 mod doctor;
 #[cfg(unix)]
 mod drive_faults;

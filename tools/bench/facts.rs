@@ -6,7 +6,7 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::visibility::ViewPages;
 use gsscale::train::error::TrainError;
-use gsscale::train::preflight::forecast::{Reach, reach};
+use gsscale::train::preflight::forecast::{Reach, TrainingPhotos, reach};
 use gsscale::train::start::first_scene::prepare;
 use gsscale::train::step::pages::PagedScene;
 use std::path::Path;
@@ -41,7 +41,9 @@ impl Facts {
         let views = ViewPages::new(scene.pager.index(), &cameras);
         let pixels = cameras.iter().map(|camera| camera.pixels() as u64).sum();
         let gaussians = columns.rows() as u64;
-        let growth = match reach(config, gaussians, pixels, 0, &[]) {
+        let per_page = views.total() as f64 / scene.pager.index().len().max(1) as f64;
+        let photos = TrainingPhotos { pixels, per_page };
+        let growth = match reach(config, gaussians, photos, 0, &[]) {
             (_, Reach::Constant) => 1.0,
             (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,
         };

@@ -31,13 +31,14 @@ use fit::FittedPair;
 use model::CHANNEL_VALUES;
 use picture::Look;
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use state::{AppearanceState, Found, camera_groups, find, first_exposures};
 use std::path::Path;
 
 /// Which corrections are trained.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum AppearanceMode {
     #[default]
     Off,
@@ -50,6 +51,12 @@ impl AppearanceMode {
     /// Whether anything is corrected.
     pub fn is_on(self) -> bool {
         self != AppearanceMode::Off
+    }
+
+    pub fn from_name(name: &str) -> Option<AppearanceMode> {
+        [AppearanceMode::Off, AppearanceMode::Exposure, AppearanceMode::Full]
+            .into_iter()
+            .find(|mode| mode.name() == name)
     }
 
     /// The name in files and on the command line.

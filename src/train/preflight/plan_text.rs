@@ -6,9 +6,11 @@ use super::plan::LargestView;
 use crate::base::units::{format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
-use crate::config::values::Residence;
+use crate::config::values::{Choice, Chosen, Residence};
 use crate::dataset::loader::Dataset;
 use crate::page::folder::file_system::free_bytes;
+use crate::photos::diagnosis::Diagnosis;
+use crate::photos::exposure::AppearanceMode;
 use crate::train::commits::checkpoint::reserve_bytes;
 use crate::train::inputs::machine::drive_of;
 use crate::train::start::first_scene::Start;
@@ -36,12 +38,33 @@ fn growth(forecast: &Forecast) -> String {
         Reach::Guess => {
             format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
         }
+        Reach::Decided if forecast.gaussians[1] == forecast.gaussians[0] => String::from(
+            ", probably to stay: few photos see each place (it grows as far as held-out training photos say that it pays)",
+        ),
         Reach::Decided => {
             format!(
                 ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"
             )
         }
     }
+}
+
+/// What the photos say, and what the run switches on because of it: where the config left it open `before`.
+pub fn describe_photos(diagnosis: &Diagnosis, before: &TrainConfig, now: &TrainConfig) -> String {
+    let mut text = format!("photos  {}", diagnosis.text().join("\n        "));
+    let appearance = format!("--appearance {}", now.appearance.word());
+    let switched_on = [
+        (before.appearance.0.is_none() && now.appearance != Chosen(Some(AppearanceMode::Off)), appearance.as_str()),
+        (before.robust_views.0.is_none() && now.robust_views.is_on(), "--robust-views"),
+        (before.robust_pixels.0.is_none() && now.robust_pixels.is_on(), "--robust-pixels"),
+        (before.refine_poses.0.is_none() && now.refine_poses.is_on(), "--refine-poses"),
+        (before.poor_points.0.is_none() && now.poor_points.is_on(), "--poor-points"),
+    ];
+    let flags: Vec<&str> = switched_on.into_iter().filter_map(|(is_on, flag)| is_on.then_some(flag)).collect();
+    if !flags.is_empty() {
+        text.push_str(&format!("\n        so this run has {}; each can be switched off", flags.join(" ")));
+    }
+    folded(&text)
 }
 
 /// The plan: dataset, start, tiers and device. `[scene, out]` are the scene and the output folder; without results the latter is empty.

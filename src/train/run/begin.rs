@@ -18,6 +18,7 @@ use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
+use crate::photos::diagnosis::{Diagnosis, Remedies};
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
 use crate::train::error::TrainError;
@@ -45,8 +46,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let _mark = Beginning::mark(request)?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
-    let request = &adapt_schedule(request, &start);
-    let config = &request.config;
+    let (request, start, diagnosis) = adapt_to_photos(adapt_schedule(request, &start), start, host_mem)?;
+    let (request, config) = (&request, &request.config);
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         check_first_drive(config, start.rows)?;
         if !request.quiet {
@@ -55,7 +56,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let FirstTrainer { dataset, trainer, tiers, begun } = first_trainer(request, start, host_mem)?;
-    plan_and_train(request, &dataset, tiers, trainer, begun)
+    plan_and_train(request, &dataset, tiers, trainer, Begun { diagnosis, ..begun })
 }
 
 /// The request, with a schedule that suits the number of training photos.
@@ -68,6 +69,26 @@ fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
         );
     }
     request
+}
+
+/// The request, with the remedies that the photos ask for, the start that follows from it, and what the photos say.
+/// Errors: the scene cannot be read.
+fn adapt_to_photos(
+    mut request: RunRequest,
+    mut start: Start,
+    host_mem: Option<u64>,
+) -> Result<(RunRequest, Start, Option<Diagnosis>), TrainError> {
+    let diagnosis = start.diagnose()?;
+    let before = request.config.clone();
+    let asked = diagnosis.as_ref().map_or_else(Remedies::default, Diagnosis::remedies);
+    new_run::adapt_to_photos(&mut request.config, &asked);
+    if request.config.init_scale != before.init_scale {
+        start = Start::read(&request.scene, &request.config, host_mem)?;
+    }
+    if let Some(diagnosis) = diagnosis.as_ref().filter(|_| !request.quiet) {
+        crate::say!("{}", plan_text::describe_photos(diagnosis, &before, &request.config));
+    }
+    Ok((request, start, diagnosis))
 }
 
 /// A trainer before its first step, with all that belongs to it. Its pages may lie in the tiers, so drop them after it.
@@ -100,7 +121,7 @@ pub(super) fn first_trainer(
         tiers.commit_in(&request.out, config);
     }
     let (print, sh_degree_start) = (dataset_print(&start)?, start.sh_degree_start);
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw() };
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw(), diagnosis: None };
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
     Ok(FirstTrainer { dataset, trainer, tiers, begun })
@@ -158,7 +179,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     };
     let host_mem = host_budget(request.config.host_mem.0);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
-    let request = adapt_schedule(&request, &start);
+    let (request, start, _) = adapt_to_photos(adapt_schedule(&request, &start), start, host_mem)?;
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }

@@ -26,8 +26,11 @@ use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
 use crate::paging::stats::PagerStats;
+use crate::photos::diagnosis::Diagnosis;
 use crate::report::page_map::PageTile;
-use crate::report::run_files::{CONFIG_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE};
+use crate::report::run_files::{
+    CONFIG_FILE, DIAGNOSIS_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
+};
 use crate::report::run_report::write_run_report;
 use crate::scene::page_meta::PageBounds;
 use crate::train::commits::checkpoint::Checkpoint;
@@ -75,6 +78,8 @@ pub(super) struct Begun {
     pub driver: u64,
     /// Identity of the run.
     pub run: RunId,
+    /// What the photos of a new run said before training, if anything.
+    pub diagnosis: Option<Diagnosis>,
 }
 
 /// Costs of the steps since the pager had counted `before`.
@@ -126,6 +131,9 @@ fn begin_files(
             let kept = resolved_config(&request.config, trainer);
             let facts = resolved(request, dataset, trainer, begun.run);
             write_config(&path, &kept, &Resolved { made_spill_dir, ..facts })?;
+            if let Some(diagnosis) = &begun.diagnosis {
+                diagnosis.write_file(&request.out.join(DIAGNOSIS_FILE))?;
+            }
             kept
         }
     };

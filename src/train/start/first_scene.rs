@@ -22,6 +22,7 @@ use crate::dataset::up::estimate_up;
 use crate::exchange::frames::to_local;
 use crate::exchange::ply::{self, PlyContent, read_ply};
 use crate::paging::pager::Pager;
+use crate::photos::diagnosis::{Diagnosis, POINTS_MOST, diagnose};
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::{InitOptions, gaussians_from_points, random_points_in_frusta};
 use crate::scene::log_scales::LogScaleRange;
@@ -71,7 +72,7 @@ impl FirstOptions {
             max_gaussians: config.max_gaussians,
             init_ply: (!config.init_ply.is_empty()).then(|| PathBuf::from(&config.init_ply)),
             init_points: config.init_points,
-            poor_points: config.poor_points,
+            poor_points: config.poor_points.is_on(),
             spills: config.residence().spill_dir().is_some(),
         }
     }
@@ -234,19 +235,36 @@ impl Start {
     /// Errors: the points cannot be read.
     pub(crate) fn up(&self) -> InputResult<Option<[f64; 3]>> {
         let cameras = self.dataset.views.iter().map(|view| &view.camera);
-        estimate_up(cameras, |take| match &self.from {
-            FirstRows::Points { cloud, extent, .. } => {
-                let points = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
-                points.read(&mut |position, _| {
-                    take(position);
-                    Ok(())
-                })
-            }
-            _ => {
-                self.dataset.points.iter().for_each(|&position| take(position));
+        estimate_up(cameras, |take| self.for_each_point(&mut |position, _| take(position)))
+    }
+
+    /// Passes the first points with their colours to `take`; none where the run starts from Gaussians.
+    /// Errors: the points cannot be read.
+    fn for_each_point(&self, take: &mut dyn FnMut([f32; 3], [u8; 3])) -> InputResult<()> {
+        if let FirstRows::Points { cloud, extent, .. } = &self.from {
+            let points = LocalCloud { cloud, extent: *extent, frame: self.dataset.frame };
+            return points.read(&mut |position, color| {
+                take(position, color);
                 Ok(())
+            });
+        }
+        let (points, colors) = (&self.dataset.points, &self.dataset.colors);
+        points.iter().zip(colors).for_each(|(&position, &color)| take(position, color));
+        Ok(())
+    }
+
+    /// What the training photos say before training; `None` where the run starts from Gaussians or random points.
+    /// Errors: the points cannot be read.
+    pub(crate) fn diagnose(&self) -> InputResult<Option<Diagnosis>> {
+        let every = self.rows.div_ceil(POINTS_MOST as u64).max(1);
+        let (mut points, mut count) = (Vec::new(), 0_u64);
+        self.for_each_point(&mut |position, color| {
+            if count.is_multiple_of(every) {
+                points.push((position, color));
             }
-        })
+            count += 1;
+        })?;
+        Ok((count > 0).then(|| diagnose(&self.dataset, &points, count)))
     }
 
     /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store

@@ -468,7 +468,7 @@ impl Trainer {
         }
         self.check_growth(step, dataset, targets)?;
         let scale = self.options.scene_scale;
-        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed() };
+        let count = RowCount { rows: self.scene.rows_bound(), allowed: self.allowed(dataset) };
         let kinds = self.options.strategy.events_after(step, scale, count, &self.scene.histogram);
         kinds.into_iter().for_each(|kind| self.scene.log_event(Event { step, kind }));
         let degree = self.options.sh_degree_at(step + 1);
@@ -479,12 +479,13 @@ impl Trainer {
     }
 
     /// Rows that the run allows now.
-    fn allowed(&mut self) -> u64 {
-        if self.options.strategy.growth().is_none() {
-            return u64::MAX;
-        }
+    fn allowed(&mut self, dataset: &Dataset) -> u64 {
+        let Some(rule) = self.options.strategy.growth() else { return u64::MAX };
         if self.state.growth.first == 0 {
-            self.state.growth.first = self.scene.rows_bound();
+            let rows = self.scene.rows_bound();
+            // Without held-out views the count stays as it is.
+            let decides = !self.turns.held_out.positions.is_empty();
+            self.state.growth.first = if decides { rule.first(rows, self.turns.pixels(dataset)) } else { rows };
         }
         self.state.growth.allowed()
     }
@@ -610,8 +611,7 @@ impl Trainer {
         let measured = [&held_out, &trained].map(|views| mean_psnr(&mut self.now(), &compared, views));
         let [held_out, trained] = measured;
         if let (Some(psnr), Some(trained_psnr)) = (held_out?, trained?) {
-            let pixels = self.turns.views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
-            let counts = [self.scene.rows_bound(), pixels];
+            let counts = [self.scene.rows_bound(), self.turns.pixels(dataset)];
             let check = rule.check(step, counts, [psnr, trained_psnr], &self.state.growth);
             self.state.growth.checks.push(check);
         }

@@ -9,6 +9,7 @@
 //! Invariant: the view is a function of the step, the order and what is known of photos; a plan of coming views changes no bit of
 //! the result.
 
+use crate::dataset::loader::Dataset;
 use crate::densify::strategy::Strategy;
 use crate::photos::PhotoParameters;
 use crate::schedule::order::ViewOrder;
@@ -32,6 +33,11 @@ impl Turns {
     /// The turns of a run of so many steps with this strategy.
     pub fn new(order: ViewOrder, views: Vec<usize>, strategy: &Arc<dyn Strategy>, steps: u32) -> Turns {
         Turns { order, held_out: HeldOut::new(strategy, views.len()), views, steps }
+    }
+
+    /// Pixels of the training photos.
+    pub fn pixels(&self, dataset: &Dataset) -> u64 {
+        self.views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum()
     }
 
     /// Index in `dataset.views` of the view of a 0-based step.

@@ -1,0 +1,464 @@
+//! What the photos say about themselves before training: whether their exposures differ, their poses are off, some of them show something
+//! else, and whether the first points fit them.
+//!
+//! The first points are drawn into each photo, each as one pixel, and the colours of points and pixels are compared. A point of another
+//! colour than its pixel may be hidden or shiny; hundreds of them are not. For each photo:
+//!
+//! - *gain*: by how many stops the photo is brighter than its points, for each colour: the median over the points;
+//! - *agreement*: the correlation of brightness over the points. A photo of another place has next to none;
+//! - *shift*: where the agreement is best, when all pixels move together by some pixels. Poses that are off have shifts.
+//!
+//! From these follow the remedies that a run switches on by itself ([`Diagnosis::remedies`]).
+//!
+//! Not here: what training finds ([`super::outlier`]).
+//!
+//! Invariants: 1. the result is a function of photos, poses and points; 2. one photo is decoded at a time, and no more than
+//! [`PIXELS_MOST`] pixels in all, beyond [`PHOTOS_LEAST`] photos.
+
+use super::exposure::AppearanceMode;
+use super::parameter::{Curve, Finding, write_values};
+use crate::base::error::InputResult;
+use crate::dataset::loader::Dataset;
+use crate::dataset::photo::decode;
+use crate::scene::camera::Camera;
+use crate::scene::image::Target;
+use serde::Serialize;
+use serde_json::Value;
+use std::path::Path;
+
+/// Pixels of the photo files that are decoded.
+const PIXELS_MOST: u64 = 300_000_000;
+/// Photos that are looked at however large they are.
+const PHOTOS_LEAST: usize = 24;
+/// Points that are drawn.
+pub const POINTS_MOST: usize = 16_384;
+/// Fewest points in a photo for a finding about it.
+const POINTS_LEAST: usize = 24;
+/// Shifts are measured in units of the longer side, and tried up to so many units in each direction.
+const UNITS: u32 = 400;
+const SHIFTS: i32 = 9;
+/// Cells of the longer side of a photo, for what hides what: a point beyond this multiple of the nearest depth in its cell is hidden.
+const CELLS: f64 = 48.0;
+const DEPTH_MOST: f64 = 1.15;
+/// Pixel values beyond these are clipped or dark noise: they say nothing about gains.
+const VALUES: std::ops::Range<u8> = 10..246;
+
+/// A first point: local frame, sRGB.
+pub type ColoredPoint = ([f32; 3], [u8; 3]);
+
+/// What one photo says.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PhotoFinding {
+    pub name: String,
+    /// Points that are drawn in it.
+    pub points: usize,
+    /// Stops by which its red, green and blue are brighter than its points.
+    pub gain: [f64; 3],
+    /// Correlation of brightness with the points, at the best shift and without one.
+    pub agreement: f64,
+    pub agreement_in_place: f64,
+    /// Pixels, right and down.
+    pub shift: [i32; 2],
+    /// Share of the points whose brightness is off by more than half a stop after the gain.
+    pub off: f64,
+}
+
+/// What the photos say.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Diagnosis {
+    /// The training photos that were looked at and show enough points, in the order of their names.
+    pub photos: Vec<PhotoFinding>,
+    /// Training photos in which a point lies, in the mean, whether or not it is hidden.
+    pub photos_per_point: f64,
+    /// First points in a training photo, the median.
+    pub points_per_photo: f64,
+    /// Robust standard deviations over the photos, stops: of the gain of green, and of that of red less that of blue.
+    pub exposure_spread: f64,
+    pub color_spread: f64,
+    /// Medians over the photos.
+    pub agreement: f64,
+    /// What a shift adds to the agreement.
+    pub agreement_by_shift: f64,
+    /// Pixels.
+    pub shift: f64,
+    pub unit: u32,
+    /// Numbers in `photos` of those that show something else.
+    pub wrong: Vec<usize>,
+}
+
+/// Fewest photos for a remedy.
+const PHOTOS_FOR_REMEDIES: usize = 8;
+/// Below this agreement, points and photos have nothing to do with each other. Measured: 0 to .04 with random points; .6 to .84 on clean
+/// scenes, and .7 with the faults of `gsscale-bench sweep stability`.
+const AGREEMENT_LEAST: f64 = 0.25;
+/// Stops of [`Diagnosis::exposure_spread`] and [`Diagnosis::color_spread`] from which on appearance is trained. Measured: .01 to .13 and 0 to
+/// .06 on clean scenes; .37 with exposures within half a stop, .44 with white balance within .3 stops.
+const EXPOSURE_SPREAD: f64 = 0.2;
+const COLOR_SPREAD: f64 = 0.2;
+/// A photo shows something else if its agreement is less than this share of the median, and this multiple of the usual share of points,
+/// and at least this share, is off. Uniform photos have a low agreement, but hardly a point that is off.
+const WRONG_AGREEMENT: f64 = 0.5;
+const WRONG_OFF: f64 = 1.5;
+const WRONG_OFF_LEAST: f64 = 0.1;
+/// Poses are refined from this median shift on, in units, if the shifts add as much to the agreement. Measured: 0 on clean scenes; 2.2 and
+/// 6.7, and .15 and .19, with poses off by .5 % of the scene's size.
+const SHIFT_UNITS: f64 = 1.5;
+const AGREEMENT_BY_SHIFT: f64 = 0.05;
+/// Photos that show a point, for the remedies of poor points, which cost more than they bring where photos overlap little. Measured: 38 on
+/// cross, which gains; 7 on seneca, which loses.
+const PHOTOS_PER_POINT: f64 = 16.0;
+
+/// What a diagnosis asks for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Remedies {
+    pub appearance: AppearanceMode,
+    pub robust_views: bool,
+    pub refine_poses: bool,
+    pub poor_points: bool,
+}
+
+#[derive(Serialize)]
+struct DiagnosisFile<'a> {
+    text: Vec<String>,
+    #[serde(flatten)]
+    found: &'a Diagnosis,
+}
+
+/// What a report says about it, from its file.
+pub fn finding(file: &Value) -> Option<Finding> {
+    let text: Vec<&str> = file["text"].as_array()?.iter().filter_map(Value::as_str).collect();
+    let photos = file["photos"].as_array()?;
+    let values: Vec<f64> = photos.iter().filter_map(|photo| photo["gain"][1].as_f64()).collect();
+    let caption =
+        String::from("By how much each photo is brighter than the first points in it. diagnosis.json has the numbers.");
+    let curve = Curve { title: "Photos against first points", unit: "stops", values, caption };
+    let curve = (!photos.is_empty()).then_some(curve);
+    Some(Finding { title: "Photos before training", text: text.join("; ") + ".", table: None, curve })
+}
+
+/// Looks at the training photos. `points` are first points with their colours, evenly drawn from `count` points. A photo that cannot be
+/// read is passed over: training names it.
+pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagnosis {
+    let views = dataset.train_views();
+    let in_view = |&view: &usize| points_in(points, &dataset.views[view].camera).len() as f64;
+    let mut in_views: Vec<f64> = views.iter().map(in_view).collect();
+    let header = |view: usize| &dataset.views[view].photo.header;
+    let pixels: u64 = views.iter().map(|&view| u64::from(header(view).width) * u64::from(header(view).height)).sum();
+    let affordable = (PIXELS_MOST as f64 / (pixels as f64 / views.len() as f64)) as usize;
+    let looked_at = views.len().min(affordable.max(PHOTOS_LEAST));
+    let (mut photos, mut longest) = (Vec::with_capacity(looked_at), 0);
+    for number in 0..looked_at {
+        let view = &dataset.views[views[number * views.len() / looked_at]];
+        let Ok(photo) = decode(&view.photo) else { continue };
+        longest = longest.max(photo.width).max(photo.height);
+        let found = PhotoLook::new(&photo, &view.camera, points).finding();
+        photos.extend(found.map(|found| PhotoFinding { name: view.name.clone(), ..found }));
+    }
+    let of = |value: &dyn Fn(&PhotoFinding) -> f64| photos.iter().map(value).collect::<Vec<f64>>();
+    let spread = |values: Vec<f64>| {
+        let middle = median(&mut values.clone());
+        // The standard deviation of normal values is 1.4826 times their median distance.
+        1.4826 * median(&mut values.iter().map(|x| (x - middle).abs()).collect::<Vec<_>>())
+    };
+    let agreement = median(&mut of(&|photo| photo.agreement));
+    let off_most = (WRONG_OFF * median(&mut of(&|photo| photo.off))).max(WRONG_OFF_LEAST);
+    let is_wrong = |photo: &PhotoFinding| photo.agreement < WRONG_AGREEMENT * agreement && photo.off > off_most;
+    let shift = |photo: &PhotoFinding| libm::hypot(photo.shift[0].into(), photo.shift[1].into());
+    Diagnosis {
+        photos_per_point: in_views.iter().sum::<f64>() / points.len().max(1) as f64,
+        points_per_photo: median(&mut in_views) * count as f64 / points.len().max(1) as f64,
+        exposure_spread: spread(of(&|photo| photo.gain[1])),
+        color_spread: spread(of(&|photo| photo.gain[0] - photo.gain[2])),
+        agreement,
+        agreement_by_shift: median(&mut of(&|photo| photo.agreement - photo.agreement_in_place)),
+        shift: median(&mut of(&shift)),
+        unit: unit_of(longest),
+        wrong: (0..photos.len()).filter(|&number| is_wrong(&photos[number])).collect(),
+        photos,
+    }
+}
+
+impl Diagnosis {
+    /// Writes the findings, and the lines that tell them. Errors: the file cannot be written.
+    pub fn write_file(&self, path: &Path) -> InputResult<()> {
+        write_values(path, &DiagnosisFile { text: self.text(), found: self })
+    }
+
+    /// Whether points and photos agree, so that a photo can be judged by the points.
+    fn points_fit(&self) -> bool {
+        self.agreement >= AGREEMENT_LEAST
+    }
+
+    /// What a run without flags switches on.
+    pub fn remedies(&self) -> Remedies {
+        if self.photos.len() < PHOTOS_FOR_REMEDIES {
+            return Remedies::default();
+        }
+        if !self.points_fit() {
+            return Remedies { poor_points: self.photos_per_point >= PHOTOS_PER_POINT, ..Remedies::default() };
+        }
+        let appearance = match (self.color_spread >= COLOR_SPREAD, self.exposure_spread >= EXPOSURE_SPREAD) {
+            (true, _) => AppearanceMode::Full,
+            (false, true) => AppearanceMode::Exposure,
+            (false, false) => AppearanceMode::Off,
+        };
+        let shifts = self.shift >= SHIFT_UNITS * f64::from(self.unit);
+        Remedies {
+            appearance,
+            robust_views: !self.wrong.is_empty(),
+            refine_poses: shifts && self.agreement_by_shift >= AGREEMENT_BY_SHIFT,
+            poor_points: false,
+        }
+    }
+
+    /// Lines of a plan.
+    pub fn text(&self) -> Vec<String> {
+        let looked_at = self.photos.len();
+        if looked_at < PHOTOS_FOR_REMEDIES {
+            return vec![format!("{looked_at} show enough first points to be judged by: no remedy is chosen")];
+        }
+        let points = format!(
+            "{:.0} first points in a photo, each in {:.0} photos",
+            self.points_per_photo, self.photos_per_point
+        );
+        if !self.points_fit() {
+            return vec![format!(
+                "{looked_at} looked at: the first points do not lie where the photos show them; {points}"
+            )];
+        }
+        let mut lines = vec![format!(
+            "{looked_at} looked at: exposures differ by {:.2} stops, colours by {:.2}; {points}",
+            self.exposure_spread, self.color_spread
+        )];
+        if self.shift > 0.0 {
+            lines.push(format!("poses are off by {:.0} pixels (half of them by more)", self.shift));
+        }
+        if let [first, ..] = self.wrong[..] {
+            let (count, name) = (self.wrong.len(), &self.photos[first].name);
+            lines.push(format!(
+                "{count} show something else than their poses look at: {name}{}",
+                if count > 1 { ", ..." } else { "" }
+            ));
+        }
+        lines
+    }
+}
+
+/// A point in a photo: its pixel, its depth, and its number.
+#[derive(Clone, Copy)]
+struct Drawn {
+    at: [f64; 2],
+    depth: f64,
+    point: usize,
+}
+
+/// The points inside the frame of a camera.
+fn points_in(points: &[ColoredPoint], camera: &Camera) -> Vec<Drawn> {
+    let m = camera.viewmat.map(|row| row.map(f64::from));
+    let project = |(point, (p, _)): (usize, &ColoredPoint)| {
+        let [x, y, depth] = m.map(|row| (0..3).map(|i| row[i] * f64::from(p[i])).sum::<f64>() + row[3]);
+        let at = [
+            f64::from(camera.fx) * x / depth + f64::from(camera.cx),
+            f64::from(camera.fy) * y / depth + f64::from(camera.cy),
+        ];
+        let is_inside =
+            (0.0..f64::from(camera.width)).contains(&at[0]) && (0.0..f64::from(camera.height)).contains(&at[1]);
+        (depth > f64::from(camera.near_plane) && is_inside).then_some(Drawn { at, depth, point })
+    };
+    points.iter().enumerate().filter_map(project).collect()
+}
+
+/// A photo beside the points that it shows.
+struct PhotoLook<'a> {
+    photo: &'a Target,
+    /// Pixels of one unit of shift.
+    unit: i32,
+    /// The column and row of each point, and its colour.
+    points: Vec<([i32; 2], [u8; 3])>,
+}
+
+impl<'a> PhotoLook<'a> {
+    fn new(photo: &'a Target, camera: &Camera, points: &[ColoredPoint]) -> PhotoLook<'a> {
+        let longer = photo.width.max(photo.height);
+        let unit = unit_of(longer) as i32;
+        let margin = unit * SHIFTS;
+        let inside = |at: i32, size: u32| (margin..size as i32 - margin).contains(&at);
+        // Points behind others in a cell of the photo are probably hidden.
+        let cell = f64::from(longer) / CELLS;
+        let cell_of = |at: [f64; 2]| at.map(|x| (x / cell) as usize);
+        let mut nearest = vec![f64::INFINITY; (CELLS as usize + 1).pow(2)];
+        let drawn = points_in(points, camera);
+        let place = |[x, y]: [usize; 2]| (CELLS as usize + 1) * y + x;
+        for point in &drawn {
+            let nearest = &mut nearest[place(cell_of(point.at))];
+            *nearest = nearest.min(point.depth);
+        }
+        let is_seen = |point: &&Drawn| point.depth <= DEPTH_MOST * nearest[place(cell_of(point.at))];
+        let counts = |[x, y]: [i32; 2]| {
+            let pixel = y as usize * photo.width as usize + x as usize;
+            inside(x, photo.width) && inside(y, photo.height) && photo.mask.as_ref().is_none_or(|mask| mask[pixel] > 0)
+        };
+        let seen = drawn.iter().filter(is_seen).map(|point| (point.at.map(|x| x as i32), points[point.point].1));
+        PhotoLook { photo, unit, points: seen.filter(|(at, _)| counts(*at)).collect() }
+    }
+
+    fn pixel(&self, [x, y]: [i32; 2]) -> [u8; 3] {
+        let at = 3 * (y as usize * self.photo.width as usize + x as usize);
+        [0, 1, 2].map(|channel| self.photo.rgb[at + channel])
+    }
+
+    /// Correlation of brightness over the points, all pixels moved by so many units of shift.
+    fn agreement(&self, [right, down]: [i32; 2]) -> f64 {
+        let mut sums = [0.0; 5];
+        for &([x, y], color) in &self.points {
+            let a = luminance(self.pixel([x + self.unit * right, y + self.unit * down]));
+            let b = luminance(color);
+            for (sum, value) in sums.iter_mut().zip([a, b, a * a, b * b, a * b]) {
+                *sum += value;
+            }
+        }
+        let [a, b, aa, bb, ab] = sums.map(|sum| sum / self.points.len() as f64);
+        let of_both = ((aa - a * a).max(0.0) * (bb - b * b).max(0.0)).sqrt();
+        if of_both > 0.0 { (ab - a * b) / of_both } else { 0.0 }
+    }
+
+    /// `None` where the photo shows too few points.
+    fn finding(&self) -> Option<PhotoFinding> {
+        if self.points.len() < POINTS_LEAST {
+            return None;
+        }
+        let agreement_in_place = self.agreement([0, 0]);
+        let (mut shift, mut agreement) = ([0, 0], agreement_in_place);
+        for down in -SHIFTS..=SHIFTS {
+            for right in -SHIFTS..=SHIFTS {
+                let here = self.agreement([right, down]);
+                if here > agreement {
+                    (shift, agreement) = ([right, down], here);
+                }
+            }
+        }
+        let moved = shift.map(|x| self.unit * x);
+        let stops = |channel: usize| {
+            let pairs = self
+                .points
+                .iter()
+                .map(|&([x, y], color)| (self.pixel([x + moved[0], y + moved[1]])[channel], color[channel]));
+            let is_clear = |(pixel, color): &(u8, u8)| VALUES.contains(pixel) && VALUES.contains(color);
+            pairs
+                .filter(is_clear)
+                .map(|(pixel, color)| (f64::from(pixel) / f64::from(color)).log2())
+                .collect::<Vec<_>>()
+        };
+        let gain = [0, 1, 2].map(|channel| median(&mut stops(channel)));
+        let green = stops(1);
+        let off =
+            green.iter().filter(|&stops| (stops - gain[1]).abs() > 0.5).count() as f64 / green.len().max(1) as f64;
+        let points = self.points.len();
+        Some(PhotoFinding { name: String::new(), points, gain, agreement, agreement_in_place, shift: moved, off })
+    }
+}
+
+/// Pixels of a unit of shift.
+fn unit_of(longer: u32) -> u32 {
+    (longer / UNITS).max(1)
+}
+
+fn luminance([r, g, b]: [u8; 3]) -> f64 {
+    0.299 * f64::from(r) + 0.587 * f64::from(g) + 0.114 * f64::from(b)
+}
+
+/// The median; 0 of nothing.
+fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    match values.len() {
+        0 => 0.0,
+        count => values[count / 2],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn finding(agreement: f64) -> PhotoFinding {
+        let name = String::from("a.jpg");
+        PhotoFinding {
+            name,
+            points: 100,
+            gain: [0.0; 3],
+            agreement,
+            agreement_in_place: agreement,
+            shift: [0; 2],
+            off: 0.1,
+        }
+    }
+
+    fn of(photos: usize, agreement: f64) -> Diagnosis {
+        Diagnosis {
+            photos: vec![finding(agreement); photos],
+            photos_per_point: 30.0,
+            points_per_photo: 500.0,
+            exposure_spread: 0.05,
+            color_spread: 0.05,
+            agreement,
+            agreement_by_shift: 0.0,
+            shift: 0.0,
+            unit: 1,
+            wrong: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn a_remedy_takes_photos_that_can_be_judged() {
+        let none = Remedies::default();
+        let exposure = |photos, agreement| Diagnosis { exposure_spread: 0.7, ..of(photos, agreement) }.remedies();
+        assert_eq!(exposure(100, 0.7), Remedies { appearance: AppearanceMode::Exposure, ..none });
+        assert_eq!((exposure(7, 0.7), of(100, 0.7).remedies()), (none, none));
+        // Points that do not fit say nothing about exposures, and are poor where photos overlap much.
+        assert_eq!(exposure(100, 0.1), Remedies { poor_points: true, ..none });
+        let sparse = Diagnosis { photos_per_point: 7.0, ..of(100, 0.1) };
+        assert_eq!(sparse.remedies(), none);
+        assert!(sparse.text()[0].contains("do not lie where"));
+        // Shifts count in units of a large photo, and where they explain something.
+        let shifted = |shift, unit, by| Diagnosis { shift, unit, agreement_by_shift: by, ..of(100, 0.7) }.remedies();
+        assert_eq!(shifted(3.0, 1, 0.1), Remedies { refine_poses: true, ..none });
+        assert_eq!((shifted(3.0, 4, 0.1), shifted(3.0, 1, 0.01)), (none, none));
+    }
+
+    #[test]
+    fn a_photo_is_compared_where_it_shows_its_points() {
+        let camera = Camera::pinhole(
+            [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]],
+            [100.0, 100.0, 50.0, 40.0],
+            [100, 80],
+        );
+        // A pattern without repetition, and a point for each fourth pixel; the photo is twice as bright.
+        let value = |x: u32, y: u32| (20 + (x * x * 7 + y * y * 13 + x * y * 3) % 90) as u8;
+        let mut points: Vec<ColoredPoint> = Vec::new();
+        for (x, y) in (0..80).step_by(4).flat_map(|y| (0..100).step_by(4).map(move |x| (x, y))) {
+            points.push((camera.unproject([f64::from(x) + 0.5, f64::from(y) + 0.5], 2.0), [value(x, y); 3]));
+        }
+        let moved = |right: u32, down: u32| {
+            let pixels = (0..80).flat_map(|y| (0..100).map(move |x| (x, y)));
+            let bright = |(x, y): (u32, u32)| [2 * value((x + 100 - right) % 100, (y + 80 - down) % 80); 3];
+            Target::new([100, 80], pixels.flat_map(bright).collect())
+        };
+        for shift in [[0, 0], [3, 2]] {
+            let photo = moved(shift[0] as u32, shift[1] as u32);
+            let found = PhotoLook::new(&photo, &camera, &points).finding().expect("enough points");
+            assert_eq!((found.shift, found.off), (shift, 0.0));
+            assert!(found.agreement > 0.999 && found.gain.iter().all(|gain| (gain - 1.0).abs() < 1e-9), "{found:?}");
+            assert_eq!(found.agreement_in_place < 0.5, shift != [0, 0]);
+        }
+        // What lies far behind another point of a cell is hidden; masked pixels show nothing.
+        let behind: Vec<ColoredPoint> = points
+            .iter()
+            .map(|&(_, color)| (camera.unproject([48.5, 40.5], 9.0), color))
+            .chain(points.clone())
+            .collect();
+        let mut photo = moved(0, 0);
+        assert_eq!(PhotoLook::new(&photo, &camera, &behind).finding().map(|found| found.off), Some(0.0));
+        photo.mask = Some(vec![0; 100 * 80]);
+        assert_eq!(PhotoLook::new(&photo, &camera, &points).finding(), None);
+    }
+}
