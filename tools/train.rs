@@ -243,7 +243,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
     if let (Some(summary), false) = (&outcome.summary, quiet) {
         let test = match &summary.test {
             Some(t) => {
-                let corrected = t.color_corrected_text();
+                let corrected = t.corrected_text();
                 format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
             }
             None if summary.finished => String::from("not measured: there is no held-out photo that counts"),

@@ -9,6 +9,7 @@
 //! a kind does not override does nothing; 3. equal values have equal bytes.
 
 use super::PhotoOptions;
+use super::exposure::picture::Look;
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
@@ -151,6 +152,12 @@ pub trait PhotoParameter {
 
     fn corrects(&self) -> bool {
         false
+    }
+
+    /// The corrections of the pictures of views that the run does not train on, as their neighbours suggest; `None` of a kind that does not
+    /// correct pictures.
+    fn predict(&self, _: &Dataset, _views: &[usize]) -> Option<Vec<Look>> {
+        None
     }
 
     /// Whether the kind adds a term to the loss: [`PhotoParameter::target`] compares picture and photo, [`PhotoParameter::loss`] gives the

@@ -48,6 +48,9 @@ pub struct RunRecord {
     /// Colour-corrected PSNR of the held-out views, dB, if the run measured it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub cc_psnr: Option<f64>,
+    /// Under the exposures that neighbouring photos suggest, with `--appearance`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub predicted_psnr: Option<f64>,
     /// Training views whose photo contradicts the scene, by name.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub outlier_views: Vec<String>,
@@ -147,10 +150,11 @@ const fn figure(
     Figure { name, title, digits, of }
 }
 
-const FIGURES: [Figure; 15] = [
+const FIGURES: [Figure; 16] = [
     figure("psnr", "PSNR, dB", Some(2), |r| r.psnr),
     figure("ssim", "SSIM", Some(4), |r| r.ssim),
     figure("cc-psnr", "PSNR after colour correction, dB", Some(2), |r| r.cc_psnr),
+    figure("predicted-psnr", "PSNR with predicted exposures, dB", Some(2), |r| r.predicted_psnr),
     figure("seconds", "seconds of training", Some(1), |r| Some(r.seconds)),
     figure("step-ms", "ms a step", Some(1), |r| Some(1e3 * r.seconds / f64::from(r.steps.max(1)))),
     figure("cpu-seconds", "CPU seconds", Some(1), |r| r.cpu_seconds),

@@ -269,6 +269,7 @@ impl Sweep {
         let ply = folder.join(PLY_FILE);
         record.ply = digest(&ply)?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
+        record.predicted_psnr = summary.test.and_then(|t| t.predicted).map(|p| p.predicted_psnr);
         record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
         record.outlier_views = views::names_in(&read_json(&folder.join(SUMMARY_FILE), AGAIN)?);
         record.seconds = summary.train_seconds;

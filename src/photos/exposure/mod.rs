@@ -17,6 +17,7 @@
 pub mod fit;
 pub mod model;
 pub mod picture;
+pub mod predict;
 pub mod state;
 
 use super::PhotoOptions;
@@ -30,6 +31,7 @@ use crate::scene::image::{PictureGradient, Target};
 use fit::FittedPair;
 use model::CHANNEL_VALUES;
 use picture::Look;
+use predict::predict;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -188,6 +190,19 @@ impl PhotoParameter for Appearance {
 
     fn corrects(&self) -> bool {
         true
+    }
+
+    fn predict(&self, dataset: &Dataset, views: &[usize]) -> Option<Vec<Look>> {
+        let camera = |view: usize| &dataset.views[view].camera;
+        let is_known = |view: &usize| self.state.images.get(*view).is_some_and(|image| image.sightings > 0);
+        let of_known = |view: usize| (camera(view), self.state.acting(view, self.mode.image_values()));
+        let known: Vec<_> = dataset.train_views().into_iter().filter(is_known).map(of_known).collect();
+        let said = predict(&known, &views.iter().map(|&view| camera(view)).collect::<Vec<_>>());
+        let look = |(&view, image): (&usize, _)| {
+            let group = self.camera_groups.get(view).copied().unwrap_or_default();
+            Look { image, ..self.state.look(self.mode, (view, group), camera(view)) }
+        };
+        Some(views.iter().zip(said).map(look).collect())
     }
 
     fn begin_step(&mut self, step: &PhotoStep<'_>) {

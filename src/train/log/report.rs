@@ -102,12 +102,23 @@ pub struct TestMetrics {
     /// Mean LPIPS, if weights were given; the report names network and input range.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub lpips: Option<f64>,
+    /// Under the exposures and colours that neighbouring training photos suggest, with `--appearance`; not comparable with `psnr`.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub predicted: Option<Predicted>,
     /// Colour-corrected PSNR, if requested; not comparable with `psnr`.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub color_corrected: Option<ColorCorrected>,
     /// PSNR of the right halves after a fit to the left halves, with `--appearance`; not comparable with `psnr`.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub half_fitted: Option<HalfFitted>,
+}
+
+/// Means over the views under predicted corrections.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Predicted {
+    /// dB.
+    pub predicted_psnr: f64,
+    pub predicted_ssim: f64,
 }
 
 /// Mean PSNR of the right halves of the held-out photos.
@@ -131,10 +142,12 @@ pub struct ColorCorrected {
 }
 
 impl TestMetrics {
-    /// Text of the colour-corrected PSNR with its name; empty if not measured.
-    pub fn color_corrected_text(&self) -> String {
-        self.color_corrected
-            .map_or(String::new(), |c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr))
+    /// Text of the PSNR under predicted exposures and of the colour-corrected one, with their names; empty if not measured.
+    pub fn corrected_text(&self) -> String {
+        let predicted = self.predicted.map(|p| format!(", with predicted exposures {:.2} dB", p.predicted_psnr));
+        let corrected =
+            self.color_corrected.map(|c| format!(", colour-corrected PSNR ({}) {:.2} dB", c.method.name(), c.cc_psnr));
+        predicted.unwrap_or_default() + &corrected.unwrap_or_default()
     }
 }
 

@@ -216,6 +216,7 @@ impl<'a> Evaluator<'a> {
         let shown = Count::new("views compared", views.len() as u32, false);
         let request = EvalRequest {
             views: &views,
+            predicted: None,
             ssim: run.ssim_variant,
             pictures,
             lpips: self.lpips,

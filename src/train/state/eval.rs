@@ -1,8 +1,8 @@
 //! Evaluation of held-out views: PSNR, SSIM, LPIPS, and pictures of render beside photo. Leaves the scene unchanged.
 //!
-//! PSNR is of the pictures as they are. Two further figures have their own names and are never mixed with it: after an
-//! affine or quadratic colour correction ([`ColorCorrected`]), and of the right halves after a fit of appearance to the left
-//! halves ([`HalfFitted`]).
+//! PSNR is of the pictures as they are. Three further figures have their own names and are never mixed with it: under the exposures that
+//! training photos suggest ([`Predicted`]), after an affine or quadratic colour correction ([`ColorCorrected`]), and of the right halves
+//! after a fit of appearance to the left halves ([`HalfFitted`]).
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_rows::write_rgb_rows;
@@ -20,7 +20,7 @@ use crate::report::run_files::VIEWS_FILE;
 use crate::scene::camera::Camera;
 use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
-use crate::train::log::report::{ColorCorrected, HalfFitted, TestMetrics, json_psnr};
+use crate::train::log::report::{ColorCorrected, HalfFitted, Predicted, TestMetrics, json_psnr};
 use crate::train::step::view::{SceneNow, draw};
 use std::path::{Path, PathBuf};
 
@@ -36,6 +36,8 @@ pub struct EvalRequest<'a> {
     pub pictures: Option<&'a Path>,
     /// LPIPS network and its input range; `None` for no LPIPS.
     pub lpips: Option<(&'a Lpips, InputRange)>,
+    /// The correction that training photos suggest for each view, if any.
+    pub predicted: Option<Vec<Look>>,
     /// Method of colour correction; `None` for no colour-corrected PSNR.
     pub color_correct: Option<ColorCorrect>,
     /// What is fitted to the left half of each photo; off for no such figures.
@@ -60,6 +62,7 @@ pub fn evaluate(
     }
     let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
     let (mut corrected, mut halves, mut figures) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut predicted, mut drawn) = ([Vec::new(), Vec::new()], Vec::new());
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = match targets.get(view) {
@@ -93,6 +96,18 @@ pub fn evaluate(
             let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
         }
+        let look = request.predicted.as_ref().and_then(|looks| looks.get(i)).filter(|_| target.counts());
+        if look.is_some() || request.appearance.is_on() {
+            drawn.clear();
+            drawn.extend_from_slice(now.renderer.picture_mut()?);
+        }
+        if let Some(look) = look {
+            look.correct(now.renderer.picture_mut()?, target.width as usize, None);
+            let image = now.renderer.image()?;
+            predicted[0].push(json_psnr(psnr(image, &target)));
+            predicted[1].extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
+            now.renderer.picture_mut()?.copy_from_slice(&drawn);
+        }
         if request.appearance.is_on() {
             // Last, since it changes the picture in its place.
             halves.extend(half_fitted(now.renderer.picture_mut()?, &target, camera, request.appearance));
@@ -115,7 +130,12 @@ pub fn evaluate(
         HalfFitted { model: request.appearance, right_psnr, fitted_right_psnr }
     });
     let views = psnrs.len() as u32;
-    Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, color_corrected, half_fitted }))
+    let [predicted_psnr, predicted_ssim] = predicted;
+    let predicted = (!predicted_psnr.is_empty()).then(|| Predicted {
+        predicted_psnr: mean(&predicted_psnr),
+        predicted_ssim: if predicted_ssim.is_empty() { 0.0 } else { mean(&predicted_ssim) },
+    });
+    Ok(Some(TestMetrics { views, psnr: mean(&psnrs), ssim, lpips, predicted, color_corrected, half_fitted }))
 }
 
 /// Warns, before a run spends its time, if no held-out photo will have figures. Decodes photos up to the first that has.

@@ -509,12 +509,16 @@ impl Trainer {
         let render = self.render_options();
         let views = dataset.test_views();
         self.run_memory().fit_frames_to_widest(views.iter().map(|&view| &dataset.views[view].camera));
+        let predicted = self.photos.iter().find_map(|parameter| parameter.predict(dataset, &views));
+        let corrects = predicted.is_some();
         let request = EvalRequest {
             views: &views,
+            predicted,
             ssim: self.options.ssim_variant,
             pictures,
             lpips: None,
-            color_correct: self.options.color_correct,
+            // Beside predicted colours, the best that a correction could do.
+            color_correct: self.options.color_correct.or(corrects.then_some(ColorCorrect::Affine)),
             appearance: self.options.photos.appearance,
             progress,
         };
