@@ -377,6 +377,7 @@ fn median(values: &mut [f64]) -> f64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
@@ -445,7 +446,7 @@ mod tests {
         };
         for shift in [[0, 0], [3, 2]] {
             let photo = moved(shift[0] as u32, shift[1] as u32);
-            let found = PhotoLook::new(&photo, &camera, &points).finding().expect("enough points");
+            let found = PhotoLook::new(&photo, &camera, &points).finding().unwrap();
             assert_eq!((found.shift, found.off), (shift, 0.0));
             assert!(found.agreement > 0.999 && found.gain.iter().all(|gain| (gain - 1.0).abs() < 1e-9), "{found:?}");
             assert_eq!(found.agreement_in_place < 0.5, shift != [0, 0]);
