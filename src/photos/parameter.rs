@@ -9,7 +9,6 @@
 //! a kind does not override does nothing; 3. equal values have equal bytes.
 
 use super::PhotoOptions;
-use super::exposure::picture::Look;
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
@@ -113,6 +112,9 @@ impl PhotoOutcome<'_> {
     }
 }
 
+/// Corrects a picture `[3][height][width]` of this width in place.
+pub type Correction = Box<dyn Fn(&mut [f32], usize)>;
+
 /// The parameters of one kind: their values for all photos, and their buffers for a step.
 pub trait PhotoParameter {
     /// The name of the kind in commits. It stands for the layout of its values: another layout needs another name, unless the older one is
@@ -156,7 +158,7 @@ pub trait PhotoParameter {
 
     /// The corrections of the pictures of views that the run does not train on, as their neighbours suggest; `None` of a kind that does not
     /// correct pictures.
-    fn predict(&self, _: &Dataset, _views: &[usize]) -> Option<Vec<Look>> {
+    fn predict(&self, _: &Dataset, _views: &[usize]) -> Option<Vec<Correction>> {
         None
     }
 

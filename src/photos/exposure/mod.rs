@@ -21,7 +21,9 @@ pub mod predict;
 pub mod state;
 
 use super::PhotoOptions;
-use super::parameter::{Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError};
+use super::parameter::{
+    Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
+};
 use super::parameter::{views_by_name, write_values};
 use crate::base::error::InputResult;
 use crate::dataset::exif;
@@ -192,15 +194,16 @@ impl PhotoParameter for Appearance {
         true
     }
 
-    fn predict(&self, dataset: &Dataset, views: &[usize]) -> Option<Vec<Look>> {
+    fn predict(&self, dataset: &Dataset, views: &[usize]) -> Option<Vec<Correction>> {
         let camera = |view: usize| &dataset.views[view].camera;
         let is_known = |view: &usize| self.state.images.get(*view).is_some_and(|image| image.sightings > 0);
         let of_known = |view: usize| (camera(view), self.state.acting(view, self.mode.image_values()));
         let known: Vec<_> = dataset.train_views().into_iter().filter(is_known).map(of_known).collect();
         let said = predict(&known, &views.iter().map(|&view| camera(view)).collect::<Vec<_>>());
-        let look = |(&view, image): (&usize, _)| {
+        let look = |(&view, image): (&usize, _)| -> Correction {
             let group = self.camera_groups.get(view).copied().unwrap_or_default();
-            Look { image, ..self.state.look(self.mode, (view, group), camera(view)) }
+            let look = Look { image, ..self.state.look(self.mode, (view, group), camera(view)) };
+            Box::new(move |picture, width| look.correct(picture, width, None))
         };
         Some(views.iter().zip(said).map(look).collect())
     }

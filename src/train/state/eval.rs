@@ -12,6 +12,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::photos::exposure::AppearanceMode;
 use crate::photos::exposure::fit::FittedPair;
 use crate::photos::exposure::picture::{LensPlane, Look};
+use crate::photos::parameter::Correction;
 use crate::render::RenderOptions;
 use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
 use crate::render::lpips::{InputRange, Lpips};
@@ -37,7 +38,7 @@ pub struct EvalRequest<'a> {
     /// LPIPS network and its input range; `None` for no LPIPS.
     pub lpips: Option<(&'a Lpips, InputRange)>,
     /// The correction that training photos suggest for each view, if any.
-    pub predicted: Option<Vec<Look>>,
+    pub predicted: Option<Vec<Correction>>,
     /// Method of colour correction; `None` for no colour-corrected PSNR.
     pub color_correct: Option<ColorCorrect>,
     /// What is fitted to the left half of each photo; off for no such figures.
@@ -96,13 +97,13 @@ pub fn evaluate(
             let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
         }
-        let look = request.predicted.as_ref().and_then(|looks| looks.get(i)).filter(|_| target.counts());
-        if look.is_some() || request.appearance.is_on() {
+        let correct = request.predicted.as_ref().and_then(|of_views| of_views.get(i)).filter(|_| target.counts());
+        if correct.is_some() || request.appearance.is_on() {
             drawn.clear();
             drawn.extend_from_slice(now.renderer.picture_mut()?);
         }
-        if let Some(look) = look {
-            look.correct(now.renderer.picture_mut()?, target.width as usize, None);
+        if let Some(correct) = correct {
+            correct(now.renderer.picture_mut()?, target.width as usize);
             let image = now.renderer.image()?;
             predicted[0].push(json_psnr(psnr(image, &target)));
             predicted[1].extend(Some(ssim(image, &target, request.ssim, options.simd)).filter(|x| !x.is_nan()));
