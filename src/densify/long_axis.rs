@@ -332,7 +332,7 @@ mod tests {
         // The checks of growth come as before.
         let checks =
             |strategy: &dyn Strategy| (0..4000).filter(|step| strategy.is_growth_checked(*step)).collect::<Vec<_>>();
-        assert_eq!(checks(&*by_epochs), [800, 1000, 1200, 1400, 1600, 1800, 2000]);
+        assert_eq!(checks(&*by_epochs), [800, 1000, 1200, 1400, 1600, 1800, 2000, 2200]);
         assert_eq!(checks(&by_steps), checks(&*by_epochs));
         // Two rounds do not fit: the rounds stay.
         for epoch in [1300, 2400, 50_000, u32::MAX] {

@@ -37,6 +37,8 @@ const POINTS_LEAST: usize = 24;
 /// Shifts are measured in units of the longer side, and tried up to so many units in each direction.
 const UNITS: u32 = 400;
 const SHIFTS: i32 = 9;
+/// Points by which shifts are compared.
+const POINTS_FOR_SHIFTS: usize = 1024;
 /// Cells of the longer side of a photo, for what hides what: a point beyond this multiple of the nearest depth in its cell is hidden.
 const CELLS: f64 = 48.0;
 const DEPTH_MOST: f64 = 1.15;
@@ -307,17 +309,17 @@ impl<'a> PhotoLook<'a> {
         [0, 1, 2].map(|channel| self.photo.rgb[at + channel])
     }
 
-    /// Correlation of brightness over the points, all pixels moved by so many units of shift.
-    fn agreement(&self, [right, down]: [i32; 2]) -> f64 {
-        let mut sums = [0.0; 5];
-        for &([x, y], color) in &self.points {
+    /// Correlation of brightness over one in `every` points, all pixels moved by so many units of shift.
+    fn agreement(&self, [right, down]: [i32; 2], every: usize) -> f64 {
+        let (mut sums, count) = ([0.0; 5], self.points.len().div_ceil(every));
+        for &([x, y], color) in self.points.iter().step_by(every) {
             let a = luminance(self.pixel([x + self.unit * right, y + self.unit * down]));
             let b = luminance(color);
             for (sum, value) in sums.iter_mut().zip([a, b, a * a, b * b, a * b]) {
                 *sum += value;
             }
         }
-        let [a, b, aa, bb, ab] = sums.map(|sum| sum / self.points.len() as f64);
+        let [a, b, aa, bb, ab] = sums.map(|sum| sum / count as f64);
         let of_both = ((aa - a * a).max(0.0) * (bb - b * b).max(0.0)).sqrt();
         if of_both > 0.0 { (ab - a * b) / of_both } else { 0.0 }
     }
@@ -327,16 +329,17 @@ impl<'a> PhotoLook<'a> {
         if self.points.len() < POINTS_LEAST {
             return None;
         }
-        let agreement_in_place = self.agreement([0, 0]);
-        let (mut shift, mut agreement) = ([0, 0], agreement_in_place);
+        let every = self.points.len().div_ceil(POINTS_FOR_SHIFTS);
+        let (mut shift, mut best) = ([0, 0], self.agreement([0, 0], every));
         for down in -SHIFTS..=SHIFTS {
             for right in -SHIFTS..=SHIFTS {
-                let here = self.agreement([right, down]);
-                if here > agreement {
-                    (shift, agreement) = ([right, down], here);
+                let here = self.agreement([right, down], every);
+                if here > best {
+                    (shift, best) = ([right, down], here);
                 }
             }
         }
+        let [agreement_in_place, agreement] = [[0, 0], shift].map(|shift| self.agreement(shift, 1));
         let moved = shift.map(|x| self.unit * x);
         let stops = |channel: usize| {
             let pairs = self

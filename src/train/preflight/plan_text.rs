@@ -39,7 +39,7 @@ fn growth(forecast: &Forecast) -> String {
             format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
         }
         Reach::Decided if forecast.gaussians[1] == forecast.gaussians[0] => String::from(
-            ", probably to stay: few photos see each place (it grows as far as held-out training photos say that it pays)",
+            ", probably to stay: few photos see each place (held-out training photos decide; see --quality)",
         ),
         Reach::Decided => {
             format!(

@@ -59,14 +59,21 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     plan_and_train(request, &dataset, tiers, trainer, Begun { diagnosis, ..begun })
 }
 
+/// Prints a part of the plan: to standard output where it is what was asked for.
+fn tell_plan(request: &RunRequest, text: &str) {
+    match request.dry_run {
+        true => crate::say!("{text}"),
+        false => crate::tell!("{text}"),
+    }
+}
+
 /// The request, with a schedule that suits the number of training photos.
 fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     let mut request = request.clone();
     let photos = start.dataset.train_views().len();
     if let Some(steps) = new_run::adapt_schedule(&mut request.config, photos).filter(|_| !request.quiet) {
-        crate::say!(
-            "photos  {photos} to train on: the rates fall until step {steps}, and stay low (see --schedule-steps)"
-        );
+        let text = format!("photos  {photos} to train on: the rates fall until step {steps}, and stay low");
+        tell_plan(&request, &(text + " (see --schedule-steps)"));
     }
     request
 }
@@ -86,7 +93,7 @@ fn adapt_to_photos(
         start = Start::read(&request.scene, &request.config, host_mem)?;
     }
     if let Some(diagnosis) = diagnosis.as_ref().filter(|_| !request.quiet) {
-        crate::say!("{}", plan_text::describe_photos(diagnosis, &before, &request.config));
+        tell_plan(&request, &plan_text::describe_photos(diagnosis, &before, &request.config));
     }
     Ok((request, start, diagnosis))
 }
@@ -200,11 +207,7 @@ pub(super) fn plan_and_train(
     let forecast = plan_run(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
     if !request.quiet {
         let plan = plan_text::describe(config, [&request.scene, &request.out], dataset, &trainer, &forecast, &tiers);
-        match request.dry_run {
-            // What was asked for goes to standard output.
-            true => crate::say!("{plan}"),
-            false => crate::tell!("{plan}"),
-        }
+        tell_plan(request, &plan);
     }
     let slots = trainer.scene.pager.slot_space().map_or(0, |slots| slots.total);
     let stored = slots * forecast.tiers.frame_bytes;

@@ -199,7 +199,7 @@ mod tests {
         let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
         let state = RunState::without_history(origin, "cpu".to_string(), 1);
         let changes = Changes::of_config(Path::new("config.toml"), &state, &config).unwrap();
-        assert_eq!(changes.numbers, ["appearance was absent and is \"off\""]);
+        assert_eq!(changes.numbers, ["appearance was absent and is \"auto\""]);
         assert!(changes.free.is_empty() && changes.fixed.is_empty());
     }
 

@@ -156,8 +156,8 @@ mod tests {
             assert!(HeldOut::new(&capped, views).positions.is_empty());
             // Every position has its turn, held-out ones once no check can come any more.
             let trained = |step: u32| (0..views).map(|at| held_out.trained_at(step, at)).collect::<Vec<usize>>();
-            assert!(trained(2000).iter().all(|at| *at < views && !held_out.positions.contains(at)));
-            assert_eq!(trained(2100), (0..views).collect::<Vec<usize>>());
+            assert!(trained(2200).iter().all(|at| *at < views && !held_out.positions.contains(at)));
+            assert_eq!(trained(2300), (0..views).collect::<Vec<usize>>());
         }
     }
 }

@@ -28,7 +28,7 @@ fn what_changed_is_said_and_left_as_it_was() {
         ],
     );
     for key in ["refine-poses", "robust-views", "robust-pixels"] {
-        assert!(said.contains(&format!("{key} was false and is true")), "{said}");
+        assert!(said.contains(&format!("{key} was \"off\" and is \"on\"")), "{said}");
     }
     assert!(!said.contains("threads"), "{said}");
     // The layout of stored pages cannot change, and steps cannot be fewer than were done.
