@@ -139,6 +139,7 @@
 //! 3. `tests/storage/schedule.rs`: what the order must do, as a simple model.
 
 pub mod base;
+pub mod cells;
 pub mod checkpoint;
 pub mod config;
 pub mod dataset;

@@ -145,7 +145,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     }
     if let Some(out) = args.resume {
         let (accept_changes, quiet) = (args.accept_changes, args.quiet);
-        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet, live };
+        let request = ResumeRequest { out, keys: args.keys, scene: args.scene, accept_changes, quiet, live, leg: None };
         if args.dry_run {
             gsscale::say!("{}", describe_resume(&request)?);
             return Ok(RunOutcome::of_nothing(request.out));
@@ -171,8 +171,10 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
     // What the run was started with is in its config.
     let (keys, accept_changes) = (TrainOverrides::default(), false);
-    let again = ResumeRequest { out: out.clone(), keys, scene: None, accept_changes, quiet, live: live.clone() };
-    go_on(run(&RunRequest { scene, out, config, dry_run, existing, quiet, live }), &again, args.restarts)
+    let request = RunRequest { scene, out, config, dry_run, existing, quiet, live, leg: None };
+    let (out, live) = (request.out.clone(), request.live.clone());
+    let again = ResumeRequest { out, keys, scene: None, accept_changes, quiet, live, leg: None };
+    go_on(run(&request), &again, args.restarts)
 }
 
 /// Config of the demo where `keys` leave it open: enough steps for a good picture within minutes on two cores, and enough Gaussians for

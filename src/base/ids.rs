@@ -6,6 +6,8 @@
 
 /// Bits of the path within an initial page.
 const PATH_BITS: u32 = 32;
+/// Set in the number of an initial page that is frozen.
+const FROZEN: u32 = 1 << 31;
 
 /// Id of a page by lineage: the number of the initial page (upper 32 bits) and the path down the splits since (lower 32
 /// bits, the in-order label of a binary tree: the root is 2^31, a child is half its parent's lowest set bit away).
@@ -13,9 +15,24 @@ const PATH_BITS: u32 = 32;
 pub struct PageId(u64);
 
 impl PageId {
-    /// The initial page number `index`.
+    /// The initial page number `index`, which is below 2^31 for a page that is trained.
     pub fn initial(index: u32) -> PageId {
         PageId((u64::from(index) << PATH_BITS) | 1 << (PATH_BITS - 1))
+    }
+
+    /// The initial page number `index` of those that are frozen: their rows are rendered and never change, so such a page never splits.
+    /// Frozen pages come after all others.
+    pub fn frozen(index: u32) -> PageId {
+        PageId::initial(FROZEN | index)
+    }
+
+    pub fn is_frozen(self) -> bool {
+        self.origin() & FROZEN != 0
+    }
+
+    /// The number of the initial page that this page is or came from.
+    pub fn origin(self) -> u32 {
+        (self.0 >> PATH_BITS) as u32
     }
 
     /// The ids of the two halves of this page, lower first; `None` after 31 splits in a row.
@@ -62,7 +79,7 @@ impl std::str::FromStr for PageId {
 impl std::fmt::Display for PageId {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let path = self.0 as u32;
-        write!(f, "{}", self.0 >> PATH_BITS)?;
+        write!(f, "{}", self.origin())?;
         // From the root down to the page: 0 is the lower half.
         let depth = PATH_BITS - 1 - path.trailing_zeros().min(PATH_BITS - 1);
         (0..depth).try_for_each(|level| write!(f, ".{}", path >> (PATH_BITS - 1 - level) & 1))

@@ -118,6 +118,9 @@ config_keys! {
         test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
         test_after: i64 = -1 => Numbers hidden;
+        /// Use only the photos that this file lists, a name on each line. The frame of the scene, and which photos are held out,
+        /// follow from all photos. Empty = all photos
+        views_file: String = String::new() => Derived;
         /// Use masks found in masks/ (white = keep), and the alpha of photos as a mask (opaque = keep). Without, transparent
         /// pixels show --background
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] masks: bool = true => Numbers;
@@ -132,6 +135,9 @@ config_keys! {
         /// Start from this PLY (Gaussians if it has f_dc_0, else coloured points), or from the last generation of this
         /// store folder (see gsscale-ckpt import), which may exceed memory. Empty = the dataset's points
         init_ply: String = String::new() => Derived;
+        /// Start from these pages of the store of --init-ply only: a file with a page on each line, as `12`, or `12 frozen` for a
+        /// page that is rendered and never changes. Empty = all pages, none frozen
+        pages_file: String = String::new() => Derived hidden;
         /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
         init_points: u32 = 100_000 => Numbers;
     }
@@ -208,6 +214,8 @@ config_keys! {
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
         appearance: Chosen<AppearanceMode> = Chosen(None) => Numbers;
+        /// With --appearance, start from the values of another run's photos, and hold their mean: its appearance.json. Empty = none
+        first_appearance: String = String::new() => Derived hidden;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
         /// auto is on where the first points contradict a photo before training. The log and the report name such views with and
         /// without this key
@@ -443,6 +451,7 @@ impl TrainConfig {
         let needs = [
             (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
             (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
+            (self.pages_file.is_empty(), "it knows no frozen pages", "leave out --pages-file"),
             (!self.refine_poses.is_on(), "it leaves the gradients of poses on the device", "leave out --refine-poses"),
             (self.strategy != StrategyName::Mcmc, "it adds no noise to means", "leave out --strategy mcmc"),
             (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
@@ -515,7 +524,7 @@ pub enum Class {
     /// Determines the layout of stored pages.
     Layout,
     /// Different values can have the same effect: for `schedule-steps` the resolved steps are compared, for `init-ply`
-    /// the digest of the first Gaussians.
+    /// and `pages-file` the digest of the first Gaussians, for `views-file` those of the views.
     Derived,
     /// The instruction path: as [`Class::Derived`]; results differ at most in rounding.
     Instructions,
@@ -568,6 +577,14 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
 /// Gives each key its help with its default, and its place in help: the first ones alone stand in `-h`, in one group and in few
 /// words. Flags have no clap defaults, because an absent flag must keep the config file's value.
 fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Command {
+    let commands: Vec<String> = command.get_subcommands().map(|command| command.get_name().to_string()).collect();
+    if !commands.is_empty() {
+        let with_help = |command| with_help_of_keys(command, is_short);
+        return commands.iter().fold(command, |command, name| command.mut_subcommand(name, with_help));
+    }
+    if !command.get_arguments().any(|argument| argument.get_id() == KEYS[0].field) {
+        return command;
+    }
     let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
     for key in KEYS {
         let value =

@@ -22,6 +22,7 @@ use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions};
 use crate::scene::init::InitOptions;
 use crate::schedule::order::Order;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 /// Resolved options of the training loop.
@@ -97,6 +98,8 @@ impl RunOptions {
             color_correct: config.color_correct.0,
             photos: PhotoOptions {
                 appearance: config.appearance.0.unwrap_or_default(),
+                // Read when a run begins.
+                first_appearance: None,
                 robust_views: config.robust_views.is_on(),
                 robust_pixels: config.robust_pixels.is_on(),
                 refine_poses: config.refine_poses.is_on(),
@@ -219,6 +222,7 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
         invert_masks: config.invert_masks,
         allow_missing: config.allow_missing,
         near_plane: config.near_plane,
+        views_file: (!config.views_file.is_empty()).then(|| PathBuf::from(&config.views_file)),
         ..LoadOptions::default()
     }
 }

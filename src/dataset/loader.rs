@@ -6,7 +6,7 @@
 //!
 //! Invariants: 1. every view of a dataset has a photo whose header and end marker exist and whose shape matches its
 //! camera; 2. frame, scene scale and split depend on the views registered in the model, so dropping a photo with
-//! `allow_missing` changes none of them; 3. everything dropped or repaired is in `warnings`.
+//! `allow_missing` or a views file changes none of them; 3. everything dropped or repaired is in `warnings`. The list of a views file, which drops most views, is no repair.
 
 use super::frame::{Extent, Frame, usable};
 use super::import::{Cloud, LocalCloud};
@@ -18,6 +18,7 @@ use super::photo_files::PhotoFiles;
 use super::photo_header::read_header;
 use super::resize::{Size, divided_size, same_shape};
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::read_text;
 use crate::scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -25,6 +26,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 const NAMES_LISTED: usize = 20;
+
+/// Longest list of views, bytes.
+const LIST_BYTES_MAX: u64 = 1 << 30;
 
 /// Masks that are decoded before a run, to say how they are read.
 const MASKS_LOOKED_AT: usize = 3;
@@ -52,6 +56,8 @@ pub struct LoadOptions {
     pub near_plane: f64,
     /// Folder that the views' names are relative to; `None`: derived from the first view's name and path.
     pub image_folder: Option<PathBuf>,
+    /// A file that lists the names of the views to keep, one on each line; `None` keeps all.
+    pub views_file: Option<PathBuf>,
 }
 
 impl Default for LoadOptions {
@@ -67,6 +73,7 @@ impl Default for LoadOptions {
             allow_missing: false,
             near_plane: 0.01,
             image_folder: None,
+            views_file: None,
         }
     }
 }
@@ -198,9 +205,15 @@ fn load_views(
         warnings
             .push(format!("{count} cameras are far from all others and do not count for the scene's size: {names}"));
     }
+    let posed = match &options.views_file {
+        Some(file) => keep_listed(posed, file)?,
+        None => posed,
+    };
     let present = drop_missing(posed, options, (root, &image_folder), &mut warnings)?;
     let photos = check_photos(&present, options, (root, &image_folder), &mut warnings)?;
-    warn_about_extra_photos(&photos, &mut warnings);
+    if options.views_file.is_none() {
+        warn_about_extra_photos(&photos, &mut warnings);
+    }
     let view = |((raw, split), photo): ((RawView, Split), PhotoSource)| {
         let k = intrinsics_at(&photo.intrinsics, photo.target);
         let pinhole = [k.fx, k.fy, k.cx, k.cy].map(|x| x as f32);
@@ -276,6 +289,22 @@ fn drop_unusable_poses(
         ));
     }
     good
+}
+
+/// Keeps the views that a file lists by name.
+/// Errors: the file cannot be read, or lists a view that the scene lacks.
+fn keep_listed(views: Vec<(RawView, Split)>, file: &Path) -> InputResult<Vec<(RawView, Split)>> {
+    let text = read_text(file, LIST_BYTES_MAX, "give a file with the name of a photo on each line")?;
+    let listed: BTreeSet<&str> = text.lines().filter(|line| !line.is_empty()).collect();
+    let kept: Vec<_> = views.into_iter().filter(|(view, _)| listed.contains(view.name.as_str())).collect();
+    let found: BTreeSet<&str> = kept.iter().map(|(view, _)| view.name.as_str()).collect();
+    let lacking: Vec<&str> = listed.difference(&found).copied().collect();
+    if lacking.is_empty() && !kept.is_empty() {
+        return Ok(kept);
+    }
+    let (count, total, names) = (lacking.len(), listed.len(), list_names(lacking.into_iter()));
+    let problem = format!("{count} of its {total} photos are not in the scene, or have no usable pose: {names}");
+    Err(InputError::new(file, problem, "list names as the model of the scene has them, at least one"))
 }
 
 /// Warns about pictures in the photos' folders that no view uses.

@@ -94,7 +94,7 @@ impl<'a> PendingEvents<'a> {
     pub fn apply(&self, id: PageId, applied: usize, rows: &mut RowsMut<'_>) -> Result<PageReplay, SplitTooDeep> {
         let mut replay = PageReplay::default();
         let mut edited = EditedRows { page: rows, table: None };
-        self.replay(applied, &mut edited, &mut replay);
+        self.replay(id, applied, &mut edited, &mut replay);
         if let Some(state) = edited.table {
             replay.edit = PageEdit::Replaced(self.split(id, state)?);
         }
@@ -122,17 +122,17 @@ impl<'a> PendingEvents<'a> {
         keeps && rounds > 0
     }
 
-    /// Applies the events from number `applied` on to a table that is neither split nor stored, for evaluation and
+    /// Applies the events from number `applied` on to the table of page `id`, which is neither split nor stored, for evaluation and
     /// export.
-    pub fn apply_to_table(&self, applied: usize, state: &mut SceneState) {
+    pub fn apply_to_table(&self, id: PageId, applied: usize, state: &mut SceneState) {
         let mut no_page = SceneState::default();
         let mut edited = EditedRows { page: &mut no_page.view_mut(), table: Some(std::mem::take(state)) };
-        self.replay(applied, &mut edited, &mut PageReplay::default());
+        self.replay(id, applied, &mut edited, &mut PageReplay::default());
         *state = edited.table.unwrap_or_default();
     }
 
-    /// Applies the events from number `from` on.
-    fn replay(&self, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut PageReplay) {
+    /// Applies the events from number `from` on. Frozen pages only get the bands that the renderer asks for.
+    fn replay(&self, id: PageId, from: usize, rows: &mut EditedRows<'_, '_>, replay: &mut PageReplay) {
         // Valid until rows are rewritten.
         let mut extremes = None;
         for index in from..self.events.len() {
@@ -141,6 +141,7 @@ impl<'a> PendingEvents<'a> {
                     rows.table().raise_sh_degree(degree);
                 }
                 Effect::RaiseShDegree { .. } => {}
+                _ if id.is_frozen() => {}
                 Effect::ResetOpacity { max_opacity } => {
                     let at = self.at(index);
                     let reset_rows = rows.in_place(|rows| ops::reset_opacity_rows(at, rows, max_opacity));

@@ -23,14 +23,16 @@ pub mod pose;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::camera::Camera;
-use exposure::AppearanceMode;
+use exposure::{AppearanceMode, GivenValues};
 use parameter::{Kind, PhotoParameter, SavedValues, ValuesError};
 
 /// What the user asked for, and what the kinds need of the other options of a run.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct PhotoOptions {
     /// Which corrections of the picture are trained.
     pub appearance: AppearanceMode,
+    /// What another run has found, to start from and to hold the mean at.
+    pub first_appearance: Option<GivenValues>,
     /// Whether views that contradict the scene are left out.
     pub robust_views: bool,
     /// Whether blocks of photos that contradict the scene are masked.

@@ -8,6 +8,8 @@ mod bench_tool;
 #[cfg(target_os = "linux")] // /proc shows the peak memory of a process
 mod bombs;
 #[cfg(unix)]
+mod cells;
+#[cfg(unix)]
 mod ckpt;
 mod cli;
 mod clients;

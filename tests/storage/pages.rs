@@ -378,7 +378,7 @@ fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, 
         let pending = PendingEvents::new(adam, SEED, page_rows, &log);
         let export = |page: &Page| {
             let mut state = page.state();
-            pending.apply_to_table(page.applied, &mut state);
+            pending.apply_to_table(PageId::initial(0), page.applied, &mut state);
             state
         };
         let seen: Vec<SceneState> = pages.pages.values().map(export).collect();
@@ -549,7 +549,7 @@ fn tightest_bounds(adam: &DeferredAdam, limits: &SplitLimits) -> f64 {
             let now = last + later;
             let due = EventLog::from_events(log.events().iter().copied().filter(|e| e.now() <= now).collect()).unwrap();
             let mut late = state.clone();
-            PendingEvents::new(adam, SEED, 1 << 20, &due).apply_to_table(0, &mut late);
+            PendingEvents::new(adam, SEED, 1 << 20, &due).apply_to_table(PageId::initial(0), 0, &mut late);
             let values = evaluate_all(&[late.view()], late.sh_degree(), adam, now);
             for row in 0..values.rows() {
                 let (mean, scales) = (values.row(Column::Means, row), values.row(Column::Scales, row));

@@ -236,6 +236,7 @@ fn train(
         existing: if args.overwrite { Existing::Overwrite } else { Existing::Refuse },
         quiet: args.quiet,
         live: None,
+        leg: None,
     })?;
     if outcome.exit_code == 0 {
         return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));

@@ -25,20 +25,24 @@ use super::parameter::{
     Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
 };
 use super::parameter::{views_by_name, write_values};
-use crate::base::error::InputResult;
+use crate::base::error::{InputError, InputResult};
+use crate::base::text::read_text;
 use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::image::{PictureGradient, Target};
-use fit::FittedPair;
-use model::CHANNEL_VALUES;
+use fit::{FittedPair, bounded};
+use model::{CHANNEL_VALUES, IMAGE_VALUES};
 use picture::Look;
 use predict::predict;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use state::{AppearanceState, Found, camera_groups, find, first_exposures};
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Which corrections are trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -77,13 +81,15 @@ impl AppearanceMode {
         match self {
             AppearanceMode::Off => 0,
             AppearanceMode::Exposure => 1,
-            AppearanceMode::Full => model::IMAGE_VALUES,
+            AppearanceMode::Full => IMAGE_VALUES,
         }
     }
 }
 
 /// Exposure and colours of each photo, vignetting of each camera.
-const FILE: &str = "appearance.json";
+pub const FILE: &str = "appearance.json";
+/// Longest such file: a million photos have some 400 MB.
+const FILE_BYTES_MAX: u64 = 1 << 30;
 
 pub(super) const KIND: Kind = Kind { name: "appearance", file: Some(FILE), first, check, finding };
 
@@ -97,6 +103,8 @@ struct Appearance {
     state: AppearanceState,
     /// Photos whose exposure started from EXIF data.
     first_exposures: u32,
+    /// What another run has found.
+    given: Option<GivenValues>,
     look: Look,
     /// The picture of the step as it was drawn, `[3][height][width]`.
     drawn: Vec<f32>,
@@ -112,6 +120,7 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
             state: AppearanceState::new(&camera_groups),
             camera_groups,
             first_exposures: 0,
+            given: options.first_appearance.clone(),
             look: Look::default(),
             drawn: Vec::new(),
             found: None,
@@ -157,8 +166,14 @@ impl PhotoParameter for Appearance {
         Ok(())
     }
 
-    /// Starts the exposures from EXIF data if more than half of the training photos state one. A function of the files alone.
+    /// Starts from the values of another run, which then hold the mean, or else starts the exposures from EXIF data if more than half of the training photos state one. A function of the files alone.
     fn start(&mut self, dataset: &Dataset) -> Vec<String> {
+        if let Some(given) = &self.given {
+            let value = |view: usize| given.get(&dataset.views[view].name).map(|&(values, seen)| (view, values, seen));
+            let values: Vec<_> = dataset.train_views().into_iter().filter_map(value).collect();
+            self.state.tie(&values);
+            return Vec::new();
+        }
         if self.state.images.iter().any(|image| image.sightings > 0) {
             return Vec::new();
         }
@@ -261,7 +276,7 @@ impl PhotoParameter for Appearance {
         };
         let trained = self.state.cameras.iter().enumerate().filter(|(_, camera)| camera.sightings > 0);
         let file = AppearanceFile {
-            model: self.mode.name(),
+            model: self.mode.name().into(),
             exposures_from_exif: self.first_exposures,
             images: views_by_name(dataset).into_iter().map(of_image).collect(),
             cameras: trained.map(|(group, camera)| (group, camera.falloff)).filter_map(of_camera).collect(),
@@ -270,10 +285,29 @@ impl PhotoParameter for Appearance {
     }
 }
 
-#[derive(Debug, Serialize)]
+/// What acted on each photo of a run, by name, and the steps that had seen it. Cameras start anew.
+pub type GivenValues = Arc<BTreeMap<String, ([f64; IMAGE_VALUES], u32)>>;
+
+/// Reads the appearance.json of a run.
+/// Errors: the file cannot be read, or is none.
+pub fn read_values(file: &Path) -> InputResult<GivenValues> {
+    let remedy = "name the appearance.json of a run with --appearance";
+    let text = read_text(file, FILE_BYTES_MAX, remedy)?;
+    let read: AppearanceFile = serde_json::from_str(&text).map_err(|e| InputError::new(file, e.to_string(), remedy))?;
+    let mut values = BTreeMap::new();
+    for ImageValues { name, exposure, homography: h, sightings } in read.images.into_iter().filter(|i| i.sightings > 0)
+    {
+        let of_photo = [exposure, h[0] - 1.0, h[1], h[2], h[3], h[4] - 1.0, h[5], h[6], h[7]];
+        let refuse = || InputError::new(file, "a value is not finite", remedy).at(name.clone());
+        values.insert(name.clone(), (bounded(of_photo).ok_or_else(refuse)?, sightings));
+    }
+    Ok(Arc::new(values))
+}
+
+#[derive(Debug, Serialize, Deserialize)]
 struct AppearanceFile {
     /// `exposure` or `full`.
-    model: &'static str,
+    model: Cow<'static, str>,
     /// Training photos whose exposure started from EXIF data.
     exposures_from_exif: u32,
     /// The training photos, in the order of their names.
@@ -282,7 +316,7 @@ struct AppearanceFile {
     cameras: Vec<CameraValues>,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 struct ImageValues {
     name: String,
     /// Stops, against the mean of all photos.
@@ -293,7 +327,7 @@ struct ImageValues {
     sightings: u32,
 }
 
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 struct CameraValues {
     /// Pixels.
     width: u32,

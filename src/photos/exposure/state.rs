@@ -63,6 +63,9 @@ pub struct AppearanceState {
     pub cameras: Vec<CameraState>,
     sums: [i64; IMAGE_VALUES],
     seen: u32,
+    /// What the mean of what acts is held at, fixed-point: zeros, or that of another run's values of these photos.
+    #[serde(skip)]
+    tied: [f64; IMAGE_VALUES],
 }
 
 /// For each camera, the number of its group: cameras that differ only in their pose form one.
@@ -115,8 +118,23 @@ impl AppearanceState {
         }
     }
 
+    /// Holds the mean of what acts at that of values that another run has found: each a view, what acted on it there, and the steps
+    /// that had seen it. Photos that no step has seen start from these values.
+    pub fn tie(&mut self, values: &[(usize, [f64; IMAGE_VALUES], u32)]) {
+        let mut sums = [0.0; IMAGE_VALUES];
+        for &(view, acting, sightings) in values {
+            let fixed = acting.map(|x| (x * PER_UNIT).clamp(-STORED_MOST, STORED_MOST).round() as i32);
+            (0..IMAGE_VALUES).for_each(|k| sums[k] += f64::from(fixed[k]));
+            let Some(image) = self.images.get_mut(view).filter(|image| image.sightings == 0) else { continue };
+            *image = ImageState { values: fixed, sightings: sightings.max(1) };
+            (0..IMAGE_VALUES).for_each(|k| self.sums[k] += i64::from(fixed[k]));
+            self.seen += 1;
+        }
+        self.tied = sums.map(|sum| sum / values.len().max(1) as f64);
+    }
+
     fn mean(&self) -> [f64; IMAGE_VALUES] {
-        self.sums.map(|sum| sum as f64 / f64::from(self.seen.max(1)))
+        std::array::from_fn(|k| self.sums[k] as f64 / f64::from(self.seen.max(1)) - self.tied[k])
     }
 
     /// What acts on a photo: its values less the mean, the first `used` of them; zeros for a photo that was not seen.
@@ -234,6 +252,24 @@ mod tests {
         assert!((far - (1.0 + 0.6 * 2.0 / 3.0)).abs() < 1e-6, "{far}");
         state.sums[0] += 1;
         assert!(state.check().is_err());
+    }
+
+    #[test]
+    fn the_values_of_another_run_act_and_their_mean_stays() {
+        let mode = AppearanceMode::Exposure;
+        let mut state = AppearanceState::new(&[0, 0, 0]);
+        let values = |exposure: f64| found(exposure).image;
+        state.tie(&[(0, values(0.5), 4), (1, values(0.25), 4)]);
+        let exposures = |state: &AppearanceState| [0, 1].map(|view| state.acting(view, 1)[0]);
+        assert_eq!((exposures(&state), state.check()), ([0.5, 0.25], Ok(())));
+        // As though the scene had become darker: no step moves the mean.
+        (0..2).for_each(|view| state.learn(mode, (view, 0), &found(0.9)));
+        let [first, second] = exposures(&state);
+        assert!((first + second - 0.75).abs() < 1e-6 && first > second, "{first}, {second}");
+        // A resumed run has its values and is tied again.
+        let mut resumed = AppearanceState { tied: [0.0; IMAGE_VALUES], ..state.clone() };
+        resumed.tie(&[(0, values(0.5), 4), (1, values(0.25), 4)]);
+        assert_eq!(resumed, state);
     }
 
     #[test]

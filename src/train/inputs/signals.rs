@@ -5,6 +5,7 @@
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::time::Instant;
 
 /// Turns writes beyond the file size limit into I/O errors, instead of ending the process.
 pub fn survive_file_size_limit() {
@@ -13,9 +14,13 @@ pub fn survive_file_size_limit() {
     let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
 }
 
+/// Exit code of a run that has come to its deadline.
+pub const DEADLINE_CODE: i32 = 75;
+
 /// The stop request of the process, with its signal.
 #[derive(Debug, Clone, Default)]
 pub struct StopFlag {
+    deadline: Option<Instant>,
     signal: Arc<AtomicUsize>,
     asked: Arc<AtomicBool>,
 }
@@ -39,10 +44,16 @@ impl StopFlag {
         Ok(flag)
     }
 
-    /// Exit code of the stop request, 129, 130 or 143; `None` without a request.
+    /// As if a signal came at this time.
+    #[must_use]
+    pub fn with_deadline(self, deadline: Option<Instant>) -> StopFlag {
+        StopFlag { deadline, ..self }
+    }
+
+    /// Exit code of the stop request, 129, 130 or 143, or [`DEADLINE_CODE`] after the deadline; `None` without a request.
     pub fn exit_code(&self) -> Option<i32> {
         match self.signal.load(Ordering::Relaxed) as i32 {
-            0 => None,
+            0 => self.deadline.filter(|at| Instant::now() >= *at).map(|_| DEADLINE_CODE),
             signal => Some(128 + signal),
         }
     }

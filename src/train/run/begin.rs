@@ -19,6 +19,7 @@ use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::{check_usable, remove_uncommitted};
 use crate::photos::diagnosis::{Diagnosis, Remedies};
+use crate::photos::exposure::read_values;
 use crate::render::Renderer;
 use crate::report::run_files::CONFIG_FILE;
 use crate::train::error::TrainError;
@@ -33,6 +34,7 @@ use crate::train::start::tiers::{self, Tiers};
 use crate::train::state::trainer::Trainer;
 use crate::train::state::turns::{keeps_first_count, too_few_to_decide};
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 /// Runs a request from beginning to end.
 /// Errors: bad input (leaves no files), or a failure while training (the last good step is written).
@@ -145,6 +147,9 @@ pub(crate) fn begin(
     }
     let mut options =
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
+    if !config.first_appearance.is_empty() {
+        options.photos.first_appearance = Some(read_values(Path::new(&config.first_appearance))?);
+    }
     let views = start.dataset.train_views().len();
     if keeps_first_count(&options.strategy, views) {
         crate::tell!("warning: {}", too_few_to_decide(views));
@@ -183,6 +188,7 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
         existing: Existing::Refuse,
         quiet: true,
         live: None,
+        leg: None,
     };
     let host_mem = host_budget(request.config.host_mem.0);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
@@ -216,6 +222,7 @@ pub(super) fn plan_and_train(
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
+    let stop = stop.with_deadline(request.leg.map(|leg| Instant::now() + leg));
     out_folder::make_folder(&request.out)?;
     // Take the lock before removing files; hold it to the end.
     let _lock = out_folder::lock(&request.out)?;

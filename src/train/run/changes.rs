@@ -31,7 +31,14 @@ pub(super) fn with_absolute_paths(config: TrainConfig) -> TrainConfig {
         "" => String::new(),
         path => std::path::absolute(path).map_or(path.to_string(), |p| p.to_string_lossy().into_owned()),
     };
-    TrainConfig { spill_dir: absolute(&config.spill_dir), init_ply: absolute(&config.init_ply), ..config }
+    TrainConfig {
+        spill_dir: absolute(&config.spill_dir),
+        init_ply: absolute(&config.init_ply),
+        pages_file: absolute(&config.pages_file),
+        first_appearance: absolute(&config.first_appearance),
+        views_file: absolute(&config.views_file),
+        ..config
+    }
 }
 
 /// Views to list of a difference; further ones are only counted.

@@ -4,6 +4,7 @@ use crate::config::file::TrainConfig;
 use crate::report::live::Live;
 use crate::train::log::report::Summary;
 use std::path::PathBuf;
+use std::time::Duration;
 
 /// Treatment of an existing output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -33,6 +34,8 @@ pub struct RunRequest {
     pub quiet: bool,
     /// The page that shows the run while it trains.
     pub live: Option<Live>,
+    /// Stop when the steps have taken so long, after one at least, as a signal would ask for it.
+    pub leg: Option<Duration>,
 }
 
 /// How a run ended.
@@ -40,7 +43,7 @@ pub struct RunRequest {
 pub struct RunOutcome {
     /// Content of summary.json; `None` for a dry run.
     pub summary: Option<Summary>,
-    /// Exit code of the process: 0, or 130/143 after a stop request.
+    /// Exit code of the process: 0, or that of the stop request.
     pub exit_code: i32,
     pub out: PathBuf,
     /// The run keeps its checkpoint after its end.

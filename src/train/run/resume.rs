@@ -43,6 +43,7 @@ use crate::train::state::trainer::Trainer;
 use crate::train::step::pages::PagedScene;
 use crate::train::stores::ownership::{Claim, Stored, last_state, open_own, read_own};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Remedy for an unusable config.toml.
 const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume restores it from the checkpoint; if the pages \
@@ -63,13 +64,15 @@ pub struct ResumeRequest {
     pub quiet: bool,
     /// The page that shows the run while it trains.
     pub live: Option<Live>,
+    /// As [`RunRequest::leg`].
+    pub leg: Option<Duration>,
 }
 
 impl ResumeRequest {
     /// The request for the rest of the run.
     fn to_run(&self, scene: &Path, config: TrainConfig, existing: Existing) -> RunRequest {
         let (scene, out, live) = (scene.to_path_buf(), self.out.clone(), self.live.clone());
-        RunRequest { scene, out, config, dry_run: false, existing, quiet: self.quiet, live }
+        RunRequest { scene, out, config, dry_run: false, existing, quiet: self.quiet, live, leg: self.leg }
     }
 }
 

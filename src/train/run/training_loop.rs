@@ -19,7 +19,7 @@ use crate::report::run_files::saved_ply_name;
 use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::save;
 use crate::train::error::TrainError;
-use crate::train::inputs::signals::StopFlag;
+use crate::train::inputs::signals::{DEADLINE_CODE, StopFlag};
 use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::{HostBudget, PLAN_BYTES};
@@ -57,8 +57,14 @@ impl TrainingLoop<'_> {
             let options = &self.trainer.options;
             (options.steps, options.eval_every, options.save_every, options.log_every)
         };
+        let first = self.trainer.steps_done();
+        let is_stopped = |done: u32| match self.stop.exit_code() {
+            // Or a run of legs that are too short would never end.
+            Some(DEADLINE_CODE) => done > first,
+            asked => asked.is_some(),
+        };
         // A step in flight is always finished.
-        while self.trainer.steps_done() < steps && (self.stop.exit_code().is_none() || self.trainer.is_ahead()) {
+        while self.trainer.steps_done() < steps && (!is_stopped(self.trainer.steps_done()) || self.trainer.is_ahead()) {
             if !self.log_due_events()? {
                 break;
             }

@@ -56,6 +56,7 @@ struct FirstOptions {
     sh_degree: u8,
     max_gaussians: u64,
     init_ply: Option<PathBuf>,
+    pages_file: Option<PathBuf>,
     init_points: u32,
     poor_points: bool,
     /// Whether Gaussians may exceed memory.
@@ -71,6 +72,7 @@ impl FirstOptions {
             sh_degree: config.sh_degree,
             max_gaussians: config.max_gaussians,
             init_ply: (!config.init_ply.is_empty()).then(|| PathBuf::from(&config.init_ply)),
+            pages_file: (!config.pages_file.is_empty()).then(|| PathBuf::from(&config.pages_file)),
             init_points: config.init_points,
             poor_points: config.poor_points.is_on(),
             spills: config.residence().spill_dir().is_some(),
@@ -168,10 +170,13 @@ impl Start {
     /// From the Gaussians of a store.
     fn of_store(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
-        let store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
+        let mut store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
             TrainError::Input(error) => error,
             other => InputError::new(folder, other.to_string(), "see the cause"),
         })?;
+        if let Some(file) = &options.pages_file {
+            store.keep_listed(file)?;
+        }
         let mut raw = read_scene(scene, &options.read)?;
         raw.points = PointCloud::default();
         let dataset = load_dataset(raw, &options.load)?;
@@ -341,9 +346,9 @@ impl Start {
             FirstRows::Store(store) => {
                 let (frame, sizes) = ((frame.origin.to_array(), frame.scale), (options.page_rows, sh_degree));
                 let mut number = 0;
-                store.for_each_page(frame, sizes, &mut |mut state| {
+                store.for_each_page(frame, sizes, &mut |is_frozen, mut state| {
                     moved += range.clamp_all(&mut state.columns.scales);
-                    take(PageId::initial(number), state)?;
+                    take(if is_frozen { PageId::frozen(number) } else { PageId::initial(number) }, state)?;
                     number += 1;
                     Ok(())
                 })?;

@@ -4,7 +4,8 @@
 //!
 //! Invariants: 1. between [`RowBackend::rows_in`] and [`RowBackend::update`] of a batch, the rows stay unchanged, because the
 //! update starts from the gathered values; 2. rows are updated in place, pages in parallel, with the same result for any number of
-//! threads; 3. an unchanged page stays clean; every changed page gets new bounds.
+//! threads; 3. an unchanged page stays clean; every changed page gets new bounds; a frozen page ([`crate::base::ids::PageId::frozen`]) is never
+//! changed.
 
 use super::catch_up;
 use super::pages::{PagedScene, SceneRules, WorkingSet, row_tables};
@@ -236,6 +237,9 @@ pub(super) fn update_pages(
     let counts: Vec<StepCounts> = shares
         .par_iter_mut()
         .map(|share| {
+            if share.page.meta.id.is_frozen() {
+                return StepCounts::default();
+            }
             let rows = share.drawn.rows;
             let counts = step_rows(&at, share.page.rows_mut(share.first_row), rows, share.values, share.grads);
             share.touched = counts.updated > 0;
@@ -246,7 +250,7 @@ pub(super) fn update_pages(
         })
         .collect();
     if collects {
-        for share in &mut shares {
+        for share in shares.iter_mut().filter(|share| !share.page.meta.id.is_frozen()) {
             let mut view = share.page.rows_mut(share.first_row);
             share.touched |= strategy.collect(&mut view, &share.drawn, &mut scene.histogram) > 0;
         }

@@ -96,9 +96,12 @@ impl SceneRules {
         PendingEvents::new(&self.adam, self.seed, self.page_rows, &self.events)
     }
 
-    /// Whether a page has not applied all events.
+    /// Whether a page has not applied all events that act on it.
     pub(super) fn is_behind(&self, meta: &PageMeta) -> bool {
-        (meta.events_applied as usize) < self.events.len()
+        match meta.id.is_frozen() {
+            true => meta.sh_degree < self.sh_degree,
+            false => (meta.events_applied as usize) < self.events.len(),
+        }
     }
 
     /// The index entry of a page that holds `state` with all events applied.
@@ -434,7 +437,7 @@ impl PagedScene {
                 .par_iter()
                 .map(|page| {
                     let mut state = rules.is_behind(&page.meta).then(|| read_page(&page.rows(0)))?;
-                    pending.apply_to_table(page.meta.events_applied as usize, &mut state);
+                    pending.apply_to_table(page.meta.id, page.meta.events_applied as usize, &mut state);
                     Some(state)
                 })
                 .collect();

@@ -10,9 +10,10 @@
 use super::comparison::Comparison;
 use super::pages::{PagedScene, WorkingSet};
 use crate::base::ids::PageNo;
-use crate::render::{Gradients, RenderOptions, Renderer, RowBatches};
+use crate::render::{Gradients, LossOptions, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
+use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use std::iter::Peekable;
 use std::vec::IntoIter;
@@ -107,6 +108,29 @@ impl Batches<'_> {
 pub fn draw(now: &mut SceneNow<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
     ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |_| {})?;
     Ok(now.renderer.picture()?)
+}
+
+/// The blending weight of each page in the picture that `camera` has: alpha T of its rows, summed over the pixels. Only pages that the
+/// camera may see are listed, in the order of their ids.
+/// Errors: as [`draw`].
+pub fn weigh_pages(
+    now: &mut SceneNow<'_>,
+    camera: &Camera,
+    options: &RenderOptions,
+) -> Result<Vec<(PageNo, f64)>, TrainError> {
+    now.renderer.weigh_rows(true)?;
+    // A page in a batch, so that the gradients come page by page.
+    let pass = ViewPass::new(now.scene, camera, options, 1);
+    pass.rows_in(now, |_| {})?;
+    now.renderer.picture()?;
+    let target = Target::new([camera.width, camera.height], vec![0; 3 * camera.pixels()]);
+    now.renderer.loss(&target, &LossOptions::default())?;
+    now.renderer.picture_back()?;
+    let mut weights = Vec::new();
+    pass.rows_out(now, |gradients| weights.push(gradients.weights.iter().map(|[weight, _]| f64::from(*weight)).sum()))?;
+    now.renderer.weigh_rows(false)?;
+    weights.reverse();
+    Ok(pass.pages.into_iter().zip(weights).collect())
 }
 
 /// Renders the view forwards and back, as a step does whose batches have at most `pages_most` pages, so that the memory of

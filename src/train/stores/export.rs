@@ -7,9 +7,10 @@
 
 use super::{StorePlace, find_store, options_of, run_state_of};
 use crate::base::error::{InputError, InputResult};
-use crate::base::ids::PageNo;
+use crate::base::ids::{PageId, PageNo};
 use crate::base::machine::host_bytes_peak;
 use crate::base::math::exp32;
+use crate::base::text::read_text;
 use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
@@ -34,6 +35,7 @@ use crate::train::inputs::gaussian_pages::truncate_sh;
 use crate::train::step::catch_up::evaluate_all;
 use crate::train::step::pages::PagedScene;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use xxhash_rust::xxh3::xxh3_64;
 
@@ -286,11 +288,36 @@ fn visibility(rows: &Columns, row: usize) -> f32 {
     opacity * exp32(scales[0] + scales[1] + scales[2] - shortest)
 }
 
-/// An opened store.
+/// The most pages of a list have a line of this many bytes each.
+const LIST_LINE_BYTES: u64 = 64;
+
+/// A page of a store as a list of pages names it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ListedPage {
+    pub page: PageId,
+    /// Its rows are rendered and never change.
+    pub is_frozen: bool,
+}
+
+impl ListedPage {
+    /// The line that names the page.
+    pub fn line(&self) -> String {
+        format!("{}{}\n", self.page, if self.is_frozen { " frozen" } else { "" })
+    }
+
+    fn of_line(line: &str) -> Result<ListedPage, String> {
+        let (page, is_frozen) = line.strip_suffix(" frozen").map_or((line, false), |page| (page, true));
+        Ok(ListedPage { page: page.parse()?, is_frozen })
+    }
+}
+
+/// An opened store, or some of its pages.
 pub struct StoredStart {
     folder: PathBuf,
     scene: PagedScene,
     state: RunState,
+    /// In the order of the first pages of a run; `None` for all pages, none frozen.
+    listed: Option<Vec<(PageNo, bool)>>,
     /// Holds the lock that excludes writers.
     _store: StoreReader,
 }
@@ -306,20 +333,63 @@ impl StoredStart {
         let state = run_state_of(&store, generation)?;
         let (_, options) = options_of(&folder, &state)?;
         let scene = scene_at(&store, generation, &state, &options, (host_mem, share), 0)?;
-        Ok(StoredStart { folder, scene, state, _store: store })
+        Ok(StoredStart { folder, scene, state, listed: None, _store: store })
+    }
+
+    /// Takes only the pages that `file` lists, a line each: trained ones first, then frozen ones.
+    /// Errors: the file cannot be read, lists no page to train, a page twice, or one that the store lacks.
+    pub fn keep_listed(&mut self, file: &Path) -> InputResult<()> {
+        let index = self.scene.pager.index();
+        let remedy = "list pages of the store, each once, those with the word `frozen` last";
+        let text = read_text(file, (index.len() as u64 + 1) * LIST_LINE_BYTES, remedy)?;
+        let mut open: BTreeMap<PageId, PageNo> = (0..).map(PageNo).zip(index).map(|(no, meta)| (meta.id, no)).collect();
+        let mut listed: Vec<(PageNo, bool)> = Vec::new();
+        for (number, line) in text.lines().enumerate() {
+            let refuse = |problem: String| InputError::new(file, problem, remedy).at(format!("line {}", number + 1));
+            let ListedPage { page, is_frozen } = ListedPage::of_line(line).map_err(refuse)?;
+            let no = open.remove(&page).ok_or_else(|| refuse(format!("the store has no further page {page}")))?;
+            if !is_frozen && listed.last().is_some_and(|(_, is_frozen)| *is_frozen) {
+                return Err(refuse("a page to train follows a frozen one".to_string()));
+            }
+            listed.push((no, is_frozen));
+        }
+        if listed.first().is_none_or(|(_, is_frozen)| *is_frozen) {
+            return Err(InputError::new(file, "it lists no page to train", remedy));
+        }
+        self.listed = Some(listed);
+        Ok(())
     }
 
     /// Upper bound of its Gaussians.
     pub fn rows_at_most(&self) -> u64 {
-        self.state.rows_bound
+        let index = self.scene.pager.index();
+        let of_page = |(page, _): &(PageNo, bool)| u64::from(index[page.index()].rows);
+        // Pages that miss events may hold more rows than they store.
+        let missed = self.state.rows_bound - self.state.rows;
+        let stored = self.listed.as_ref().map_or(self.state.rows, |listed| listed.iter().map(of_page).sum());
+        stored + missed
     }
 
-    /// Digest of the start: of the run state, from which the pages follow.
+    /// Digest of the start: of the run state, from which the pages follow, and of the list of pages.
     /// Errors: the state cannot be encoded.
     pub fn digest(&self) -> InputResult<u64> {
         let bytes = self.state.to_bytes();
-        let bytes = bytes.map_err(|e| InputError::new(&self.folder, e, "report this as a bug"))?;
+        let mut bytes = bytes.map_err(|e| InputError::new(&self.folder, e, "report this as a bug"))?;
+        for (page, is_frozen) in self.listed.iter().flatten() {
+            bytes.extend(self.scene.pager.index()[page.index()].id.to_bits().to_le_bytes());
+            bytes.push(u8::from(*is_frozen));
+        }
         Ok(xxh3_64(&bytes))
+    }
+
+    /// Its run without the pages.
+    pub fn state(&self) -> &RunState {
+        &self.state
+    }
+
+    /// Its pages after all steps of its run.
+    pub fn scene(&mut self) -> &mut PagedScene {
+        &mut self.scene
     }
 
     /// SH degree of its Gaussians.
@@ -327,39 +397,58 @@ impl StoredStart {
         self.scene.rules.sh_degree
     }
 
-    /// Passes first pages to `take`: at most `page_rows` rows each, in the local frame of `origin` and `scale`, with at
-    /// most `sh_degree` and with their uids. May be called repeatedly.
+    /// Passes first pages to `take`, with whether they are frozen: at most `page_rows` rows each, in the local frame of `origin` and
+    /// `scale`, with at most `sh_degree` and with their uids. May be called repeatedly.
     /// Errors: a page cannot be read or overflows f32 in the new frame, or `take` failed.
     pub fn for_each_page(
         &mut self,
-        (origin, scale): ([f64; 3], f64),
+        frame: ([f64; 3], f64),
         (page_rows, sh_degree): (usize, u8),
-        take: &mut dyn FnMut(SceneState) -> Result<(), TrainError>,
+        take: &mut dyn FnMut(bool, SceneState) -> Result<(), TrainError>,
     ) -> Result<(), TrainError> {
-        let print = &self.state.origin.dataset;
-        let meta =
-            SceneMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..SceneMeta::default() };
-        let index = self.scene.pager.index();
-        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
-        pages.sort_unstable_by_key(|p| index[p.index()].id);
-        let now = self.state.trainer.step;
-        for page in pages {
-            let (mut uid, mut columns) = (Vec::new(), Columns::default());
-            self.scene.visit(&[page], &[], &mut |rules, tables| {
-                uid = tables.iter().flat_map(|table| table.uid).copied().collect();
-                columns = evaluate_all(tables, rules.sh_degree, &rules.adam, now);
-                Ok::<(), TrainError>(())
-            })?;
-            if to_local(&mut columns, &meta, origin, scale) > 0 {
-                let problem = "its Gaussians are too far from the cameras for f32";
-                return Err(InputError::new(&self.folder, problem, "check that it is a scene of this dataset").into());
-            }
+        let pages = match &self.listed {
+            Some(listed) => listed.clone(),
+            None => self.pages().into_iter().map(|(page, _)| (page, false)).collect(),
+        };
+        for (page, is_frozen) in pages {
+            let (uid, columns) = self.rows_of(page, frame)?;
             let mut state = SceneState::from_columns(truncate_sh(columns, sh_degree));
             state.raise_sh_degree(sh_degree);
             state.uid = uid;
             let rows: Vec<u32> = (0..state.rows() as u32).collect();
-            rows.chunks(page_rows).try_for_each(|rows| take(state.select(rows)))?;
+            rows.chunks(page_rows).try_for_each(|rows| take(is_frozen, state.select(rows)))?;
         }
         Ok(())
+    }
+
+    /// All pages, in the order of their ids.
+    pub fn pages(&self) -> Vec<(PageNo, PageId)> {
+        let index = self.scene.pager.index();
+        let mut pages: Vec<(PageNo, PageId)> = (0..).map(PageNo).zip(index.iter().map(|meta| meta.id)).collect();
+        pages.sort_unstable_by_key(|(_, id)| *id);
+        pages
+    }
+
+    /// The uids and the values of the rows of a page, in the local frame of `origin` and `scale`.
+    /// Errors: the page cannot be read, or overflows f32 in that frame.
+    pub fn rows_of(
+        &mut self,
+        page: PageNo,
+        (origin, scale): ([f64; 3], f64),
+    ) -> Result<(Vec<u64>, Columns), TrainError> {
+        let print = &self.state.origin.dataset;
+        let meta =
+            SceneMeta { origin: print.origin, scale: print.scale, frame: ExportFrame::Local, ..SceneMeta::default() };
+        let (mut uid, mut columns, now) = (Vec::new(), Columns::default(), self.state.trainer.step);
+        self.scene.visit(&[page], &[], &mut |rules, tables| {
+            uid = tables.iter().flat_map(|table| table.uid).copied().collect();
+            columns = evaluate_all(tables, rules.sh_degree, &rules.adam, now);
+            Ok::<(), TrainError>(())
+        })?;
+        if to_local(&mut columns, &meta, origin, scale) > 0 {
+            let problem = "its Gaussians are too far from the cameras for f32";
+            return Err(InputError::new(&self.folder, problem, "check that it is a scene of this dataset").into());
+        }
+        Ok((uid, columns))
     }
 }

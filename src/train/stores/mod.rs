@@ -13,7 +13,7 @@ pub mod ownership;
 mod salvage;
 
 pub use change::{ClonedStore, PruneRequest, Pruned, RolledBack, clone_store, prune, rollback};
-pub use export::{ExportRequest, Exported, StoredStart, export};
+pub use export::{ExportRequest, Exported, ListedPage, StoredStart, export};
 pub use import::{ImportRequest, Imported, import};
 pub use inspect::{
     GenerationLine, Inspected, Listed, PageInspected, StoreFault, ValueSpread, Verdict, inspect, inspect_page, list,

@@ -1,0 +1,321 @@
+//! Cuts a city into cells: median splits of the ground until the cells have equal work and bytes, the views of each cell by blending weight,
+//! its margin and its ring, and what it will cost.
+//!
+//! Invariants: 1. every page has one owner, by its middle; every training view is in some cell; 2. every cell has [`VIEWS_LEAST`] training
+//! views, or there is only one cell; 3. `plan.toml` is written last; a city is cut once.
+
+use super::plan::{CELL_FILES, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
+use super::prior::GAUSSIANS_SHARE;
+use super::ring::pages_of_cell;
+use super::views::{Seen, SeenView, see};
+use super::{City, check_machine_keys, config_of};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
+use crate::config::file::{TrainConfig, TrainOverrides};
+use crate::config::new_run;
+use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
+use crate::scene::state::row_bytes;
+use crate::train::error::TrainError;
+use crate::train::log::report::Summary;
+use crate::train::stores::ListedPage;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// Keys that a run may decide by its diagnosis.
+const REMEDIES: [&str; 4] = ["appearance", "robust-views", "robust-pixels", "refine-poses"];
+/// A cell with fewer training views is joined to a neighbour.
+const VIEWS_LEAST: usize = 8;
+/// Pages are this full on average.
+const FILL: f64 = 0.7;
+
+/// How many cells a city gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum CellCount {
+    Cells(usize),
+    /// As many as it takes for none to train more Gaussians than this.
+    MostGaussians(u64),
+}
+
+/// A city to cut.
+#[derive(Debug, Clone)]
+pub struct CutRequest {
+    pub scene: PathBuf,
+    pub city: PathBuf,
+    pub cells: CellCount,
+    pub view_share: f64,
+    pub margin: f64,
+    /// Keys of this machine.
+    pub keys: TrainOverrides,
+    pub dry_run: bool,
+    pub quiet: bool,
+}
+
+/// A cell before it is written.
+pub(crate) struct Draft {
+    pub train: Vec<usize>,
+    pub test: Vec<usize>,
+    /// Places of pages.
+    pub trained: Vec<usize>,
+    pub frozen: Vec<usize>,
+}
+
+/// Cuts the city.
+/// Errors: it is cut already, there is no prior, or it has too few pages.
+pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
+    let city = City(request.city.clone());
+    check_machine_keys(&request.keys)?;
+    if !request.dry_run && city.plan().exists() {
+        let problem = "the city is cut already";
+        return Err(InputError::new(city.plan(), problem, "go on with gsscale-cells run, or begin another city").into());
+    }
+    let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
+    keys.extend(remedies_of_prior(&city)?);
+    let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
+    let seen = see(&request.scene, &city, &request.keys, request.quiet)?;
+    let gaussians: u64 = seen.pages.iter().map(|page| page.rows).sum();
+    let most = if whole.max_gaussians == 0 { GAUSSIANS_SHARE * gaussians } else { whole.max_gaussians };
+    let growth = (most as f64 / gaussians as f64).max(1.0);
+    let (leaves, drafts) = fitting_cells(&seen, request, growth)?;
+    let views = seen.views.iter().filter(|view| view.is_train).count();
+    let past = past_of(&city)?;
+    let mut cells = Vec::new();
+    for (number, draft) in drafts.iter().enumerate() {
+        let mut planned = plan_cell(&seen, draft, &whole, growth, views, past);
+        if !request.dry_run {
+            planned.files = write_cell(&city, number, &seen, draft, keys.clone(), &planned)?;
+        }
+        cells.push(planned);
+    }
+    let plan = CityPlan {
+        version: env!("CARGO_PKG_VERSION").to_string(),
+        prior: prior_digest(&city, seen.digest),
+        gaussians,
+        views,
+        growth,
+        view_share: request.view_share,
+        margin: request.margin,
+        origin: seen.origin,
+        scale: seen.scale,
+        up: seen.up,
+        axes: seen.axes,
+        cells,
+        leaves,
+    };
+    if !request.dry_run {
+        plan.write(&city)?;
+    }
+    Ok(plan)
+}
+
+/// The remedies that the prior has decided on: its diagnosis saw all photos, and every cell shall have the same.
+fn remedies_of_prior(city: &City) -> InputResult<toml::Table> {
+    let file = city.prior_run().join(CONFIG_FILE);
+    let config = toml::Table::try_from(TrainConfig::read(&file)?);
+    let config = config.map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+    Ok(config.into_iter().filter(|(key, _)| REMEDIES.contains(&key.as_str())).collect())
+}
+
+/// Cells of the number asked for or, if that is a number of Gaussians, the fewest whose trained rows stay below it.
+fn fitting_cells(seen: &Seen, request: &CutRequest, growth: f64) -> InputResult<(Vec<GroundRect>, Vec<Draft>)> {
+    let (mut cells, most) = match request.cells {
+        CellCount::Cells(cells) => (cells.max(1), u64::MAX),
+        CellCount::MostGaussians(most) => (1, most),
+    };
+    loop {
+        if cells > seen.pages.len() {
+            let problem = format!("the prior has {} pages, too few for {cells} cells", seen.pages.len());
+            return Err(InputError::new(
+                "--cells",
+                problem,
+                "ask for fewer or larger cells, or begin a city with smaller --page-rows",
+            ));
+        }
+        let (leaves, drafts) = drafts(seen, leaves_of(seen, cells), request);
+        let rows = |draft: &Draft| draft.trained.iter().map(|&page| seen.pages[page].rows).sum::<u64>();
+        let largest = drafts.iter().map(rows).max().unwrap_or(0);
+        if largest as f64 * growth <= most as f64 {
+            return Ok((leaves, drafts));
+        }
+        cells += 1;
+    }
+}
+
+/// The leaves of `cells` cells: halves of equal work, again and again, across the longest axis.
+fn leaves_of(seen: &Seen, cells: usize) -> Vec<GroundRect> {
+    // Bytes are rows, and work is the rows that views draw; each counts half.
+    let mut drawn = vec![0u64; seen.pages.len()];
+    let drawing = seen.views.iter().filter(|view| view.is_train).flat_map(|view| &view.weights);
+    drawing.for_each(|&(page, _)| drawn[page] += seen.pages[page].rows);
+    let [rows, drawings] =
+        [seen.pages.iter().map(|page| page.rows).sum::<u64>(), drawn.iter().sum()].map(|sum| sum.max(1) as f64);
+    let work: Vec<f64> =
+        seen.pages.iter().zip(&drawn).map(|(page, &drawn)| page.rows as f64 / rows + drawn as f64 / drawings).collect();
+    let all = GroundRect { cell: 0, low: [f64::NEG_INFINITY; 2], high: [f64::INFINITY; 2] };
+    let mut leaves = Vec::new();
+    halve(seen, &work, &mut (0..seen.pages.len()).collect::<Vec<_>>(), cells, all, &mut leaves);
+    leaves
+}
+
+fn halve(seen: &Seen, work: &[f64], pages: &mut [usize], cells: usize, leaf: GroundRect, leaves: &mut Vec<GroundRect>) {
+    if cells == 1 {
+        return leaves.push(GroundRect { cell: leaves.len(), ..leaf });
+    }
+    let extent = |axis: usize| {
+        let along = pages.iter().map(|&page| seen.pages[page].middle[axis]);
+        along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min)
+    };
+    let axis = usize::from(extent(1) > extent(0));
+    let along = |page: usize| seen.pages[page].middle[axis];
+    pages.sort_unstable_by(|&a, &b| along(a).total_cmp(&along(b)).then(a.cmp(&b)));
+    let low_cells = cells / 2;
+    let share: f64 = pages.iter().map(|&page| work[page]).sum::<f64>() * low_cells as f64 / cells as f64;
+    let mut below = 0.0;
+    let at = pages.iter().position(|&page| {
+        below += work[page];
+        below > share
+    });
+    // Each side keeps a page for each of its cells.
+    let at = at.unwrap_or(0).clamp(low_cells, pages.len() - (cells - low_cells));
+    let plane = 0.5 * (along(pages[at - 1]) + along(pages[at]));
+    let (mut low, mut high) = (leaf, leaf);
+    (low.high[axis], high.low[axis]) = (plane, plane);
+    let (low_pages, high_pages) = pages.split_at_mut(at);
+    halve(seen, work, low_pages, low_cells, low, leaves);
+    halve(seen, work, high_pages, cells - low_cells, high, leaves);
+}
+
+/// Gives the cells their views and pages. Cells with few views are joined to the neighbour that shares most of these views.
+fn drafts(seen: &Seen, mut leaves: Vec<GroundRect>, request: &CutRequest) -> (Vec<GroundRect>, Vec<Draft>) {
+    loop {
+        let cells = leaves.iter().map(|leaf| leaf.cell + 1).max().unwrap_or(0);
+        let cell_at = |at: [f64; 2]| leaves.iter().find(|leaf| leaf.holds(at)).map_or(0, |leaf| leaf.cell);
+        let owner: Vec<usize> = seen.pages.iter().map(|page| cell_at(page.middle)).collect();
+        let shares: Vec<Vec<f64>> = seen.views.iter().map(|view| shares_of(view, &owner, cells)).collect();
+        let takes = |view: usize, cell: usize| {
+            let of_view = &shares[view];
+            let largest = (0..cells).fold(0, |best, cell| if of_view[cell] > of_view[best] { cell } else { best });
+            of_view[cell] >= request.view_share || cell == largest || cell_at(seen.views[view].at) == cell
+        };
+        let views = |cell: usize, is_train: bool| -> Vec<usize> {
+            (0..seen.views.len()).filter(|&view| seen.views[view].is_train == is_train && takes(view, cell)).collect()
+        };
+        let train: Vec<Vec<usize>> = (0..cells).map(|cell| views(cell, true)).collect();
+        let fewest = (0..cells).min_by_key(|&cell| train[cell].len()).unwrap_or(0);
+        if cells == 1 || train[fewest].len() >= VIEWS_LEAST {
+            let draft = |cell: usize| {
+                let test = views(cell, false);
+                let (trained, frozen) =
+                    pages_of_cell(seen, &leaves, &owner, cell, train[cell].iter().chain(&test), request.margin);
+                Draft { train: train[cell].clone(), test, trained, frozen }
+            };
+            let drafts = (0..cells).map(draft).collect();
+            return (leaves, drafts);
+        }
+        let to = neighbour(seen, &leaves, &owner, fewest, &train[fewest], &shares);
+        for leaf in &mut leaves {
+            let cell = if leaf.cell == fewest { to } else { leaf.cell };
+            leaf.cell = cell - usize::from(cell > fewest);
+        }
+    }
+}
+
+/// The share of each cell in the blending weight of a view.
+fn shares_of(view: &SeenView, owner: &[usize], cells: usize) -> Vec<f64> {
+    let all: f64 = view.weights.iter().map(|(_, weight)| weight).sum();
+    let mut shares = vec![0.0; cells];
+    view.weights.iter().for_each(|&(page, weight)| shares[owner[page]] += weight / all);
+    shares
+}
+
+/// The cell that has most of the weight of these views beside `cell`; without views the one that owns the nearest page.
+fn neighbour(
+    seen: &Seen,
+    leaves: &[GroundRect],
+    owner: &[usize],
+    cell: usize,
+    views: &[usize],
+    shares: &[Vec<f64>],
+) -> usize {
+    let mut sums: BTreeMap<usize, f64> = BTreeMap::new();
+    for leaf in leaves.iter().filter(|leaf| leaf.cell != cell) {
+        let shared: f64 = views.iter().map(|&view| shares[view][leaf.cell]).sum();
+        sums.insert(leaf.cell, shared);
+    }
+    if let Some((&other, _)) =
+        sums.iter().max_by(|a, b| a.1.total_cmp(b.1).then(b.0.cmp(a.0))).filter(|(_, shared)| **shared > 0.0)
+    {
+        return other;
+    }
+    let own: Vec<[f64; 2]> =
+        (0..owner.len()).filter(|&page| owner[page] == cell).map(|page| seen.pages[page].middle).collect();
+    let apart = |page: usize| {
+        let to = |from: &[f64; 2]| (0..2).map(|i| (from[i] - seen.pages[page].middle[i]).powi(2)).sum::<f64>();
+        own.iter().map(to).fold(f64::INFINITY, f64::min)
+    };
+    let others = (0..owner.len()).filter(|&page| owner[page] != cell);
+    others.min_by(|&a, &b| apart(a).total_cmp(&apart(b))).map_or(usize::from(cell == 0), |page| owner[page])
+}
+
+/// Seconds of a step of the prior, from its summary.
+fn past_of(city: &City) -> InputResult<f64> {
+    let file = city.prior_run().join(SUMMARY_FILE);
+    let text = std::fs::read_to_string(&file).map_err(|e| InputError::io(&file, "reading", &e))?;
+    let summary: Summary =
+        serde_json::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), "train the prior again"))?;
+    Ok(summary.train_seconds / f64::from(summary.steps.max(1)))
+}
+
+/// What a cell has to do. Equal steps a view: a cell with a third of the training views takes a third of the steps.
+fn plan_cell(
+    seen: &Seen,
+    draft: &Draft,
+    whole: &TrainConfig,
+    growth: f64,
+    views: usize,
+    step_seconds: f64,
+) -> CellPlan {
+    let rows = |pages: &[usize]| pages.iter().map(|&page| seen.pages[page].rows).sum::<u64>();
+    let (trained, frozen) = (rows(&draft.trained), rows(&draft.frozen));
+    let steps = (u64::from(whole.steps) * draft.train.len() as u64).div_ceil(views as u64) as u32;
+    let grown = (trained as f64 * growth).ceil() as u64;
+    CellPlan {
+        train_views: draft.train.len(),
+        test_views: draft.test.len(),
+        steps,
+        trained_pages: draft.trained.len(),
+        frozen_pages: draft.frozen.len(),
+        trained,
+        frozen,
+        max_gaussians: grown + frozen,
+        bytes: ((grown + frozen) as f64 * row_bytes(whole.sh_degree) as f64 / FILL) as u64,
+        // A step draws up to `growth` times the rows of the prior's.
+        seconds: f64::from(steps) * step_seconds * (1.0 + growth) / 2.0,
+        files: String::new(),
+    }
+}
+
+/// Writes the files of a cell; returns their digest.
+fn write_cell(
+    city: &City,
+    number: usize,
+    seen: &Seen,
+    draft: &Draft,
+    mut keys: toml::Table,
+    planned: &CellPlan,
+) -> InputResult<String> {
+    let folder = city.cell(number);
+    std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "making the folder of the cell", &e))?;
+    keys.insert("steps".into(), i64::from(planned.steps).into());
+    keys.insert("max-gaussians".into(), (planned.max_gaussians as i64).into());
+    let text = toml::to_string(&keys).map_err(|e| InputError::new(&folder, e.to_string(), "report this as a bug"))?;
+    let mut views: Vec<usize> = draft.train.iter().chain(&draft.test).copied().collect();
+    views.sort_unstable_by_key(|&view| &seen.views[view].name);
+    let names: String = views.iter().map(|&view| format!("{}\n", seen.views[view].name)).collect();
+    let line = |(&page, is_frozen): (&usize, bool)| ListedPage { page: seen.pages[page].id, is_frozen }.line();
+    let trained = draft.trained.iter().map(|page| (page, false));
+    let pages: String = trained.chain(draft.frozen.iter().map(|page| (page, true))).map(line).collect();
+    for (name, text) in CELL_FILES.iter().zip([&text, &names, &pages]) {
+        write_whole(&folder.join(name), text.as_bytes())?;
+    }
+    files_digest(&folder)
+}

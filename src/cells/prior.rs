@@ -1,0 +1,113 @@
+//! The prior: the whole scene, coarsely, as an ordinary run on one machine; then its rows as a store without history, from which all cells
+//! start.
+//!
+//! Invariants: 1. the keys of the city are fixed here; 2. the store appears last, so a city that has it has a finished prior.
+
+use super::{AnyRun, City, begin_or_resume, config_of, is_of_machine};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
+use crate::config::file::{KEYS, TrainConfig, TrainOverrides};
+use crate::config::new_run;
+use crate::page::format::codec::Codec;
+use crate::train::error::TrainError;
+use crate::train::memory::host_budget;
+use crate::train::state::trainer::Trainer;
+use crate::train::stores::{ImportRequest, import};
+use std::path::PathBuf;
+
+/// The prior takes this part of the steps, and of the Gaussians.
+const STEPS_SHARE: u32 = 4;
+pub(crate) const GAUSSIANS_SHARE: u64 = 5;
+/// Longest side of its photos, pixels.
+const RESOLUTION_MOST: u32 = 800;
+/// Its highest SH degree.
+const SH_DEGREE_MOST: u8 = 1;
+
+/// A prior to train.
+#[derive(Debug, Clone)]
+pub struct PriorRequest {
+    pub scene: PathBuf,
+    pub city: PathBuf,
+    /// Config file of the whole scene; flags override it.
+    pub config: Option<PathBuf>,
+    /// Keys of the whole scene, and of this machine.
+    pub keys: TrainOverrides,
+    pub quiet: bool,
+}
+
+/// Begins the prior, goes on with it, or says that it is done. Returns the exit code: 0, or that of a stop request.
+/// Errors: those of a run; the city was begun with other keys.
+pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
+    let city = City(request.city.clone());
+    let mut keys = new_run::given_keys(request.config.as_deref(), &request.keys)?;
+    let of_machine = |name: &str| KEYS.iter().any(|key| key.name() == name && is_of_machine(key));
+    let machine: toml::Table = keys.clone().into_iter().filter(|(name, _)| of_machine(name)).collect();
+    keys.retain(|name, _| !machine.contains_key(name));
+    fix_keys(&city, &keys)?;
+    if city.prior_store().is_dir() {
+        crate::say!("the prior in {} is done", city.0.display());
+        return Ok(0);
+    }
+    let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
+    keys.extend(machine);
+    keys.extend(keys_of_prior(&whole));
+    let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
+    let (out, page_rows) = (city.prior_run(), config.page_rows);
+    let budget = host_budget(config.host_mem.0);
+    let (scene, quiet) = (&request.scene, request.quiet);
+    let any = AnyRun { scene, out: &out, config, keys: machine_keys(&request.keys), leg: None, quiet };
+    let outcome = begin_or_resume(any)?;
+    if outcome.exit_code != 0 {
+        return Ok(outcome.exit_code);
+    }
+    let rows = import(&ImportRequest {
+        file: Trainer::ply_path(&out),
+        out: city.prior_store(),
+        host_mem: budget.unwrap_or(1 << 30),
+        page_rows,
+        codec: Codec::Raw,
+    })?;
+    crate::say!("the prior in {} is done: {} Gaussians in {} pages", city.0.display(), rows.gaussians, rows.pages);
+    Ok(0)
+}
+
+/// The flags that may be given anew on a resume.
+fn machine_keys(keys: &TrainOverrides) -> TrainOverrides {
+    let (host_mem, threads, device) = (keys.host_mem, keys.threads, keys.device.clone());
+    TrainOverrides { host_mem, threads, device, device_mem: keys.device_mem, ..TrainOverrides::default() }
+}
+
+/// Keeps the keys of the whole scene, or compares them with those that the city has.
+fn fix_keys(city: &City, keys: &toml::Table) -> InputResult<()> {
+    let file = city.keys();
+    let text = toml::to_string(keys).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+    if !file.exists() {
+        std::fs::create_dir_all(&city.0).map_err(|e| InputError::io(&city.0, "making the folder", &e))?;
+        return write_whole(&file, text.as_bytes());
+    }
+    let before = new_run::given_keys(Some(&file), &TrainOverrides::default())?;
+    if before == *keys {
+        return Ok(());
+    }
+    let remedy = "give the flags with which it was begun, or another --out";
+    Err(InputError::new(&file, "the city was begun with other keys", remedy))
+}
+
+/// What makes the prior of a scene with this config coarse, and what lets its PLY keep all bits.
+pub(crate) fn keys_of_prior(whole: &TrainConfig) -> toml::Table {
+    let resolution =
+        Some(whole.max_resolution).filter(|&most| most > 0).map_or(RESOLUTION_MOST, |most| most.min(RESOLUTION_MOST));
+    let mut keys = toml::toml! {
+        export-frame = "local"
+        up = "keep"
+        keep-checkpoint = false
+    };
+    keys.insert("steps".into(), i64::from((whole.steps / STEPS_SHARE).max(1)).into());
+    keys.insert("max-resolution".into(), i64::from(resolution).into());
+    keys.insert("sh-degree".into(), i64::from(whole.sh_degree.min(SH_DEGREE_MOST)).into());
+    keys.insert("sh-start".into(), i64::from(whole.sh_start.min(SH_DEGREE_MOST)).into());
+    if whole.max_gaussians > 0 {
+        keys.insert("max-gaussians".into(), (whole.max_gaussians.div_ceil(GAUSSIANS_SHARE) as i64).into());
+    }
+    keys
+}

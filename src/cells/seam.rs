@@ -1,0 +1,248 @@
+//! What the borders of cells cost: the quality of held-out views in bands along borders in the picture, and how dense
+//! Gaussians are on both sides of them, against another scene of the same photos if one is given.
+//!
+//! A border is projected at the median height of the Gaussians beside it, without regard to what stands before it.
+//!
+//! Not here: the figures of whole views (`gsscale-eval`).
+
+use super::City;
+use super::plan::{CityPlan, GroundRect};
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::TrainConfig;
+use crate::config::limits::{self, RunOptions};
+use crate::dataset::loader::{Dataset, load_dataset};
+use crate::dataset::read::read_scene;
+use crate::dataset::target_cache::TargetCache;
+use crate::exchange::frames::to_local;
+use crate::exchange::ply::{PlyContent, read_ply};
+use crate::paging::pager::{Pager, PagerConfig};
+use crate::render::RenderOptions;
+use crate::render::metrics::{mean, psnr};
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
+use crate::scene::camera::Camera;
+use crate::scene::columns::Columns;
+use crate::scene::image::Target;
+use crate::train::error::TrainError;
+use crate::train::inputs::machine;
+use crate::train::step::pages::{PagedScene, WorkingSet};
+use crate::train::step::view::{SceneNow, draw};
+use glam::DVec3;
+use serde::Serialize;
+use std::path::Path;
+
+/// Points along a border, and the strips beside it in which Gaussians are counted, as a share of its length.
+const POINTS: usize = 256;
+const STRIP: f64 = 0.1;
+
+/// The figures of a scene at the borders of a city.
+#[derive(Debug, Clone, Serialize)]
+pub struct SeamReport {
+    /// Held-out views that show a border, and views that show none.
+    pub views: [usize; 2],
+    /// Mean PSNR of the first kind: whole, and in the bands; and of the second kind.
+    pub crossing_psnr: f64,
+    pub band_psnr: f64,
+    pub other_psnr: f64,
+    pub borders: Vec<BorderReport>,
+}
+
+/// The Gaussians beside a border.
+#[derive(Debug, Clone, Serialize)]
+pub struct BorderReport {
+    pub cells: [usize; 2],
+    /// Gaussians in the strips on both sides.
+    pub gaussians: [u64; 2],
+}
+
+/// A part of the border of two cells, along one axis of the ground.
+struct Border {
+    cells: [usize; 2],
+    /// The axis across it, and where it lies on that axis.
+    across: usize,
+    at: f64,
+    /// Its extent on the other axis.
+    from: f64,
+    to: f64,
+}
+
+/// Measures the scene in the folder `model`, which a merge or a run has written, at the borders of a city, in bands of this width, pixels.
+/// Errors: the plan, the model or its photos cannot be read.
+pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Result<SeamReport, TrainError> {
+    let city = City(city.to_path_buf());
+    let plan = CityPlan::read(&city)?;
+    let config = TrainConfig::read(&model.join(CONFIG_FILE))?;
+    machine::set_up(&config)?;
+    let scene = scene.map_or_else(|| city.scene(), |scene| Ok(scene.to_path_buf()))?;
+    let dataset = load_dataset(read_scene(&scene, &limits::read_options(&config))?, &limits::load_options(&config))?;
+    let columns = read_model(&model.join(PLY_FILE), &dataset)?;
+    let places = places_of(&plan, &dataset, &columns);
+    let borders = borders_of(&plan, &places);
+    let lines: Vec<Vec<DVec3>> = borders.iter().map(|border| line_of(border, &plan, &places, &dataset)).collect();
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    let run = RunOptions::new(&config, dataset.scene_scale);
+    let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
+    let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
+    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
+    let mut pages = PagedScene::new(&columns, pager, &bands)?;
+    let mut renderer = machine::renderer(&config)?.renderer;
+    let (mut crossing, mut banded, mut others) = (Vec::new(), Vec::new(), Vec::new());
+    for view in dataset.test_views() {
+        let (camera, target) = (&dataset.views[view].camera, targets.get(view)?);
+        let image = {
+            let working = &mut WorkingSet::default();
+            let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *renderer };
+            draw(&mut now, camera, &render)?;
+            renderer.image()?
+        };
+        let mask = band_mask(camera, &lines, 0.5 * band, target.mask.as_deref());
+        let banded_target = Target { mask: Some(mask), ..(*target).clone() };
+        match banded_target.counts() {
+            true => {
+                crossing.push(psnr(image, &target));
+                banded.push(psnr(image, &banded_target));
+            }
+            false => others.push(psnr(image, &target)),
+        }
+    }
+    let borders = borders.iter().map(|border| beside(border, &places)).collect();
+    let [crossing_psnr, band_psnr, other_psnr] = [&crossing, &banded, &others].map(|values| mean(values));
+    Ok(SeamReport { views: [crossing.len(), others.len()], crossing_psnr, band_psnr, other_psnr, borders })
+}
+
+fn read_model(file: &Path, dataset: &Dataset) -> InputResult<Columns> {
+    let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(file)? else {
+        return Err(InputError::new(file, "it holds points, not Gaussians", "name the folder of a merge or a run"));
+    };
+    to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+    Ok(columns)
+}
+
+/// Each row's place on the ground and its height, in the plan's frame.
+fn places_of(plan: &CityPlan, dataset: &Dataset, columns: &Columns) -> Vec<([f64; 2], f64)> {
+    let (origin, up) = (DVec3::from_array(plan.origin), DVec3::from_array(plan.up).normalize_or_zero());
+    let place = |mean: &[f32; 3]| {
+        let world = DVec3::from_array(mean.map(f64::from)) * dataset.frame.scale + dataset.frame.origin;
+        let local = (world - origin) / plan.scale;
+        (plan.ground(local.as_vec3().to_array()), local.dot(up))
+    };
+    columns.means.as_chunks::<3>().0.iter().map(place).collect()
+}
+
+/// The borders of neighbouring leaves of different cells, within the box of the rows without a hundredth on each side.
+fn borders_of(plan: &CityPlan, places: &[([f64; 2], f64)]) -> Vec<Border> {
+    let limits: [(f64, f64); 2] = [0, 1].map(|axis| {
+        let mut along: Vec<f64> = places.iter().map(|(at, _)| at[axis]).collect();
+        along.sort_unstable_by(f64::total_cmp);
+        let cut = along.len() / 100;
+        along.get(cut).copied().zip(along.iter().rev().nth(cut).copied()).unwrap_or((0.0, 0.0))
+    });
+    let mut borders = Vec::new();
+    let pairs = plan.leaves.iter().flat_map(|a| plan.leaves.iter().map(move |b| (a, b)));
+    for (a, b) in pairs.filter(|(a, b)| a.cell != b.cell) {
+        borders.extend((0..2).filter_map(|across| border(a, b, across, limits[1 - across])));
+    }
+    borders
+}
+
+/// The border of two leaves if `b` begins where `a` ends on the axis `across`.
+fn border(a: &GroundRect, b: &GroundRect, across: usize, (low, high): (f64, f64)) -> Option<Border> {
+    let other = 1 - across;
+    let (from, to) = (a.low[other].max(b.low[other]).max(low), a.high[other].min(b.high[other]).min(high));
+    let meet = a.high[across] == b.low[across] && from < to;
+    meet.then(|| Border { cells: [a.cell, b.cell], across, at: a.high[across], from, to })
+}
+
+impl Border {
+    /// How far a place lies beyond it, and whether it lies beside it.
+    fn beside(&self, at: [f64; 2], within: f64) -> Option<f64> {
+        let (away, along) = (at[self.across] - self.at, at[1 - self.across]);
+        (away.abs() < within && along >= self.from && along < self.to).then_some(away)
+    }
+}
+
+fn beside(border: &Border, places: &[([f64; 2], f64)]) -> BorderReport {
+    let mut gaussians = [0; 2];
+    let strip = STRIP * (border.to - border.from);
+    let sides = places.iter().filter_map(|(at, _)| border.beside(*at, strip));
+    sides.for_each(|away| gaussians[usize::from(away >= 0.0)] += 1);
+    BorderReport { cells: border.cells, gaussians }
+}
+
+/// Points of a border in the frame of the dataset, at the median height of the rows beside them.
+fn line_of(border: &Border, plan: &CityPlan, places: &[([f64; 2], f64)], dataset: &Dataset) -> Vec<DVec3> {
+    let step = (border.to - border.from) / POINTS as f64;
+    let mut heights: Vec<Vec<f64>> = vec![Vec::new(); POINTS];
+    let near = (border.to - border.from) * STRIP;
+    for (at, height) in places {
+        if border.beside(*at, near).is_some() {
+            let point = ((at[1 - border.across] - border.from) / step) as usize;
+            heights[point.min(POINTS - 1)].push(*height);
+        }
+    }
+    let [first, second] = plan.axes.map(DVec3::from_array);
+    let up = DVec3::from_array(plan.up).normalize_or_zero();
+    let mut line = Vec::new();
+    for (point, heights) in heights.iter_mut().enumerate().filter(|(_, heights)| !heights.is_empty()) {
+        heights.sort_unstable_by(f64::total_cmp);
+        let mut at = [0.0; 2];
+        (at[border.across], at[1 - border.across]) = (border.at, border.from + (point as f64 + 0.5) * step);
+        let local = first * at[0] + second * at[1] + up * heights[heights.len() / 2];
+        let world = local * plan.scale + DVec3::from_array(plan.origin);
+        line.push((world - dataset.frame.origin) / dataset.frame.scale);
+    }
+    line
+}
+
+/// The pixels of a view within `reach` of a border, without those that are masked already.
+fn band_mask(camera: &Camera, lines: &[Vec<DVec3>], reach: f64, masked: Option<&[u8]>) -> Vec<u8> {
+    let (width, height) = (camera.width as usize, camera.height as usize);
+    let mut mask = vec![0u8; width * height];
+    for line in lines {
+        let pixels: Vec<Option<[f64; 2]>> = line.iter().map(|&at| pixel_of(camera, at, reach)).collect();
+        for pair in pixels.windows(2) {
+            let [Some(from), Some(to)] = pair else { continue };
+            mark(&mut mask, [width, height], reach, *from, *to);
+        }
+    }
+    masked.into_iter().flatten().zip(&mut mask).for_each(|(of_photo, of_band)| *of_band = (*of_band).min(*of_photo));
+    mask
+}
+
+/// Where a position of the local frame is in the picture; `None` behind the camera or far outside.
+fn pixel_of(camera: &Camera, at: DVec3, reach: f64) -> Option<[f64; 2]> {
+    let row = |i: usize| {
+        let [x, y, z, t] = camera.viewmat[i].map(f64::from);
+        x * at.x + y * at.y + z * at.z + t
+    };
+    let z = row(2);
+    if z <= f64::from(camera.near_plane) {
+        return None;
+    }
+    let pixel = [
+        f64::from(camera.fx) * row(0) / z + f64::from(camera.cx),
+        f64::from(camera.fy) * row(1) / z + f64::from(camera.cy),
+    ];
+    let is_near =
+        pixel.iter().zip([camera.width, camera.height]).all(|(x, side)| *x > -reach && *x < f64::from(side) + reach);
+    is_near.then_some(pixel)
+}
+
+/// Marks the pixels within `reach` of a piece of a line.
+fn mark(mask: &mut [u8], [width, height]: [usize; 2], reach: f64, from: [f64; 2], to: [f64; 2]) {
+    let range = |axis: usize, side: usize| {
+        let (low, high) = (from[axis].min(to[axis]) - reach, from[axis].max(to[axis]) + reach);
+        (low.max(0.0) as usize)..(high.max(0.0) as usize + 1).min(side)
+    };
+    let along = [to[0] - from[0], to[1] - from[1]];
+    let length = (along[0] * along[0] + along[1] * along[1]).max(1e-12);
+    for y in range(1, height) {
+        for x in range(0, width) {
+            let off = [x as f64 + 0.5 - from[0], y as f64 + 0.5 - from[1]];
+            let share = ((off[0] * along[0] + off[1] * along[1]) / length).clamp(0.0, 1.0);
+            let away = [off[0] - share * along[0], off[1] - share * along[1]];
+            if away[0] * away[0] + away[1] * away[1] <= reach * reach {
+                mask[y * width + x] = 255;
+            }
+        }
+    }
+}

@@ -1,0 +1,290 @@
+//! Works on one cell: begins its run, goes on with it here or from the copy of another machine, and publishes what it has.
+//!
+//! The run goes in legs. Between two of them the last commit is copied to the city, so a machine that is lost costs a leg. A leg ends as a
+//! stop by a signal does, which changes no byte of the result.
+//!
+//! | in `cells/K/` | is |
+//! | --- | --- |
+//! | `run/` | the run's own folder and pages, without `--spill-dir` |
+//! | `copy/N/` | a commit; the largest N that is whole counts |
+//! | `done.toml` | the last step is in the copy |
+//!
+//! Invariants: 1. `done.toml` comes after the copy of the last commit; 2. only stores that are whole, and only under the cell's lock, get
+//! their name in `copy/`; 3. stores are removed by their identity.
+
+use super::lock::{CellLock, owner_of};
+use super::plan::{CityPlan, prior_digest};
+use super::{AnyRun, City, begin_or_resume, check_machine_keys, config_of};
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::write_whole;
+use crate::config::file::{TrainConfig, TrainOverrides};
+use crate::config::new_run;
+use crate::config::values::ByteSize;
+use crate::page::folder::spill_dir::SpillDir;
+use crate::page::tool::new_store::PART_SUFFIX;
+use crate::page::tool::reading::Access;
+use crate::train::error::TrainError;
+use crate::train::inputs::signals::DEADLINE_CODE;
+use crate::train::memory::host_budget;
+use crate::train::stores::ownership::last_state;
+use crate::train::stores::{StoredStart, clone_store, find_store};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Exit code: another attempt may succeed, here or elsewhere.
+pub const AGAIN: i32 = 75;
+/// Exit code: no further attempt will succeed.
+pub const NEVER: i32 = 2;
+
+/// Work on a cell.
+#[derive(Debug, Clone)]
+pub struct WorkRequest {
+    pub city: PathBuf,
+    pub cell: usize,
+    /// The scene, if it is not where the prior found it.
+    pub scene: Option<PathBuf>,
+    /// Keys of this machine.
+    pub keys: TrainOverrides,
+    /// Time between copies.
+    pub copy_every: Duration,
+    pub quiet: bool,
+}
+
+/// What `done.toml` says of a cell.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Done {
+    /// Digest of the cell's files.
+    pub files: String,
+    /// Number of the copy.
+    pub copy: u32,
+    pub steps: u32,
+    pub gaussians: u64,
+    pub seconds: f64,
+    /// PSNR on the held-out views of the cell, if it has any.
+    pub psnr: Option<f64>,
+}
+
+/// Works on a cell until it is done, or a signal stops it. Returns the exit code.
+/// Errors: those of a run; see [`code_of`].
+pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
+    let city = City(request.city.clone());
+    check_machine_keys(&request.keys)?;
+    let plan = CityPlan::read(&city)?;
+    plan.cell(&city, request.cell)?;
+    let folder = city.cell(request.cell);
+    if done_of(&plan, &city, request.cell)?.is_some() {
+        crate::say!("cell {} is done", request.cell);
+        return Ok(0);
+    }
+    check_prior(&plan, &city, &request.keys)?;
+    let lock = match CellLock::take(&folder)? {
+        Ok(lock) => lock,
+        Err(owner) => {
+            crate::tell!("another process works on cell {}: {owner}", request.cell);
+            return Ok(AGAIN);
+        }
+    };
+    let place = WorkPlace::of(request, &folder);
+    let files = &plan.cells[request.cell].files;
+    let (scene, keys) =
+        (request.scene.clone().map_or_else(|| city.scene(), Ok)?, place.keys(&city, &folder, &request.keys));
+    let config = config_of(&folder.join("cell.toml"), keys_of_cell(&folder)?, &keys)?;
+    place.fetch(&folder)?;
+    loop {
+        let leg = Some(request.copy_every);
+        let (config, keys) = (TrainConfig { keep_checkpoint: true, ..config.clone() }, keys.clone());
+        let (out, quiet) = (place.out.as_path(), request.quiet);
+        let outcome = begin_or_resume(AnyRun { scene: &scene, out, config, keys, leg, quiet })?;
+        if !lock.is_held() {
+            crate::tell!(
+                "another process has taken cell {} over: {}",
+                request.cell,
+                owner_of(&folder).unwrap_or_default()
+            );
+            return Ok(AGAIN);
+        }
+        let copy = publish(&folder, &place.out)?;
+        match (outcome.summary.filter(|summary| summary.finished), outcome.exit_code) {
+            (Some(summary), _) => {
+                let psnr = summary.test.map(|test| test.psnr);
+                let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
+                write_done(&folder, &Done { files: files.clone(), copy, steps, gaussians, seconds, psnr })?;
+                place.clear()?;
+                return Ok(0);
+            }
+            (None, DEADLINE_CODE) => {}
+            (None, _) => return Ok(AGAIN),
+        }
+    }
+}
+
+/// The exit code for an error: [`NEVER`] for bad input and for a run that diverges, which it will do again; [`AGAIN`] for what another
+/// machine, or another hour, may not have.
+pub fn code_of(error: &TrainError) -> i32 {
+    match error {
+        TrainError::Input(input) if !input.is_out_of_space() => NEVER,
+        TrainError::NonFinite { .. } => NEVER,
+        _ => AGAIN,
+    }
+}
+
+/// What the city knows of a cell that is done; `None` for one that is not.
+/// Errors: it was done under another plan.
+pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<Option<Done>> {
+    let file = city.cell(cell).join("done.toml");
+    let Ok(text) = std::fs::read_to_string(&file) else { return Ok(None) };
+    let again = "remove the file and the cell's folder copy, and run the cell again";
+    let done: Done = toml::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), again))?;
+    if done.files == plan.cells[cell].files {
+        return Ok(Some(done));
+    }
+    Err(InputError::new(&file, "the cell was trained under another plan", again))
+}
+
+/// The newest copy of a cell with its number.
+pub(crate) fn newest_copy(folder: &Path) -> Option<(u32, PathBuf)> {
+    let entries = std::fs::read_dir(folder.join("copy")).ok()?.flatten();
+    let number = |entry: std::fs::DirEntry| entry.file_name().to_str()?.parse().ok().map(|n: u32| (n, entry.path()));
+    entries.filter_map(number).max()
+}
+
+/// Steps of the newest copy of a cell.
+pub(crate) fn copied_steps(folder: &Path) -> Option<u32> {
+    let (_, copy) = newest_copy(folder)?;
+    last_state(&copy, Access::Map).ok().map(|state| state.trainer.step)
+}
+
+/// Refuses a prior that is not the one that was cut.
+fn check_prior(plan: &CityPlan, city: &City, keys: &TrainOverrides) -> Result<(), TrainError> {
+    let memory = host_budget(keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
+    let rows = StoredStart::open(&city.prior_store(), memory, 2)?.digest()?;
+    if prior_digest(city, rows) == plan.prior {
+        return Ok(());
+    }
+    let problem = "it is not the prior that was cut";
+    Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder").into())
+}
+
+fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
+    new_run::given_keys(Some(&folder.join("cell.toml")), &TrainOverrides::default())
+}
+
+fn write_done(folder: &Path, done: &Done) -> InputResult<()> {
+    let file = folder.join("done.toml");
+    let text = toml::to_string(done).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+    write_whole(&file, text.as_bytes())
+}
+
+/// Where this machine works on a cell.
+struct WorkPlace {
+    out: PathBuf,
+    /// The spill directory; `None` for a run in memory, whose checkpoint lies in `out`.
+    pages: Option<PathBuf>,
+}
+
+impl WorkPlace {
+    fn of(request: &WorkRequest, folder: &Path) -> WorkPlace {
+        match request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) {
+            None => WorkPlace { out: folder.join("run"), pages: None },
+            Some(drive) => {
+                let own = Path::new(drive).join(format!("cell-{}", request.cell));
+                WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) }
+            }
+        }
+    }
+
+    fn store(&self) -> PathBuf {
+        self.pages.clone().unwrap_or_else(|| self.out.join("checkpoint"))
+    }
+
+    /// The keys of this machine with the places of the cell's inputs.
+    fn keys(&self, city: &City, folder: &Path, machine: &TrainOverrides) -> TrainOverrides {
+        let text = |path: &Path| Some(path.to_string_lossy().into_owned());
+        TrainOverrides {
+            init_ply: text(&city.prior_store()),
+            views_file: text(&folder.join("views.txt")),
+            pages_file: text(&folder.join("pages.txt")),
+            spill_dir: self.pages.as_deref().and_then(text),
+            first_appearance: Some(city.prior_appearance()).filter(|file| file.is_file()).as_deref().and_then(text),
+            ..machine.clone()
+        }
+    }
+
+    /// Takes the newest copy of the cell as the checkpoint of this machine, unless it has one that is as new.
+    /// Errors: the copy is damaged, or the drive is not there or cannot be written.
+    fn fetch(&self, folder: &Path) -> Result<(), TrainError> {
+        let store = self.store();
+        let parent = store.parent().unwrap_or(&self.out);
+        // Not its parents: the folder that the user named may be a drive that is not mounted.
+        if !parent.is_dir() {
+            std::fs::create_dir(parent).map_err(|e| InputError::io(parent, "making the folder of the cell", &e))?;
+        }
+        let steps = |store: &Path| last_state(store, Access::Map).ok().map(|state| state.trainer.step);
+        let Some((_, copy)) = newest_copy(folder) else { return Ok(()) };
+        if steps(&store) >= steps(&copy) {
+            return Ok(());
+        }
+        remove_store(&store)?;
+        clone_store(&find_store(&copy)?, &store)?;
+        Ok(())
+    }
+
+    /// Removes the pages of a cell that is done; its results stay.
+    fn clear(&self) -> Result<(), TrainError> {
+        remove_store(&self.store())
+    }
+}
+
+/// Copies the last commit of the run in `out` into the city; returns the number of the copy.
+/// Errors: the commit is damaged, or the city cannot be written.
+fn publish(folder: &Path, out: &Path) -> Result<u32, TrainError> {
+    let copies = folder.join("copy");
+    std::fs::create_dir_all(&copies).map_err(|e| InputError::io(&copies, "making the folder of copies", &e))?;
+    let number = newest_copy(folder).map_or(0, |(number, _)| number + 1);
+    remove_store(&copies.join(format!("{number}{PART_SUFFIX}")))?;
+    clone_store(&find_store(out)?, &copies.join(number.to_string()))?;
+    (0..number).try_for_each(|older| remove_store(&copies.join(older.to_string())))?;
+    Ok(number)
+}
+
+/// Removes a store and its folder, if there is one.
+/// Errors: it is no store, or in use.
+fn remove_store(store: &Path) -> Result<(), TrainError> {
+    if !store.is_dir() {
+        return Ok(());
+    }
+    if SpillDir::exists_in(store) {
+        let mut spill = SpillDir::open(store, true)?;
+        spill.adopt_folder();
+        spill.remove()?;
+    }
+    // Only an empty folder goes.
+    let _ = std::fs::remove_dir(store);
+    Ok(())
+}
+
+/// The state of a cell as the folder of the city tells it.
+#[derive(Debug, Clone)]
+pub struct CellStatus {
+    pub done: Option<Done>,
+    /// Steps that the city has a copy of.
+    pub copied: u32,
+    /// Who works on it now.
+    pub owner: Option<String>,
+}
+
+/// The state of every cell.
+/// Errors: there is no plan, or a cell was done under another one.
+pub fn status(city: &Path) -> InputResult<(CityPlan, Vec<CellStatus>)> {
+    let city = City(city.to_path_buf());
+    let plan = CityPlan::read(&city)?;
+    let of = |cell: usize| {
+        let done = done_of(&plan, &city, cell)?;
+        let folder = city.cell(cell);
+        let copied = done.as_ref().map(|done| done.steps).or_else(|| copied_steps(&folder)).unwrap_or(0);
+        Ok(CellStatus { done, copied, owner: owner_of(&folder) })
+    };
+    let cells = (0..plan.cells.len()).map(of).collect::<InputResult<_>>()?;
+    Ok((plan, cells))
+}

@@ -1,0 +1,212 @@
+//! A city in cells through the program: the bytes of a cell, its failures, the ring, and the merge.
+
+use crate::support::scenes::told;
+use crate::support::workdir::{Running, Workdir, says};
+use gsscale::scene::columns::Column;
+use gsscale::train::stores::StoredStart;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+use std::time::Duration;
+
+const CELLS: &str = env!("CARGO_BIN_EXE_gsscale-cells");
+const GIB: u64 = 1 << 30;
+/// What is trained, so small that a cell takes a second.
+const KEYS: &str = "--max-gaussians 4000 --page-rows 32";
+const ON_CPU: &str = "--device cpu --quiet";
+
+struct Cells(Workdir);
+
+impl Cells {
+    /// A city of this many steps that is cut with these flags.
+    fn cut(steps: u32, flags: &str) -> Cells {
+        let cells = Cells(Workdir::wide_city(3000));
+        cells.done(&format!("prior scene --out city --steps {steps} {KEYS}"));
+        cells.done(&format!("cut scene --out city {flags}"));
+        cells
+    }
+
+    /// Runs the program, on the CPU where it trains; returns the exit code, and what it said.
+    fn says(&self, flags: &str) -> (Option<i32>, String) {
+        let trains = ["prior", "cut", "run"].iter().any(|command| flags.starts_with(command));
+        let output = self.0.output(CELLS, &format!("{flags} {}", if trains { ON_CPU } else { "" }));
+        (output.status.code(), told(&output))
+    }
+
+    fn done(&self, flags: &str) -> String {
+        let (code, said) = self.says(flags);
+        assert_eq!(code, Some(0), "{flags}: {said}");
+        said
+    }
+
+    fn plan(&self) -> toml::Table {
+        self.0.text("city/plan.toml").parse().unwrap()
+    }
+
+    fn count(&self) -> usize {
+        self.plan()["cells"].as_array().unwrap().len()
+    }
+
+    fn copy(&self, cell: usize) -> PathBuf {
+        let mut copies = std::fs::read_dir(self.0.path(&format!("city/cells/{cell}/copy"))).unwrap();
+        copies.next().unwrap().unwrap().path()
+    }
+
+    fn begin(&self, flags: &str) -> Running<'_> {
+        Running::spawn(&self.0, &mut self.0.command(CELLS, &format!("{flags} {ON_CPU}")))
+    }
+}
+
+#[test]
+fn one_cell_equals_the_plain_run_from_the_same_prior() {
+    let cells = Cells::cut(120, "--cells 1");
+    cells.done("run city --cell 0");
+    says(&cells.done("run city --cell 0"), &["cell 0 is done"]);
+    let plain = "--config city/cells/0/cell.toml --schedule run-length --strategy long-axis";
+    let plain = cells.0.run("plain", &format!("{plain} --init-ply city/prior/store"));
+    assert!(cells.0.ply("city/cells/0/run") == plain, "the scenes differ");
+    // On a drive and in few frames, too.
+    std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
+    std::fs::remove_dir_all(cells.0.path("city/cells/0/copy")).unwrap();
+    std::fs::create_dir(cells.0.path("nvme")).unwrap();
+    cells.done("run city --cell 0 --spill-dir nvme --frames 60");
+    assert!(cells.0.ply("nvme/cell-0/run") == plain, "the scenes differ");
+}
+
+#[test]
+fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
+    let cells = Cells::cut(120, "--cells 3");
+    for cell in 0..3 {
+        cells.done(&format!("run city --cell {cell}"));
+    }
+    let alone = cells.0.ply("city/cells/1/run");
+    says(&cells.done("status city"), &["3 of 3 cells are done"]);
+    let merged = cells.done("merge city --out whole");
+    ring_is_frozen(&cells, 1);
+    merge_is_by_place(&cells, &merged);
+    // As if nothing had been done; then two machines in turn, each killed.
+    for gone in ["done.toml", "copy", "run"] {
+        let path = cells.0.path(&format!("city/cells/1/{gone}"));
+        if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) }.unwrap();
+    }
+    ["one", "two"].iter().for_each(|drive| std::fs::create_dir(cells.0.path(drive)).unwrap());
+    let mut lives = 0;
+    let last = loop {
+        let drive = ["one", "two"][lives % 2];
+        let flags = format!("run city --cell 1 --spill-dir {drive} --commit-every 0.02 --copy-every 0.3");
+        if lives == 4 {
+            cells.done(&flags);
+            break drive;
+        }
+        let worker = cells.begin(&flags);
+        std::thread::sleep(Duration::from_millis(350 + 200 * lives as u64));
+        if !worker.kill() {
+            break drive;
+        }
+        lives += 1;
+    };
+    assert!(cells.0.ply(&format!("{last}/cell-1/run")) == alone, "after {lives} lives the scene is another");
+}
+
+/// The rows of the ring are those of the prior, bit for bit.
+fn ring_is_frozen(cells: &Cells, cell: usize) {
+    let mut prior = StoredStart::open(&cells.0.path("city/prior/store"), GIB, 2).unwrap();
+    let mut done = StoredStart::open(&cells.copy(cell), GIB, 2).unwrap();
+    let print = &done.state().origin.dataset;
+    let frame = (print.origin, print.scale);
+    let in_prior: BTreeMap<_, _> = prior.pages().into_iter().map(|(no, id)| (id, no)).collect();
+    let listed = cells.0.text(&format!("city/cells/{cell}/pages.txt"));
+    let (mut frozen, mut changed) = (0, 0);
+    for (no, id) in done.pages() {
+        let line = listed.lines().nth((id.origin() & 0x7fff_ffff) as usize).unwrap();
+        assert_eq!(line.ends_with("frozen"), id.is_frozen(), "{line}");
+        let page = in_prior[&line.trim_end_matches(" frozen").parse().unwrap()];
+        let (before, after) = (prior.rows_of(page, frame).unwrap(), done.rows_of(no, frame).unwrap());
+        let same = before.0 == after.0
+            && [Column::Means, Column::Quats, Column::Scales, Column::Opacities, Column::Sh0]
+                .into_iter()
+                .all(|column| before.1.column(column) == after.1.column(column));
+        assert!(same || !id.is_frozen(), "page {line} has changed");
+        frozen += usize::from(id.is_frozen());
+        changed += usize::from(!same);
+    }
+    assert!(frozen > 0 && changed > 0, "{frozen} pages are frozen, {changed} have changed");
+}
+
+/// The merged scene has each row of a cell that lies in its ground, and no row of the prior twice.
+fn merge_is_by_place(cells: &Cells, merged: &str) {
+    let plan = cells.plan();
+    let numbers =
+        |value: &toml::Value| -> Vec<f64> { value.as_array().unwrap().iter().map(|x| x.as_float().unwrap()).collect() };
+    let origin: [f64; 3] = numbers(&plan["origin"]).try_into().unwrap();
+    let axes: Vec<Vec<f64>> = plan["axes"].as_array().unwrap().iter().map(numbers).collect();
+    let frame = (origin, plan["scale"].as_float().unwrap());
+    let (leaves, of_prior) = (plan["leaves"].as_array().unwrap(), plan["gaussians"].as_integer().unwrap() as u64);
+    let cell_at = |mean: &[f32]| {
+        let at = |axis: usize| (0..3).map(|i| axes[axis][i] * f64::from(mean[i])).sum::<f64>();
+        let holds = |leaf: &&toml::Value| {
+            let [low, high] = ["low", "high"].map(|end| numbers(&leaf[end]));
+            (0..2).all(|axis| at(axis) >= low[axis] && at(axis) < high[axis])
+        };
+        leaves.iter().find(holds).unwrap()["cell"].as_integer().unwrap() as usize
+    };
+    let (mut uids, mut kept) = (BTreeSet::new(), 0);
+    for cell in 0..3 {
+        let mut store = StoredStart::open(&cells.copy(cell), GIB, 2).unwrap();
+        for (no, _) in store.pages().into_iter().filter(|(_, id)| !id.is_frozen()) {
+            let (of_page, columns) = store.rows_of(no, frame).unwrap();
+            let own = (0..columns.rows()).filter(|&row| cell_at(columns.row(Column::Means, row)) == cell);
+            kept += own.filter(|&row| of_page[row] >= of_prior || uids.insert(of_page[row])).count();
+        }
+    }
+    let (columns, _) = cells.0.gaussians("whole/point_cloud.ply");
+    let put_back: usize = merged.split(" put back").next().unwrap().rsplit(' ').next().unwrap().parse().unwrap();
+    assert_eq!(columns.rows(), kept + put_back, "{merged}");
+    assert!(columns.rows() > 1500, "{merged}");
+    assert!(cells.0.eval_psnr("whole --device cpu") > 10.0);
+}
+
+#[test]
+fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
+    let cells = Cells::cut(800, "--cells 2");
+    let refused = cells.says("run city --cell 0 --optimizer-on host");
+    assert_eq!(refused.0, Some(2), "a key that decides bytes: {}", refused.1);
+    let worker =
+        cells.begin("run city --cell 0 --threads 1 --log-every 1").once(|| cells.0.lines("city/cells/0/run") > 0);
+    let (code, said) = cells.says("run city --cell 0");
+    assert_eq!(code, Some(75), "{said}");
+    says(&said, &["another process works on cell 0"]);
+    worker.signal("TERM").ends(75);
+    says(&cells.done("status city"), &["cell 0:", "waiting", "0 of 2 cells are done"]);
+    cells.copy(0);
+    let (code, said) = cells.says("merge city --out whole");
+    assert_eq!(code, Some(2), "{said}");
+    says(&said, &["cells 0, 1 are not done"]);
+    for (file, from, to) in [("plan.toml", "steps = ", "steps = 1"), ("cells/1/pages.txt", "\n", " frozen\n")] {
+        let file = format!("city/{file}");
+        let before = cells.0.text(&file);
+        cells.0.write(&file, before.replacen(from, to, 1));
+        let (code, said) = cells.says("run city --cell 1");
+        assert_eq!(code, Some(2), "{said}");
+        says(&said, &["was changed after the cut", "remedy"]);
+        cells.0.write(&file, before);
+    }
+    let (code, said) = cells.says("cut scene --out city --cells 3");
+    assert_eq!(code, Some(2), "{said}");
+    says(&said, &["the city is cut already"]);
+}
+
+#[test]
+fn cells_with_few_photos_or_none_are_joined_to_a_neighbour() {
+    let cells = Cells::cut(40, "--cells 16 --view-share 0.6");
+    let plan = cells.plan();
+    let of = |cell: &toml::Value| cell["train_views"].as_integer().unwrap();
+    let views: Vec<i64> = plan["cells"].as_array().unwrap().iter().map(of).collect();
+    assert!(cells.count() < 16 && views.iter().all(|&views| views >= 8 || cells.count() == 1), "{views:?}");
+    // All photos have a cell, and all of the ground has one.
+    let names = (0..cells.count()).flat_map(|cell| {
+        let names = cells.0.text(&format!("city/cells/{cell}/views.txt"));
+        names.lines().map(str::to_string).collect::<Vec<_>>()
+    });
+    assert_eq!(names.collect::<BTreeSet<_>>().len(), cells.0.photos().len());
+    assert_eq!(plan["leaves"].as_array().unwrap().len(), 16);
+}

@@ -1,0 +1,38 @@
+#!/bin/bash
+# Runs the cells of a city as a Slurm array, and merges them when all are done:
+#
+#   bash slurm.sh city runs/city --mem=24G --cpus-per-task=16        flags after the second folder are those of sbatch
+#
+# GSSCALE_FLAGS holds flags for `gsscale-cells run`, such as "--host-mem 20GiB"; SPILL_DIR a folder on a fast drive of each node.
+# A task that is preempted, or comes to its time limit, commits, copies the commit into the city and is queued again.
+#SBATCH --job-name=gsscale-cells
+#SBATCH --requeue
+#SBATCH --signal=B:TERM@120
+#SBATCH --open-mode=append
+set -u
+
+if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
+    city=$(realpath "$1") out=$2
+    shift 2
+    last=$(($(grep -c '^\[\[cells\]\]' "$city/plan.toml") - 1))
+    job=$(sbatch --parsable --array="0-$last" "$@" --export=ALL,CITY="$city" "$0") || exit 1
+    sbatch --dependency="afterok:$job" --job-name=gsscale-merge --wrap "gsscale-cells merge '$city' --out '$(realpath -m "$out")'"
+    exit
+fi
+
+# Word splitting of the flags is wanted.
+# shellcheck disable=SC2086
+gsscale-cells run "$CITY" --cell "$SLURM_ARRAY_TASK_ID" --quiet ${SPILL_DIR:+--spill-dir "$SPILL_DIR"} ${GSSCALE_FLAGS:-} &
+worker=$!
+trap 'kill -TERM $worker' TERM
+wait $worker
+code=$?
+# The first wait ends with the signal, the second with the commit.
+if [ $code -gt 128 ]; then
+    wait $worker
+    code=$?
+fi
+if [ $code -eq 75 ]; then
+    scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"
+fi
+exit $code
