@@ -108,7 +108,7 @@ pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
 }
 
 /// The remedies that the prior has decided on: its diagnosis saw all photos, and every cell shall have the same.
-fn remedies_of_prior(city: &City) -> InputResult<toml::Table> {
+pub(crate) fn remedies_of_prior(city: &City) -> InputResult<toml::Table> {
     let file = city.prior_run().join(CONFIG_FILE);
     let config = toml::Table::try_from(TrainConfig::read(&file)?);
     let config = config.map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;

@@ -8,6 +8,7 @@
 //! Invariants: 1. the result is a function of the cells' copies and the plan; 2. no identity of a prior row comes twice; 3. the PLY appears
 //! as a whole.
 
+use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
 use super::work::{done_of, newest_copy};
 use super::{City, config_of};
@@ -233,12 +234,17 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path) -> InputResult<()> {
     let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
     let of_cell = new_run::given_keys(Some(&city.cell(0).join("cell.toml")), &TrainOverrides::default())?;
     let ended = config_of(&city.cell(0), of_cell, &TrainOverrides::default())?;
+    keys.extend(remedies_of_prior(city)?);
     keys.remove("max-gaussians");
     keys.insert("steps".into(), i64::from((whole.steps / POLISH_SHARE).max(1)).into());
     for (key, word) in [("strategy", "none"), ("schedule", "classic")] {
         keys.insert(key.into(), word.into());
     }
-    for (key, path) in [("init-ply", out.join(PLY_FILE)), ("views-file", views)] {
+    let mut paths = vec![("init-ply", out.join(PLY_FILE)), ("views-file", views)];
+    if city.prior_appearance().is_file() {
+        paths.push(("first-appearance", city.prior_appearance()));
+    }
+    for (key, path) in paths {
         let path = std::path::absolute(&path).unwrap_or(path);
         keys.insert(key.into(), path.to_string_lossy().into_owned().into());
     }
