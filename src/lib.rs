@@ -35,6 +35,7 @@
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
+//! | [`cells`] | a city in cells, on several machines: the prior, the cut, a cell's run, the merge, the seam |
 //!
 //! The programs are in `tools/`, one file each, with a folder where a program has several commands: they parse, call, print.
 //!
