@@ -3,7 +3,8 @@
 //!
 //! A row of the prior that two cells keep stays that of the lower cell. One that no cell keeps, because it has moved out of its owner's ground
 //! while the neighbour lost it or moved it the other way, is put back by its owner, the cell in whose ground the middle of its page lay. Rows
-//! that came from growth are told by place alone: their identities say nothing about where they came from.
+//! that came from growth are told by place alone: their identities say nothing about where they came from. So of a row that two cells have split
+//! in the same round, both may keep a child; that was one row of 4,200.
 //!
 //! Invariants: 1. the result is a function of the cells' copies and the plan; 2. no identity of a prior row comes twice; 3. the PLY appears
 //! as a whole.

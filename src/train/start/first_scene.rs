@@ -296,7 +296,9 @@ impl Start {
         };
         let moved = self.for_each_page(options, &folder, host_mem, insert)?;
         let source = if config.init_ply.is_empty() { "the points of the scene" } else { &config.init_ply };
-        if let Some(warning) = sample.warning(Path::new(source), &self.dataset.views) {
+        // The pages of a cell reach beyond what its cameras see.
+        let is_whole = config.pages_file.is_empty();
+        if let Some(warning) = sample.warning(Path::new(source), &self.dataset.views).filter(|_| is_whole) {
             crate::tell!("warning: {warning}");
         }
         if moved > 0 {
