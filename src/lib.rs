@@ -21,6 +21,7 @@
 //! | [`base`] | errors, names of pages, random draws, deterministic math, instruction paths; knows neither Gaussians nor disks |
 //! | [`scene`] | Gaussians, cameras and images as data; first Gaussians from points; the log of global events |
 //! | [`dataset`] | where views come from: COLMAP, transforms.json, MatrixCity, Mega-NeRF, OpenSfM, RealityCapture, the generated city; decoding photos |
+//! | [`poses`] | camera poses of photos without any: runs COLMAP or pycolmap on pairs that it chooses; GPS to metres |
 //! | [`schedule`] | which view comes when, and which pages it needs |
 //! | [`page`] | pages as bytes: buffers, slots on disk, checksums, the engines that move them, the map of versions and the commits that make them last |
 //! | [`paging`] | one cache and one plan, for runs and for simulations: brings the pages of a view into memory and takes them back; writes a commit's pages beside training |
@@ -152,6 +153,7 @@ pub mod optim;
 pub mod page;
 pub mod paging;
 pub mod photos;
+pub mod poses;
 pub mod render;
 pub mod report;
 pub mod scene;

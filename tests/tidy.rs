@@ -10,6 +10,7 @@ const LAYERS: &[(&str, &str)] = &[
     ("base", ""),
     ("scene", "base"),
     ("dataset", "base scene"),
+    ("poses", "base dataset"),
     ("schedule", "base scene"),
     ("page", "base"),
     ("paging", "base scene page schedule"),

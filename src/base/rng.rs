@@ -28,6 +28,8 @@ pub enum Purpose {
     Relocation = 9,
     /// Noise on means; keys: uid, step.
     MeanNoise = 10,
+    /// Places that descriptions of corners compare; keys: 0, 0.
+    CornerPattern = 11,
 }
 
 /// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number

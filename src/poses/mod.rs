@@ -1,0 +1,569 @@
+//! Camera poses for a folder of photos without any: COLMAP or pycolmap computes them, this room decides what they compute.
+//!
+//! In order: lists the photos ([`photos`]), chooses the pairs to compare ([`pairs`], [`similar`]), runs the phases of the program
+//! ([`program`]), and writes the largest model into `sparse/0` of the scene ([`model`]), in metres where GPS allows ([`geo`]).
+//!
+//! The program works in the folder `poses` of the scene, on links of the photos under plain names: its lists of pairs have no way to
+//! write a space. A phase that is finished is not done again, as long as photos and options are the same.
+//!
+//! Not here: reading the result ([`crate::dataset`]).
+//!
+//! Invariants: 1. photos are never changed, moved or deleted; 2. an existing model is never replaced; 3. only files that this room has
+//! made are deleted, in a folder whose state file says that it is this room's; 4. `sparse` appears as a whole.
+
+pub mod geo;
+pub mod model;
+pub mod pairs;
+pub mod photos;
+pub mod program;
+pub mod similar;
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::units::{format_grouped, format_seconds};
+use crate::base::whole_file::write_whole;
+use crate::base::whole_folder::remove_ours;
+use crate::dataset::exif::GpsPlace;
+use crate::dataset::model::{RawScene, ReadOptions};
+use crate::dataset::read::read_scene;
+use geo::{Similarity, metres_from, robust_similarity};
+use pairs::{ChosenBy, Pairs, choose_pairs, count_of, way_of};
+use photos::{FoundPhoto, camera_groups, list_photos};
+use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Places, Program, SPARSE};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+/// The folder in the scene in which the program works.
+pub const WORK_FOLDER: &str = "poses";
+/// Where the origin of a model in metres lies, as OpenSfM names it.
+pub const ORIGIN_FILE: &str = "reference_lla.json";
+const STATE_FILE: &str = "state.json";
+/// What marks a work folder as ours.
+const MADE_BY: &str = "gsscale-poses 1";
+/// Photos of a camera from which all its lens parameters follow well; below, one parameter of distortion is sought.
+const PHOTOS_FOR_OPENCV: usize = 10;
+/// Chunks of pairs: progress is known between them.
+const CHUNKS: usize = 50;
+const CHUNK_LEAST: usize = 200;
+/// Seconds of one core: features a megapixel, likeness a photo, the model a photo of a small scene.
+const FEATURES_SECONDS: f64 = 1.6;
+const LIKENESS_SECONDS: f64 = 0.3;
+const MODEL_SECONDS: f64 = 0.5;
+/// Photos from which a model takes noticeably longer for each photo.
+const MODEL_GROWTH: f64 = 500.0;
+/// GPS that disagrees with the model by more than this part of the extent of the places aligns nothing.
+const DISAGREEMENT_MAX: f64 = 0.3;
+
+/// What the user asks for.
+#[derive(Debug, Clone)]
+pub struct PosesRequest {
+    /// A folder of photos, or one that holds them in `images`.
+    pub photos: PathBuf,
+    /// The folder of the scene; `None` is that of the photos.
+    pub out: Option<PathBuf>,
+    pub places: Places,
+    pub features: FeatureOptions,
+}
+
+/// Shows progress: what is done, how much of it, and of how much.
+pub type Watch<'a> = dyn FnMut(&'static str, u32, u32) + 'a;
+
+/// Makes the display of one kind of progress, by its name and total.
+pub type NewDisplay<'a> = dyn Fn(&'static str, u32) -> Box<dyn Fn(u32)> + 'a;
+
+/// A search that can begin: photos, program and folders are known.
+#[derive(Debug)]
+pub struct PoseSearch {
+    /// Gets `sparse` and, if the photos are elsewhere, `images`.
+    pub scene: PathBuf,
+    /// Whether the scene needs links of the photos.
+    links_photos: bool,
+    photos: Vec<FoundPhoto>,
+    groups: Vec<Vec<usize>>,
+    program: Program,
+    features: FeatureOptions,
+    /// Sentences for the user, about photos that are left out.
+    pub warnings: Vec<String>,
+}
+
+/// What a search found.
+#[derive(Debug)]
+pub struct FoundPoses {
+    pub scene: PathBuf,
+    pub photos: usize,
+    pub registered: usize,
+    /// Names of photos without a pose.
+    pub missing: Vec<String>,
+    /// Where the model's origin lies, and the median distance of its cameras from their GPS, metres.
+    pub aligned: Option<(GpsPlace, f64)>,
+    /// Sentences for the user.
+    pub said: Vec<String>,
+}
+
+/// How far the work is, and for which photos and options.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct State {
+    made_by: String,
+    program: String,
+    options: String,
+    /// Names with bytes and camera group.
+    photos: Vec<(String, u64, usize)>,
+    /// Finished phases.
+    done: Vec<String>,
+}
+
+impl PoseSearch {
+    /// Looks at the photos and for a program. Writes nothing.
+    /// Errors: no photos, a model is there already, photos in sub-folders without a folder for the scene, or no program.
+    pub fn new(request: &PosesRequest) -> InputResult<PoseSearch> {
+        let (home, folder) = home_of(&request.photos);
+        let scene = request.out.clone().unwrap_or_else(|| home.clone());
+        let same =
+            |a: &Path, b: &Path| a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
+        let links_photos = !same(&scene, &home);
+        let sparse = scene.join(SPARSE);
+        if sparse.exists() {
+            let remedy = format!(
+                "to train with it: gsscale-train {}; for new poses, name another folder with --out",
+                scene.display()
+            );
+            return Err(InputError::new(sparse, "a model is here already", remedy));
+        }
+        let (photos, warnings) = list_photos(&folder)?;
+        let is_flat = !links_photos && same(&folder, &scene);
+        if let Some(below) = photos.iter().find(|photo| is_flat && photo.name.contains('/')) {
+            let problem = format!("photos lie in sub-folders ({})", below.name);
+            return Err(InputError::new(
+                folder,
+                problem,
+                "name a new folder with --out; its images/ will hold links to the photos",
+            ));
+        }
+        let program = Program::find(&request.places)?;
+        let groups = camera_groups(&photos);
+        Ok(PoseSearch { scene, links_photos, photos, groups, program, features: request.features, warnings })
+    }
+
+    /// What will be done, and about how long it takes.
+    pub fn forecast(&self) -> String {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let (n, pairs) = (self.photos.len(), count_of(&self.photos));
+        let places = self.photos.iter().filter(|photo| photo.place.is_some()).count();
+        let way = match way_of(&self.photos) {
+            ChosenBy::All => "each with each",
+            ChosenBy::Distance => "the nearest by GPS",
+            ChosenBy::SequenceAndLikeness => "the next by name, and those that look alike",
+        };
+        let megapixels = |photo: &FoundPhoto| {
+            let [width, height] = [photo.header.width, photo.header.height].map(f64::from);
+            width * height * (f64::from(self.features.max_image_size) / width.max(height)).min(1.0).powi(2) / 1e6
+        };
+        let likeness =
+            if way_of(&self.photos) == ChosenBy::SequenceAndLikeness { LIKENESS_SECONDS * n as f64 } else { 0.0 };
+        let features = self.photos.iter().map(megapixels).sum::<f64>() * FEATURES_SECONDS;
+        let of_features = (f64::from(self.features.max_features) / 8192.0).powi(2);
+        let matches = pairs as f64 * self.program.seconds_a_pair() * of_features;
+        let model = n as f64 * MODEL_SECONDS * (1.0 + n as f64 / MODEL_GROWTH);
+        let parallel = if self.program.uses_gpu { 1.0 } else { cores as f64 };
+        let seconds = (likeness + features) / cores as f64 + matches / parallel + model;
+        format!(
+            "{n} photos of {} camera(s), {places} with GPS; {} on {}\n\
+             compares about {} pairs: {way}\n\
+             forecast: {} to {}; a stopped search goes on where it was",
+            self.groups.len(),
+            self.program.name,
+            if self.program.uses_gpu { "the GPU".to_string() } else { format!("{cores} core(s)") },
+            format_grouped(pairs),
+            format_seconds(seconds * 0.7),
+            format_seconds(seconds * 2.0),
+        )
+    }
+
+    /// [`PoseSearch::run`] with words about what it does and found, and with progress.
+    /// Errors: those of `run`.
+    pub fn run_shown(&self, quiet: bool, display: &NewDisplay<'_>) -> InputResult<FoundPoses> {
+        self.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
+        if !quiet {
+            crate::tell!("{}", self.forecast());
+        }
+        let mut shown: Option<(&str, Box<dyn Fn(u32)>)> = None;
+        let found = self.run(&mut |what, done, total| {
+            if shown.as_ref().is_none_or(|(shown, _)| *shown != what) {
+                shown = None;
+                shown = Some((what, display(what, total)));
+            }
+            shown.iter().for_each(|(_, show)| show(done));
+        });
+        drop(shown);
+        let found = found?;
+        if !quiet {
+            crate::tell!("{found}");
+        }
+        Ok(found)
+    }
+
+    /// Finds the poses, and writes them as a scene.
+    /// Errors: a folder that is not ours is in the way, the program fails or finds no model, or the disk fails.
+    pub fn run(&self, watch: &mut Watch<'_>) -> InputResult<FoundPoses> {
+        let work = self.scene.join(WORK_FOLDER);
+        let mut state = self.begin(&work)?;
+        self.link_photos(&work)?;
+        self.find_features(&work, &mut state, watch)?;
+        let pairs = self.pairs(&work, watch)?;
+        if !state.is_done("matches") {
+            let size = CHUNK_LEAST.max(pairs.pairs.len().div_ceil(CHUNKS));
+            let mut done = 0;
+            for chunk in pairs.pairs.chunks(size) {
+                watch("pairs compared", done as u32, pairs.pairs.len() as u32);
+                write_whole(&work.join("chunk.txt"), self.lines_of(chunk).as_bytes())?;
+                self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, &work, &mut |_| ())?;
+                done += chunk.len();
+            }
+            state.finish("matches", &work)?;
+        }
+        if !state.is_done("model") {
+            remove_ours(&work.join(SPARSE), is_of_model)?;
+            make_folder(&work.join(SPARSE))?;
+            let total = self.photos.len() as u32;
+            let mut show = |line: &str| registered_in(line).into_iter().for_each(|n| watch("photos placed", n, total));
+            self.program.run(&Phase::Model, &self.features, &work, &mut show)?;
+            state.finish("model", &work)?;
+        }
+        self.write_scene(&work)
+    }
+
+    /// The state of the work folder, which is made, emptied if it is of other photos or options, or refused if it is not ours.
+    fn begin(&self, work: &Path) -> InputResult<State> {
+        let groups = |i: usize| self.groups.iter().position(|group| group.contains(&i)).unwrap_or(0);
+        let of_photo = |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, groups(i));
+        let new = State {
+            made_by: MADE_BY.to_string(),
+            program: self.program.name.clone(),
+            options: format!("{} pixels, {} features", self.features.max_image_size, self.features.max_features),
+            photos: self.photos.iter().enumerate().map(of_photo).collect(),
+            done: Vec::new(),
+        };
+        let images = self.scene.join("images");
+        if !work.exists() {
+            if self.links_photos && images.exists() {
+                return Err(InputError::new(images, "exists already", "name a new folder with --out"));
+            }
+            make_folder(work)?;
+            new.write(work)?;
+            return Ok(new);
+        }
+        let file = work.join(STATE_FILE);
+        let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<State>(&text).ok());
+        let Some(old) = old.filter(|old| old.made_by == MADE_BY) else {
+            let problem = "exists already, and is not a work folder of gsscale-poses";
+            return Err(InputError::new(
+                work,
+                problem,
+                "name a new folder for the scene with --out, or move that one away",
+            ));
+        };
+        if (State { done: Vec::new(), ..old.clone() }) == new {
+            return Ok(old);
+        }
+        clear(work)?;
+        new.write(work)?;
+        Ok(new)
+    }
+
+    /// Makes the photos known under plain names in the work folder, and in `images` of a scene in another place.
+    fn link_photos(&self, work: &Path) -> InputResult<()> {
+        make_folder(&work.join(PHOTOS))?;
+        for (i, photo) in self.photos.iter().enumerate() {
+            link(&photo.path, &work.join(PHOTOS).join(self.plain_name(i)))?;
+            if self.links_photos {
+                let target = self.scene.join("images").join(&photo.name);
+                make_folder(target.parent().unwrap_or(&target))?;
+                link(&photo.path, &target)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn plain_name(&self, i: usize) -> String {
+        let ending = self.photos[i].path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
+        format!("{i:06}.{}", ending.unwrap_or_default())
+    }
+
+    fn lines_of(&self, pairs: &[(u32, u32)]) -> String {
+        let line = |&(a, b): &(u32, u32)| format!("{} {}\n", self.plain_name(a as usize), self.plain_name(b as usize));
+        pairs.iter().map(line).collect()
+    }
+
+    /// Features of every photo. An interrupted search begins them again: COLMAP would give the rest of a group another camera.
+    fn find_features(&self, work: &Path, state: &mut State, watch: &mut Watch<'_>) -> InputResult<()> {
+        if state.is_done("features") {
+            return Ok(());
+        }
+        remove_files(work, &|name| name.starts_with(DATABASE))?;
+        let (single, shared): (Vec<&Vec<usize>>, Vec<_>) = self.groups.iter().partition(|group| group.len() == 1);
+        let single: Vec<usize> = single.into_iter().flatten().copied().collect();
+        let total = self.photos.len() as u32;
+        let mut done = 0;
+        for (group, one_camera) in shared.into_iter().map(|group| (group, true)).chain([(&single, false)]) {
+            if group.is_empty() {
+                continue;
+            }
+            let is_enough = one_camera && group.len() >= PHOTOS_FOR_OPENCV;
+            let camera_model = if is_enough { "OPENCV" } else { "SIMPLE_RADIAL" };
+            let names: String = group.iter().map(|&i| self.plain_name(i) + "\n").collect();
+            write_whole(&work.join("list.txt"), names.as_bytes())?;
+            let mut in_group = 0;
+            let mut show = |line: &str| {
+                if line.contains("Processed file [") {
+                    in_group += 1;
+                    watch("photos searched for features", done + in_group, total);
+                }
+            };
+            let phase = Phase::Features { list: "list.txt", camera_model, one_camera };
+            self.program.run(&phase, &self.features, work, &mut show)?;
+            done += group.len() as u32;
+        }
+        state.finish("features", work)
+    }
+
+    fn pairs(&self, work: &Path, watch: &mut Watch<'_>) -> InputResult<Pairs> {
+        let total = self.photos.len() as u32;
+        watch("photos looked at", 0, total);
+        let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most, &|_| ()))?;
+        write_whole(&work.join("pairs.txt"), self.lines_of(&pairs.pairs).as_bytes())?;
+        Ok(pairs)
+    }
+
+    /// Writes the largest model into the scene, in metres if GPS allows.
+    fn write_scene(&self, work: &Path) -> InputResult<FoundPoses> {
+        let options = ReadOptions { images: Some(PHOTOS.to_string()), points_later: true, ..ReadOptions::default() };
+        let no_model = |error: InputError| InputError {
+            problem: format!("no model was found: {}", error.problem),
+            remedy: MORE_OVERLAP.to_string(),
+            ..error
+        };
+        let raw = read_scene(work, &options).map_err(no_model)?;
+        let index = |name: &str| name.split('.').next()?.parse::<usize>().ok().filter(|&i| i < self.photos.len());
+        let mut is_placed = vec![false; self.photos.len()];
+        raw.views.iter().filter_map(|view| index(&view.name)).for_each(|i| is_placed[i] = true);
+        let missing: Vec<String> =
+            self.photos.iter().zip(&is_placed).filter(|(_, is)| !**is).map(|(photo, _)| photo.name.clone()).collect();
+        let registered = self.photos.len() - missing.len();
+        let mut said: Vec<String> = raw.warnings.clone();
+        let alignment = self.align(&raw, &index, &mut said);
+        let (origin, moved, rest) = alignment.unwrap_or((None, Similarity::IDENTITY, 0.0));
+        let model = raw.points_path.as_deref().and_then(Path::parent).unwrap_or(work);
+        let part = work.join("result");
+        remove_ours(&part, is_of_model)?;
+        make_folder(&part.join("0"))?;
+        let name_of = |name: &str| index(name).map(|i| self.photos[i].name.clone());
+        model::write_moved(model, &part.join("0"), &moved, &name_of)?;
+        if let Some(origin) = origin {
+            let text = serde_json::json!({
+                "latitude": origin.latitude, "longitude": origin.longitude, "altitude": origin.altitude,
+            });
+            write_whole(&self.scene.join(ORIGIN_FILE), format!("{text:#}\n").as_bytes())?;
+        }
+        let sparse = self.scene.join(SPARSE);
+        std::fs::rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
+        let aligned = origin.map(|origin| (origin, rest));
+        Ok(FoundPoses { scene: self.scene.clone(), photos: self.photos.len(), registered, missing, aligned, said })
+    }
+
+    /// The first place as the origin, the similarity from the model to metres east, north and up of it, and the median distance that
+    /// remains; `None`, with a sentence, where places do not fix it.
+    fn align(
+        &self,
+        raw: &RawScene,
+        index: &dyn Fn(&str) -> Option<usize>,
+        said: &mut Vec<String>,
+    ) -> Option<(Option<GpsPlace>, Similarity, f64)> {
+        let place = |name: &str| self.photos[index(name)?].place.filter(|place| place.altitude.is_some());
+        let with_place = || raw.views.iter().filter_map(|view| Some((view.pose.centre(), place(&view.name)?)));
+        let origin = with_place().next()?.1;
+        let (centres, metres): (Vec<_>, Vec<_>) =
+            with_place().map(|(at, place)| (at, metres_from(&origin, &place))).unzip();
+        let middle = metres.iter().sum::<glam::DVec3>() / metres.len() as f64;
+        let extent = metres.iter().map(|at| at.distance(middle)).sum::<f64>() / metres.len() as f64;
+        match robust_similarity(&centres, &metres) {
+            Some((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => Some((Some(origin), moved, rest)),
+            Some((_, rest)) => {
+                said.push(format!(
+                    "the photos' GPS disagrees with the model by {rest:.1} m, so the model has no metres and no north"
+                ));
+                None
+            }
+            None => {
+                said.push(
+                    "the photos' GPS places are too few or lie on a line, so the model has no metres and no north"
+                        .to_string(),
+                );
+                None
+            }
+        }
+    }
+}
+
+/// What to do if photos have no pose.
+pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
+    blurred photos; if all is sharp and overlaps, try --max-resolution 2400";
+
+impl fmt::Display for FoundPoses {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.said.iter().try_for_each(|sentence| writeln!(f, "{sentence}"))?;
+        write!(f, "{} of {} photos have poses: {}", self.registered, self.photos, self.scene.join(SPARSE).display())?;
+        if let Some((origin, rest)) = &self.aligned {
+            let (latitude, longitude) = (origin.latitude, origin.longitude);
+            write!(f, "\nin metres east, north and up of {latitude:.6}, {longitude:.6} ({ORIGIN_FILE}); ")?;
+            write!(f, "median distance from GPS {rest:.1} m")?;
+        }
+        if self.registered < self.photos * 9 / 10 {
+            let first = self.missing.iter().take(5).map(String::as_str).collect::<Vec<_>>().join(", ");
+            let more = if self.missing.len() > 5 { ", ..." } else { "" };
+            write!(f, "\nwithout poses: {first}{more}\n  remedy: {MORE_OVERLAP}")?;
+        }
+        Ok(())
+    }
+}
+
+impl State {
+    fn is_done(&self, phase: &str) -> bool {
+        self.done.iter().any(|done| done == phase)
+    }
+
+    fn finish(&mut self, phase: &str, work: &Path) -> InputResult<()> {
+        self.done.push(phase.to_string());
+        self.write(work)
+    }
+
+    fn write(&self, work: &Path) -> InputResult<()> {
+        let file = work.join(STATE_FILE);
+        let text = serde_json::to_vec(self)
+            .map_err(|e| InputError::new(&file, e.to_string(), "name another folder with --out"))?;
+        write_whole(&file, &text)
+    }
+}
+
+/// The folder of the scene whose photos are named, and the folder of the photos.
+fn home_of(named: &Path) -> (PathBuf, PathBuf) {
+    let images = named.join("images");
+    if images.is_dir() {
+        return (named.to_path_buf(), images);
+    }
+    match named.parent().filter(|above| !above.as_os_str().is_empty()) {
+        Some(above) if named.file_name().is_some_and(|name| name == "images") => {
+            (above.to_path_buf(), named.to_path_buf())
+        }
+        _ => (named.to_path_buf(), named.to_path_buf()),
+    }
+}
+
+/// The number of photos that a line of the reconstruction says are placed: `Registering image #16 (num_reg_frames=2)`, or with
+/// the number alone.
+fn registered_in(line: &str) -> Option<u32> {
+    let (_, rest) = line.split_once("Registering image #")?;
+    let inside = rest.split_once('(')?.1.split(')').next()?;
+    let number = inside.rsplit('=').next()?.parse::<u32>().ok()?;
+    Some(number + 1)
+}
+
+/// Whether COLMAP's mapper writes a file of this path.
+fn is_of_model(path: &Path) -> bool {
+    const STEMS: [&str; 6] = ["cameras", "images", "points3D", "rigs", "frames", "project"];
+    let word =
+        |part: Option<&std::ffi::OsStr>| part.and_then(|part| part.to_str()).map(String::from).unwrap_or_default();
+    let is_numbered = path.parent().is_some_and(|parent| word(Some(parent.as_os_str())).parse::<u32>().is_ok());
+    is_numbered
+        && STEMS.contains(&word(path.file_stem()).as_str())
+        && ["bin", "ini"].contains(&word(path.extension()).as_str())
+}
+
+/// Removes what earlier work left in a folder of ours.
+fn clear(work: &Path) -> InputResult<()> {
+    remove_ours(&work.join(SPARSE), is_of_model)?;
+    remove_files(work, &|name| name.starts_with(DATABASE))?;
+    let is_plain =
+        |name: &str| name.split_once('.').is_some_and(|(stem, _)| stem.len() >= 6 && stem.parse::<u64>().is_ok());
+    if work.join(PHOTOS).is_dir() { remove_files(&work.join(PHOTOS), &is_plain) } else { Ok(()) }
+}
+
+/// Removes the files and links, but no folders, of a folder whose names are `ours`.
+fn remove_files(folder: &Path, ours: &dyn Fn(&str) -> bool) -> InputResult<()> {
+    let io = |e: &std::io::Error| InputError::io(folder, "removing what an earlier search left", e);
+    for entry in std::fs::read_dir(folder).map_err(|e| io(&e))? {
+        let entry = entry.map_err(|e| io(&e))?;
+        let is_file = entry.file_type().is_ok_and(|kind| !kind.is_dir());
+        if is_file && entry.file_name().to_str().is_some_and(ours) {
+            std::fs::remove_file(entry.path()).map_err(|e| io(&e))?;
+        }
+    }
+    Ok(())
+}
+
+fn make_folder(folder: &Path) -> InputResult<()> {
+    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
+}
+
+/// A second name for a photo, or a copy where the drive knows no second names. An existing one stays.
+fn link(photo: &Path, name: &Path) -> InputResult<()> {
+    if name.exists() {
+        return Ok(());
+    }
+    // A link's own target, so that moving the link leaves the photo reachable.
+    let photo = photo.canonicalize().unwrap_or_else(|_| photo.to_path_buf());
+    if std::fs::hard_link(&photo, name).is_ok() {
+        return Ok(());
+    }
+    std::fs::copy(&photo, name).map(|_| ()).map_err(|e| InputError::io(name, "copying a photo", &e))
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn progress_is_read_from_lines_of_old_and_new_versions() {
+        let new =
+            "I20261128 17:38:59.335402 140283 incremental_pipeline.cc:620] Registering image #16 (num_reg_frames=2)";
+        assert_eq!(registered_in(new), Some(3));
+        assert_eq!(registered_in("Registering image #9 (11)"), Some(12));
+        assert_eq!(registered_in("Registering initial image pair #8 and #18"), None);
+    }
+
+    #[test]
+    fn the_scene_of_photos_is_their_folder_or_the_one_above_images() {
+        let root = tempfile::tempdir().unwrap();
+        let images = root.path().join("a/images");
+        std::fs::create_dir_all(&images).unwrap();
+        let above = root.path().join("a");
+        assert_eq!(home_of(&above), (above.clone(), images.clone()));
+        assert_eq!(home_of(&images), (above, images.clone()));
+        assert_eq!(home_of(root.path()), (root.path().to_path_buf(), root.path().to_path_buf()));
+    }
+
+    #[test]
+    fn only_what_a_search_makes_is_removed() {
+        let root = tempfile::tempdir().unwrap();
+        let work = root.path();
+        for file in [
+            "sparse/0/images.bin",
+            "sparse/1/project.ini",
+            "database.db",
+            "database.db-wal",
+            "photos/000001.jpg",
+            "photos/mine.jpg",
+        ] {
+            std::fs::create_dir_all(work.join(file).parent().unwrap()).unwrap();
+            std::fs::write(work.join(file), b"").unwrap();
+        }
+        clear(work).unwrap();
+        let left = |folder: &str| {
+            std::fs::read_dir(work.join(folder)).unwrap().map(|e| e.unwrap().file_name()).collect::<Vec<_>>()
+        };
+        assert_eq!((left(""), left("photos")), (vec!["photos".into()], vec!["mine.jpg".into()]));
+        std::fs::create_dir_all(work.join("sparse/0")).unwrap();
+        std::fs::write(work.join("sparse/0/notes.txt"), b"mine").unwrap();
+        assert!(clear(work).unwrap_err().problem.contains("notes.txt"));
+    }
+}

@@ -1,0 +1,330 @@
+//! The program that computes poses: finds COLMAP or pycolmap on the machine, and runs its phases with a log.
+//!
+//! COLMAP's options have other names in other versions, so they are looked up in its help. Neither a display nor a GPU is needed;
+//! COLMAP's GPU code runs only where it was built with CUDA and a GPU answers.
+//!
+//! Invariant: what a program prints goes to the log, never to the terminal.
+
+use crate::base::error::{InputError, InputResult};
+use serde_json::json;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+/// Oldest COLMAP whose commands and options are used.
+const OLDEST: (u32, u32) = (3, 8);
+/// What pycolmap runs.
+const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
+/// Lines of the log that an error shows.
+const LAST_LINES: usize = 6;
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+
+const INSTALL: &str = "install one of them, and name this folder again:\n  \
+    any system:     pip install pycolmap    (or name another Python that has it: --python PATH)\n  \
+    Debian, Ubuntu: apt-get install colmap\n  \
+    macOS:          brew install colmap\n  \
+    Windows:        https://github.com/colmap/colmap/releases, then --colmap PATH";
+
+/// One run of the program. Paths are below the folder it works in.
+#[derive(Debug, Clone)]
+pub enum Phase<'a> {
+    /// Finds features in the photos of `list`, which share one camera or have one each.
+    Features { list: &'a str, camera_model: &'static str, one_camera: bool },
+    /// Compares the pairs of a file of lines `NAME NAME`.
+    Matches { pairs: &'a str },
+    /// Reconstructs into the folder `sparse`, which exists.
+    Model,
+}
+
+/// Names of files and folders that phases use, below the folder that they work in.
+pub const DATABASE: &str = "database.db";
+pub const PHOTOS: &str = "photos";
+pub const SPARSE: &str = "sparse";
+const LOG: &str = "log.txt";
+
+/// What features are sought.
+#[derive(Debug, Clone, Copy)]
+pub struct FeatureOptions {
+    /// Photos are reduced to this longer side first, pixels.
+    pub max_image_size: u32,
+    /// Most features of a photo.
+    pub max_features: u32,
+}
+
+/// Where the user says the programs are.
+#[derive(Debug, Clone, Default)]
+pub struct Places {
+    pub colmap: Option<PathBuf>,
+    pub python: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone)]
+pub struct Program {
+    path: PathBuf,
+    /// Name and version.
+    pub name: String,
+    pub uses_gpu: bool,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone)]
+enum Kind {
+    /// With the help of its phases for features and matches.
+    Colmap {
+        features_help: String,
+        matches_help: String,
+    },
+    Pycolmap,
+}
+
+impl Program {
+    /// The program that `places` names; otherwise the best of COLMAP with a GPU, pycolmap, COLMAP on the CPU.
+    /// Errors: none is there, which says how to install one; or the named one does not run or is too old.
+    pub fn find(places: &Places) -> InputResult<Program> {
+        if let Some(path) = &places.colmap {
+            return Program::colmap(path);
+        }
+        if let Some(path) = &places.python {
+            return Program::pycolmap(path);
+        }
+        let colmap = Program::colmap(Path::new("colmap"));
+        if colmap.as_ref().is_ok_and(|program| program.uses_gpu) {
+            return colmap;
+        }
+        let named = std::env::var_os("GSSCALE_PYTHON").map(PathBuf::from);
+        let pythons = named.into_iter().chain(["python3", "python"].map(PathBuf::from));
+        let found = pythons.map(|python| Program::pycolmap(&python)).find_map(Result::ok);
+        found.map_or(colmap, Ok).map_err(|mut error| {
+            if error.kind == Some(std::io::ErrorKind::NotFound) {
+                error.problem = "neither COLMAP nor a Python with pycolmap is on this machine".to_string();
+            }
+            error
+        })
+    }
+
+    fn colmap(path: &Path) -> InputResult<Program> {
+        let first = said_by(path, &["help"])?;
+        let version = colmap_version(&first);
+        if version.is_none_or(|version| version < OLDEST) {
+            let line = first.lines().find(|line| !line.trim().is_empty()).unwrap_or("nothing");
+            let problem = format!("COLMAP {}.{} or newer is needed; this says: {line}", OLDEST.0, OLDEST.1);
+            return Err(InputError::new(path, problem, INSTALL));
+        }
+        let (major, minor) = version.unwrap_or(OLDEST);
+        let has_cuda = first.contains("with CUDA");
+        let kind = Kind::Colmap {
+            features_help: said_by(path, &["feature_extractor", "-h"])?,
+            matches_help: said_by(path, &["matches_importer", "-h"])?,
+        };
+        let uses_gpu = has_cuda && said_by(Path::new("nvidia-smi"), &["-L"]).is_ok_and(|said| said.starts_with("GPU"));
+        Ok(Program { path: path.to_path_buf(), name: format!("COLMAP {major}.{minor}"), uses_gpu, kind })
+    }
+
+    fn pycolmap(python: &Path) -> InputResult<Program> {
+        let said = said_by(python, &["-c", SCRIPT, "version", "{}"])?;
+        let Some(name) = said.lines().find(|line| line.starts_with("pycolmap ")) else {
+            let last = said.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("nothing");
+            return Err(InputError::new(
+                python,
+                format!("this Python has no pycolmap that can be used: {last}"),
+                INSTALL,
+            ));
+        };
+        let (path, name) = (python.to_path_buf(), name.trim().to_string());
+        Ok(Program { path, uses_gpu: name.ends_with("CUDA"), name, kind: Kind::Pycolmap })
+    }
+
+    /// About how many seconds of one core a pair of photos takes to compare, for 8,192 features each.
+    pub fn seconds_a_pair(&self) -> f64 {
+        match &self.kind {
+            _ if self.uses_gpu => 0.02,
+            Kind::Pycolmap => 0.2,
+            // Options of this name came with faster comparison.
+            Kind::Colmap { matches_help, .. } if matches_help.contains("--FeatureMatching.") => 0.2,
+            Kind::Colmap { .. } => 0.9,
+        }
+    }
+
+    /// Runs a phase in the folder `work` and waits for it. `watch` gets every line that it prints.
+    /// Errors: the program cannot be started, or says that it failed: then the error shows its last lines.
+    pub fn run(
+        &self,
+        phase: &Phase<'_>,
+        features: &FeatureOptions,
+        work: &Path,
+        watch: &mut dyn FnMut(&str),
+    ) -> InputResult<()> {
+        let log = work.join(LOG);
+        let io = |e: &std::io::Error| InputError::io(&log, "writing the log", e);
+        let file = File::create(&log).map_err(|e| io(&e))?;
+        let twin = file.try_clone().map_err(|e| io(&e))?;
+        let mut command = Command::new(&self.path);
+        command.args(self.arguments(phase, features)).current_dir(work);
+        // Of Qt, on which COLMAP's window is built.
+        command.env("QT_QPA_PLATFORM", "offscreen").env("PYTHONUNBUFFERED", "1");
+        command.stdin(Stdio::null()).stdout(file).stderr(twin);
+        let mut child = command.spawn().map_err(|e| InputError::io(&self.path, "starting the program", &e))?;
+        let mut lines = Lines::of(&log).map_err(|e| io(&e))?;
+        let status = loop {
+            let ended = child.try_wait().map_err(|e| InputError::io(&self.path, "waiting for the program", &e))?;
+            lines.new_ones(watch).map_err(|e| io(&e))?;
+            match ended {
+                Some(status) => break status,
+                None => std::thread::sleep(LOOK_EVERY),
+            }
+        };
+        if status.success() {
+            return Ok(());
+        }
+        let text = std::fs::read(&log).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).unwrap_or_default();
+        let last: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
+        let last = last[last.len().saturating_sub(LAST_LINES)..].join("\n    ");
+        let remedy = "name the folder again to go on with this phase; with less memory, use --max-resolution 1000";
+        let problem = format!("{} stopped with {status}; its last lines:\n    {last}", self.name);
+        Err(InputError::new(log, problem, remedy))
+    }
+
+    fn arguments(&self, phase: &Phase<'_>, features: &FeatureOptions) -> Vec<String> {
+        match &self.kind {
+            Kind::Colmap { features_help, matches_help } => {
+                self.colmap_arguments(phase, features, features_help, matches_help)
+            }
+            Kind::Pycolmap => {
+                let (name, values) = match phase {
+                    Phase::Features { list, camera_model, one_camera } => {
+                        let values = json!({
+                            "database": DATABASE, "photos": PHOTOS, "list_file": list,
+                            "camera_model": camera_model, "one_camera": one_camera,
+                            "max_image_size": features.max_image_size, "max_num_features": features.max_features,
+                        });
+                        ("features", values)
+                    }
+                    Phase::Matches { pairs } => ("matches", json!({ "database": DATABASE, "pairs": pairs })),
+                    Phase::Model => ("model", json!({ "database": DATABASE, "photos": PHOTOS, "model": SPARSE })),
+                };
+                ["-c", SCRIPT, name, &values.to_string()].map(String::from).to_vec()
+            }
+        }
+    }
+
+    fn colmap_arguments(
+        &self,
+        phase: &Phase<'_>,
+        features: &FeatureOptions,
+        features_help: &str,
+        matches_help: &str,
+    ) -> Vec<String> {
+        let gpu = u8::from(self.uses_gpu).to_string();
+        let mut arguments: Vec<String> = Vec::new();
+        let mut add = |flag: &str, value: &str| arguments.extend([flag.to_string(), value.to_string()]);
+        // An option that this version lacks is left at its default.
+        let named = |help: &str, name: &str| option_of(help, name);
+        let command = match phase {
+            Phase::Features { list, camera_model, one_camera } => {
+                add("--image_path", PHOTOS);
+                add("--image_list_path", list);
+                add("--ImageReader.camera_model", camera_model);
+                add(
+                    if *one_camera { "--ImageReader.single_camera" } else { "--ImageReader.single_camera_per_image" },
+                    "1",
+                );
+                let sizes = [features.max_image_size, features.max_features].map(|n| n.to_string());
+                for (name, value) in [("use_gpu", &gpu), ("max_image_size", &sizes[0]), ("max_num_features", &sizes[1])]
+                {
+                    if let Some(flag) = named(features_help, name) {
+                        add(&flag, value);
+                    }
+                }
+                "feature_extractor"
+            }
+            Phase::Matches { pairs } => {
+                add("--match_list_path", pairs);
+                add("--match_type", "pairs");
+                if let Some(flag) = named(matches_help, "use_gpu") {
+                    add(&flag, &gpu);
+                }
+                "matches_importer"
+            }
+            Phase::Model => {
+                add("--image_path", PHOTOS);
+                add("--output_path", SPARSE);
+                "mapper"
+            }
+        };
+        add("--database_path", DATABASE);
+        arguments.insert(0, command.to_string());
+        arguments
+    }
+}
+
+/// What a program prints, whatever it says of its success: COLMAP's help does not agree with itself.
+fn said_by(path: &Path, arguments: &[&str]) -> InputResult<String> {
+    let mut command = Command::new(path);
+    command.args(arguments).env("QT_QPA_PLATFORM", "offscreen").stdin(Stdio::null());
+    let output = command
+        .output()
+        .map_err(|e| InputError { remedy: INSTALL.to_string(), ..InputError::io(path, "starting the program", &e) })?;
+    Ok([output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).join("\n"))
+}
+
+/// Major and minor version in the first line of COLMAP's help: `COLMAP 3.12.0.dev0 -- Structure-from-Motion ...`.
+fn colmap_version(text: &str) -> Option<(u32, u32)> {
+    let mut numbers = text[text.find("COLMAP ")? + 7..].split(|c: char| !c.is_ascii_digit());
+    Some((numbers.next()?.parse().ok()?, numbers.next()?.parse().ok()?))
+}
+
+/// The option with this name in COLMAP's help, in whatever group: `--SiftExtraction.use_gpu`, `--FeatureExtraction.use_gpu`.
+fn option_of(help: &str, name: &str) -> Option<String> {
+    let words = help.split_whitespace().filter(|word| word.starts_with("--"));
+    words.into_iter().find(|word| word.ends_with(&format!(".{name}"))).map(String::from)
+}
+
+/// The lines of a file that another process writes.
+struct Lines {
+    file: File,
+    /// The start of a line whose end is not written yet.
+    begun: Vec<u8>,
+    at: u64,
+}
+
+impl Lines {
+    fn of(path: &Path) -> std::io::Result<Lines> {
+        Ok(Lines { file: File::open(path)?, begun: Vec::new(), at: 0 })
+    }
+
+    fn new_ones(&mut self, take: &mut dyn FnMut(&str)) -> std::io::Result<()> {
+        self.file.seek(SeekFrom::Start(self.at))?;
+        self.at += self.file.read_to_end(&mut self.begun)? as u64;
+        let Some(end) = self.begun.iter().rposition(|&byte| byte == b'\n') else { return Ok(()) };
+        let whole: Vec<u8> = self.begun.drain(..=end).collect();
+        String::from_utf8_lossy(&whole).lines().for_each(take);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn versions_are_read_from_the_first_line_and_options_from_the_help() {
+        let texts = [
+            ("COLMAP 3.8 -- Structure-from-Motion and Multi-View Stereo\n (Commit Unknown without CUDA)", Some((3, 8))),
+            ("\nCOLMAP 3.12.0.dev0 -- Structure-from-Motion", Some((3, 12))),
+            ("COLMAP 4.0.1 (Commit abc on 2026-01-01 with CUDA)", Some((4, 0))),
+            ("COLMAP -- Structure-from-Motion", None),
+            ("colmap: command not found", None),
+        ];
+        for (text, version) in texts {
+            assert_eq!(colmap_version(text), version, "{text}");
+        }
+        assert!((3, 7) < OLDEST && (3, 10) > OLDEST);
+        let old = "  --SiftExtraction.num_threads arg (=-1)\n  --SiftExtraction.use_gpu arg (=1)\n";
+        assert_eq!(option_of(old, "use_gpu").as_deref(), Some("--SiftExtraction.use_gpu"));
+        let new = "  --FeatureExtraction.use_gpu arg (=1)\n  --SiftExtraction.max_num_features arg (=8192)\n";
+        assert_eq!(option_of(new, "use_gpu").as_deref(), Some("--FeatureExtraction.use_gpu"));
+        assert_eq!(option_of(new, "max_image_size"), None);
+    }
+}
