@@ -4,7 +4,6 @@ use clap::Parser;
 use gsscale::base::error::InputResult;
 use gsscale::poses::program::{FeatureOptions, Places};
 use gsscale::poses::{PoseSearch, PosesRequest};
-use gsscale::train::log::progress::Count;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -68,10 +67,7 @@ fn start(flags: &Flags) -> InputResult<()> {
         gsscale::say!("{}", search.forecast());
         return Ok(());
     }
-    let found = search.run_shown(flags.quiet, &|what, total| {
-        let count = Count::new(what, total, flags.quiet);
-        Box::new(move |done| count.show(done))
-    })?;
+    let found = search.run_shown(flags.quiet)?;
     if !flags.quiet {
         gsscale::tell!("next: gsscale-train {}", found.scene.display());
     }

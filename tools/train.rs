@@ -2,17 +2,19 @@
 
 use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
+use gsscale::base::count::Count;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::config::new_run;
+use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::poses::{PoseSearch, PosesRequest};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
-use gsscale::train::log::progress::Count;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::out_folder::{default_out, is_trace, remedy_of_existing};
 use gsscale::train::run::request::{Existing, RunOutcome, RunRequest};
@@ -53,12 +55,18 @@ struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), or one of the other layouts that --help names
     ///
     /// These are one with transforms.json, an OpenDroneMap project, RealityScan's CSV, and Mega-NeRF's layout
-    #[arg(required_unless_present_any = ["demo", "list_devices", "resume"])]
+    #[arg(required_unless_present_any = ["demo", "list_devices", "resume", "data"])]
     scene: Option<PathBuf>,
+    /// The scene as a flag, as other trainers name it
+    #[arg(long, short = 's', aliases = ["data-dir", "source-path", "source"], hide = true, conflicts_with_all = ["scene", "demo"])]
+    data: Option<PathBuf>,
+    /// Photos without poses: `auto` finds the poses first, as gsscale-poses does
+    #[arg(long, value_name = "HOW", value_parser = ["auto"], hide_short_help = true)]
+    poses: Option<String>,
     /// Output folder [default: runs/NAME, with the name of the scene]
     ///
     /// If that is taken, runs/NAME-2 and so on
-    #[arg(long, short)]
+    #[arg(long, short, aliases = ["result-dir", "model-path", "output-dir"], short_alias = 'm')]
     out: Option<PathBuf>,
     /// Config file; flags override it
     #[arg(long, hide_short_help = true)]
@@ -107,7 +115,8 @@ struct Args {
 fn main() -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    let args: Args = parse_command_line();
+    let mut args: Args = parse_command_line();
+    args.scene = args.scene.or(args.data.take());
     if args.list_devices {
         list_devices();
         return ExitCode::SUCCESS;
@@ -163,6 +172,14 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     }
     let mut scratch = None;
     let scene = match args.scene {
+        Some(photos) if args.poses.is_some() && lacks_poses(&photos) => {
+            let search = PoseSearch::new(&PosesRequest::of(&photos))?;
+            if args.dry_run {
+                gsscale::say!("{}", search.forecast());
+                return Ok(RunOutcome::of_nothing(out));
+            }
+            search.run_shown(args.quiet)?.scene
+        }
         Some(scene) => scene,
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.quiet)?,

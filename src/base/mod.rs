@@ -2,6 +2,7 @@
 //! folders that are written whole. Knows neither Gaussians, pictures nor disk formats.
 
 pub mod allocator;
+pub mod count;
 pub mod environment;
 pub mod error;
 pub mod identity;

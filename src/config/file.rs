@@ -15,6 +15,7 @@ use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
+use crate::config::habits::{ALIASES, advice_for};
 use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, RgbColor, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -569,6 +570,10 @@ pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T
 
 /// As [`parse_command_line`], for given arguments, starting with the program's name.
 pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
+    if let Some((flag, advice)) = advice_for(arguments) {
+        crate::tell!("error: {flag} is no flag of gsscale\n  remedy: {advice}");
+        std::process::exit(2);
+    }
     let is_short = arguments.iter().any(|argument| argument == "-h");
     let matches = with_help_of_keys(T::command(), is_short).get_matches_from(arguments);
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
@@ -600,6 +605,9 @@ fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Comman
                 |arg: clap::Arg| arg.help_heading(None::<&str>).value_name("VALUE").hide_possible_values(true);
             if is_short { in_short(arg) } else { arg }
         });
+    }
+    for (name, key) in ALIASES {
+        command = command.mut_arg(key.replace('-', "_"), |arg| arg.alias(name));
     }
     // Of fewer columns, clap would make each flag two lines.
     if is_short {

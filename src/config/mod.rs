@@ -2,6 +2,7 @@
 //! derived from them ([`limits`]), values that a new run takes from its length ([`new_run`]), and published runs ([`published`]).
 
 pub mod file;
+pub mod habits;
 pub mod limits;
 pub mod new_run;
 pub mod published;

@@ -134,22 +134,27 @@ fn scene_above(folder: &Path) -> Option<(PathBuf, String)> {
     (has_poses && photos_in(folder) > 0).then(|| (above.to_path_buf(), name))
 }
 
+/// Whether `path` is a folder of photos without poses that a reader knows, in it or above it.
+pub fn lacks_poses(path: &Path) -> bool {
+    path.is_dir()
+        && !READERS.iter().any(|(knows, _)| knows(path))
+        && scene_above(path).is_none()
+        && without_poses(path).is_some()
+}
+
 /// The error, which says how to get poses, for a folder of photos without a model that a reader knows.
 fn without_poses(folder: &Path) -> Option<InputError> {
     let images = folder.join("images");
-    let (photos, count) = [images.as_path(), folder].into_iter().map(|f| (f, photos_in(f))).find(|(_, n)| *n > 0)?;
-    let (place, photos) = (folder.display(), photos.display());
+    let count = [images.as_path(), folder].into_iter().map(photos_in).find(|n| *n > 0)?;
+    let place = folder.display();
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(
-        "recover the poses first, and name this folder again:\n  \
-         COLMAP (free):  colmap feature_extractor --database_path {place}/colmap.db --image_path {photos}\n                  \
-         colmap exhaustive_matcher --database_path {place}/colmap.db\n                  \
-         mkdir -p {place}/sparse\n                  \
-         colmap mapper --database_path {place}/colmap.db --image_path {photos} --output_path {place}/sparse\n  \
+        "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}\n  \
+         (--poses auto does that, and then trains), or with another program:\n  \
          OpenDroneMap:   its project folder (with opensfm/reconstruction.json and images/) is read as it is\n  \
          RealityScan, RealityCapture:  export 'Internal/External camera parameters' (CSV) into {place}\n  \
          Metashape:      File > Export > Export Cameras, as COLMAP, into {place}\n\
-         photos outside images/ need --images; tools/POSES.md says more"
+         tools/POSES.md says more"
     );
     Some(InputError::new(folder, problem, remedy))
 }

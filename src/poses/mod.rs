@@ -18,6 +18,7 @@ pub mod photos;
 pub mod program;
 pub mod similar;
 
+use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_grouped, format_seconds};
 use crate::base::whole_file::write_whole;
@@ -68,8 +69,13 @@ pub struct PosesRequest {
 /// Shows progress: what is done, how much of it, and of how much.
 pub type Watch<'a> = dyn FnMut(&'static str, u32, u32) + 'a;
 
-/// Makes the display of one kind of progress, by its name and total.
-pub type NewDisplay<'a> = dyn Fn(&'static str, u32) -> Box<dyn Fn(u32)> + 'a;
+impl PosesRequest {
+    /// The request for these photos that leaves the rest to this room.
+    pub fn of(photos: &Path) -> PosesRequest {
+        let features = FeatureOptions { max_image_size: 1600, max_features: 8192 };
+        PosesRequest { photos: photos.to_path_buf(), out: None, places: Places::default(), features }
+    }
+}
 
 /// A search that can begin: photos, program and folders are known.
 #[derive(Debug)]
@@ -181,18 +187,19 @@ impl PoseSearch {
 
     /// [`PoseSearch::run`] with words about what it does and found, and with progress.
     /// Errors: those of `run`.
-    pub fn run_shown(&self, quiet: bool, display: &NewDisplay<'_>) -> InputResult<FoundPoses> {
+    pub fn run_shown(&self, quiet: bool) -> InputResult<FoundPoses> {
         self.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
         if !quiet {
             crate::tell!("{}", self.forecast());
         }
-        let mut shown: Option<(&str, Box<dyn Fn(u32)>)> = None;
+        let mut shown: Option<(&str, Count)> = None;
         let found = self.run(&mut |what, done, total| {
             if shown.as_ref().is_none_or(|(shown, _)| *shown != what) {
+                // The bar before ends first.
                 shown = None;
-                shown = Some((what, display(what, total)));
+                shown = Some((what, Count::new(what, total, quiet)));
             }
-            shown.iter().for_each(|(_, show)| show(done));
+            shown.iter().for_each(|(_, count)| count.show(done));
         });
         drop(shown);
         let found = found?;
@@ -329,7 +336,7 @@ impl PoseSearch {
     fn pairs(&self, work: &Path, watch: &mut Watch<'_>) -> InputResult<Pairs> {
         let total = self.photos.len() as u32;
         watch("photos looked at", 0, total);
-        let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most, &|_| ()))?;
+        let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most))?;
         write_whole(&work.join("pairs.txt"), self.lines_of(&pairs.pairs).as_bytes())?;
         Ok(pairs)
     }

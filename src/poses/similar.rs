@@ -17,7 +17,6 @@ use crate::dataset::resize::{Size, divided_size, resize_area};
 use rayon::prelude::*;
 use std::collections::HashMap;
 use std::f32::consts::TAU;
-use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Longer side of a reduced photo, pixels, and the sizes relative to it at which corners are sought.
 const SIDE: f64 = 480.0;
@@ -47,15 +46,13 @@ struct Corner {
     bits: [u64; 4],
 }
 
-/// For each photo up to `most` others that look alike, best first. `watch` gets the number of photos that are looked at.
+/// For each photo up to `most` others that look alike, best first.
 /// Errors: a photo cannot be decoded.
-pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &(dyn Fn(u32) + Sync)) -> InputResult<Vec<Vec<u32>>> {
-    let (pattern, done) = (pattern(), AtomicU32::new(0));
+pub fn look_alikes(photos: &[FoundPhoto], most: usize) -> InputResult<Vec<Vec<u32>>> {
+    let pattern = pattern();
     let describe = |photo: &FoundPhoto| {
         let (gray, size) = reduced(photo)?;
-        let corners = corners(&gray, size, &pattern);
-        watch(done.fetch_add(1, Ordering::Relaxed) + 1);
-        Ok(corners)
+        Ok(corners(&gray, size, &pattern))
     };
     let corners: Vec<Vec<Corner>> = photos.par_iter().map(describe).collect::<InputResult<_>>()?;
     let best = |a: usize| {
@@ -274,9 +271,9 @@ mod tests {
             FoundPhoto { name: k.to_string(), path, bytes: 0, header, camera: String::new(), place: None }
         };
         let photos: Vec<FoundPhoto> = views.iter().enumerate().map(take).collect();
-        let mut alike = look_alikes(&photos, 4, &|_| ()).unwrap();
+        let mut alike = look_alikes(&photos, 4).unwrap();
         alike.iter_mut().for_each(|others| others.sort_unstable());
         assert_eq!(alike, [vec![1, 2], vec![0, 2], vec![0, 1], vec![4], vec![3]]);
-        assert_eq!(look_alikes(&photos, 1, &|_| ()).unwrap()[3], [4]);
+        assert_eq!(look_alikes(&photos, 1).unwrap()[3], [4]);
     }
 }

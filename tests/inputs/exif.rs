@@ -1,7 +1,7 @@
 //! Camera settings from the EXIF data of JPEG and PNG photos, and what damaged data give.
 
-use crate::support::exif::{Settings, with_exif};
-use gsscale::dataset::exif::{MOST_BYTES, brightness};
+use crate::support::exif::{Settings, tiff_of_place, with_exif};
+use gsscale::dataset::exif::{MOST_BYTES, brightness, camera_and_place};
 use gsscale::dataset::photo_header::{ExifPlace, read_header};
 use image::{ImageFormat, RgbImage};
 use std::io::Cursor;
@@ -62,6 +62,35 @@ fn settings_that_mean_nothing_are_unknown() {
         }
         // A directory without the settings.
         assert_eq!(read(&with_exif(&photo, b"II*\0\x08\0\0\0\0\0\0\0\0\0")).1, Ok(None));
+    }
+}
+
+#[test]
+fn the_camera_and_the_place_are_read() {
+    let read = |photo: &[u8], tiff: &[u8]| {
+        let folder = TempDir::new().unwrap();
+        let path = folder.path().join("photo");
+        std::fs::write(&path, with_exif(photo, tiff)).unwrap();
+        camera_and_place(&path, read_header(&path).unwrap().exif.unwrap())
+    };
+    for photo in photos() {
+        for want in [[43.123_456, -87.98, 210.5], [-33.87, 151.2, -4.0], [0.5, 0.0, 0.0]] {
+            let (camera, place) = read(&photo, &tiff_of_place("FC6310 (a long name)", want)).unwrap();
+            let place = place.unwrap();
+            let got = [place.latitude, place.longitude, place.altitude.unwrap()];
+            assert!(got.iter().zip(want).all(|(got, want)| (got - want).abs() < 1e-8), "{got:?}");
+            assert!(camera.contains("FC6310 (a long name)"), "{camera}");
+        }
+        // A camera without a fix; a latitude beyond the pole; no place at all.
+        assert_eq!(read(&photo, &tiff_of_place("A", [0.0; 3])).unwrap().1, None);
+        assert_eq!(read(&photo, &tiff_of_place("A", [91.0, 0.0, 0.0])).unwrap().1, None);
+        assert_eq!(read(&photo, &SETTINGS.tiff()), Ok((String::new(), None)));
+        let tiff = tiff_of_place("A", [43.0, -87.0, 210.0]);
+        for length in 0..tiff.len() {
+            // What is cut off is unknown or an error, never a wrong number.
+            let place = read(&photo, &tiff[..length]).ok().and_then(|(_, place)| place);
+            assert!(place.is_none_or(|p| (p.latitude, p.longitude) == (43.0, -87.0)), "{length}: {place:?}");
+        }
     }
 }
 

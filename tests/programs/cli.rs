@@ -4,6 +4,7 @@
 use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
+use gsscale::config::habits::ADVICE;
 use gsscale::config::values::choices;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -326,6 +327,21 @@ fn help_is_grouped_and_has_examples() {
     assert!(said.lines().count() <= 30, "{said}");
     let at = |word: &str| said.find(word).expect(&said);
     assert!(at("Examples:") < at("Usage:") && at("Usage:") < at("--steps") && !said.contains("--refine-start"));
+}
+
+#[test]
+fn flags_of_other_trainers_work_or_are_answered() {
+    let work = Workdir::city(3, 32, 24, 100);
+    for flags in ["-s scene -m out", "--data scene --result-dir out", "--data-dir scene --model-path out"] {
+        let said = stdout(&work.output(TRAIN, &format!("{flags} --iterations 7 --cap-max 50 --dry-run")));
+        assert!(said.contains("steps = 7\n") && said.contains("max-gaussians = 50\n"), "{flags}: {said}");
+    }
+    for (flag, advice) in ADVICE {
+        let output = work.output(TRAIN, &format!("scene --out out {flag}"));
+        let told = stderr(&output);
+        assert!(output.status.code() == Some(2) && told.contains(flag) && told.contains(advice), "{told}");
+    }
+    assert!(!work.exists("out"));
 }
 
 /// `gsscale-plan ... | head` exits with success, whatever remains unprinted.

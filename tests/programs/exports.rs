@@ -83,9 +83,9 @@ fn photos_without_poses_are_told_how_to_get_them() {
         let output = work.command(TRAIN, "--out out").arg(&photos).output().unwrap();
         let told = stderr(&output);
         assert_eq!(output.status.code(), Some(1), "{told}");
-        says(&told, &["3 photos, but no camera poses", "colmap mapper", "OpenDroneMap", "Metashape", "RealityScan"]);
-        // The commands of COLMAP hold the paths as they were given.
-        assert!(told.contains(&format!("--image_path {} ", work.path("scene/images").display())), "{told}");
+        says(&told, &["3 photos, but no camera poses", "pycolmap", "OpenDroneMap", "Metashape", "RealityScan"]);
+        // The command holds the path as it was given.
+        assert!(told.contains(&format!("gsscale-poses {}\n", photos.display())), "{told}");
         assert!(!work.exists("out"));
     }
 }

@@ -20,6 +20,7 @@ mod drive_faults;
 mod dry_runs;
 mod exports;
 mod extremes;
+mod find_poses;
 mod first_hour;
 mod forecast;
 mod foreign_files;

@@ -43,6 +43,45 @@ impl Settings {
     }
 }
 
+/// A TIFF structure of a camera's name, and a directory of a place: degrees north and east (of any sign), metres above the sea.
+pub fn tiff_of_place(camera: &str, [north, east, up]: [f64; 3]) -> Vec<u8> {
+    let entry = |tag: u16, kind: u16, count: u32, value: [u8; 4]| -> Vec<u8> {
+        [&tag.to_le_bytes()[..], &kind.to_le_bytes(), &count.to_le_bytes(), &value].concat()
+    };
+    let letter = |letter: u8| [letter, 0, 0, 0];
+    let ratio =
+        |value: f64, by: u32| [((value * f64::from(by)).round() as u32).to_le_bytes(), by.to_le_bytes()].concat();
+    let angle = |degrees: f64| {
+        let (whole, minutes) = (degrees.abs().floor(), degrees.abs().fract() * 60.0);
+        [ratio(whole, 1), ratio(minutes.floor(), 1), ratio(minutes.fract() * 60.0, 1_000_000)].concat()
+    };
+    let (ascii, long, rational) = (2, 4, 5);
+    // Header 8, first directory 2 + 2 * 12 + 4, directory of the place 2 + 6 * 12 + 4, then what is longer than 4 bytes.
+    let (gps, values) = (38u32, 116u32);
+    let name = [camera.as_bytes(), &[0]].concat();
+    [
+        b"II*\0".to_vec(),
+        8u32.to_le_bytes().to_vec(),
+        2u16.to_le_bytes().to_vec(),
+        entry(0x0110, ascii, name.len() as u32, (values + 56).to_le_bytes()),
+        entry(0x8825, long, 1, gps.to_le_bytes()),
+        vec![0; 4],
+        6u16.to_le_bytes().to_vec(),
+        entry(1, ascii, 2, letter(if north < 0.0 { b'S' } else { b'N' })),
+        entry(2, rational, 3, values.to_le_bytes()),
+        entry(3, ascii, 2, letter(if east < 0.0 { b'W' } else { b'E' })),
+        entry(4, rational, 3, (values + 24).to_le_bytes()),
+        entry(5, 1, 1, letter(u8::from(up < 0.0))),
+        entry(6, rational, 1, (values + 48).to_le_bytes()),
+        vec![0; 4],
+        angle(north),
+        angle(east),
+        ratio(up.abs(), 1000),
+        name,
+    ]
+    .concat()
+}
+
 /// A JPEG or PNG with these EXIF data before its other segments or chunks.
 pub fn with_exif(photo: &[u8], tiff: &[u8]) -> Vec<u8> {
     if photo.starts_with(&[0xff, 0xd8]) {

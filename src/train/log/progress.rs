@@ -3,20 +3,18 @@
 //! Invariants: 1. a line, and a bar on a terminal of 80 columns, fits 80 columns for any number of steps and Gaussians;
 //! 2. rate and time left follow from the last half minute, since steps become slower while a scene grows.
 
+use crate::base::count::{LINE_EVERY, new_bar};
 use crate::base::say::visible;
 use crate::base::units::{format_count, format_seconds};
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use std::collections::VecDeque;
 use std::io::IsTerminal;
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Columns of a line.
 const COLUMNS: usize = 80;
 /// Columns of the text beside `done/total`: see the test.
 const WORDS: usize = 54;
-/// Time between two lines without a terminal: logs stay small.
-const LINE_EVERY: Duration = Duration::from_secs(10);
 /// Time between two changes of a bar's text.
 const BAR_EVERY: Duration = Duration::from_millis(100);
 /// The rate is that of this time.
@@ -111,12 +109,6 @@ impl RunProgress {
     }
 }
 
-fn new_bar(total: u64, template: &str) -> ProgressBar {
-    let bar = ProgressBar::new(total);
-    bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));
-    bar
-}
-
 fn digits(n: u32) -> usize {
     n.checked_ilog10().unwrap_or(0) as usize + 1
 }
@@ -155,47 +147,6 @@ impl RecentRate {
         }
         let (then, before) = self.samples.front().copied().unwrap_or_default();
         f64::from(steps.saturating_sub(before)) / (seconds - then).max(1e-9)
-    }
-}
-
-/// Progress of another task: photos, views. May be shown from any thread.
-pub struct Count {
-    bar: Option<ProgressBar>,
-    quiet: bool,
-    what: &'static str,
-    total: u32,
-    last_line: Mutex<Instant>,
-}
-
-impl Count {
-    /// A display for `total` parts, called `what` (`photos made`).
-    pub fn new(what: &'static str, total: u32, quiet: bool) -> Count {
-        let template = format!("{{bar:32.cyan/blue}} {{pos}}/{{len}} {what}  {{eta}} left");
-        let bar =
-            (!quiet && total > 0 && std::io::stderr().is_terminal()).then(|| new_bar(u64::from(total), &template));
-        Count { bar, quiet, what, total, last_line: Mutex::new(Instant::now()) }
-    }
-
-    /// Shows that `done` parts are done.
-    pub fn show(&self, done: u32) {
-        if let Some(bar) = &self.bar {
-            bar.set_position(u64::from(done));
-            return;
-        }
-        // A thread that panicked while it held the time left a valid time.
-        let mut last = self.last_line.lock().unwrap_or_else(PoisonError::into_inner);
-        if !self.quiet && last.elapsed() >= LINE_EVERY {
-            *last = Instant::now();
-            crate::tell!("{done}/{} {}", self.total, self.what);
-        }
-    }
-}
-
-impl Drop for Count {
-    fn drop(&mut self) {
-        if let Some(bar) = &self.bar {
-            bar.finish_and_clear();
-        }
     }
 }
 

@@ -2,6 +2,7 @@
 //!
 //! Not here: the figures of a view ([`crate::train::state::eval`]).
 
+use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
@@ -20,7 +21,6 @@ use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{PositionSample, file_warnings};
 use crate::train::inputs::machine::{self, OpenedDevice};
-use crate::train::log::progress::Count;
 use crate::train::log::report::TestMetrics;
 use crate::train::memory::{check_evaluation_fits, check_photos_fit, host_budget};
 use crate::train::state::eval::{EvalRequest, evaluate};
