@@ -38,6 +38,26 @@
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
 //! | [`cells`] | a city in cells, on several machines: the prior, the cut, a cell's run, the merge, the seam |
 //!
+//! As a library, in as many words as a training loop takes (`tools/examples` has whole programs):
+//!
+//! ```no_run
+//! use gsscale::config::{file::TrainConfig, limits::RunOptions};
+//! use gsscale::dataset::target_cache::TargetCache;
+//! use gsscale::render::cpu::CpuRenderer;
+//! use gsscale::train::{start::first_scene::prepare, state::trainer::Trainer};
+//!
+//! let config = TrainConfig { steps: 3000, ..TrainConfig::default() };
+//! let first = prepare("scans/village".as_ref(), &config)?;
+//! let options = RunOptions { sh_degree_start: first.sh_degree_start, ..RunOptions::new(&config, first.dataset.scene_scale) };
+//! let photos = TargetCache::new(&first.dataset.views, 1 << 30, 2)?;
+//! let mut trainer = Trainer::new(first.columns, &first.dataset, Box::new(CpuRenderer::new()), options)?;
+//! for _ in 0..config.steps {
+//!     let outcome = trainer.step(&first.dataset, &photos)?;
+//!     println!("loss {}", outcome.loss.total);
+//! }
+//! # Ok::<(), gsscale::train::error::TrainError>(())
+//! ```
+//!
 //! The programs are in `tools/`, one file each, with a folder where a program has several commands: they parse, call, print.
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a

@@ -83,17 +83,22 @@ impl Program {
     /// The program that `places` names; otherwise the best of COLMAP with a GPU, pycolmap, COLMAP on the CPU.
     /// Errors: none is there, which says how to install one; or the named one does not run or is too old.
     pub fn find(places: &Places) -> InputResult<Program> {
+        // Phases run in another folder. A name alone is searched for on the PATH.
+        let whole = |path: &PathBuf| match path.components().count() {
+            1 => path.clone(),
+            _ => std::path::absolute(path).unwrap_or_else(|_| path.clone()),
+        };
         if let Some(path) = &places.colmap {
-            return Program::colmap(path);
+            return Program::colmap(&whole(path));
         }
         if let Some(path) = &places.python {
-            return Program::pycolmap(path);
+            return Program::pycolmap(&whole(path));
         }
         let colmap = Program::colmap(Path::new("colmap"));
         if colmap.as_ref().is_ok_and(|program| program.uses_gpu) {
             return colmap;
         }
-        let named = std::env::var_os("GSSCALE_PYTHON").map(PathBuf::from);
+        let named = std::env::var_os("GSSCALE_PYTHON").map(|path| whole(&PathBuf::from(path)));
         let pythons = named.into_iter().chain(["python3", "python"].map(PathBuf::from));
         let found = pythons.map(|python| Program::pycolmap(&python)).find_map(Result::ok);
         found.map_or(colmap, Ok).map_err(|mut error| {

@@ -334,7 +334,7 @@ fn flags_of_other_trainers_work_or_are_answered() {
     let work = Workdir::city(3, 32, 24, 100);
     for flags in ["-s scene -m out", "--data scene --result-dir out", "--data-dir scene --model-path out"] {
         let said = stdout(&work.output(TRAIN, &format!("{flags} --iterations 7 --cap-max 50 --dry-run")));
-        assert!(said.contains("steps = 7\n") && said.contains("max-gaussians = 50\n"), "{flags}: {said}");
+        assert!(said.contains(" 7 steps on ") && said.contains(" 50 Gaussians,"), "{flags}: {said}");
     }
     for (flag, advice) in ADVICE {
         let output = work.output(TRAIN, &format!("scene --out out {flag}"));

@@ -2,8 +2,8 @@
 //! splat-transform. A test runs where its client is installed, and elsewhere prints why it was skipped.
 //!
 //! `GSSCALE_PYTHON` names a Python that has the packages (`pip install plyfile pycolmap tensorboard`), `GSSCALE_NODE_BIN`
-//! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`). `.ci/run` installs all
-//! but pycolmap.
+//! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`). `.ci/run` installs
+//! them.
 
 use crate::support::scenes::stderr;
 use crate::support::workdir::Workdir;

@@ -14,7 +14,7 @@ use std::path::Path;
 use std::process::Command;
 
 /// Less work than by default: photos are 1,200 pixels wide.
-const QUICK: &str = "--max-resolution 800 --features 2000";
+const QUICK: &str = "--max-resolution 600 --features 1500";
 /// Metres of a unit of brighton's model.
 const METRES: f64 = 8.26;
 
@@ -75,7 +75,7 @@ fn poses(work: &Workdir, flags: &str, program: &[&str]) -> String {
 /// The scene, of which at least 16 of 18 photos must have poses.
 fn found(scene: &Path) -> RawScene {
     let raw = read_scene(scene, &ReadOptions::default()).unwrap();
-    assert!(raw.views.len() >= 16 && raw.points.positions.len() > 500, "{} photos", raw.views.len());
+    assert!(raw.views.len() >= 16 && raw.points.positions.len() > 300, "{} photos", raw.views.len());
     assert!(raw.views.iter().all(|view| view.image_path.is_file()), "{:?}", raw.views);
     raw
 }
@@ -137,7 +137,8 @@ fn a_folder_of_photos_becomes_a_scene_by_colmap() {
     if !is_installed("colmap", &["help"], "COLMAP") || flight(&work, false).is_none() {
         return;
     }
-    let told = poses(&work, &format!("photos {QUICK}"), &["--colmap", "colmap"]);
+    // Debian's COLMAP compares in four times the time of newer ones.
+    let told = poses(&work, "photos --max-resolution 500 --features 1000", &["--colmap", "colmap"]);
     says(&told, &["18 photos of 1 camera(s), 0 with GPS; COLMAP ", "next: gsscale-train photos"]);
     found(&work.path("photos"));
     let said = work.command(TRAIN, "photos --out out --dry-run --poses auto").output().unwrap();

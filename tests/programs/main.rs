@@ -18,6 +18,7 @@ mod doctor;
 #[cfg(unix)]
 mod drive_faults;
 mod dry_runs;
+mod examples;
 mod exports;
 mod extremes;
 mod find_poses;
