@@ -53,7 +53,7 @@
 //! let mut trainer = Trainer::new(first.columns, &first.dataset, Box::new(CpuRenderer::new()), options)?;
 //! for _ in 0..config.steps {
 //!     let outcome = trainer.step(&first.dataset, &photos)?;
-//!     println!("loss {}", outcome.loss.total);
+//!     println!("loss {}", outcome.loss.loss);
 //! }
 //! # Ok::<(), gsscale::train::error::TrainError>(())
 //! ```

@@ -50,7 +50,7 @@ fn main() -> Result<(), TrainError> {
     for step in 0..config.steps {
         let outcome = trainer.step(&dataset, &photos)?;
         if step % 50 == 49 {
-            println!("step {}: loss {:.4}", step + 1, outcome.loss.total);
+            println!("step {}: loss {:.4}", step + 1, outcome.loss.loss);
         }
     }
     let test = trainer.evaluate(&dataset, &photos, None, &|_| ())?;
