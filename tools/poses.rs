@@ -2,7 +2,7 @@
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
-use gsscale::poses::program::{FeatureOptions, Places};
+use gsscale::poses::program::{FeatureOptions, ProgramPaths};
 use gsscale::poses::{PoseSearch, PosesRequest};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -60,7 +60,7 @@ fn start(flags: &Flags) -> InputResult<()> {
     let search = PoseSearch::new(&PosesRequest {
         photos: flags.photos.clone(),
         out: flags.out.clone(),
-        places: Places { colmap: flags.colmap.clone(), python: flags.python.clone() },
+        places: ProgramPaths { colmap: flags.colmap.clone(), python: flags.python.clone() },
         features: FeatureOptions { max_image_size: flags.max_resolution, max_features: flags.features },
     })?;
     if flags.dry_run {

@@ -27,9 +27,9 @@ use crate::dataset::exif::GpsPlace;
 use crate::dataset::model::{RawScene, ReadOptions};
 use crate::dataset::read::read_scene;
 use geo::{Similarity, metres_from, robust_similarity};
-use pairs::{ChosenBy, Pairs, choose_pairs, count_of, way_of};
+use pairs::{ChosenBy, ChosenPairs, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos};
-use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Places, Program, SPARSE};
+use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -62,7 +62,7 @@ pub struct PosesRequest {
     pub photos: PathBuf,
     /// The folder of the scene; `None` is that of the photos.
     pub out: Option<PathBuf>,
-    pub places: Places,
+    pub places: ProgramPaths,
     pub features: FeatureOptions,
 }
 
@@ -73,7 +73,7 @@ impl PosesRequest {
     /// The request for these photos that leaves the rest to this room.
     pub fn of(photos: &Path) -> PosesRequest {
         let features = FeatureOptions { max_image_size: 1600, max_features: 8192 };
-        PosesRequest { photos: photos.to_path_buf(), out: None, places: Places::default(), features }
+        PosesRequest { photos: photos.to_path_buf(), out: None, places: ProgramPaths::default(), features }
     }
 }
 
@@ -108,7 +108,7 @@ pub struct FoundPoses {
 
 /// How far the work is, and for which photos and options.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct State {
+struct SearchState {
     made_by: String,
     program: String,
     options: String,
@@ -240,10 +240,13 @@ impl PoseSearch {
     }
 
     /// The state of the work folder, which is made, emptied if it is of other photos or options, or refused if it is not ours.
-    fn begin(&self, work: &Path) -> InputResult<State> {
-        let groups = |i: usize| self.groups.iter().position(|group| group.contains(&i)).unwrap_or(0);
-        let of_photo = |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, groups(i));
-        let new = State {
+    fn begin(&self, work: &Path) -> InputResult<SearchState> {
+        let mut group_of = vec![0; self.photos.len()];
+        for (g, group) in self.groups.iter().enumerate() {
+            group.iter().for_each(|&i| group_of[i] = g);
+        }
+        let of_photo = |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, group_of[i]);
+        let new = SearchState {
             made_by: MADE_BY.to_string(),
             program: self.program.name.clone(),
             options: format!("{} pixels, {} features", self.features.max_image_size, self.features.max_features),
@@ -260,7 +263,7 @@ impl PoseSearch {
             return Ok(new);
         }
         let file = work.join(STATE_FILE);
-        let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<State>(&text).ok());
+        let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<SearchState>(&text).ok());
         let Some(old) = old.filter(|old| old.made_by == MADE_BY) else {
             let problem = "exists already, and is not a work folder of gsscale-poses";
             return Err(InputError::new(
@@ -269,7 +272,7 @@ impl PoseSearch {
                 "name a new folder for the scene with --out, or move that one away",
             ));
         };
-        if (State { done: Vec::new(), ..old.clone() }) == new {
+        if (SearchState { done: Vec::new(), ..old.clone() }) == new {
             return Ok(old);
         }
         clear(work)?;
@@ -302,7 +305,7 @@ impl PoseSearch {
     }
 
     /// Features of every photo. An interrupted search begins them again: COLMAP would give the rest of a group another camera.
-    fn find_features(&self, work: &Path, state: &mut State, watch: &mut Watch<'_>) -> InputResult<()> {
+    fn find_features(&self, work: &Path, state: &mut SearchState, watch: &mut Watch<'_>) -> InputResult<()> {
         if state.is_done("features") {
             return Ok(());
         }
@@ -333,7 +336,7 @@ impl PoseSearch {
         state.finish("features", work)
     }
 
-    fn pairs(&self, work: &Path, watch: &mut Watch<'_>) -> InputResult<Pairs> {
+    fn pairs(&self, work: &Path, watch: &mut Watch<'_>) -> InputResult<ChosenPairs> {
         let total = self.photos.len() as u32;
         watch("photos looked at", 0, total);
         let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most))?;
@@ -433,7 +436,7 @@ impl fmt::Display for FoundPoses {
     }
 }
 
-impl State {
+impl SearchState {
     fn is_done(&self, phase: &str) -> bool {
         self.done.iter().any(|done| done == phase)
     }

@@ -31,7 +31,7 @@ pub enum ChosenBy {
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Pairs {
+pub struct ChosenPairs {
     pub pairs: Vec<(u32, u32)>,
     pub by: ChosenBy,
 }
@@ -62,7 +62,7 @@ pub fn count_of(photos: &[FoundPhoto]) -> u64 {
 pub fn choose_pairs<E>(
     photos: &[FoundPhoto],
     alike: impl FnOnce(usize) -> Result<Vec<Vec<u32>>, E>,
-) -> Result<Pairs, E> {
+) -> Result<ChosenPairs, E> {
     let (n, by) = (photos.len(), way_of(photos));
     let mut pairs = BTreeSet::new();
     let mut add = |a: usize, b: usize| {
@@ -87,7 +87,7 @@ pub fn choose_pairs<E>(
             }
         }
     }
-    Ok(Pairs { pairs: pairs.into_iter().collect(), by })
+    Ok(ChosenPairs { pairs: pairs.into_iter().collect(), by })
 }
 
 /// For each photo the nearest others, in metres; none for one without a place.
@@ -135,7 +135,7 @@ mod tests {
         places.map(of_place).collect()
     }
 
-    fn chosen(photos: &[FoundPhoto], alike: Vec<Vec<u32>>) -> Pairs {
+    fn chosen(photos: &[FoundPhoto], alike: Vec<Vec<u32>>) -> ChosenPairs {
         choose_pairs(photos, |_| Ok::<_, Infallible>(alike)).unwrap()
     }
 
@@ -152,7 +152,7 @@ mod tests {
         let grid =
             |i: i32| Some((47.0 + 1e-4 * f64::from(i / 20), 9.0 + 1.5e-4 * f64::from(i % 20))).filter(|_| i != 7);
         let photos = photos((0..400).map(grid));
-        let Pairs { pairs, by } = chosen(&photos, Vec::new());
+        let ChosenPairs { pairs, by } = chosen(&photos, Vec::new());
         assert_eq!(by, ChosenBy::Distance);
         let partners = |a: u32| pairs.iter().filter(|(x, y)| *x == a || *y == a).count();
         let estimate = count_of(&photos) as usize;
@@ -168,7 +168,7 @@ mod tests {
         let photos = photos((0..100).map(|i| (i < 49).then_some((47.0, 9.0 + f64::from(i)))));
         let mut alike = vec![Vec::new(); 100];
         alike[3] = vec![97, 3, 98];
-        let Pairs { pairs, by } = chosen(&photos, alike);
+        let ChosenPairs { pairs, by } = chosen(&photos, alike);
         assert_eq!(by, ChosenBy::SequenceAndLikeness);
         assert!(pairs.contains(&(3, 97)) && pairs.contains(&(3, 98)) && pairs.contains(&(0, 8)));
         assert!(!pairs.contains(&(0, 9)) && pairs.iter().all(|(a, b)| a < b && *b < 100));

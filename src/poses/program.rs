@@ -17,7 +17,7 @@ use std::time::Duration;
 const OLDEST: (u32, u32) = (3, 8);
 /// What pycolmap runs.
 const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
-/// Lines of the log that an error shows.
+/// GrowingLog of the log that an error shows.
 const LAST_LINES: usize = 6;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
@@ -55,7 +55,7 @@ pub struct FeatureOptions {
 
 /// Where the user says the programs are.
 #[derive(Debug, Clone, Default)]
-pub struct Places {
+pub struct ProgramPaths {
     pub colmap: Option<PathBuf>,
     pub python: Option<PathBuf>,
 }
@@ -66,11 +66,11 @@ pub struct Program {
     /// Name and version.
     pub name: String,
     pub uses_gpu: bool,
-    kind: Kind,
+    called_as: CalledAs,
 }
 
 #[derive(Debug, Clone)]
-enum Kind {
+enum CalledAs {
     /// With the help of its phases for features and matches.
     Colmap {
         features_help: String,
@@ -82,7 +82,7 @@ enum Kind {
 impl Program {
     /// The program that `places` names; otherwise the best of COLMAP with a GPU, pycolmap, COLMAP on the CPU.
     /// Errors: none is there, which says how to install one; or the named one does not run or is too old.
-    pub fn find(places: &Places) -> InputResult<Program> {
+    pub fn find(places: &ProgramPaths) -> InputResult<Program> {
         // Phases run in another folder. A name alone is searched for on the PATH.
         let whole = |path: &PathBuf| match path.components().count() {
             1 => path.clone(),
@@ -119,12 +119,12 @@ impl Program {
         }
         let (major, minor) = version.unwrap_or(OLDEST);
         let has_cuda = first.contains("with CUDA");
-        let kind = Kind::Colmap {
+        let called_as = CalledAs::Colmap {
             features_help: said_by(path, &["feature_extractor", "-h"])?,
             matches_help: said_by(path, &["matches_importer", "-h"])?,
         };
         let uses_gpu = has_cuda && said_by(Path::new("nvidia-smi"), &["-L"]).is_ok_and(|said| said.starts_with("GPU"));
-        Ok(Program { path: path.to_path_buf(), name: format!("COLMAP {major}.{minor}"), uses_gpu, kind })
+        Ok(Program { path: path.to_path_buf(), name: format!("COLMAP {major}.{minor}"), uses_gpu, called_as })
     }
 
     fn pycolmap(python: &Path) -> InputResult<Program> {
@@ -138,17 +138,17 @@ impl Program {
             ));
         };
         let (path, name) = (python.to_path_buf(), name.trim().to_string());
-        Ok(Program { path, uses_gpu: name.ends_with("CUDA"), name, kind: Kind::Pycolmap })
+        Ok(Program { path, uses_gpu: name.ends_with("CUDA"), name, called_as: CalledAs::Pycolmap })
     }
 
     /// About how many seconds of one core a pair of photos takes to compare, for 8,192 features each.
     pub fn seconds_a_pair(&self) -> f64 {
-        match &self.kind {
+        match &self.called_as {
             _ if self.uses_gpu => 0.02,
-            Kind::Pycolmap => 0.2,
+            CalledAs::Pycolmap => 0.2,
             // Options of this name came with faster comparison.
-            Kind::Colmap { matches_help, .. } if matches_help.contains("--FeatureMatching.") => 0.2,
-            Kind::Colmap { .. } => 0.9,
+            CalledAs::Colmap { matches_help, .. } if matches_help.contains("--FeatureMatching.") => 0.2,
+            CalledAs::Colmap { .. } => 0.9,
         }
     }
 
@@ -171,7 +171,7 @@ impl Program {
         command.env("QT_QPA_PLATFORM", "offscreen").env("PYTHONUNBUFFERED", "1");
         command.stdin(Stdio::null()).stdout(file).stderr(twin);
         let mut child = command.spawn().map_err(|e| InputError::io(&self.path, "starting the program", &e))?;
-        let mut lines = Lines::of(&log).map_err(|e| io(&e))?;
+        let mut lines = GrowingLog::of(&log).map_err(|e| io(&e))?;
         let status = loop {
             let ended = child.try_wait().map_err(|e| InputError::io(&self.path, "waiting for the program", &e))?;
             lines.new_ones(watch).map_err(|e| io(&e))?;
@@ -180,10 +180,11 @@ impl Program {
                 None => std::thread::sleep(LOOK_EVERY),
             }
         };
-        if status.success() {
+        let text = std::fs::read(&log).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).unwrap_or_default();
+        // Photos without a model are no failure of the program; pycolmap ends without an error then.
+        if status.success() || matches!(phase, Phase::Model) && text.contains("failed to create") {
             return Ok(());
         }
-        let text = std::fs::read(&log).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).unwrap_or_default();
         let last: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
         let last = last[last.len().saturating_sub(LAST_LINES)..].join("\n    ");
         let remedy = "name the folder again to go on with this phase; with less memory, use --max-resolution 1000";
@@ -192,11 +193,11 @@ impl Program {
     }
 
     fn arguments(&self, phase: &Phase<'_>, features: &FeatureOptions) -> Vec<String> {
-        match &self.kind {
-            Kind::Colmap { features_help, matches_help } => {
+        match &self.called_as {
+            CalledAs::Colmap { features_help, matches_help } => {
                 self.colmap_arguments(phase, features, features_help, matches_help)
             }
-            Kind::Pycolmap => {
+            CalledAs::Pycolmap => {
                 let (name, values) = match phase {
                     Phase::Features { list, camera_model, one_camera } => {
                         let values = json!({
@@ -287,16 +288,16 @@ fn option_of(help: &str, name: &str) -> Option<String> {
 }
 
 /// The lines of a file that another process writes.
-struct Lines {
+struct GrowingLog {
     file: File,
     /// The start of a line whose end is not written yet.
     begun: Vec<u8>,
     at: u64,
 }
 
-impl Lines {
-    fn of(path: &Path) -> std::io::Result<Lines> {
-        Ok(Lines { file: File::open(path)?, begun: Vec::new(), at: 0 })
+impl GrowingLog {
+    fn of(path: &Path) -> std::io::Result<GrowingLog> {
+        Ok(GrowingLog { file: File::open(path)?, begun: Vec::new(), at: 0 })
     }
 
     fn new_ones(&mut self, take: &mut dyn FnMut(&str)) -> std::io::Result<()> {

@@ -7,6 +7,7 @@ mod configs;
 mod disturb;
 mod exif;
 mod import;
+mod moved_model;
 mod photos;
 mod ply;
 mod readers;

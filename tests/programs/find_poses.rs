@@ -152,6 +152,8 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     refused("scene", &["scene/sparse", "a model is here already", "--out"]);
     work.remove("scene/sparse");
     refused("scene --colmap nowhere/colmap", &["nowhere/colmap", "pip install pycolmap", "apt-get install colmap"]);
+    let without = work.command(POSES, "scene").env("PATH", "").env_remove("GSSCALE_PYTHON").output().unwrap();
+    says(&stderr(&without), &["neither COLMAP nor a Python with pycolmap", "pip install pycolmap", "--colmap PATH"]);
     // A program that is no COLMAP, and a Python that is none.
     let echo = if cfg!(unix) { "/bin/echo" } else { "hostname" };
     refused(&format!("scene --colmap {echo}"), &["COLMAP 3.8 or newer is needed"]);

@@ -50,10 +50,10 @@ fn main() -> Result<(), TrainError> {
     for step in 0..config.steps {
         let outcome = trainer.step(&dataset, &photos)?;
         if step % 50 == 49 {
-            println!("step {}: loss {:.4}", step + 1, outcome.loss.loss);
+            gsscale::say!("step {}: loss {:.4}", step + 1, outcome.loss.loss);
         }
     }
     let test = trainer.evaluate(&dataset, &photos, None, &|_| ())?;
-    println!("{} rounds, PSNR {:.2} dB", trainer.events().events().len(), test.map_or(0.0, |test| test.psnr));
+    gsscale::say!("{} rounds, PSNR {:.2} dB", trainer.events().events().len(), test.map_or(0.0, |test| test.psnr));
     Ok(())
 }

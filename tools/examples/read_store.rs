@@ -14,7 +14,7 @@ const PAGE_ROWS: usize = 4096;
 
 fn main() -> Result<(), TrainError> {
     let Some(folder) = std::env::args_os().nth(1).map(PathBuf::from) else {
-        eprintln!("usage: read_store OUT");
+        gsscale::tell!("usage: read_store OUT");
         std::process::exit(2);
     };
     let mut store = StoredStart::open(&folder, HOST_MEM, 1)?;
@@ -25,10 +25,10 @@ fn main() -> Result<(), TrainError> {
     store.for_each_page((origin, scale), (PAGE_ROWS, degree), &mut |page| {
         let opacities = &page.columns.opacities;
         let is_solid = opacities.iter().filter(|logit| sigmoid(**logit) > 0.5).count();
-        println!("page {pages}: {} Gaussians, {is_solid} more than half opaque", opacities.len());
+        gsscale::say!("page {pages}: {} Gaussians, {is_solid} more than half opaque", opacities.len());
         (pages, rows, solid) = (pages + 1, rows + opacities.len(), solid + is_solid);
         Ok(())
     })?;
-    println!("{rows} Gaussians in {pages} pages, {solid} more than half opaque");
+    gsscale::say!("{rows} Gaussians in {pages} pages, {solid} more than half opaque");
     Ok(())
 }

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 fn main() -> Result<(), TrainError> {
     let mut arguments = std::env::args_os().skip(1).map(PathBuf::from);
     let (Some(scene), Some(out)) = (arguments.next(), arguments.next()) else {
-        eprintln!("usage: train_in_memory SCENE OUT");
+        gsscale::tell!("usage: train_in_memory SCENE OUT");
         std::process::exit(2);
     };
     // Each flag of gsscale-train is a field. Without `spill_dir`, all pages stay in memory.
@@ -20,9 +20,9 @@ fn main() -> Result<(), TrainError> {
     let existing = Existing::Refuse;
     let outcome = run(&RunRequest { scene, out, config, dry_run: false, existing, quiet: true, live: None })?;
     if let Some(summary) = outcome.summary {
-        println!("{} Gaussians after {} steps", summary.gaussians, summary.steps);
+        gsscale::say!("{} Gaussians after {} steps", summary.gaussians, summary.steps);
         if let Some(test) = summary.test {
-            println!("PSNR {:.2} dB on {} held-out photos", test.psnr, test.views);
+            gsscale::say!("PSNR {:.2} dB on {} held-out photos", test.psnr, test.views);
         }
     }
     Ok(())
