@@ -49,7 +49,7 @@ report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, con
 
 /// Trains a 3D Gaussian Splatting scene from photos with known poses.
 #[derive(Parser)]
-#[command(name = "gsscale-train", version, help_template = HELP)]
+#[command(name = "gsscale-train", version, help_template = HELP, arg_required_else_help = true)]
 #[command(before_help = FIRST_EXAMPLES, before_long_help = EXAMPLES)]
 struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), or one of the other layouts that --help names

@@ -27,11 +27,12 @@ use crate::dataset::exif::GpsPlace;
 use crate::dataset::model::{RawScene, ReadOptions};
 use crate::dataset::read::read_scene;
 use geo::{Similarity, metres_from, robust_similarity};
-use pairs::{ChosenBy, ChosenPairs, choose_pairs, count_of, way_of};
+use pairs::{ChosenBy, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos};
 use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 /// The folder in the scene in which the program works.
@@ -213,17 +214,18 @@ impl PoseSearch {
     /// Errors: a folder that is not ours is in the way, the program fails or finds no model, or the disk fails.
     pub fn run(&self, watch: &mut Watch<'_>) -> InputResult<FoundPoses> {
         let work = self.scene.join(WORK_FOLDER);
-        let mut state = self.begin(&work)?;
+        let (mut state, lock) = self.begin(&work)?;
+        let place = (work.as_path(), &lock);
         self.link_photos(&work)?;
-        self.find_features(&work, &mut state, watch)?;
-        let pairs = self.pairs(&work, watch)?;
+        self.find_features(place, &mut state, watch)?;
         if !state.is_done("matches") {
+            let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most));
             let size = CHUNK_LEAST.max(pairs.pairs.len().div_ceil(CHUNKS));
             let mut done = 0;
             for chunk in pairs.pairs.chunks(size) {
                 watch("pairs compared", done as u32, pairs.pairs.len() as u32);
                 write_whole(&work.join("chunk.txt"), self.lines_of(chunk).as_bytes())?;
-                self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, &work, &mut |_| ())?;
+                self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, place, &mut |_| ())?;
                 done += chunk.len();
             }
             state.finish("matches", &work)?;
@@ -233,14 +235,15 @@ impl PoseSearch {
             make_folder(&work.join(SPARSE))?;
             let total = self.photos.len() as u32;
             let mut show = |line: &str| registered_in(line).into_iter().for_each(|n| watch("photos placed", n, total));
-            self.program.run(&Phase::Model, &self.features, &work, &mut show)?;
+            self.program.run(&Phase::Model, &self.features, place, &mut show)?;
             state.finish("model", &work)?;
         }
         self.write_scene(&work)
     }
 
     /// The state of the work folder, which is made, emptied if it is of other photos or options, or refused if it is not ours.
-    fn begin(&self, work: &Path) -> InputResult<SearchState> {
+    /// With the lock of the folder.
+    fn begin(&self, work: &Path) -> InputResult<(SearchState, File)> {
         let mut group_of = vec![0; self.photos.len()];
         for (g, group) in self.groups.iter().enumerate() {
             group.iter().for_each(|&i| group_of[i] = g);
@@ -259,8 +262,9 @@ impl PoseSearch {
                 return Err(InputError::new(images, "exists already", "name a new folder with --out"));
             }
             make_folder(work)?;
+            let lock = lock(work)?;
             new.write(work)?;
-            return Ok(new);
+            return Ok((new, lock));
         }
         let file = work.join(STATE_FILE);
         let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<SearchState>(&text).ok());
@@ -272,12 +276,13 @@ impl PoseSearch {
                 "name a new folder for the scene with --out, or move that one away",
             ));
         };
+        let lock = lock(work)?;
         if (SearchState { done: Vec::new(), ..old.clone() }) == new {
-            return Ok(old);
+            return Ok((old, lock));
         }
         clear(work)?;
         new.write(work)?;
-        Ok(new)
+        Ok((new, lock))
     }
 
     /// Makes the photos known under plain names in the work folder, and in `images` of a scene in another place.
@@ -305,7 +310,12 @@ impl PoseSearch {
     }
 
     /// Features of every photo. An interrupted search begins them again: COLMAP would give the rest of a group another camera.
-    fn find_features(&self, work: &Path, state: &mut SearchState, watch: &mut Watch<'_>) -> InputResult<()> {
+    fn find_features(
+        &self,
+        (work, lock): (&Path, &File),
+        state: &mut SearchState,
+        watch: &mut Watch<'_>,
+    ) -> InputResult<()> {
         if state.is_done("features") {
             return Ok(());
         }
@@ -330,18 +340,10 @@ impl PoseSearch {
                 }
             };
             let phase = Phase::Features { list: "list.txt", camera_model, one_camera };
-            self.program.run(&phase, &self.features, work, &mut show)?;
+            self.program.run(&phase, &self.features, (work, lock), &mut show)?;
             done += group.len() as u32;
         }
         state.finish("features", work)
-    }
-
-    fn pairs(&self, work: &Path, watch: &mut Watch<'_>) -> InputResult<ChosenPairs> {
-        let total = self.photos.len() as u32;
-        watch("photos looked at", 0, total);
-        let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most))?;
-        write_whole(&work.join("pairs.txt"), self.lines_of(&pairs.pairs).as_bytes())?;
-        Ok(pairs)
     }
 
     /// Writes the largest model into the scene, in metres if GPS allows.
@@ -508,6 +510,18 @@ fn remove_files(folder: &Path, ours: &dyn Fn(&str) -> bool) -> InputResult<()> {
         }
     }
     Ok(())
+}
+
+/// Locks a work folder, as long as the file is open.
+fn lock(work: &Path) -> InputResult<File> {
+    let lock = File::create(work.join("lock")).map_err(|e| InputError::io(work, "locking the folder", &e))?;
+    match lock.try_lock() {
+        Err(TryLockError::WouldBlock) => {
+            Err(InputError::new(work, "another search works in this folder", "wait for its end, or stop it"))
+        }
+        // Some file systems know no locks.
+        _ => Ok(lock),
+    }
 }
 
 fn make_folder(folder: &Path) -> InputResult<()> {

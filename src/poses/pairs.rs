@@ -59,10 +59,7 @@ pub fn count_of(photos: &[FoundPhoto]) -> u64 {
 
 /// The pairs to compare. `alike` gives for each photo up to that many others that look alike, best first; it is asked only if
 /// places do not decide.
-pub fn choose_pairs<E>(
-    photos: &[FoundPhoto],
-    alike: impl FnOnce(usize) -> Result<Vec<Vec<u32>>, E>,
-) -> Result<ChosenPairs, E> {
+pub fn choose_pairs(photos: &[FoundPhoto], alike: impl FnOnce(usize) -> Vec<Vec<u32>>) -> ChosenPairs {
     let (n, by) = (photos.len(), way_of(photos));
     let mut pairs = BTreeSet::new();
     let mut add = |a: usize, b: usize| {
@@ -81,39 +78,40 @@ pub fn choose_pairs<E>(
             }
         }
         ChosenBy::SequenceAndLikeness => {
-            for (a, others) in alike(NEAREST)?.into_iter().enumerate() {
+            for (a, others) in alike(NEAREST).into_iter().enumerate() {
                 others.into_iter().for_each(|b| add(a, b as usize));
                 (1..=NEXT).for_each(|step| add(a, a + step));
             }
         }
     }
-    Ok(ChosenPairs { pairs: pairs.into_iter().collect(), by })
+    ChosenPairs { pairs: pairs.into_iter().collect(), by }
 }
 
-/// For each photo the nearest others, in metres; none for one without a place.
+/// For each photo the nearest others, in metres, and of equally near ones those close to it in the sequence: places may be as coarse as
+/// a street. None for one without a place.
 fn nearest(places: &[Option<GpsPlace>]) -> Vec<Vec<usize>> {
     let Some(origin) = places.iter().flatten().next() else { return vec![Vec::new(); places.len()] };
     let metres: Vec<Option<DVec3>> = places.iter().map(|p| p.as_ref().map(|p| metres_from(origin, p))).collect();
     let near = |a: usize| -> Vec<usize> {
         let Some(at) = metres[a] else { return Vec::new() };
-        let distance = |b: usize| metres[b].filter(|_| a != b).map(|other| (at.distance_squared(other), b));
-        let mut others: Vec<(f64, usize)> = (0..metres.len()).filter_map(distance).collect();
-        let order = |x: &(f64, usize), y: &(f64, usize)| x.0.total_cmp(&y.0).then(x.1.cmp(&y.1));
+        let distance =
+            |b: usize| metres[b].filter(|_| a != b).map(|other| (at.distance_squared(other), a.abs_diff(b), b));
+        let mut others: Vec<(f64, usize, usize)> = (0..metres.len()).filter_map(distance).collect();
+        let order =
+            |x: &(f64, usize, usize), y: &(f64, usize, usize)| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2)));
         if others.len() > NEAREST {
             others.select_nth_unstable_by(NEAREST, order);
             others.truncate(NEAREST);
         }
-        others.into_iter().map(|(_, b)| b).collect()
+        others.into_iter().map(|(_, _, b)| b).collect()
     };
     (0..metres.len()).into_par_iter().map(near).collect()
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::dataset::photo_header::{PhotoFormat, PhotoHeader};
-    use std::convert::Infallible;
     use std::path::PathBuf;
 
     fn photos(places: impl Iterator<Item = Option<(f64, f64)>>) -> Vec<FoundPhoto> {
@@ -136,7 +134,7 @@ mod tests {
     }
 
     fn chosen(photos: &[FoundPhoto], alike: Vec<Vec<u32>>) -> ChosenPairs {
-        choose_pairs(photos, |_| Ok::<_, Infallible>(alike)).unwrap()
+        choose_pairs(photos, |_| alike)
     }
 
     #[test]
@@ -161,6 +159,12 @@ mod tests {
             assert!(pairs.contains(&(a, b)), "{a}, {b}");
         }
         assert!(!pairs.contains(&(190, 390)) && (20..60).contains(&partners(190)) && partners(7) >= 10);
+    }
+
+    #[test]
+    fn photos_at_one_place_are_compared_with_those_close_to_them_in_the_sequence() {
+        let ChosenPairs { pairs, .. } = chosen(&photos((0..90).map(|_| Some((47.0, 9.0)))), Vec::new());
+        assert!(pairs.iter().all(|(a, b)| b - a <= 20) && (0..80).all(|a| pairs.contains(&(a, a + 10))), "{pairs:?}");
     }
 
     #[test]

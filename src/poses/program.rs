@@ -152,13 +152,14 @@ impl Program {
         }
     }
 
-    /// Runs a phase in the folder `work` and waits for it. `watch` gets every line that it prints.
+    /// Runs a phase in the folder `work` and waits for it. `watch` gets every line that it prints. `lock` is the locked file of the folder:
+    /// the program gets it as its input, so that the folder stays locked while the program outlives this process.
     /// Errors: the program cannot be started, or says that it failed: then the error shows its last lines.
     pub fn run(
         &self,
         phase: &Phase<'_>,
         features: &FeatureOptions,
-        work: &Path,
+        (work, lock): (&Path, &File),
         watch: &mut dyn FnMut(&str),
     ) -> InputResult<()> {
         let log = work.join(LOG);
@@ -169,7 +170,7 @@ impl Program {
         command.args(self.arguments(phase, features)).current_dir(work);
         // Of Qt, on which COLMAP's window is built.
         command.env("QT_QPA_PLATFORM", "offscreen").env("PYTHONUNBUFFERED", "1");
-        command.stdin(Stdio::null()).stdout(file).stderr(twin);
+        command.stdin(lock.try_clone().map_err(|e| io(&e))?).stdout(file).stderr(twin);
         let mut child = command.spawn().map_err(|e| InputError::io(&self.path, "starting the program", &e))?;
         let mut lines = GrowingLog::of(&log).map_err(|e| io(&e))?;
         let status = loop {

@@ -47,14 +47,14 @@ struct Corner {
 }
 
 /// For each photo up to `most` others that look alike, best first.
-/// Errors: a photo cannot be decoded.
-pub fn look_alikes(photos: &[FoundPhoto], most: usize) -> InputResult<Vec<Vec<u32>>> {
+/// A photo that cannot be decoded looks like none: the program that computes poses leaves it out as well.
+pub fn look_alikes(photos: &[FoundPhoto], most: usize) -> Vec<Vec<u32>> {
     let pattern = pattern();
-    let describe = |photo: &FoundPhoto| {
-        let (gray, size) = reduced(photo)?;
-        Ok(corners(&gray, size, &pattern))
+    let describe = |photo: &FoundPhoto| match reduced(photo) {
+        Ok((gray, size)) => corners(&gray, size, &pattern),
+        Err(_) => Vec::new(),
     };
-    let corners: Vec<Vec<Corner>> = photos.par_iter().map(describe).collect::<InputResult<_>>()?;
+    let corners: Vec<Vec<Corner>> = photos.par_iter().map(describe).collect();
     let best = |a: usize| {
         let score =
             |b: usize| (if a < b { agreeing(&corners[a], &corners[b]) } else { agreeing(&corners[b], &corners[a]) }, b);
@@ -63,7 +63,7 @@ pub fn look_alikes(photos: &[FoundPhoto], most: usize) -> InputResult<Vec<Vec<u3
         found.sort_by_key(|&(score, b)| (u16::MAX - score, b));
         found.into_iter().take(most).map(|(_, b)| b as u32).collect()
     };
-    Ok((0..corners.len()).into_par_iter().map(best).collect())
+    (0..corners.len()).into_par_iter().map(best).collect()
 }
 
 /// The photo in gray, reduced.
@@ -271,9 +271,9 @@ mod tests {
             FoundPhoto { name: k.to_string(), path, bytes: 0, header, camera: String::new(), place: None }
         };
         let photos: Vec<FoundPhoto> = views.iter().enumerate().map(take).collect();
-        let mut alike = look_alikes(&photos, 4).unwrap();
+        let mut alike = look_alikes(&photos, 4);
         alike.iter_mut().for_each(|others| others.sort_unstable());
         assert_eq!(alike, [vec![1, 2], vec![0, 2], vec![0, 1], vec![4], vec![3]]);
-        assert_eq!(look_alikes(&photos, 1).unwrap()[3], [4]);
+        assert_eq!(look_alikes(&photos, 1)[3], [4]);
     }
 }

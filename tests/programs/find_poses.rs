@@ -11,7 +11,8 @@ use gsscale::dataset::model::RawScene;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::poses::geo::metres_from;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Command, Stdio};
+use std::time::Duration;
 
 /// Less work than by default: photos are 1,200 pixels wide.
 const QUICK: &str = "--max-resolution 600 --features 1500";
@@ -125,9 +126,31 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     work.remove("scan/sparse");
     poses(&work, &format!("photos --out scan {QUICK}"), &program);
     assert!(database() == before && work.files("scan/sparse") == model);
-    // Other options begin again.
+    // Other options begin again, and a search that was killed goes on, at the latest when the program that it has left is done.
     work.remove("scan/sparse");
-    let told = poses(&work, "photos --out scan --max-resolution 400 --features 500", &program);
+    let again = || {
+        let mut command = work.command(POSES, "photos --out scan --max-resolution 400 --features 500");
+        command.args(program).stderr(Stdio::piped());
+        command
+    };
+    let mut killed = again().spawn().unwrap();
+    let log = work.path("scan/poses/log.txt");
+    while !std::fs::read_to_string(&log).is_ok_and(|text| text.contains("Processed file [2/18]")) {
+        assert!(killed.try_wait().unwrap().is_none(), "it ended before it was killed");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    killed.kill().unwrap();
+    killed.wait().unwrap();
+    assert!(!work.exists("scan/sparse"));
+    let told = loop {
+        let output = again().output().unwrap();
+        let told = stderr(&output);
+        if !told.contains("another search works in this folder") {
+            assert!(output.status.success(), "{told}");
+            break told;
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    };
     assert!(database() != before && told.contains("of 18 photos have poses"), "{told}");
 }
 
@@ -177,5 +200,8 @@ fn what_cannot_work_is_refused_with_a_remedy() {
         // Photos of a size that shows nothing: pycolmap finds no model.
         let told = refused(&format!("scene --out small {program}"), &["no model was found", "remedy"]);
         assert!(!work.exists("small/sparse"), "{told}");
+        let lock = std::fs::File::open(work.path("small/poses/lock")).unwrap();
+        lock.try_lock().unwrap();
+        refused(&format!("scene --out small {program}"), &["small/poses", "another search works in this folder"]);
     }
 }
