@@ -220,10 +220,10 @@ impl PoseSearch {
         self.find_features(place, &mut state, watch)?;
         if !state.is_done("matches") {
             let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most));
-            let size = CHUNK_LEAST.max(pairs.pairs.len().div_ceil(CHUNKS));
+            let size = CHUNK_LEAST.max(pairs.len().div_ceil(CHUNKS));
             let mut done = 0;
-            for chunk in pairs.pairs.chunks(size) {
-                watch("pairs compared", done as u32, pairs.pairs.len() as u32);
+            for chunk in pairs.chunks(size) {
+                watch("pairs compared", done as u32, pairs.len() as u32);
                 write_whole(&work.join("chunk.txt"), self.lines_of(chunk).as_bytes())?;
                 self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, place, &mut |_| ())?;
                 done += chunk.len();

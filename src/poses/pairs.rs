@@ -30,12 +30,6 @@ pub enum ChosenBy {
     SequenceAndLikeness,
 }
 
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct ChosenPairs {
-    pub pairs: Vec<(u32, u32)>,
-    pub by: ChosenBy,
-}
-
 /// How the pairs of these photos are chosen.
 pub fn way_of(photos: &[FoundPhoto]) -> ChosenBy {
     let places = photos.iter().filter(|photo| photo.place.is_some()).count();
@@ -59,15 +53,15 @@ pub fn count_of(photos: &[FoundPhoto]) -> u64 {
 
 /// The pairs to compare. `alike` gives for each photo up to that many others that look alike, best first; it is asked only if
 /// places do not decide.
-pub fn choose_pairs(photos: &[FoundPhoto], alike: impl FnOnce(usize) -> Vec<Vec<u32>>) -> ChosenPairs {
-    let (n, by) = (photos.len(), way_of(photos));
+pub fn choose_pairs(photos: &[FoundPhoto], alike: impl FnOnce(usize) -> Vec<Vec<u32>>) -> Vec<(u32, u32)> {
+    let n = photos.len();
     let mut pairs = BTreeSet::new();
     let mut add = |a: usize, b: usize| {
         if a != b && b < n {
             pairs.insert((a.min(b) as u32, a.max(b) as u32));
         }
     };
-    match by {
+    match way_of(photos) {
         ChosenBy::All => (0..n).for_each(|a| (a + 1..n).for_each(|b| add(a, b))),
         ChosenBy::Distance => {
             let places: Vec<Option<GpsPlace>> = photos.iter().map(|photo| photo.place).collect();
@@ -84,7 +78,7 @@ pub fn choose_pairs(photos: &[FoundPhoto], alike: impl FnOnce(usize) -> Vec<Vec<
             }
         }
     }
-    ChosenPairs { pairs: pairs.into_iter().collect(), by }
+    pairs.into_iter().collect()
 }
 
 /// For each photo the nearest others, in metres, and of equally near ones those close to it in the sequence: places may be as coarse as
@@ -133,15 +127,14 @@ mod tests {
         places.map(of_place).collect()
     }
 
-    fn chosen(photos: &[FoundPhoto], alike: Vec<Vec<u32>>) -> ChosenPairs {
+    fn chosen(photos: &[FoundPhoto], alike: Vec<Vec<u32>>) -> Vec<(u32, u32)> {
         choose_pairs(photos, |_| alike)
     }
 
     #[test]
     fn few_photos_are_compared_with_each_other() {
         let pairs = chosen(&photos((0..40).map(|_| None)), Vec::new());
-        assert_eq!((pairs.by, pairs.pairs.len()), (ChosenBy::All, 780));
-        assert_eq!(pairs.pairs[..3], [(0, 1), (0, 2), (0, 3)]);
+        assert_eq!((pairs.len(), &pairs[..3]), (780, &[(0, 1), (0, 2), (0, 3)][..]));
     }
 
     #[test]
@@ -150,8 +143,8 @@ mod tests {
         let grid =
             |i: i32| Some((47.0 + 1e-4 * f64::from(i / 20), 9.0 + 1.5e-4 * f64::from(i % 20))).filter(|_| i != 7);
         let photos = photos((0..400).map(grid));
-        let ChosenPairs { pairs, by } = chosen(&photos, Vec::new());
-        assert_eq!(by, ChosenBy::Distance);
+        let pairs = chosen(&photos, Vec::new());
+        assert_eq!(way_of(&photos), ChosenBy::Distance);
         let partners = |a: u32| pairs.iter().filter(|(x, y)| *x == a || *y == a).count();
         let estimate = count_of(&photos) as usize;
         assert!(pairs.len() <= estimate && pairs.len() > estimate / 2, "{} of {estimate}", pairs.len());
@@ -163,7 +156,7 @@ mod tests {
 
     #[test]
     fn photos_at_one_place_are_compared_with_those_close_to_them_in_the_sequence() {
-        let ChosenPairs { pairs, .. } = chosen(&photos((0..90).map(|_| Some((47.0, 9.0)))), Vec::new());
+        let pairs = chosen(&photos((0..90).map(|_| Some((47.0, 9.0)))), Vec::new());
         assert!(pairs.iter().all(|(a, b)| b - a <= 20) && (0..80).all(|a| pairs.contains(&(a, a + 10))), "{pairs:?}");
     }
 
@@ -172,8 +165,8 @@ mod tests {
         let photos = photos((0..100).map(|i| (i < 49).then_some((47.0, 9.0 + f64::from(i)))));
         let mut alike = vec![Vec::new(); 100];
         alike[3] = vec![97, 3, 98];
-        let ChosenPairs { pairs, by } = chosen(&photos, alike);
-        assert_eq!(by, ChosenBy::SequenceAndLikeness);
+        assert_eq!(way_of(&photos), ChosenBy::SequenceAndLikeness);
+        let pairs = chosen(&photos, alike);
         assert!(pairs.contains(&(3, 97)) && pairs.contains(&(3, 98)) && pairs.contains(&(0, 8)));
         assert!(!pairs.contains(&(0, 9)) && pairs.iter().all(|(a, b)| a < b && *b < 100));
     }
