@@ -556,6 +556,26 @@ mod tests {
     }
 
     #[test]
+    fn few_poses_are_told_what_to_do() {
+        let missing: Vec<String> = (0..7).map(|i| format!("{i}.jpg")).collect();
+        let place = GpsPlace { latitude: 43.25, longitude: -87.5, altitude: Some(210.0) };
+        let (scene, said) = (PathBuf::from("scan"), Vec::new());
+        let found = FoundPoses { scene, photos: 18, registered: 11, missing, aligned: Some((place, 0.4)), said };
+        let text = found.to_string();
+        let parts = [
+            "11 of 18 photos have poses",
+            "43.250000, -87.500000",
+            "GPS 0.4 m",
+            "0.jpg, 1.jpg",
+            "4.jpg, ...",
+            MORE_OVERLAP,
+        ];
+        assert!(parts.iter().all(|part| text.contains(part)), "{text}");
+        let all = FoundPoses { registered: 18, missing: Vec::new(), aligned: None, ..found }.to_string();
+        assert!(!all.contains("remedy") && !all.contains("GPS"), "{all}");
+    }
+
+    #[test]
     fn the_scene_of_photos_is_their_folder_or_the_one_above_images() {
         let root = tempfile::tempdir().unwrap();
         let images = root.path().join("a/images");
