@@ -1,5 +1,4 @@
 //! A densification strategy of one's own, in a training loop of one's own: every 20 steps it removes Gaussians that are nearly transparent.
-//!
 //! `cargo run --release --example own_strategy -- scans/village`
 
 use gsscale::config::file::TrainConfig;
@@ -13,7 +12,7 @@ use gsscale::scene::events::{EventKind, RoundThresholds};
 use gsscale::train::error::TrainError;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 #[derive(Debug)]
@@ -41,19 +40,22 @@ impl Strategy for RemoveFaint {
 
 fn main() -> Result<(), TrainError> {
     let scene = PathBuf::from(std::env::args_os().nth(1).unwrap_or_else(|| "runs/demo/scene".into()));
+    let (rounds, psnr) = train(&scene)?;
+    gsscale::say!("{rounds} rounds, PSNR {psnr:.2} dB");
+    Ok(())
+}
+
+/// Rounds, and the PSNR of the held-out photos, dB.
+pub fn train(scene: &Path) -> Result<(usize, f64), TrainError> {
     let config = TrainConfig { steps: 200, max_resolution: 400, ..TrainConfig::default() };
-    let Prepared { dataset, columns, sh_degree_start } = prepare(&scene, &config)?;
+    let Prepared { dataset, columns, sh_degree_start } = prepare(scene, &config)?;
     let strategy = Arc::new(RemoveFaint(RoundSteps { start: 50, stop: 200, every: 20 }));
     let options = RunOptions { sh_degree_start, strategy, ..RunOptions::new(&config, dataset.scene_scale) };
     let photos = TargetCache::new(&dataset.views, 1 << 30, 2)?;
     let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options)?;
-    for step in 0..config.steps {
-        let outcome = trainer.step(&dataset, &photos)?;
-        if step % 50 == 49 {
-            gsscale::say!("step {}: loss {:.4}", step + 1, outcome.loss.loss);
-        }
+    for _ in 0..config.steps {
+        trainer.step(&dataset, &photos)?;
     }
     let test = trainer.evaluate(&dataset, &photos, None, &|_| ())?;
-    gsscale::say!("{} rounds, PSNR {:.2} dB", trainer.events().events().len(), test.map_or(0.0, |test| test.psnr));
-    Ok(())
+    Ok((trainer.events().events().len(), test.map_or(0.0, |test| test.psnr)))
 }

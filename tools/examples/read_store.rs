@@ -6,7 +6,7 @@
 use gsscale::base::math::sigmoid;
 use gsscale::train::error::TrainError;
 use gsscale::train::stores::StoredStart;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// Memory for pages, bytes.
 const HOST_MEM: u64 = 1 << 30;
@@ -17,7 +17,14 @@ fn main() -> Result<(), TrainError> {
         gsscale::tell!("usage: read_store OUT");
         std::process::exit(2);
     };
-    let mut store = StoredStart::open(&folder, HOST_MEM, 1)?;
+    let [pages, rows, solid] = count(&folder)?;
+    gsscale::say!("{rows} Gaussians in {pages} pages, {solid} more than half opaque");
+    Ok(())
+}
+
+/// Pages, Gaussians, and how many of these are more than half opaque.
+pub fn count(folder: &Path) -> Result<[usize; 3], TrainError> {
+    let mut store = StoredStart::open(folder, HOST_MEM, 1)?;
     let (mut pages, mut rows, mut solid) = (0, 0, 0);
     let degree = store.sh_degree();
     // Positions are (world - origin) / scale.
@@ -29,6 +36,5 @@ fn main() -> Result<(), TrainError> {
         (pages, rows, solid) = (pages + 1, rows + opacities.len(), solid + is_solid);
         Ok(())
     })?;
-    gsscale::say!("{rows} Gaussians in {pages} pages, {solid} more than half opaque");
-    Ok(())
+    Ok([pages, rows, solid])
 }

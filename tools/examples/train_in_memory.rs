@@ -5,7 +5,7 @@
 use gsscale::config::file::TrainConfig;
 use gsscale::train::error::TrainError;
 use gsscale::train::run::begin::run;
-use gsscale::train::run::request::{Existing, RunRequest};
+use gsscale::train::run::request::{Existing, RunOutcome, RunRequest};
 use std::path::PathBuf;
 
 fn main() -> Result<(), TrainError> {
@@ -14,11 +14,7 @@ fn main() -> Result<(), TrainError> {
         gsscale::tell!("usage: train_in_memory SCENE OUT");
         std::process::exit(2);
     };
-    // Each flag of gsscale-train is a field. Without `spill_dir`, all pages stay in memory.
-    let config = TrainConfig { steps: 300, max_gaussians: 50_000, max_resolution: 800, ..TrainConfig::default() };
-    config.check()?;
-    let existing = Existing::Refuse;
-    let outcome = run(&RunRequest { scene, out, config, dry_run: false, existing, quiet: true, live: None })?;
+    let outcome = train(scene, out)?;
     if let Some(summary) = outcome.summary {
         gsscale::say!("{} Gaussians after {} steps", summary.gaussians, summary.steps);
         if let Some(test) = summary.test {
@@ -26,4 +22,12 @@ fn main() -> Result<(), TrainError> {
         }
     }
     Ok(())
+}
+
+pub fn train(scene: PathBuf, out: PathBuf) -> Result<RunOutcome, TrainError> {
+    // Each flag of gsscale-train is a field. Without `spill_dir`, all pages stay in memory.
+    let config = TrainConfig { steps: 300, max_gaussians: 50_000, max_resolution: 800, ..TrainConfig::default() };
+    config.check()?;
+    let existing = Existing::Refuse;
+    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet: true, live: None })
 }
