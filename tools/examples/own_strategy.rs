@@ -40,9 +40,7 @@ impl Strategy for RemoveFaint {
 
 fn main() -> Result<(), TrainError> {
     let scene = PathBuf::from(std::env::args_os().nth(1).unwrap_or_else(|| "runs/demo/scene".into()));
-    let (rounds, psnr) = train(&scene)?;
-    gsscale::say!("{rounds} rounds, PSNR {psnr:.2} dB");
-    Ok(())
+    train(&scene).map(|(rounds, psnr)| gsscale::say!("{rounds} rounds, PSNR {psnr:.2} dB"))
 }
 
 /// Rounds, and the PSNR of the held-out photos, dB.
