@@ -1,7 +1,7 @@
 //! Cuts a city into cells: median splits of the ground until the cells have equal work and bytes, the views of each cell by blending weight,
 //! its margin and its ring, and what it will cost.
 //!
-//! Invariants: 1. every page has one owner, by its middle; every training view is in some cell; 2. every cell has [`VIEWS_LEAST`] training
+//! Invariants: 1. every page has one owner, by its middle; every training view is in some cell; 2. every cell has `VIEWS_LEAST` training
 //! views, or there is only one cell; 3. `plan.toml` is written last; a city is cut once.
 
 use super::plan::{CELL_FILES, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};

@@ -2,7 +2,7 @@
 //! the file system has locks, and by a heartbeat where it has none, or other machines do not see them.
 //!
 //! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. who
-//! has lost the cell finds out before it publishes ([`CellLock::is_held`]). Two owners at once, which a folder that lags can cause, cost work
+//! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
 //! and no result: the bytes are the same.
 
 use crate::base::error::{InputError, InputResult};

@@ -6,6 +6,7 @@
 use super::plan::ground;
 use super::prior::keys_of_prior;
 use super::{City, NO_PRIOR, config_of};
+use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::{PageId, PageNo};
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -18,7 +19,6 @@ use crate::scene::page_meta::PageBounds;
 use crate::scene::rotation::VIEWER_UP;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
-use crate::train::log::progress::Count;
 use crate::train::memory::host_budget;
 use crate::train::start::first_scene::Start;
 use crate::train::step::pages::WorkingSet;

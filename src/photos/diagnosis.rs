@@ -13,7 +13,7 @@
 //! Not here: what training finds ([`super::outlier`]).
 //!
 //! Invariants: 1. the result is a function of photos, poses and points; 2. one photo is decoded at a time, and no more than
-//! [`PIXELS_MOST`] pixels in all, beyond [`PHOTOS_LEAST`] photos.
+//! `PIXELS_MOST` pixels in all, beyond `PHOTOS_LEAST` photos.
 
 use super::exposure::AppearanceMode;
 use super::parameter::{Curve, Finding, write_values};

@@ -29,5 +29,5 @@ pub fn train(scene: PathBuf, out: PathBuf) -> Result<RunOutcome, TrainError> {
     let config = TrainConfig { steps: 300, max_gaussians: 50_000, max_resolution: 800, ..TrainConfig::default() };
     config.check()?;
     let existing = Existing::Refuse;
-    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet: true, live: None })
+    run(&RunRequest { scene, out, config, dry_run: false, existing, quiet: true, live: None, leg: None })
 }
