@@ -29,7 +29,7 @@ pub fn count(folder: &Path) -> Result<[usize; 3], TrainError> {
     let degree = store.sh_degree();
     // Positions are (world - origin) / scale.
     let (origin, scale) = ([0.0; 3], 1.0);
-    store.for_each_page((origin, scale), (PAGE_ROWS, degree), &mut |page| {
+    store.for_each_page((origin, scale), (PAGE_ROWS, degree), &mut |_, page| {
         let opacities = &page.columns.opacities;
         let is_solid = opacities.iter().filter(|logit| sigmoid(**logit) > 0.5).count();
         gsscale::say!("page {pages}: {} Gaussians, {is_solid} more than half opaque", opacities.len());
