@@ -12,6 +12,8 @@ use super::limits::schedule_steps;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::config::file::ConfigKey;
+use crate::config::new_run;
+use crate::photos::diagnosis::Remedies;
 use crate::render::metrics::SsimVariant;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -137,8 +139,10 @@ impl PublishedRun {
         let refuse = |problem: String| {
             InputError::new(file, problem, "configs/rubble.toml is an example of a published run's config")
         };
-        let config = TrainConfig::parse(text).map_err(refuse)?;
+        let mut config = TrainConfig::parse(text).map_err(refuse)?;
         config.check()?;
+        // No published run has a remedy that its config does not name.
+        new_run::adapt_to_photos(&mut config, &Remedies::default());
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| refuse(e.to_string()))?;
         table.retain(|key, _| TABLES.contains(&key));
         if !table.contains_key("published") {

@@ -61,7 +61,7 @@ const GAP_MOST: f64 = 2.2;
 /// Decibels by which trained views must be better than held-out ones for a lag to count: a check soon after a doubling may find either
 /// better by some tenths. Measured: -.3 to 1.5 where more Gaussians pay, 2.3 and more where they do not.
 const GAP_OF_A_LAG: f64 = 1.6;
-/// Checks after a doubling within which the held-out views must have gained anything.
+/// Checks after a doubling within which the held-out views must have gained anything, if the trained ones have: a doubling shakes both.
 const PATIENCE: usize = 3;
 /// A scene begins with at least this part of the most that is allowed, and has this part at most while stages are twice as large.
 const FIRST_PART_OF_MOST: u64 = 16;
@@ -240,7 +240,8 @@ impl GrowthRule {
                 // Differences of less are the noise of single steps.
                 let lags = gap >= GAP_OF_A_LAG && trained_gain - gain >= LAG_LEAST;
                 let lags_by = |share: f64| lags && gain < share * trained_gain.max(0.0);
-                let is_fruitless = doubled.is_some_and(|(checks, _)| checks.len() >= PATIENCE && gain <= 0.0);
+                let is_fruitless =
+                    doubled.is_some_and(|(checks, _)| checks.len() >= PATIENCE && gain <= 0.0 && trained_gain > 0.0);
                 if doubled.is_some() && (lags_by(UNDONE_BELOW) || is_fruitless) {
                     GrowthDecision::Undoes
                 } else if is_last || !has_room || lags_by(share_least) {

@@ -186,7 +186,7 @@ pub(crate) fn check_evaluation_fits(
     let gaussians =
         columns.bytes() as u64 + frames_in_memory(rows, columns.sh_degree, false) + rows * RENDERER_ROW_BYTES;
     let features = lpips.map_or(0, |network| network.bytes([largest.width, largest.height]));
-    let needed = 2 * BASE_BYTES + photos + gaussians + features + largest.pixels() as u64 * PIXEL_BYTES;
+    let needed = BASE_BYTES + photos + gaussians + features + largest.pixels() as u64 * PIXEL_BYTES;
     if needed <= budget {
         return Ok(());
     }

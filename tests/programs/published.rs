@@ -6,10 +6,12 @@ use crate::support::scenes::{stderr, told};
 use crate::support::workdir::{BENCH, EVAL, Workdir, says};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::{BUILT_IN, PublishedRun};
+use gsscale::config::values::Chosen;
 use gsscale::dataset::layout::Layout;
 use gsscale::dataset::lookalike::write_lookalike;
 use gsscale::dataset::synthetic::CityOptions;
 use gsscale::densify::strategy::StrategyName;
+use gsscale::photos::exposure::AppearanceMode;
 use gsscale::render::metrics::SsimVariant;
 use serde_json::Value;
 use std::fs;
@@ -77,6 +79,11 @@ fn the_files_hold_the_tables() {
             refine_stop: 15_000,
             ..TrainConfig::parse(&SHARED.replace(',', "\n").replace(';', ",")).unwrap()
         };
+        // And no remedy.
+        let off = Chosen(Some(false));
+        let (poor_points, robust_views, robust_pixels, refine_poses) = (off, off, off, off);
+        let appearance = Chosen(Some(AppearanceMode::Off));
+        let expected = TrainConfig { appearance, poor_points, robust_views, robust_pixels, refine_poses, ..expected };
         assert_eq!(run.config, expected, "{name}");
         assert_eq!((run.facts.size, run.tier_of(&run.config)), (size, Some("S1")), "{name}");
         assert_eq!(run.tiers.len(), 6);

@@ -42,7 +42,7 @@ impl Facts {
         let pixels = cameras.iter().map(|camera| camera.pixels() as u64).sum();
         let gaussians = columns.rows() as u64;
         let per_page = views.total() as f64 / scene.pager.index().len().max(1) as f64;
-        let photos = TrainingPhotos { pixels, per_page };
+        let photos = TrainingPhotos { pixels, count: cameras.len(), per_page };
         let growth = match reach(config, gaussians, photos, 0, &[]) {
             (_, Reach::Constant) => 1.0,
             (last, _) => last as f64 / gaussians.max(1) as f64 * SPLIT_GROWTH,

@@ -98,11 +98,9 @@ pub fn evaluate(
             figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
         }
         let correct = request.predicted.as_ref().and_then(|of_views| of_views.get(i)).filter(|_| target.counts());
-        if correct.is_some() || request.appearance.is_on() {
+        if let Some(correct) = correct {
             drawn.clear();
             drawn.extend_from_slice(now.renderer.picture_mut()?);
-        }
-        if let Some(correct) = correct {
             correct(now.renderer.picture_mut()?, target.width as usize);
             let image = now.renderer.image()?;
             predicted[0].push(json_psnr(psnr(image, &target)));
