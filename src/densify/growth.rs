@@ -78,6 +78,18 @@ const PARTS: u32 = 15;
 const FIRST_PART: u32 = 4;
 const LAST_PART: u32 = 11;
 
+/// Pixels of the largest photos that the bound was measured with.
+const MEASURED_PIXELS: u64 = 120_000;
+
+/// Pixels of a photo as they count for [`GrowthRule::most`]: all of a photo as small as those that the bound was measured with. Beyond,
+/// detail is taken to grow with the side of a photo and not with its area; this is an assumption, not a measurement.
+pub fn counted_pixels(pixels: u64) -> u64 {
+    match pixels <= MEASURED_PIXELS {
+        true => pixels,
+        false => (pixels as f64 * MEASURED_PIXELS as f64).sqrt() as u64,
+    }
+}
+
 /// The rule of a run that decides its count.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GrowthRule {
@@ -177,7 +189,7 @@ impl GrowthRule {
         GrowthRule { quality, unit: steps.clamp(1, UNIT_MOST) }
     }
 
-    /// The most Gaussians that such a run allows for training photos of so many pixels.
+    /// The most Gaussians that such a run allows for training photos of so many [`counted_pixels`].
     pub fn most(&self, pixels: u64) -> u64 {
         pixels / self.quality.demand().pixels
     }
@@ -322,6 +334,7 @@ mod tests {
             [25.52, 26.59],
             [26.1, 27.4],
         ];
+        assert_eq!([0, 117_315, 469_260, 1_920_000].map(counted_pixels), [0, 117_315, 237_299, 480_000]);
         let most = PIXELS / 32;
         let first = GrowthRule::new(Quality::Normal, 3000).first(3000, PIXELS);
         assert_eq!(first, most / 16, "more than 3,000 points");

@@ -2,6 +2,7 @@
 
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
+use gsscale::densify::growth::counted_pixels;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::schedule::visibility::ViewPages;
@@ -39,7 +40,9 @@ impl Facts {
         let scene = PagedScene::new(columns, pager, &options)?;
         let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
         let views = ViewPages::new(scene.pager.index(), &cameras);
-        let pixels = cameras.iter().map(|camera| camera.pixels() as u64).sum();
+        let pixels_of = |camera: &Camera| camera.pixels() as u64;
+        let pixels =
+            [cameras.iter().map(pixels_of).sum(), cameras.iter().map(|camera| counted_pixels(pixels_of(camera))).sum()];
         let gaussians = columns.rows() as u64;
         let per_page = views.total() as f64 / scene.pager.index().len().max(1) as f64;
         let photos = TrainingPhotos { pixels, count: cameras.len(), per_page };

@@ -21,7 +21,7 @@ use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::values::Residence;
 use crate::dataset::loader::Dataset;
-use crate::densify::growth::GrowthCheck;
+use crate::densify::growth::{GrowthCheck, counted_pixels};
 use crate::densify::strategy::StrategyName;
 use crate::exchange::format::ExportFormat;
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
@@ -95,8 +95,8 @@ pub enum Reach {
 /// What the training photos say about the number of Gaussians before training.
 #[derive(Debug, Clone, Copy)]
 pub struct TrainingPhotos {
-    /// Pixels of all of them.
-    pub pixels: u64,
+    /// Pixels of all of them, and the [`counted_pixels`].
+    pub pixels: [u64; 2],
     pub count: usize,
     /// Mean number of photos that see a page, by the bounds of pages.
     pub per_page: f64,
@@ -131,11 +131,11 @@ pub fn reach(
     if config.max_gaussians > 0 {
         return (rows_at_most(config, rows), Reach::Cap);
     }
-    let guess = guess(rows, rounds, every).min(photos.pixels.max(rows));
+    let guess = guess(rows, rounds, every).min(photos.pixels[0].max(rows));
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess, Reach::Guess),
-        (Some(rule), None) if photos.overlap_little() => (rule.first(rows, photos.pixels), Reach::Decided),
-        (Some(rule), None) => (guess.min(rule.most(photos.pixels).max(rows)), Reach::Decided),
+        (Some(rule), None) if photos.overlap_little() => (rule.first(rows, photos.pixels[1]), Reach::Decided),
+        (Some(rule), None) => (guess.min(rule.most(photos.pixels[1]).max(rows)), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
 }
@@ -225,7 +225,8 @@ pub(crate) fn plan_run(
     let probe = Probe::of_run(dataset, trainer, largest.view, driver);
     let (rows, steps_done) = (trainer.scene.rows(), trainer.steps_done());
     let views = dataset.train_views();
-    let pixels = views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum();
+    let pixels_of = |&view: &usize| dataset.views[view].camera.pixels() as u64;
+    let pixels = [views.iter().map(pixels_of).sum(), views.iter().map(|view| counted_pixels(pixels_of(view))).sum()];
     let pages = trainer.scene.pager.index().len().max(1);
     let photos =
         TrainingPhotos { pixels, count: views.len(), per_page: views.len() as f64 * largest.mean / pages as f64 };
@@ -680,7 +681,7 @@ mod tests {
     }
 
     fn well_seen(pixels: u64) -> TrainingPhotos {
-        TrainingPhotos { pixels, count: 100, per_page: PHOTOS_PER_PAGE_LEAST }
+        TrainingPhotos { pixels: [pixels; 2], count: 100, per_page: PHOTOS_PER_PAGE_LEAST }
     }
 
     #[test]
@@ -709,7 +710,7 @@ mod tests {
             (41_321, Reach::Decided),
             "no fewer than at first"
         );
-        let hardly_seen = TrainingPhotos { pixels: 9_600_000, count: 100, per_page: PHOTOS_PER_PAGE_LEAST - 1.0 };
+        let hardly_seen = TrainingPhotos { pixels: [9_600_000; 2], count: 100, per_page: PHOTOS_PER_PAGE_LEAST - 1.0 };
         assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (41_321, Reach::Decided));
         let check = GrowthCheck {
             step: 1001,

@@ -10,6 +10,7 @@
 //! the result.
 
 use crate::dataset::loader::Dataset;
+use crate::densify::growth::counted_pixels;
 use crate::densify::strategy::Strategy;
 use crate::photos::PhotoParameters;
 use crate::schedule::order::ViewOrder;
@@ -35,9 +36,9 @@ impl Turns {
         Turns { order, held_out: HeldOut::new(strategy, views.len()), views, steps }
     }
 
-    /// Pixels of the training photos.
+    /// [`counted_pixels`] of the training photos.
     pub fn pixels(&self, dataset: &Dataset) -> u64 {
-        self.views.iter().map(|&view| dataset.views[view].camera.pixels() as u64).sum()
+        self.views.iter().map(|&view| counted_pixels(dataset.views[view].camera.pixels() as u64)).sum()
     }
 
     /// Index in `dataset.views` of the view of a 0-based step.
