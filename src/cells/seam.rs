@@ -210,18 +210,7 @@ fn band_mask(camera: &Camera, lines: &[Vec<DVec3>], reach: f64, masked: Option<&
 
 /// Where a position of the local frame is in the picture; `None` behind the camera or far outside.
 fn pixel_of(camera: &Camera, at: DVec3, reach: f64) -> Option<[f64; 2]> {
-    let row = |i: usize| {
-        let [x, y, z, t] = camera.viewmat[i].map(f64::from);
-        x * at.x + y * at.y + z * at.z + t
-    };
-    let z = row(2);
-    if z <= f64::from(camera.near_plane) {
-        return None;
-    }
-    let pixel = [
-        f64::from(camera.fx) * row(0) / z + f64::from(camera.cx),
-        f64::from(camera.fy) * row(1) / z + f64::from(camera.cy),
-    ];
+    let (pixel, _) = camera.project(at.to_array())?;
     let is_near =
         pixel.iter().zip([camera.width, camera.height]).all(|(x, side)| *x > -reach && *x < f64::from(side) + reach);
     is_near.then_some(pixel)

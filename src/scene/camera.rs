@@ -32,6 +32,15 @@ impl Camera {
         std::array::from_fn(|i| -(m[0][i] * m[0][3] + m[1][i] * m[1][3] + m[2][i] * m[2][3]))
     }
 
+    /// The pixel position `[u, v]` of a point in the world, and its depth; `None` at or before the near plane. The position may lie outside
+    /// of the picture.
+    pub fn project(&self, point: [f64; 3]) -> Option<([f64; 2], f64)> {
+        let [x, y, z] =
+            self.viewmat.map(|row| (0..3).map(|i| f64::from(row[i]) * point[i]).sum::<f64>() + f64::from(row[3]));
+        let [fx, fy, cx, cy] = [self.fx, self.fy, self.cx, self.cy].map(f64::from);
+        (z > f64::from(self.near_plane)).then(|| ([fx * x / z + cx, fy * y / z + cy], z))
+    }
+
     /// The point in the world that pixel position `[u, v]` shows at depth `z`.
     pub fn unproject(&self, [u, v]: [f64; 2], z: f64) -> [f32; 3] {
         let x = (u - f64::from(self.cx)) / f64::from(self.fx) * z;

@@ -13,10 +13,10 @@ pub mod views;
 use crate::scene::image::Target;
 
 /// Median absolute deviation of a normal distribution, in standard deviations.
-const MAD_OF_NORMAL: f64 = 0.674_489_75;
+pub(super) const MAD_OF_NORMAL: f64 = 0.674_489_75;
 
 /// Median and median absolute deviation of values, each the lower of two middle values; `None` without values. Overwrites the values.
-fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
+pub(super) fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
     let middle = values.len().checked_sub(1)? / 2;
     let median = *values.select_nth_unstable_by(middle, f64::total_cmp).1;
     values.iter_mut().for_each(|value| *value = (*value - median).abs());
@@ -24,6 +24,6 @@ fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
 }
 
 /// Whether a pixel (y * width + x) of a photo is not masked.
-fn is_used(photo: &Target, pixel: usize) -> bool {
+pub(super) fn is_used(photo: &Target, pixel: usize) -> bool {
     photo.mask.as_ref().is_none_or(|mask| mask[pixel] != 0)
 }
