@@ -93,9 +93,9 @@ fn no_option_takes_more_memory_than_promised_with_large_photos() {
         assert!(!is_limited || work.text("limited/metrics.jsonl").contains("trained_psnr") == decides, "{flags}");
         work.remove("spill");
     }
-    // The evaluation of a file on the same photos.
+    // The evaluation of a file on the same photos; with LPIPS on smaller ones, of which its weights are a part that counts.
     lpips_weights(&work.path(""));
-    for more in ["", "--lpips lpips_alex.safetensors --appearance full"] {
+    for more in ["", "--max-resolution 1280 --lpips lpips_alex.safetensors --appearance full"] {
         let flags = "out scene --image-cache 1MiB --color-correct quadratic --renders pictures";
         succeeds_within_the_least(&work, EVAL, &format!("{flags} {more}"));
     }

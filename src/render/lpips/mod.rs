@@ -181,16 +181,17 @@ impl Lpips {
 }
 
 impl Network {
-    /// The most bytes that features of a picture and its photo of this size, pixels, take at once.
+    /// The most bytes that the weights, and features of a picture and its photo of this size in pixels, take at once.
     pub fn bytes(self, [width, height]: [u32; 2]) -> u64 {
         let bytes = |channels: usize, [width, height]: [usize; 2]| (4 * channels * width * height) as u64;
         let (mut channels, mut size) = (3, [width as usize, height as usize]);
         let mut input = bytes(channels, size);
-        let mut most = 2 * input;
+        let (mut most, mut weights) = (2 * input, 0);
         for layer in self.layers() {
             match *layer {
                 Layer::Pool { size: window } => size = size.map(|side| side.saturating_sub(window) / 2 + 1),
                 Layer::Conv { shape, kernel, stride, padding, .. } => {
+                    weights += 4 * (shape[0] * shape[1] * kernel * kernel) as u64;
                     channels = shape[1];
                     size = size.map(|side| (side + 2 * padding).saturating_sub(kernel) / stride + 1);
                 }
@@ -200,7 +201,7 @@ impl Network {
             most = most.max(input + output + input.max(output));
             input = output;
         }
-        most
+        weights + most
     }
 }
 

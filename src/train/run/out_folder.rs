@@ -124,7 +124,10 @@ pub fn remedy_of_existing(out: &Path) -> String {
         false if has_result => {
             format!("choose another --out, or give its run more steps: gsscale-train --resume {shown} --steps N")
         }
-        false => "choose another --out, or replace it with --overwrite".to_string(),
+        false => format!(
+            "begin this run again, since it had no commit yet: gsscale-train --resume {shown}; replace it with --overwrite, or choose \
+             another --out"
+        ),
         true if has_result => format!("resume its run with gsscale-train --resume {shown}, or choose another --out"),
         true => {
             let over = match residence.spill_dir() {
