@@ -5,6 +5,7 @@ pub mod allocator;
 pub mod count;
 pub mod environment;
 pub mod error;
+pub mod even_sample;
 pub mod identity;
 pub mod ids;
 pub mod machine;

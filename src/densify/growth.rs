@@ -130,7 +130,7 @@ pub struct GrowthCheck {
 /// The state of the decision about the count.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GrowthState {
-    /// Gaussians before the first event; 0 before that, and in runs that do not decide.
+    /// Gaussians that are allowed before the first check ([`GrowthRule::first`]); 0 before the first round, and in runs that do not decide.
     pub first: u64,
     /// The checks so far, in order.
     pub checks: Vec<GrowthCheck>,

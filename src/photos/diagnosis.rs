@@ -33,7 +33,7 @@ use std::path::Path;
 const PIXELS_MOST: u64 = 300_000_000;
 /// Photos that are looked at however large they are.
 const PHOTOS_LEAST: usize = 24;
-/// Points that are drawn.
+/// Most points that are drawn.
 pub const POINTS_MOST: usize = 16_384;
 /// Fewest points in a photo for a finding about it.
 const POINTS_LEAST: usize = 24;
@@ -347,7 +347,7 @@ impl<'a> PhotoLook<'a> {
             let is_clear = |(pixel, color): &(u8, u8)| VALUES.contains(pixel) && VALUES.contains(color);
             pairs
                 .filter(is_clear)
-                .map(|(pixel, color)| (f64::from(pixel) / f64::from(color)).log2())
+                .map(|(pixel, color)| libm::log2(f64::from(pixel) / f64::from(color)))
                 .collect::<Vec<_>>()
         };
         let gain = [0, 1, 2].map(|channel| median(stops(channel)));

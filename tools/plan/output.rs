@@ -71,7 +71,7 @@ fn text_of_forecast(scene: &Scene) -> String {
         "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \
          drive   {drive}, PLY {}; commits write {} at most\n  time    about {}\n{}",
         format_grouped(forecast.gaussians[1]),
-        if matches!(forecast.reach, Reach::Guess | Reach::Decided) { " (a guess)" } else { "" },
+        if matches!(forecast.reach, Reach::Guess | Reach::Decided | Reach::Sparse) { " (a guess)" } else { "" },
         format_bytes(forecast.memory_at_end().total()),
         format_bytes(forecast.ply_bytes),
         format_bytes(forecast.commit_bytes_most as u64),

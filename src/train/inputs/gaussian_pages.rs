@@ -8,6 +8,7 @@
 //! in its order; the uid of a row is its number in the file; 3. the warning depends on the rows, their order and the cameras alone.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::even_sample::EvenSample;
 use crate::base::ids::PageId;
 use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
 use crate::dataset::loader::View;
@@ -271,45 +272,26 @@ const POSITIONS_A_CAMERA: usize = 20;
 /// Median distance of the cameras from the box of the positions, in diagonals of the box, beyond which photos show a dot.
 const FAR_DIAGONALS: f32 = 20.0;
 
-/// A sample of positions in the local frame: every row, or every second, fourth and so on.
+/// A sample of positions in the local frame.
 #[derive(Debug, Clone)]
-pub(crate) struct PositionSample {
-    positions: Vec<[f32; 3]>,
-    rows: u64,
-    stride: u64,
-}
+pub(crate) struct PositionSample(EvenSample<[f32; 3]>);
 
 impl Default for PositionSample {
     fn default() -> PositionSample {
-        PositionSample { positions: Vec::new(), rows: 0, stride: 1 }
+        PositionSample(EvenSample::new(SAMPLE_MOST))
     }
 }
 
 impl PositionSample {
     /// Adds the rows of a column of positions.
     pub fn add(&mut self, means: &[f32]) {
-        for &position in means.as_chunks::<3>().0 {
-            if self.rows.is_multiple_of(self.stride) {
-                if self.positions.len() == SAMPLE_MOST {
-                    let mut number = 0;
-                    self.positions.retain(|_| {
-                        number += 1;
-                        number % 2 == 1
-                    });
-                    self.stride *= 2;
-                }
-                if self.rows.is_multiple_of(self.stride) {
-                    self.positions.push(position);
-                }
-            }
-            self.rows += 1;
-        }
+        means.as_chunks::<3>().0.iter().for_each(|&position| self.0.add(position));
     }
 
     /// The lower and upper corner of the box of the sample without a twentieth on each side.
     fn robust_box(&self) -> [[f32; 3]; 2] {
         let of_axis = |axis: usize| {
-            let mut values: Vec<f32> = self.positions.iter().map(|p| p[axis]).collect();
+            let mut values: Vec<f32> = self.0.kept.iter().map(|p| p[axis]).collect();
             values.sort_unstable_by(f32::total_cmp);
             let cut = values.len() / 20;
             (values[cut], values[values.len() - 1 - cut])
@@ -321,7 +303,7 @@ impl PositionSample {
     /// Half the diagonal of the box that holds nine tenths of the rows on each axis: the size of the scene where no cameras
     /// state it. `None` without rows, or if all are in one place.
     pub fn radius(&self) -> Option<f32> {
-        if self.positions.is_empty() {
+        if self.0.kept.is_empty() {
             return None;
         }
         let [low, high] = self.robust_box();
@@ -330,18 +312,18 @@ impl PositionSample {
 
     /// The warning that the rows of `file` and the cameras of the views do not fit each other, if they do not.
     pub fn warning(&self, file: &Path, views: &[View]) -> Option<String> {
-        if self.positions.is_empty() || views.is_empty() {
+        if self.0.kept.is_empty() || views.is_empty() {
             return None;
         }
         let frustums: Vec<Frustum> = views.iter().map(|view| Frustum::new(&view.camera)).collect();
-        let step = self.positions.len().div_ceil(LOOKED_FOR);
-        let looked_for: Vec<[f32; 3]> = self.positions.iter().step_by(step).copied().collect();
+        let step = self.0.kept.len().div_ceil(LOOKED_FOR);
+        let looked_for: Vec<[f32; 3]> = self.0.kept.iter().step_by(step).copied().collect();
         let seen = looked_for.par_iter().filter(|&&p| frustums.iter().any(|f| f.may_draw(p, 0.0))).count();
         let seen = seen as f64 / looked_for.len() as f64;
         let asked: Vec<&Frustum> = frustums.iter().step_by(views.len().div_ceil(CAMERAS_ASKED)).collect();
-        let blind = asked.par_iter().filter(|f| !self.positions.iter().any(|&p| f.may_draw(p, 0.0))).count();
+        let blind = asked.par_iter().filter(|f| !self.0.kept.iter().any(|&p| f.may_draw(p, 0.0))).count();
         let blind = blind as f64 / asked.len() as f64;
-        let blind_by_chance = self.stride > 1 && self.positions.len() < POSITIONS_A_CAMERA * views.len();
+        let blind_by_chance = self.0.stride > 1 && self.0.kept.len() < POSITIONS_A_CAMERA * views.len();
         let away = self.diagonals_away(views);
         let problem = match () {
             () if seen < SEEN_LEAST => format!("only {:.0} % of its rows are in view of any camera", 100.0 * seen),

@@ -88,8 +88,10 @@ pub enum Reach {
     Guess,
     /// The number at the start: the run has too few photos to decide another one.
     Kept,
-    /// What usual runs decide as they train ([`crate::densify::growth`]): the most that they allow, or the number at the start.
+    /// The most that usual runs decide as they train ([`crate::densify::growth`]).
     Decided,
+    /// As [`Reach::Decided`], where photos overlap little: the number at the start.
+    Sparse,
 }
 
 /// What the training photos say about the number of Gaussians before training.
@@ -134,7 +136,7 @@ pub fn reach(
     let guess = guess(rows, rounds, every).min(photos.pixels[0].max(rows));
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess, Reach::Guess),
-        (Some(rule), None) if photos.overlap_little() => (rule.first(rows, photos.pixels[1]), Reach::Decided),
+        (Some(rule), None) if photos.overlap_little() => (rule.first(rows, photos.pixels[1]), Reach::Sparse),
         (Some(rule), None) => (guess.min(rule.most(photos.pixels[1]).max(rows)), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
@@ -257,7 +259,7 @@ pub(crate) fn plan_run(
         frames_at_end,
     };
     let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
-    if !(known == Reach::Decided && last > rows && trainer.growth().is_empty()) {
+    if !(matches!(known, Reach::Decided | Reach::Sparse) && last > rows && trainer.growth().is_empty()) {
         return Ok(forecast);
     }
     let [first, most, _] = memory;
@@ -711,7 +713,7 @@ mod tests {
             "no fewer than at first"
         );
         let hardly_seen = TrainingPhotos { pixels: [9_600_000; 2], count: 100, per_page: PHOTOS_PER_PAGE_LEAST - 1.0 };
-        assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (41_321, Reach::Decided));
+        assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (41_321, Reach::Sparse));
         let check = GrowthCheck {
             step: 1001,
             gaussians: 41_000,

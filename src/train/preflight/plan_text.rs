@@ -31,6 +31,7 @@ const INDENT: &str = "        ";
 /// The growth of the number of Gaussians, as text of a plan.
 fn growth(forecast: &Forecast) -> String {
     let last = format_grouped(forecast.gaussians[1]);
+    let grows = forecast.gaussians[1] > forecast.gaussians[0];
     match forecast.reach {
         Reach::Constant => String::from(" (no densification)"),
         Reach::Kept => String::from(", which stays their number (too few photos to decide by)"),
@@ -38,9 +39,11 @@ fn growth(forecast: &Forecast) -> String {
         Reach::Guess => {
             format!(", growing to perhaps {last} (a guess; --max-gaussians caps them)")
         }
-        Reach::Decided if forecast.gaussians[1] == forecast.gaussians[0] => String::from(
-            ", probably to stay: few photos see each place (held-out training photos decide; see --quality)",
-        ),
+        Reach::Sparse => {
+            let reach = if grows { format!("growing to perhaps {last}") } else { String::from("probably to stay") };
+            format!(", {reach}: few photos see each place (held-out training photos decide; see --quality)")
+        }
+        Reach::Decided if !grows => String::from(", which probably stays their number (see --quality)"),
         Reach::Decided => {
             format!(
                 ", growing as far as held-out training photos say that it pays, perhaps to {last} (a guess; see --quality)"

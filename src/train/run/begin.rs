@@ -84,16 +84,21 @@ fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
 /// Errors: the scene cannot be read.
 fn adapt_to_photos(
     mut request: RunRequest,
-    mut start: Start,
+    start: Start,
     host_mem: Option<u64>,
 ) -> Result<(RunRequest, Start, Option<Diagnosis>), TrainError> {
     let diagnosis = start.diagnose()?;
     let before = request.config.clone();
     let asked = diagnosis.as_ref().map_or_else(Remedies::default, Diagnosis::remedies);
     new_run::adapt_to_photos(&mut request.config, &asked);
-    if request.config.init_scale != before.init_scale {
-        start = Start::read(&request.scene, &request.config, host_mem)?;
-    }
+    let start = match request.config.init_scale == before.init_scale {
+        true => start,
+        false => {
+            // Not both in memory.
+            drop(start);
+            Start::read(&request.scene, &request.config, host_mem)?
+        }
+    };
     if let Some(diagnosis) = diagnosis.as_ref().filter(|_| !request.quiet) {
         tell_plan(&request, &plan_text::describe_photos(diagnosis, &before, &request.config));
     }

@@ -7,6 +7,7 @@
 //! here, before any file is written.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::even_sample::EvenSample;
 use crate::base::ids::PageId;
 use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::{DatasetPrint, ViewPrint};
@@ -261,15 +262,9 @@ impl Start {
     /// What the training photos say before training; `None` where the run starts from Gaussians or random points.
     /// Errors: the points cannot be read.
     pub(crate) fn diagnose(&self) -> InputResult<Option<Diagnosis>> {
-        let every = self.rows.div_ceil(POINTS_MOST as u64).max(1);
-        let (mut points, mut count) = (Vec::new(), 0_u64);
-        self.for_each_point(&mut |position, color| {
-            if count.is_multiple_of(every) {
-                points.push((position, color));
-            }
-            count += 1;
-        })?;
-        Ok((count > 0).then(|| diagnose(&self.dataset, &points, count)))
+        let mut points = EvenSample::new(POINTS_MOST);
+        self.for_each_point(&mut |position, color| points.add((position, color)))?;
+        Ok((points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)))
     }
 
     /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store
