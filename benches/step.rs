@@ -33,10 +33,8 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
 use gsscale::train::step::batch::RowsInHost;
-use gsscale::train::step::catch_up::{gather, visible_rows};
 use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::WorkingSet;
-use gsscale::train::step::pages::{PagedScene, row_tables};
+use gsscale::train::step::pages::{PagedScene, WorkingSet};
 use gsscale::train::step::train_step::{StepView, train_step};
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -191,7 +189,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
     let [rows, updated, pairs, isects, pinned, pixels] = counts.map(|c| c / steps);
     let counts = CpuCounts { pinned, rows, updated, isects, pixels };
     let rate = floor.bytes * rayon::current_num_threads() as f64;
-    let parts = split_cull(&renderer.parts, &mut scene, step, &views).into_iter().map(|(name, seconds)| {
+    let parts = renderer.parts.iter().map(|&(name, seconds)| {
         let bytes = part_bytes(name, &counts);
         Part { name, wall: seconds / steps, bytes, floor: bytes / rate }
     });
@@ -208,43 +206,6 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
         parts,
         hash: hash.0,
     }
-}
-
-/// Splits the span of acquire, cull and gather in proportion to the times of each part alone on the final state.
-fn split_cull(
-    parts: &[(&'static str, f64)],
-    scene: &mut PagedScene,
-    now: u32,
-    views: &[&(Camera, Target)],
-) -> Vec<(&'static str, f64)> {
-    let (mut rows, mut columns) = (Vec::new(), Columns::default());
-    let mut alone = [0.0; 3];
-    for (camera, _) in views {
-        let start = Instant::now();
-        let acquired = scene.pager.acquire(now, camera);
-        let Ok(pages) = acquired else { panic!("no pages: {:?}", acquired.err()) };
-        let tables = row_tables(&pages);
-        let acquired = start.elapsed().as_secs_f64();
-        visible_rows(&tables, &scene.rules.adam, now, camera, &mut rows);
-        let culled = start.elapsed().as_secs_f64();
-        gather(&tables, scene.rules.sh_degree, &scene.rules.adam, now, &rows, &mut columns);
-        let gathered = start.elapsed().as_secs_f64();
-        let spans = [acquired, culled - acquired, gathered - culled];
-        alone.iter_mut().zip(spans).for_each(|(sum, seconds)| *sum += seconds);
-        drop(tables);
-        scene.pager.release(pages);
-    }
-    let all = alone.iter().sum::<f64>().max(1e-12);
-    let mut out = Vec::new();
-    for &(name, seconds) in parts {
-        if name == "acquire+cull+gather" {
-            let names = ["acquire", "cull", "gather"];
-            out.extend(names.into_iter().zip(alone).map(|(name, part)| (name, seconds * part / all)));
-        } else {
-            out.push((name, seconds));
-        }
-    }
-    out
 }
 
 impl StepResult {
@@ -309,6 +270,8 @@ impl StepResult {
 struct Watched {
     inner: CpuRenderer,
     begin: Option<Instant>,
+    /// When the renderer handed back to the gather of the next batch.
+    before_gather: Option<Instant>,
     rows_out: Option<Instant>,
     parts: Vec<(&'static str, f64)>,
 }
@@ -353,12 +316,18 @@ impl Renderer for Watched {
 
     fn begin_view(&mut self, camera: &Camera, options: &RenderOptions, batches: RowBatches) -> Result<(), RenderError> {
         let before = self.begin.map_or(0.0, |t| t.elapsed().as_secs_f64());
-        self.add("acquire+cull+gather", before);
-        self.inner.begin_view(camera, options, batches)
+        self.add("acquire", before);
+        let done = self.inner.begin_view(camera, options, batches);
+        self.before_gather = Some(Instant::now());
+        done
     }
 
     fn rows_in(&mut self, rows: &Columns) -> Result<(), RenderError> {
-        self.inner.rows_in(rows)
+        let gathered = self.before_gather.map_or(0.0, |t| t.elapsed().as_secs_f64());
+        self.add("cull+gather", gathered);
+        let done = self.inner.rows_in(rows);
+        self.before_gather = Some(Instant::now());
+        done
     }
 
     fn picture(&mut self) -> Result<(), RenderError> {

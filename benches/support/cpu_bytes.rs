@@ -34,10 +34,9 @@ const PARTIAL: f64 = 36.0;
 pub fn part_bytes(part: &str, counts: &CpuCounts) -> f64 {
     let CpuCounts { pinned, rows, updated, isects, pixels } = *counts;
     match part {
-        // Means and scales with both moments, and the stamp.
-        "cull" => pinned * (2.0 * 36.0 + 4.0) + 4.0 * rows,
-        // Values with both moments in, values out.
-        "gather" => rows * (3.0 * ROW + 8.0 + ROW),
+        // Of all rows means and scales with both moments, and the stamp; of rows in view all values with both moments in, the
+        // values out.
+        "cull+gather" => pinned * (2.0 * 36.0 + 4.0) + 4.0 * rows + rows * (3.0 * ROW + 8.0 + ROW),
         "project_fwd" => rows * (GEOMETRY + FOOTPRINT),
         "sh_fwd" => rows * (8.0 + 12.0 + SH0 + BANDS + 12.0),
         // Three passes over keys of 8 bytes, each read twice and written once.

@@ -461,14 +461,14 @@ impl Renderer for CpuRenderer {
 
     fn loss(&mut self, target: &Target, options: &LossOptions) -> Result<(), RenderError> {
         self.sequence.loss(target)?;
-        let Self { clock, image_loss, image, gradient, .. } = self;
+        let Self { clock, image_loss, image, gradient, errors, .. } = self;
         gradient.v_alpha = None;
         clock.reset(&["image_loss"]);
         let value =
             clock.time("image_loss", || image_loss.value_and_gradient(image, target, options, &mut gradient.v_rgb));
         self.loss_value = Some(value);
         if self.weighs {
-            squared_errors(&ImagePair::new(&self.image, target), &mut self.errors);
+            clock.time("image_loss", || squared_errors(&ImagePair::new(image, target), errors));
         }
         Ok(())
     }
