@@ -4,17 +4,17 @@
 use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
-use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::whole_file::{folder_of, write_whole};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line, read_resolved};
+use gsscale::base::error::InputError;
+use gsscale::base::whole_file::write_whole;
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::exchange::sog::is_tree;
 use gsscale::render::lpips::InputRange;
 use gsscale::report::chart::{Chart, Mark};
 use gsscale::report::html::{Cell, Page};
-use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
-use std::path::{Path, PathBuf};
+use gsscale::train::run::model_of_run::ModelOfRun;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 const EXAMPLES: &str = "\
@@ -68,20 +68,12 @@ fn main() -> ExitCode {
 }
 
 fn start(args: Args) -> Result<(), TrainError> {
-    let (ply, run_config) = if args.model.is_dir() {
-        (args.model.join(PLY_FILE), Some(args.model.join(CONFIG_FILE)))
-    } else {
-        (args.model.clone(), None)
-    };
+    let ModelOfRun { file: ply, scene, config: run_config } =
+        ModelOfRun::find("gsscale-eval", &args.model, args.scene.clone())?;
     if args.page.is_some() && !is_tree(&ply) {
         let remedy = "give the lod-meta.json of a folder of SOGs (--export sog), or leave --page out";
         return Err(InputError::new("--page", format!("{} has no levels of detail", ply.display()), remedy).into());
     }
-    // A file whose run names the scene is measured on that run's photos.
-    let (scene, run_config) = match args.scene.clone() {
-        Some(scene) => (scene, run_config),
-        None => scene_of(&ply).map(|(scene, config)| (scene, Some(config)))?,
-    };
     let file = args.config.as_deref().or(run_config.as_deref());
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.apply(&mut config);
@@ -136,21 +128,4 @@ fn page_of(report: &EvalReport) -> String {
     };
     page.table(["level", "Gaussians", "PSNR, dB", "against the finest", "SSIM"], report.levels.iter().map(row));
     page.finish()
-}
-
-/// The scene and the config file of the run that wrote `file`: a PLY in the run's folder, or a folder of SOGs there.
-fn scene_of(file: &Path) -> InputResult<(PathBuf, PathBuf)> {
-    let whole = std::path::absolute(file).map_err(|e| InputError::io(file, "finding its folder", &e))?;
-    let folder = if is_tree(&whole) { folder_of(folder_of(&whole)) } else { folder_of(&whole) };
-    let config = folder.join(CONFIG_FILE);
-    if !config.is_file() {
-        let problem = "a file outside of a run's folder does not say its scene";
-        return Err(InputError::new(file, problem, "name the scene: gsscale-eval FILE SCENE"));
-    }
-    let scene = read_resolved(&config)?.scene;
-    if scene.exists() {
-        return Ok((scene, config));
-    }
-    let remedy = format!("if it was moved: gsscale-eval {} SCENE", file.display());
-    Err(InputError::new(&scene, "the scene of this run is missing", remedy))
 }

@@ -279,6 +279,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         gsscale::tell!("  quality     {test}");
         gsscale::tell!("  Gaussians   {}", out.join(PLY_FILE).display());
         gsscale::tell!("  report      {}", out.join(REPORT_FILE).display());
+        gsscale::tell!("  look        gsscale-view {}", out.display());
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
             gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());

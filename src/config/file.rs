@@ -133,8 +133,9 @@ config_keys! {
         image_cache: ByteSize = ByteSize(1 << 30) => Free;
         /// Near plane, relative to the size of the scene
         near_plane: f64 = 0.01 => Numbers hidden;
-        /// Start from this PLY (Gaussians if it has f_dc_0, else coloured points), or from the last generation of this
-        /// store folder (see gsscale-ckpt import), which may exceed memory. Empty = the dataset's points
+        /// Start from this PLY (Gaussians if it has f_dc_0, else coloured points), from the finest level of SOGs (lod-meta.json), or
+        /// from the last generation of this store folder (see gsscale-ckpt import), which may exceed memory. Empty = the dataset's
+        /// points
         init_ply: String = String::new() => Derived;
         /// Start from these pages of the store of --init-ply only: a file with a page on each line, as `12`, or `12 frozen` for a
         /// page that is rendered and never changes. Empty = all pages, none frozen

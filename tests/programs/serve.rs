@@ -1,6 +1,6 @@
 //! The live page (`--serve`): what it answers, that it changes no byte of the result, and what is refused.
 
-use crate::support::workdir::{Running, TRAIN, Workdir};
+use crate::support::workdir::{EVAL, Running, TRAIN, VIEW, Workdir};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::Duration;
@@ -12,8 +12,12 @@ struct Served<'a> {
 
 /// Starts a run and reads the address of its page.
 fn begin<'a>(work: &'a Workdir, flags: &str) -> Served<'a> {
-    let mut run =
-        Running::spawn(work, &mut work.command(TRAIN, &format!("scene --out out --serve 127.0.0.1:0 {flags}")));
+    serve(work, TRAIN, &format!("scene --out out {flags}"))
+}
+
+/// Starts a program with a page and reads its address.
+fn serve<'a>(work: &'a Workdir, program: &str, flags: &str) -> Served<'a> {
+    let mut run = Running::spawn(work, &mut work.command(program, &format!("{flags} --serve 127.0.0.1:0")));
     let line = run.says("\n");
     let address = line.strip_prefix("live page: http://").and_then(|rest| rest.split('/').next());
     let address = address.unwrap_or_else(|| panic!("no address: {line}")).parse().unwrap();
@@ -122,6 +126,51 @@ fn a_picture_of_more_gaussians_than_the_budget_allows_is_refused_and_the_run_goe
     );
     served.picture("view=0&width=48");
     served.run.ends(0);
+}
+
+/// The same Gaussians from a PLY in memory, from SOGs, from a store, and through a spill directory with few frames.
+#[test]
+fn a_finished_run_is_shown_beside_its_photos() {
+    let work = Workdir::wide_city(3000);
+    work.run("out", "--steps 120 --max-gaussians 3000 --device cpu --export sog --keep-checkpoint --log-every 40");
+    let held_out = work.json_of(EVAL, "out");
+    let before = work.files("out");
+    let mut first: Option<image::RgbImage> = None;
+    let paged = "out --spill-dir spill --host-mem 200MiB --page-rows 32";
+    for flags in ["out", "out/point_cloud_sog/lod-meta.json", "out/checkpoint", paged] {
+        let served = serve(&work, VIEW, &format!("{flags} --device cpu"));
+        // Pictures wait until the scene is read.
+        let scene = served.picture("view=2&width=64");
+        let status = served.json("/status");
+        assert!(status["name"] == "scene" && status["is_training"] == false, "{status}");
+        assert!(status["gaussians"].as_u64().unwrap() >= 2900, "{status}");
+        let view = &status["overview"];
+        assert!(view.as_u64().unwrap() < status["views"].as_u64().unwrap(), "{status}");
+        assert!(served.get("/metrics?from=0").1 == work.bytes("out/metrics.jsonl"), "the curves of the run");
+        let same = first.get_or_insert_with(|| scene.clone());
+        // SOGs round colours and positions to bytes and words: two steps of a byte a value.
+        let rounding = if flags.ends_with("json") { 2 * 64 * 48 * 3 } else { 0 };
+        assert!(difference(same, &scene) <= rounding, "{flags}: {}", difference(same, &scene));
+
+        let photo = served.picture("view=2&turn=40&show=photo");
+        let whole = served.picture("view=2&width=1280");
+        let differs = served.picture("view=2&turn=40&show=difference");
+        assert_eq!(photo.dimensions(), whole.dimensions());
+        for ((photo, whole), differs) in photo.iter().zip(whole.iter()).zip(differs.iter()) {
+            let four = 4 * u32::from(photo.abs_diff(*whole));
+            // The picture was rounded to bytes, the difference after it was taken.
+            assert!(u32::from(*differs).abs_diff(four.min(255)) <= 4, "{differs} for {photo} and {whole}");
+        }
+        let depth = served.picture("view=2&width=64&show=depth");
+        let grey = |pixel: &image::Rgb<u8>| pixel.0.iter().all(|value| value.abs_diff(pixel.0[0]) <= 1);
+        assert!(depth.pixels().all(grey) && depth.pixels().any(|pixel| pixel != depth.get_pixel(0, 0)));
+        assert!(difference(&scene, &served.picture("view=2&width=64&ahead=.2")) > 64 * 48);
+        served.run.signal("INT").ends(0);
+        assert!(!work.exists("spill"), "{flags}: the pages are removed");
+    }
+    assert!(work.files("out") == before && work.json_of(EVAL, "out") == held_out, "a viewer changes nothing of a run");
+    work.refuses_with(VIEW, "out/point_cloud.spz", &["point_cloud.spz"]);
+    work.refuses_with(VIEW, "scene/points.ply", &["name the scene"]);
 }
 
 #[test]

@@ -1,9 +1,10 @@
-//! A page that shows a run while it trains (`--serve`): its curves, and a picture from a camera that the person watching moves.
+//! A page that shows a run while it trains (`--serve`) or a scene after training (`gsscale-view`): its curves, and a picture from a
+//! camera that the person watching moves.
 //!
 //! The run and the server share a [`Live`]. The server stores the requests for pictures. The run draws the oldest one between two
 //! steps and stores its PNG. The server reads curves from the run's `metrics.jsonl`, so they cost the run nothing.
 //!
-//! Not here: drawing, and how often the run does it (`train::run::live`).
+//! Not here: drawing (`train::run::scene_picture`), and how often a run does it (`train::run::live`).
 //!
 //! Invariants: 1. a page can only request pictures, so no request changes a result; 2. the server reads one file, the metrics; 3. each
 //! request gets the picture of its own camera; 4. the run never draws for a page that was closed before the picture was begun.
@@ -19,6 +20,23 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Widest picture, pixels.
 pub const WIDTH_MOST: u32 = 1280;
+/// Most distances of the pivot by which it is shifted.
+const SHIFT_MOST: f32 = 1000.0;
+
+/// What a picture shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum PictureKind {
+    /// The scene.
+    #[default]
+    Scene,
+    /// How near it is: grey at the pivot, brighter before it.
+    Depth,
+    /// The photo of the training view, wherever the camera is.
+    Photo,
+    /// The absolute difference of the photo and the scene from the photo's place, four times as bright.
+    Difference,
+}
 
 /// A camera on an orbit around the point that a training view looks at.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -32,13 +50,26 @@ pub struct Orbit {
     pub tilt: f32,
     /// Distance to the pivot, over the distance of the training view.
     pub distance: f32,
+    /// Level shifts of the pivot, to the right of the training view and ahead, over its distance to the pivot.
+    pub aside: f32,
+    pub ahead: f32,
     /// Width of the picture, pixels.
     pub width: u32,
+    pub show: PictureKind,
 }
 
 impl Default for Orbit {
     fn default() -> Orbit {
-        Orbit { view: 0, turn: 0.0, tilt: 0.0, distance: 1.0, width: 640 }
+        Orbit {
+            view: 0,
+            turn: 0.0,
+            tilt: 0.0,
+            distance: 1.0,
+            aside: 0.0,
+            ahead: 0.0,
+            width: 640,
+            show: PictureKind::Scene,
+        }
     }
 }
 
@@ -50,6 +81,8 @@ impl Orbit {
             turn: or(self.turn, 0.0) % 360.0,
             tilt: or(self.tilt, 0.0).clamp(-180.0, 180.0),
             distance: or(self.distance, 1.0).clamp(0.01, 100.0),
+            aside: or(self.aside, 0.0).clamp(-SHIFT_MOST, SHIFT_MOST),
+            ahead: or(self.ahead, 0.0).clamp(-SHIFT_MOST, SHIFT_MOST),
             width: self.width.clamp(16, WIDTH_MOST),
             ..self
         }
@@ -58,6 +91,12 @@ impl Orbit {
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Status {
+    /// Name of the scene.
+    pub name: String,
+    /// Whether the scene is still trained.
+    pub is_training: bool,
+    /// The view that the page shows first.
+    pub overview: u32,
     /// Steps done.
     pub step: u32,
     pub steps: u32,
@@ -214,8 +253,10 @@ mod tests {
 
     #[test]
     fn an_orbit_that_cannot_be_drawn_becomes_the_nearest_one_that_can() {
-        let absurd = Orbit { view: 9, turn: f32::NAN, tilt: 1e9, distance: f32::INFINITY, width: 1 << 30 };
-        assert_eq!(absurd.bounded(), Orbit { view: 9, turn: 0.0, tilt: 180.0, distance: 1.0, width: WIDTH_MOST });
+        let far = Orbit { tilt: 1e9, aside: -1e9, ahead: f32::NAN, width: 1 << 30, ..Orbit::default() };
+        let absurd = Orbit { view: 9, turn: f32::NAN, distance: f32::INFINITY, ..far };
+        let nearest = Orbit { view: 9, tilt: 180.0, aside: -SHIFT_MOST, width: WIDTH_MOST, ..Orbit::default() };
+        assert_eq!(absurd.bounded(), nearest);
     }
 
     #[test]

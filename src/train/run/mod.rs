@@ -1,4 +1,4 @@
-//! A run from its request to its results: begin, the loop, resume, restart, the output folder.
+//! A run from its request to its results: begin, the loop, resume, restart, the output folder; and the viewer of what came out.
 //!
 //! [`begin`] is the page to read first.
 
@@ -6,9 +6,12 @@ pub mod begin;
 mod changes;
 pub mod eval_file;
 pub mod live;
+pub mod model_of_run;
 mod more_steps;
 pub mod out_folder;
 pub mod request;
 pub mod resume;
 mod run_folder;
+mod scene_picture;
 pub mod training_loop;
+pub mod viewer;

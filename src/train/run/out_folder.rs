@@ -77,16 +77,18 @@ pub fn is_trace(name: &OsStr) -> bool {
 /// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
 /// without a scene; with `-2`, `-3` and so on where that is taken.
 pub fn default_out(scene: Option<&Path>) -> PathBuf {
-    let folder = |scene: &Path| {
-        // A name such as `.` or `scans/..` is no name; one that does not exist is refused later.
-        let whole = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
-        let folder = if whole.is_file() { folder_of(&whole).to_path_buf() } else { whole };
-        folder.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned())
-    };
-    let name = scene.map_or_else(|| "demo".to_string(), folder);
+    let name = scene.map_or_else(|| "demo".to_string(), scene_name);
     let numbered = |n: u32| Path::new("runs").join(if n == 1 { name.clone() } else { format!("{name}-{n}") });
     let is_free = |out: &PathBuf| !out.exists() || is_empty(out);
     (1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1))
+}
+
+/// The name of a scene: that of its folder.
+pub fn scene_name(scene: &Path) -> String {
+    // A name such as `.` or `scans/..` is no name; one that does not exist is refused later.
+    let whole = scene.canonicalize().unwrap_or_else(|_| scene.to_path_buf());
+    let folder = if whole.is_file() { folder_of(&whole).to_path_buf() } else { whole };
+    folder.file_name().map_or_else(|| "scene".into(), |name| name.to_string_lossy().into_owned())
 }
 
 /// Refuses an output folder in which a run may not begin. Changes nothing, so a dry run asks the same.

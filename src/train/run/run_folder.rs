@@ -8,7 +8,7 @@
 
 use super::changes::with_absolute_paths;
 use super::live::LivePage;
-use super::out_folder::{self, remove_mark};
+use super::out_folder::{self, remove_mark, scene_name};
 use super::request::{RunOutcome, RunRequest};
 use super::training_loop::TrainingLoop;
 use crate::base::count::Count;
@@ -172,7 +172,7 @@ pub(super) fn train_into(
     warn_of_held_out(dataset, &targets);
     let live = request.live.clone().map(|live| {
         live.set_metrics(out.join(METRICS_FILE));
-        LivePage::new(live)
+        LivePage::new(live, scene_name(&request.scene))
     });
     let mut progress = RunProgress::new(config.steps, request.quiet).after(trainer.steps_done());
     let before = trainer.scene.pager.stats();

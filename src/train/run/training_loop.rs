@@ -99,7 +99,7 @@ impl TrainingLoop<'_> {
             }
             self.progress.step(done, ShownStep { gaussians: self.trainer.scene.rows(), psnr });
             if let Some(live) = &mut self.live {
-                live.show(self.trainer, self.dataset, psnr);
+                live.show(self.trainer, self.dataset, self.targets, psnr);
             }
             if let Some(checkpoint) = self.checkpoint.as_deref_mut().filter(|_| !self.trainer.is_ahead()) {
                 let done = checkpoint.between_steps(self.trainer, self.metrics);

@@ -22,6 +22,7 @@ use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::up::estimate_up;
 use crate::exchange::frames::to_local;
 use crate::exchange::ply::{self, PlyContent, read_ply};
+use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::Pager;
 use crate::photos::diagnosis::{Diagnosis, POINTS_MOST, diagnose};
 use crate::scene::columns::{Columns, row_width};
@@ -140,6 +141,7 @@ impl Start {
     fn with(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         let start = match options.store() {
             Some(store) => Start::of_store(scene, options, store, host_mem)?,
+            None if options.init_ply.as_deref().is_some_and(is_tree) => Start::in_memory(scene, options, host_mem)?,
             None => match Start::stream(scene, options, &budget(folder, host_mem))? {
                 Some(start) => start,
                 None => Start::in_memory(scene, options, host_mem)?,
@@ -383,12 +385,18 @@ fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
     let mut gaussians = None;
     let mut dropped = None;
     if let Some(path) = options.init_ply.clone().or(raw.points_path.clone()) {
-        match read_ply(&path)? {
-            PlyContent::Gaussians { columns, meta, .. } => {
+        let content = if is_tree(&path) { None } else { Some(read_ply(&path)?) };
+        match content {
+            None => {
+                let sog = SogReader::open(&path)?;
+                raw.points = PointCloud::default();
+                gaussians = Some((sog.rows(0)?, sog.meta().clone(), path));
+            }
+            Some(PlyContent::Gaussians { columns, meta, .. }) => {
                 raw.points = PointCloud::default();
                 gaussians = Some((columns, meta, path));
             }
-            PlyContent::Points { positions, colors, dropped: count } => {
+            Some(PlyContent::Points { positions, colors, dropped: count }) => {
                 raw.points = PointCloud { positions, colors };
                 dropped = (count > 0).then(|| format!("{}: {count} points are not finite, dropped", path.display()));
             }
@@ -473,7 +481,7 @@ fn check_gaussians_fit(options: &FirstOptions, host_mem: Option<u64>) -> InputRe
 }
 
 fn is_ply(file: &Path) -> bool {
-    !file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bin") || e.eq_ignore_ascii_case("txt"))
+    !is_tree(file) && !file.extension().is_some_and(|e| e.eq_ignore_ascii_case("bin") || e.eq_ignore_ascii_case("txt"))
 }
 
 fn read_points(file: &Path, warnings: &mut Vec<String>, take: &mut TakePoint<'_>) -> InputResult<()> {

@@ -10,6 +10,7 @@
 use super::comparison::Comparison;
 use super::pages::{PagedScene, WorkingSet};
 use crate::base::ids::PageNo;
+use crate::kernels::sh_fwd::C0;
 use crate::render::{Gradients, LossOptions, RenderOptions, Renderer, RowBatches};
 use crate::scene::camera::Camera;
 use crate::scene::columns::Columns;
@@ -107,6 +108,26 @@ impl Batches<'_> {
 /// Errors: pages could not be had, or the renderer failed.
 pub fn draw(now: &mut SceneNow<'_>, camera: &Camera, options: &RenderOptions) -> Result<(), TrainError> {
     ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |_| {})?;
+    Ok(now.renderer.picture()?)
+}
+
+/// As [`draw`], with the nearness of each Gaussian's centre in place of its colours: grey at the depth `middle`, brighter before it,
+/// black at infinity.
+pub fn draw_depth(
+    now: &mut SceneNow<'_>,
+    camera: &Camera,
+    options: &RenderOptions,
+    middle: f32,
+) -> Result<(), TrainError> {
+    let [_, _, [x, y, z, w]] = camera.viewmat;
+    ViewPass::new(now.scene, camera, options, PAGES_PER_BATCH).rows_in(now, |columns| {
+        columns.sh_n.fill(0.0);
+        for (mean, sh0) in columns.means.chunks_exact(3).zip(columns.sh0.chunks_exact_mut(3)) {
+            let depth = x * mean[0] + y * mean[1] + z * mean[2] + w;
+            let nearness = (0.5 * middle / depth.max(camera.near_plane)).min(1.0);
+            sh0.fill((nearness - 0.5) / C0);
+        }
+    })?;
     Ok(now.renderer.picture()?)
 }
 

@@ -19,6 +19,7 @@ pub const TRAIN: &str = env!("CARGO_BIN_EXE_gsscale-train");
 pub const EVAL: &str = env!("CARGO_BIN_EXE_gsscale-eval");
 pub const CKPT: &str = env!("CARGO_BIN_EXE_gsscale-ckpt");
 pub const POSES: &str = env!("CARGO_BIN_EXE_gsscale-poses");
+pub const VIEW: &str = env!("CARGO_BIN_EXE_gsscale-view");
 pub const BENCH: &str = env!("CARGO_BIN_EXE_gsscale-bench");
 
 /// A temporary folder; its scene, if it has one, is `scene`.

@@ -1,0 +1,49 @@
+//! The Gaussians, the scene and the config that the name of a run, or of one of its files, stands for.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::folder_of;
+use crate::config::file::read_resolved;
+use crate::exchange::sog::is_tree;
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
+use std::path::{Path, PathBuf};
+
+/// What a run, or a file of Gaussians, stands for.
+#[derive(Debug)]
+pub struct ModelOfRun {
+    /// The file of Gaussians; the folder of a store.
+    pub file: PathBuf,
+    pub scene: PathBuf,
+    /// The config of the run, if the model lies in its folder or says its scene.
+    pub config: Option<PathBuf>,
+}
+
+impl ModelOfRun {
+    /// `model` is the output folder of a run, a file of Gaussians, or a store. Without `scene`, the run names it. Remedies name `program`.
+    /// Errors: no run names the scene, or the scene is not there.
+    pub fn find(program: &str, model: &Path, scene: Option<PathBuf>) -> InputResult<ModelOfRun> {
+        let is_run = model.is_dir() && (model.join(CONFIG_FILE).is_file() || model.join(PLY_FILE).is_file());
+        let file = if is_run { model.join(PLY_FILE) } else { model.to_path_buf() };
+        if let Some(scene) = scene {
+            return Ok(ModelOfRun { file, scene, config: is_run.then(|| model.join(CONFIG_FILE)) });
+        }
+        let (scene, config) = scene_of(program, &file)?;
+        Ok(ModelOfRun { file, scene, config: Some(config) })
+    }
+}
+
+/// The scene and the config file of the run that wrote `file`: a PLY in the run's folder, or a folder of SOGs or a store there.
+fn scene_of(program: &str, file: &Path) -> InputResult<(PathBuf, PathBuf)> {
+    let whole = std::path::absolute(file).map_err(|e| InputError::io(file, "finding its folder", &e))?;
+    let folder = if is_tree(&whole) { folder_of(folder_of(&whole)) } else { folder_of(&whole) };
+    let config = folder.join(CONFIG_FILE);
+    if !config.is_file() {
+        let problem = "a file outside of a run's folder does not say its scene";
+        return Err(InputError::new(file, problem, format!("name the scene: {program} FILE SCENE")));
+    }
+    let scene = read_resolved(&config)?.scene;
+    if scene.exists() {
+        return Ok((scene, config));
+    }
+    let remedy = format!("if it was moved: {program} {} SCENE", file.display());
+    Err(InputError::new(&scene, "the scene of this run is missing", remedy))
+}

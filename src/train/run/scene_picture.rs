@@ -1,0 +1,192 @@
+//! Pictures for a page that shows a scene ([`crate::report::live`]): from an orbit, or a training photo beside what the scene shows there.
+//!
+//! Invariants: 1. nothing is stored, and no bit of the scene changes; 2. memory is bounded: a picture that would take too much is an error.
+
+use crate::base::error::{InputError, InputResult};
+use crate::base::png_rows::write_rgb_rows;
+use crate::base::units::format_bytes;
+use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
+use crate::report::live::{Orbit, Picture, PictureKind};
+use crate::scene::camera::Camera;
+use crate::scene::image::{Image, Target};
+use crate::train::error::TrainError;
+use crate::train::state::trainer::Trainer;
+use crate::train::step::pages::PagedScene;
+use crate::train::step::view::{draw, draw_depth};
+use glam::{Mat3, Vec3};
+
+/// The renderer may take this part of the budget for the rows of a picture, or as much as for a training view so far.
+const PICTURE_SHARE: u64 = 8;
+/// A difference of a quarter is white.
+const DIFFERENCE_FACTOR: f32 = 4.0;
+/// Most views that are looked at for an overview.
+const OVERVIEWS_MOST: usize = 64;
+
+/// What an orbit shows of the scene after the last step, as PNG. A photo and its difference have the size of the training photo.
+pub(super) fn picture(trainer: &mut Trainer, dataset: &Dataset, targets: &TargetCache, orbit: Orbit) -> Picture {
+    let drawn = draw_orbit(trainer, dataset, targets, orbit);
+    let image = drawn.map_err(|error| format!("the picture cannot be drawn: {error}"))?;
+    png(&image).map_err(|error| format!("the picture cannot be written: {error}"))
+}
+
+fn draw_orbit(
+    trainer: &mut Trainer,
+    dataset: &Dataset,
+    targets: &TargetCache,
+    orbit: Orbit,
+) -> Result<Image, TrainError> {
+    trainer.drain()?;
+    let views = dataset.train_views();
+    let view = views[orbit.view as usize % views.len().max(1)];
+    let base = dataset.views[view].camera;
+    let photo = match orbit.show {
+        PictureKind::Photo | PictureKind::Difference => Some(targets.get(view)?),
+        PictureKind::Scene | PictureKind::Depth => None,
+    };
+    if let (PictureKind::Photo, Some(photo)) = (orbit.show, &photo) {
+        let mut image = Image::new(photo.width, photo.height);
+        each_value(&mut image, photo, |_, byte| f32::from(byte) / 255.0);
+        return Ok(image);
+    }
+    let pivot = median_depth(&trainer.scene, &base).unwrap_or(dataset.scene_scale);
+    let camera = if photo.is_some() { base } else { orbit_camera(&base, pivot, trainer.options.up, orbit) };
+    check_picture(trainer, &camera)?;
+    trainer.run_memory().fit_frames_to_picture(&camera);
+    let render = trainer.render_options();
+    match orbit.show {
+        PictureKind::Depth => draw_depth(&mut trainer.now(), &camera, &render, pivot * orbit.distance)?,
+        _ => draw(&mut trainer.now(), &camera, &render)?,
+    }
+    let mut image = trainer.renderer.image()?.clone();
+    if let Some(photo) = photo {
+        each_value(&mut image, &photo, |value, byte| {
+            DIFFERENCE_FACTOR * (value.clamp(0.0, 1.0) - f32::from(byte) / 255.0).abs()
+        });
+    }
+    Ok(image)
+}
+
+/// Replaces each value of an image by one that follows from it and from the value of a photo of the same size.
+fn each_value(image: &mut Image, photo: &Target, value: impl Fn(f32, u8) -> f32) {
+    let pixels = photo.pixels();
+    for (plane, values) in image.rgb.chunks_mut(pixels.max(1)).enumerate() {
+        let bytes = photo.rgb.iter().skip(plane).step_by(3);
+        values.iter_mut().zip(bytes).for_each(|(out, byte)| *out = value(*out, *byte));
+    }
+}
+
+/// The training view that sees the most pages, by its number among the training views: of [`OVERVIEWS_MOST`] that are spread evenly.
+pub(super) fn overview(scene: &PagedScene, dataset: &Dataset) -> u32 {
+    let views = dataset.train_views();
+    let numbers = (0..views.len()).step_by(views.len().div_ceil(OVERVIEWS_MOST).max(1));
+    let seen = |number: &usize| scene.pager.pages_of_view(&dataset.views[views[*number]].camera).len();
+    // The first of equals.
+    numbers.rev().max_by_key(seen).unwrap_or(0) as u32
+}
+
+/// Refuses a picture for which the renderer would need too much memory ([`PICTURE_SHARE`]). Batches bound the memory of gathered rows,
+/// not that of the splats, which the renderer keeps for every visible row.
+/// Errors: the camera may see too many Gaussians.
+fn check_picture(trainer: &Trainer, camera: &Camera) -> InputResult<()> {
+    let Some(budget) = trainer.memory.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
+    let pager = &trainer.scene.pager;
+    let rows: u64 = pager.pages_of_view(camera).iter().map(|page| u64::from(pager.index()[page.index()].rows)).sum();
+    let needed = trainer.renderer.host_bytes_for_rows(rows);
+    if needed <= trainer.renderer.host_bytes_of_rows().max(budget.bytes / PICTURE_SHARE) {
+        return Ok(());
+    }
+    let problem = format!("{rows} Gaussians may be in view, which takes {} of memory", format_bytes(needed));
+    Err(InputError::new("--serve", problem, "move nearer"))
+}
+
+/// Median depth of the pages that a camera sees, local units; `None` if no page is in front of the camera.
+fn median_depth(scene: &PagedScene, camera: &Camera) -> Option<f32> {
+    let index = scene.pager.index();
+    let [_, _, axis] = camera.viewmat;
+    let depth = |centre: [f32; 3]| axis[0] * centre[0] + axis[1] * centre[1] + axis[2] * centre[2] + axis[3];
+    let pages = scene.pager.pages_of_view(camera);
+    let mut depths: Vec<f32> = pages.iter().map(|page| depth(index[page.index()].bounds.centre())).collect();
+    depths.retain(|depth| depth.is_finite() && *depth > camera.near_plane);
+    depths.sort_unstable_by(f32::total_cmp);
+    depths.get(depths.len() / 2).copied()
+}
+
+/// The camera of an orbit around the point `pivot`, which lies in front of `base`. `up` is the direction that points up, if it is known.
+fn orbit_camera(base: &Camera, pivot: f32, up: Option<[f64; 3]>, orbit: Orbit) -> Camera {
+    let row = |i: usize| Vec3::new(base.viewmat[i][0], base.viewmat[i][1], base.viewmat[i][2]);
+    let (right, down, forward) = (row(0), row(1), row(2));
+    let up = up.map_or(-down, |up| Vec3::from(up.map(|x| x as f32)));
+    let up = up.try_normalize().unwrap_or(-down);
+    let turn =
+        Mat3::from_axis_angle(up, orbit.turn.to_radians()) * Mat3::from_axis_angle(right, orbit.tilt.to_radians());
+    // Shifts are level, also those of a camera that looks down.
+    let aside = (right - right.dot(up) * up).try_normalize().unwrap_or(right);
+    let ahead = up.cross(aside);
+    let centre = Vec3::from(base.centre());
+    let pivot_point = centre + pivot * (forward + orbit.aside * aside + orbit.ahead * ahead);
+    let centre = pivot_point - orbit.distance * pivot * (turn * forward);
+    let axes = [right, down, forward].map(|axis| turn * axis);
+    let viewmat = axes.map(|axis| [axis.x, axis.y, axis.z, -axis.dot(centre)]);
+    let scale = (orbit.width as f32 / base.width as f32).min(1.0);
+    let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
+    Camera {
+        viewmat,
+        fx: base.fx * scale,
+        fy: base.fy * scale,
+        cx: base.cx * scale,
+        cy: base.cy * scale,
+        width: side(base.width),
+        height: side(base.height),
+        ..*base
+    }
+}
+
+fn png(image: &Image) -> std::io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    write_rgb_rows(&mut bytes, [image.width, image.height], |y, row| image.row_to_rgb8(y, row))?;
+    Ok(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn base() -> Camera {
+        let viewmat = [[1.0, 0.0, 0.0, -3.0], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, -1.0]];
+        Camera::pinhole(viewmat, [90.0, 80.0, 60.0, 40.0], [120, 80])
+    }
+
+    /// Coordinates of a world point before the camera.
+    fn seen(camera: &Camera, point: [f32; 3]) -> [f32; 3] {
+        camera.viewmat.map(|row| row[0] * point[0] + row[1] * point[1] + row[2] * point[2] + row[3])
+    }
+
+    #[test]
+    fn an_orbit_at_rest_is_the_view_and_the_pivot_stays_before_every_other() {
+        let still = Orbit { width: 120, ..Orbit::default() };
+        let at_rest = orbit_camera(&base(), 4.0, None, still);
+        for (row, of_base) in at_rest.viewmat.iter().zip(&base().viewmat) {
+            // Rounding of sums of a few numbers below 10.
+            assert!(row.iter().zip(of_base).all(|(a, b)| (a - b).abs() < 1e-5), "{at_rest:?}");
+        }
+        let pivot = [3.0, -2.0, 5.0];
+        for (turn, tilt, distance) in [(90.0, 0.0, 1.0), (10.0, 70.0, 0.5), (-200.0, -30.0, 3.0)] {
+            let orbit = Orbit { turn, tilt, distance, width: 60, ..still };
+            let camera = orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), orbit);
+            let [x, y, z] = seen(&camera, pivot);
+            assert!(x.abs() < 1e-4 && y.abs() < 1e-4 && (z - 4.0 * distance).abs() < 1e-4, "{orbit:?}: {x} {y} {z}");
+            assert_eq!((camera.width, camera.height, camera.fx, camera.cy), (60, 40, 45.0, 20.0));
+        }
+        // Shifts are level, in distances of the pivot: two to the right of the view and four ahead, which a look down does not change.
+        let [still_centre, shifted] = [0.0, 1.0].map(|by| {
+            let orbit = Orbit { aside: 0.5 * by, ahead: by, ..still };
+            orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), orbit).centre()
+        });
+        let moved: Vec<f32> = shifted.iter().zip(still_centre).map(|(a, b)| a - b).collect();
+        assert!(moved.iter().zip([2.0, 0.0, 4.0]).all(|(is, want)| (is - want).abs() < 1e-4), "{moved:?}");
+        // A turn to the right by a quarter, seen from above: the camera stands left of the pivot and looks along +x.
+        let camera = orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), Orbit { turn: 90.0, ..still });
+        assert!((camera.viewmat[2][0].abs() - 1.0).abs() < 1e-5, "{camera:?}");
+    }
+}
