@@ -33,9 +33,12 @@ struct Flags {
     /// Number of photos; the city grows with it
     #[arg(long, default_value_t = 60, help_heading = "Size")]
     views: u32,
-    /// Further photos from high above, each of two fifths of the city
+    /// Further photos from high above
     #[arg(long, default_value_t = 0, value_name = "N", help_heading = "Size")]
     overviews: u32,
+    /// Share of the area of all copies of the city that each of them shows
+    #[arg(long, default_value_t = 0.4, value_name = "SHARE", help_heading = "Size")]
+    overview_area: f64,
     /// Size of a photo, pixels
     #[arg(long, default_value = "480x320", value_name = "WxH", value_parser = parse_size, help_heading = "Size")]
     resolution: (u32, u32),
@@ -111,6 +114,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         seed: flags.seed,
         views: flags.views,
         overviews: flags.overviews,
+        overview_area: flags.overview_area,
         width: flags.resolution.0,
         height: flags.resolution.1,
         points: flags.points,

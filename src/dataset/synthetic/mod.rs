@@ -37,9 +37,10 @@ pub struct CityOptions {
     pub seed: u64,
     /// Photos of the flight; with the overview photos 1 to 100,000.
     pub views: u32,
-    /// Photos from high above, each of two fifths of all copies of the city, after those of the flight. They see no
-    /// points.
+    /// Photos from high above, after those of the flight. They see no points.
     pub overviews: u32,
+    /// Share of the area of all copies of the city that each of them shows, .0001 to 1.
+    pub overview_area: f64,
     /// Width of a photo, pixels, 16 to 16,384.
     pub width: u32,
     /// Height of a photo, pixels, 16 to 16,384.
@@ -70,6 +71,7 @@ impl Default for CityOptions {
             seed: 1,
             views: 60,
             overviews: 0,
+            overview_area: 0.4,
             width: 480,
             height: 320,
             points: 20_000,
@@ -115,6 +117,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
     };
     in_range("--views", f64::from(options.views), 1.0, 100_000.0)?;
     in_range("--overviews", f64::from(options.overviews), 0.0, 100_000.0 - f64::from(options.views))?;
+    in_range("--overview-area", options.overview_area, 1e-4, 1.0)?;
     in_range("--resolution", f64::from(options.width), 16.0, 16_384.0)?;
     in_range("--resolution", f64::from(options.height), 16.0, 16_384.0)?;
     in_range("--points", f64::from(options.points), 0.0, 50e6)?;
@@ -267,7 +270,8 @@ mod tests {
 
     #[test]
     fn options_out_of_range_are_refused_by_flag() {
-        let cases: [(CityOptions, &str); 6] = [
+        let cases: [(CityOptions, &str); 7] = [
+            (CityOptions { overview_area: 0.0, ..Default::default() }, "--overview-area"),
             (CityOptions { overviews: 99_950, ..Default::default() }, "--overviews"),
             (CityOptions { views: 0, ..Default::default() }, "--views"),
             (CityOptions { width: 8, ..Default::default() }, "--resolution"),
