@@ -12,8 +12,8 @@
 //!
 //! Not here: what training finds ([`super::outlier`]).
 //!
-//! Invariants: 1. the result is a function of photos, poses and points; 2. one photo is decoded at a time, and no more than
-//! `PIXELS_MOST` pixels in all, beyond `PHOTOS_LEAST` photos.
+//! Invariants: 1. the result is a function of photos, poses and points; 2. one photo is decoded at a time, and beyond `PHOTOS_LEAST`
+//! photos no more than `PIXELS_MOST` pixels are decoded and `DRAWN_MOST` points drawn in all.
 
 use super::exposure::AppearanceMode;
 use super::outlier::{MAD_OF_NORMAL, is_used, median_and_deviation};
@@ -33,8 +33,13 @@ use std::path::Path;
 const PIXELS_MOST: u64 = 300_000_000;
 /// Photos that are looked at however large they are.
 const PHOTOS_LEAST: usize = 24;
-/// Most points that are drawn.
-pub const POINTS_MOST: usize = 16_384;
+/// Most points that are kept of a scene: a photo of a city shows a thousandth of it.
+pub const POINTS_MOST: usize = 1 << 20;
+/// Most points that tell how many a photo shows, and that are drawn if photos show `POINTS_WANTED` of them.
+const POINTS_FIRST: usize = 16_384;
+const POINTS_WANTED: f64 = 512.0;
+/// Points that are drawn into all photos.
+const DRAWN_MOST: usize = 1 << 31;
 /// Fewest points in a photo for a finding about it.
 const POINTS_LEAST: usize = 24;
 /// Shifts are measured in units of the longer side, and tried up to so many units in each direction.
@@ -62,10 +67,17 @@ pub struct PhotoFinding {
     /// Correlation of brightness with the points, at the best shift and without one.
     pub agreement: f64,
     pub agreement_in_place: f64,
-    /// Pixels, right and down.
+    /// Pixels, right and down, and those of a unit.
     pub shift: [i32; 2],
+    pub unit: u32,
     /// Share of the points whose brightness is off by more than half a stop after the gain.
     pub off: f64,
+}
+
+impl PhotoFinding {
+    fn shift_pixels(&self) -> f64 {
+        libm::hypot(self.shift[0].into(), self.shift[1].into())
+    }
 }
 
 /// What the photos say.
@@ -84,9 +96,9 @@ pub struct Diagnosis {
     pub agreement: f64,
     /// What a shift adds to the agreement.
     pub agreement_by_shift: f64,
-    /// Pixels.
+    /// Pixels, and in units of each photo.
     pub shift: f64,
-    pub unit: u32,
+    pub shift_units: f64,
     /// Numbers in `photos` of those that show something else.
     pub wrong: Vec<usize>,
 }
@@ -147,17 +159,21 @@ pub fn finding(file: &Value) -> Option<Finding> {
 /// read is passed over: training names it.
 pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagnosis {
     let views = dataset.train_views();
-    let in_view = |&view: &usize| points_in(points, &dataset.views[view].camera).len() as f64;
+    let first = thinned(points, points.len().div_ceil(POINTS_FIRST));
+    let in_view = |&view: &usize| points_in(&first, &dataset.views[view].camera).len() as f64;
     let in_views: Vec<f64> = views.par_iter().map(in_view).collect();
+    let share = median(in_views.clone()) / first.len().max(1) as f64;
+    let every = (points.len() as f64 * share / POINTS_WANTED) as usize;
+    let points = &thinned(points, every.clamp(1, points.len().div_ceil(POINTS_FIRST).max(1)))[..];
     let header = |view: usize| &dataset.views[view].photo.header;
     let pixels: u64 = views.iter().map(|&view| u64::from(header(view).width) * u64::from(header(view).height)).sum();
     let affordable = (PIXELS_MOST as f64 / (pixels as f64 / views.len() as f64)) as usize;
+    let affordable = affordable.min(DRAWN_MOST / points.len().max(1));
     let looked_at = views.len().min(affordable.max(PHOTOS_LEAST));
-    let (mut photos, mut longest) = (Vec::with_capacity(looked_at), 0);
+    let mut photos = Vec::with_capacity(looked_at);
     for number in 0..looked_at {
         let view = &dataset.views[views[number * views.len() / looked_at]];
         let Ok(photo) = decode(&view.photo) else { continue };
-        longest = longest.max(photo.width).max(photo.height);
         let found = PhotoLook::new(&photo, &view.camera, points).finding();
         photos.extend(found.map(|found| PhotoFinding { name: view.name.clone(), ..found }));
     }
@@ -165,16 +181,15 @@ pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagn
     let agreement = median(of(&|photo| photo.agreement));
     let off_most = (WRONG_OFF * median(of(&|photo| photo.off))).max(WRONG_OFF_LEAST);
     let is_wrong = |photo: &PhotoFinding| photo.agreement < WRONG_AGREEMENT * agreement && photo.off > off_most;
-    let shift = |photo: &PhotoFinding| libm::hypot(photo.shift[0].into(), photo.shift[1].into());
     Diagnosis {
-        photos_per_point: in_views.iter().sum::<f64>() / points.len().max(1) as f64,
-        points_per_photo: median(in_views) * count as f64 / points.len().max(1) as f64,
+        photos_per_point: in_views.iter().sum::<f64>() / first.len().max(1) as f64,
+        points_per_photo: share * count as f64,
         exposure_spread: spread(of(&|photo| photo.gain[1])),
         color_spread: spread(of(&|photo| photo.gain[0] - photo.gain[2])),
         agreement,
         agreement_by_shift: median(of(&|photo| photo.agreement - photo.agreement_in_place)),
-        shift: median(of(&shift)),
-        unit: unit_of(longest),
+        shift: median(of(&PhotoFinding::shift_pixels)),
+        shift_units: median(of(&|photo| photo.shift_pixels() / f64::from(photo.unit))),
         wrong: (0..photos.len()).filter(|&number| is_wrong(&photos[number])).collect(),
         photos,
     }
@@ -204,11 +219,10 @@ impl Diagnosis {
             (false, true) => AppearanceMode::Exposure,
             (false, false) => AppearanceMode::Off,
         };
-        let shifts = self.shift >= SHIFT_UNITS * f64::from(self.unit);
         Remedies {
             appearance,
             robust_views: !self.wrong.is_empty(),
-            refine_poses: shifts && self.agreement_by_shift >= AGREEMENT_BY_SHIFT,
+            refine_poses: self.shift_units >= SHIFT_UNITS && self.agreement_by_shift >= AGREEMENT_BY_SHIFT,
             poor_points: false,
         }
     }
@@ -265,7 +279,12 @@ fn points_in(points: &[ColoredPoint], camera: &Camera) -> Vec<Drawn> {
         let (at, depth) = camera.project(position.map(f64::from))?;
         (0..2).all(|axis| (0.0..size[axis]).contains(&at[axis])).then_some(Drawn { at, depth, point })
     };
-    points.iter().enumerate().filter_map(project).collect()
+    points.par_iter().enumerate().filter_map(project).collect()
+}
+
+/// One point in `every`.
+fn thinned(points: &[ColoredPoint], every: usize) -> Vec<ColoredPoint> {
+    points.iter().step_by(every.max(1)).copied().collect()
 }
 
 /// A photo beside the points that it shows.
@@ -322,7 +341,7 @@ impl<'a> PhotoLook<'a> {
         if of_both > 0.0 { (ab - a * b) / of_both } else { 0.0 }
     }
 
-    /// `None` where the photo shows too few points.
+    /// `None` where the photo shows too few points, or too few that are neither clipped nor dark.
     fn finding(&self) -> Option<PhotoFinding> {
         if self.points.len() < POINTS_LEAST {
             return None;
@@ -352,10 +371,20 @@ impl<'a> PhotoLook<'a> {
         };
         let gain = [0, 1, 2].map(|channel| median(stops(channel)));
         let green = stops(1);
-        let off =
-            green.iter().filter(|&stops| (stops - gain[1]).abs() > 0.5).count() as f64 / green.len().max(1) as f64;
-        let points = self.points.len();
-        Some(PhotoFinding { name: String::new(), points, gain, agreement, agreement_in_place, shift: moved, off })
+        let off = green.iter().filter(|&stops| (stops - gain[1]).abs() > 0.5).count() as f64 / green.len() as f64;
+        if green.len() < POINTS_LEAST {
+            return None;
+        }
+        Some(PhotoFinding {
+            name: String::new(),
+            points: self.points.len(),
+            gain,
+            agreement,
+            agreement_in_place,
+            shift: moved,
+            unit: self.unit as u32,
+            off,
+        })
     }
 }
 
@@ -392,6 +421,7 @@ mod tests {
             agreement,
             agreement_in_place: agreement,
             shift: [0; 2],
+            unit: 1,
             off: 0.1,
         }
     }
@@ -406,7 +436,7 @@ mod tests {
             agreement,
             agreement_by_shift: 0.0,
             shift: 0.0,
-            unit: 1,
+            shift_units: 0.0,
             wrong: Vec::new(),
         }
     }
@@ -422,10 +452,10 @@ mod tests {
         let sparse = Diagnosis { photos_per_point: 7.0, ..of(100, 0.1) };
         assert_eq!(sparse.remedies(), none);
         assert!(sparse.text()[0].contains("have not the colours"));
-        // Shifts count in units of a large photo, and where they explain something.
-        let shifted = |shift, unit, by| Diagnosis { shift, unit, agreement_by_shift: by, ..of(100, 0.7) }.remedies();
-        assert_eq!(shifted(3.0, 1, 0.1), Remedies { refine_poses: true, ..none });
-        assert_eq!((shifted(3.0, 4, 0.1), shifted(3.0, 1, 0.01)), (none, none));
+        // Shifts count in units of each photo, and where they explain something.
+        let shifted = |shift_units, by| Diagnosis { shift_units, agreement_by_shift: by, ..of(100, 0.7) }.remedies();
+        assert_eq!(shifted(3.0, 0.1), Remedies { refine_poses: true, ..none });
+        assert_eq!((shifted(0.75, 0.1), shifted(3.0, 0.01)), (none, none));
     }
 
     #[test]

@@ -4,6 +4,7 @@ use crate::support::scenes::told;
 use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
+use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::start::first_scene::prepare;
 
 const SEED: u64 = 3;
@@ -61,6 +62,17 @@ fn each_fault_of_a_capture_switches_its_remedy_on_and_a_clean_one_none() {
     assert!(flags.is_empty(), "{flags:?}");
     let (flags, ..) = switched_on(&work, "exposure", &Disturbance::Exposure { stops: 0.5 }, "--appearance full");
     assert!(flags.is_empty(), "{flags:?}");
+}
+
+/// A photo of a large city shows a small part of its points.
+#[test]
+fn photos_of_a_large_city_are_examined_too() {
+    let work = Workdir::new();
+    let size = CityOptions { views: 40, width: 96, height: 64, points: 1000, ..CityOptions::default() };
+    let options = CityOptions { tiles: [30, 30], exposure: 0.3, ..size };
+    write_city(&work.path("city"), &options, &|_, _| {}).unwrap();
+    let said = told(&work.output(TRAIN, "city --dry-run --steps 300 --device cpu --spill-dir spill"));
+    assert!(said.contains("35 examined") && said.contains("--appearance exposure"), "{said}");
 }
 
 #[test]
