@@ -233,8 +233,9 @@ impl Diagnosis {
         if examined < PHOTOS_FOR_REMEDIES {
             return vec![format!("only {examined} show enough first points to be examined: no remedy is chosen")];
         }
+        let digits = usize::from(self.photos_per_point < 10.0);
         let points = format!(
-            "a photo shows {} first points (median), and {:.0} photos show each point (mean)",
+            "a photo shows {} first points (median), and {:.digits$} photos show each point (mean)",
             format_grouped(self.points_per_photo as u64),
             self.photos_per_point
         );

@@ -202,6 +202,8 @@ struct Measured {
     view_seconds: f64,
     /// Largest share of the Gaussians that a view draws.
     visible_share: f64,
+    /// Largest share of the pages that the steps to do can change: a page that no view sees keeps one version.
+    changed_share: f64,
     /// What steps do with the drive.
     drive: DriveUse,
     /// Frames with the Gaussians of the end; `None` for a run in memory.
@@ -232,6 +234,8 @@ pub(crate) fn plan_run(
     let pages = trainer.scene.pager.index().len().max(1);
     let photos =
         TrainingPhotos { pixels, count: views.len(), per_page: views.len() as f64 * largest.mean / pages as f64 };
+    let steps = config.steps.saturating_sub(steps_done) as usize;
+    let changed_share = (views.len().min(steps) as f64 * largest.mean / pages as f64).min(1.0);
     let (last, known) = match keeps_first_count(&trainer.options.strategy, views.len()) {
         true => (rows, Reach::Kept),
         false => reach(config, rows, photos, steps_done, trainer.growth()),
@@ -241,7 +245,7 @@ pub(crate) fn plan_run(
     let plan = plan_tiers(config, dataset, trainer, tiers, largest, host_mem, &mut memory)?;
     let frames_at_end = limit_memory(config, &plan, host_mem, [rows, last], &mut memory);
     if let Some(free) = plan.free_bytes.filter(|_| plan.frames.is_some() && tiers.spills()) {
-        check_drive(config, free, plan.pages, plan.frame_bytes)?;
+        check_drive(config, free, plan.pages, plan.frame_bytes, changed_share)?;
     }
     let growth = last as f64 / rows.max(1) as f64;
     let step_seconds = probed.seconds * STEP_OVER_RENDERING;
@@ -255,6 +259,7 @@ pub(crate) fn plan_run(
         steps_done,
         view_seconds: probed.seconds,
         visible_share: probed.visible as f64 / rows.max(1) as f64,
+        changed_share,
         drive,
         frames_at_end,
     };
@@ -278,8 +283,9 @@ impl Forecast {
         measured: &Measured,
         host_mem: Option<u64>,
     ) -> Forecast {
-        let Measured { rows, reach: (last, reach), steps_done, view_seconds, visible_share, drive, frames_at_end } =
-            *measured;
+        let Measured {
+            rows, reach: (last, reach), steps_done, view_seconds, visible_share, drive, frames_at_end, ..
+        } = *measured;
         let growth = last as f64 / rows.max(1) as f64;
         let steps = config.steps.saturating_sub(steps_done);
         let step_seconds = view_seconds * STEP_OVER_RENDERING;
@@ -301,7 +307,8 @@ impl Forecast {
             bytes => bytes,
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
-        let slots = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
+        let of_all = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
+        let slots = slots_of(pages_then.ceil() as u64, of_all, measured.changed_share);
         // A run that makes a second commit fills one more segment: evicted versions wait there until the next commit frees them, and
         // the scene gains pages after its first commit.
         let is_short = first_commit_seconds(config).is_none_or(|first| seconds < 2.0 * first);
@@ -394,6 +401,11 @@ fn versions(is_in_memory: bool, commits: u64) -> [u64; 2] {
         (false, 0 | 1) => [1, commits + 1],
         _ => [0, VERSIONS.min(commits + 1)],
     }
+}
+
+/// Slots for one version of each of `pages` pages, and for the others of `of_all` versions where a page of the changed share has them.
+fn slots_of(pages: u64, of_all: u64, changed_share: f64) -> u64 {
+    pages + (changed_share * of_all.saturating_sub(pages) as f64).ceil() as u64
 }
 
 /// Bytes of a PLY of `rows` Gaussians.
@@ -508,11 +520,18 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
 
 /// Refuses a drive that cannot hold the `now` pages of a scene, and warns of one that may not hold the `most` pages of the
 /// grown scene with its last commits.
-fn check_drive(config: &TrainConfig, free: u64, [now, most]: [u64; 2], frame_bytes: u64) -> InputResult<()> {
+fn check_drive(
+    config: &TrainConfig,
+    free: u64,
+    [now, most]: [u64; 2],
+    frame_bytes: u64,
+    changed_share: f64,
+) -> InputResult<()> {
     // Each named checkpoint of --save-every may hold a version of every page.
     let kept = u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0));
     refuse_small_drive(free, now, frame_bytes)?;
-    let with_past = drive_bytes(most, frame_bytes).saturating_mul(VERSIONS.saturating_add(kept));
+    let of_all = most.saturating_mul(VERSIONS.saturating_add(kept));
+    let with_past = drive_bytes(slots_of(most, of_all, changed_share), frame_bytes);
     if free < with_past {
         let (named, fewer) = match kept {
             0 => (String::new(), ""),
@@ -767,6 +786,8 @@ mod tests {
     fn each_commit_that_is_kept_holds_a_version_of_its_own() {
         assert_eq!([0, 1, 2, 9].map(|commits| versions(true, commits)), [[0, 1], [0, 2], [0, 3], [0, 3]]);
         assert_eq!([0, 1, 2, 9].map(|commits| versions(false, commits)), [[1, 1], [1, 2], [0, 3], [0, 3]]);
+        // Pages that no view sees have one.
+        assert_eq!([0.0, 0.1, 1.0].map(|share| slots_of(100, 300, share)), [100, 120, 300]);
     }
 
     #[test]
