@@ -64,6 +64,7 @@ fn start(flags: &Flags) -> InputResult<()> {
         features: FeatureOptions { max_image_size: flags.max_resolution, max_features: flags.features },
     })?;
     if flags.dry_run {
+        search.warnings.iter().for_each(|warning| gsscale::tell!("warning: {warning}"));
         gsscale::say!("{}", search.forecast());
         return Ok(());
     }

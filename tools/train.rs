@@ -11,12 +11,12 @@ use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::config::new_run;
 use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::poses::{PoseSearch, PosesRequest};
+use gsscale::poses::{MORE_OVERLAP, PoseSearch, PosesRequest};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::begin::run;
-use gsscale::train::run::out_folder::{default_out, is_trace, remedy_of_existing};
+use gsscale::train::run::out_folder::{check_usable_out, default_out, is_trace, remedy_of_existing};
 use gsscale::train::run::request::{Existing, RunOutcome, RunRequest};
 use gsscale::train::run::resume::{ResumeRequest, describe_resume, go_on, resume};
 use std::net::SocketAddr;
@@ -170,22 +170,30 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     if args.demo {
         check_demo_out(&out, args.overwrite)?;
     }
+    let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
     let mut scratch = None;
     let scene = match args.scene {
         Some(photos) if args.poses.is_some() && lacks_poses(&photos) => {
+            // Not hours later.
+            check_usable_out(&out, existing)?;
             let search = PoseSearch::new(&PosesRequest::of(&photos))?;
             if args.dry_run {
                 gsscale::say!("{}", search.forecast());
                 return Ok(RunOutcome::of_nothing(out));
             }
-            search.run_shown(args.quiet)?.scene
+            let found = search.run_shown(args.quiet)?;
+            if 2 * found.registered < found.photos {
+                let problem = format!("only {} of {} photos have poses", found.registered, found.photos);
+                let remedy = format!("{MORE_OVERLAP}; to train with these: gsscale-train {}", found.scene.display());
+                return Err(InputError::new(&photos, problem, remedy).into());
+            }
+            found.scene
         }
         Some(scene) => scene,
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.quiet)?,
     };
     let (dry_run, quiet) = (args.dry_run, args.quiet);
-    let existing = if args.overwrite || args.demo { Existing::Overwrite } else { Existing::Refuse };
     // What the run was started with is in its config.
     let (keys, accept_changes) = (TrainOverrides::default(), false);
     let request = RunRequest { scene, out, config, dry_run, existing, quiet, live, leg: None };

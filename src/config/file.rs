@@ -15,7 +15,7 @@ use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
-use crate::config::habits::{ALIASES, advice_for};
+use crate::config::habits::{ALIASES, advice_for, with_our_spelling};
 use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, RgbColor, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -571,6 +571,7 @@ pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T
 
 /// As [`parse_command_line`], for given arguments, starting with the program's name.
 pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
+    let arguments = &with_our_spelling(arguments)[..];
     if let Some((flag, advice)) = advice_for(arguments) {
         crate::tell!("error: {flag} is no flag of gsscale\n  remedy: {advice}");
         std::process::exit(2);

@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 
 const EXTENSIONS: [&str; 3] = ["png", "jpg", "jpeg"];
 /// Folders of masks, folded.
-const FOLDERS: [&str; 5] = ["masks", "mask", "_mask", "_masks", ".mask"];
+pub(crate) const FOLDERS: [&str; 5] = ["masks", "mask", "_mask", "_masks", ".mask"];
 /// What stands before and after the photo's name, with or without its ending, and whether white is left out: RealityScan's,
 /// Metashape's, OpenMVG's and OpenDroneMap's, instant-ngp's. The first is for folders of masks alone.
 const FORMS: [(&str, &str, bool); 6] = [

@@ -45,6 +45,13 @@ pub(super) fn photos_in(folder: &Path) -> usize {
     entries.take(FILES_MAX).filter(|entry| is_photo(&entry.path())).count()
 }
 
+/// The same, with folders in it and theirs; links to folders are not followed.
+pub(super) fn photos_below(folder: &Path, deepest: usize) -> usize {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().take(FILES_MAX);
+    let folders = entries.filter(|entry| entry.file_type().is_ok_and(|kind| kind.is_dir()) && deepest > 0);
+    photos_in(folder) + folders.map(|entry| photos_below(&entry.path(), deepest - 1)).sum::<usize>()
+}
+
 /// The folders in front of a name, and its last component.
 pub(super) fn split_folder(name: &str) -> (&str, &str) {
     name.rsplit_once('/').unwrap_or(("", name))

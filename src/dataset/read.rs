@@ -5,7 +5,7 @@ use crate::base::text::{as_windows_1252, has_raw_bytes, head_of, shown};
 use crate::dataset::gathered::{listed, sort_views};
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::name_index::photos_in;
+use crate::dataset::name_index::{photos_below, photos_in};
 use crate::dataset::{colmap, mega_nerf, opensfm, reality_capture, transforms};
 use std::path::{Path, PathBuf};
 
@@ -142,10 +142,13 @@ pub fn lacks_poses(path: &Path) -> bool {
         && without_poses(path).is_some()
 }
 
+/// Photos of a drone's card lie in folders of folders.
+const FOLDERS_DEEP: usize = 3;
+
 /// The error, which says how to get poses, for a folder of photos without a model that a reader knows.
 fn without_poses(folder: &Path) -> Option<InputError> {
     let images = folder.join("images");
-    let count = [images.as_path(), folder].into_iter().map(photos_in).find(|n| *n > 0)?;
+    let count = [images.as_path(), folder].into_iter().map(|at| photos_below(at, FOLDERS_DEEP)).find(|n| *n > 0)?;
     let place = folder.display();
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(

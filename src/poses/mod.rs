@@ -27,12 +27,14 @@ use crate::dataset::exif::GpsPlace;
 use crate::dataset::model::{RawScene, ReadOptions};
 use crate::dataset::read::read_scene;
 use geo::{Similarity, metres_from, robust_similarity};
+use glam::DVec3;
 use pairs::{ChosenBy, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos};
 use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
-use std::fs::{File, TryLockError};
+use std::fs::{File, Metadata, TryLockError};
+use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
 
 /// The folder in the scene in which the program works.
@@ -129,14 +131,16 @@ impl PoseSearch {
             |a: &Path, b: &Path| a == b || a.canonicalize().is_ok_and(|a| b.canonicalize().is_ok_and(|b| a == b));
         let links_photos = !same(&scene, &home);
         let sparse = scene.join(SPARSE);
-        if sparse.exists() {
+        let is_empty = |folder: &Path| std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
+        if sparse.exists() && !is_empty(&sparse) {
             let remedy = format!(
-                "to train with it: gsscale-train {}; for new poses, name another folder with --out",
-                scene.display()
+                "to train with it: gsscale-train {}; for new poses: gsscale-poses {} --out FOLDER",
+                scene.display(),
+                request.photos.display()
             );
             return Err(InputError::new(sparse, "a model is here already", remedy));
         }
-        let (photos, warnings) = list_photos(&folder)?;
+        let (photos, warnings) = list_photos(&folder, &scene)?;
         let is_flat = !links_photos && same(&folder, &scene);
         if let Some(below) = photos.iter().find(|photo| is_flat && photo.name.contains('/')) {
             let problem = format!("photos lie in sub-folders ({})", below.name);
@@ -206,6 +210,8 @@ impl PoseSearch {
         let found = found?;
         if !quiet {
             crate::tell!("{found}");
+        } else if found.registered < found.photos * 9 / 10 {
+            crate::tell!("warning: {} of {} photos have poses", found.registered, found.photos);
         }
         Ok(found)
     }
@@ -267,6 +273,13 @@ impl PoseSearch {
             return Ok((new, lock));
         }
         let file = work.join(STATE_FILE);
+        let entries = || std::fs::read_dir(work).into_iter().flatten().flatten();
+        if !file.exists() && entries().all(|entry| entry.file_name() == "lock") {
+            // A search was killed before its first word.
+            let lock = lock(work)?;
+            new.write(work)?;
+            return Ok((new, lock));
+        }
         let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<SearchState>(&text).ok());
         let Some(old) = old.filter(|old| old.made_by == MADE_BY) else {
             let problem = "exists already, and is not a work folder of gsscale-poses";
@@ -280,6 +293,12 @@ impl PoseSearch {
         if (SearchState { done: Vec::new(), ..old.clone() }) == new {
             return Ok((old, lock));
         }
+        let (was, is) = match (old.program == new.program, old.options == new.options) {
+            (false, _) => (old.program.as_str(), new.program.as_str()),
+            (_, false) => (old.options.as_str(), new.options.as_str()),
+            _ => ("of other photos", "of these"),
+        };
+        crate::tell!("warning: the search begins again: it was {was}, and is {is} now");
         clear(work)?;
         new.write(work)?;
         Ok((new, lock))
@@ -289,11 +308,13 @@ impl PoseSearch {
     fn link_photos(&self, work: &Path) -> InputResult<()> {
         make_folder(&work.join(PHOTOS))?;
         for (i, photo) in self.photos.iter().enumerate() {
-            link(&photo.path, &work.join(PHOTOS).join(self.plain_name(i)))?;
+            let plain = work.join(PHOTOS).join(self.plain_name(i));
+            link(&photo.path, photo.bytes, &plain)?;
             if self.links_photos {
                 let target = self.scene.join("images").join(&photo.name);
                 make_folder(target.parent().unwrap_or(&target))?;
-                link(&photo.path, &target)?;
+                // From the copy, if it is one: the photos may lie on a slow card.
+                link(&plain, photo.bytes, &target)?;
             }
         }
         Ok(())
@@ -382,7 +403,7 @@ impl PoseSearch {
         Ok(FoundPoses { scene: self.scene.clone(), photos: self.photos.len(), registered, missing, aligned, said })
     }
 
-    /// The first place as the origin, the similarity from the model to metres east, north and up of it, and the median distance that
+    /// The place in the middle as the origin, the similarity from the model to metres east, north and up of it, and the median distance that
     /// remains; `None`, with a sentence, where places do not fix it.
     fn align(
         &self,
@@ -392,11 +413,22 @@ impl PoseSearch {
     ) -> Option<(Option<GpsPlace>, Similarity, f64)> {
         let place = |name: &str| self.photos[index(name)?].place.filter(|place| place.altitude.is_some());
         let with_place = || raw.views.iter().filter_map(|view| Some((view.pose.centre(), place(&view.name)?)));
-        let origin = with_place().next()?.1;
+        // Medians: a place that is far off moves neither.
+        let first = with_place().next()?.1;
+        let of_first: Vec<DVec3> = with_place().map(|(_, place)| metres_from(&first, &place)).collect();
+        let median_of = |values: &mut dyn Iterator<Item = f64>| {
+            let mut values: Vec<f64> = values.collect();
+            values.sort_unstable_by(f64::total_cmp);
+            values[values.len() / 2]
+        };
+        let middle = DVec3::from([0, 1, 2].map(|axis| median_of(&mut of_first.iter().map(|at| at[axis]))));
+        let extent = median_of(&mut of_first.iter().map(|at| at.distance(middle)));
+        let nearest = |a: &(&DVec3, GpsPlace), b: &(&DVec3, GpsPlace)| {
+            a.0.distance_squared(middle).total_cmp(&b.0.distance_squared(middle))
+        };
+        let origin = of_first.iter().zip(with_place().map(|(_, place)| place)).min_by(nearest)?.1;
         let (centres, metres): (Vec<_>, Vec<_>) =
             with_place().map(|(at, place)| (at, metres_from(&origin, &place))).unzip();
-        let middle = metres.iter().sum::<glam::DVec3>() / metres.len() as f64;
-        let extent = metres.iter().map(|at| at.distance(middle)).sum::<f64>() / metres.len() as f64;
         match robust_similarity(&centres, &metres) {
             Some((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => Some((Some(origin), moved, rest)),
             Some((_, rest)) => {
@@ -418,7 +450,7 @@ impl PoseSearch {
 
 /// What to do if photos have no pose.
 pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
-    blurred photos; if all is sharp and overlaps, try --max-resolution 2400";
+    blurred photos; if all is sharp and overlaps, try gsscale-poses with --max-resolution 2400";
 
 impl fmt::Display for FoundPoses {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -479,15 +511,15 @@ fn registered_in(line: &str) -> Option<u32> {
     Some(number + 1)
 }
 
-/// Whether COLMAP's mapper writes a file of this path.
+/// Whether COLMAP's mapper writes a file of this path, or this room writes it, perhaps not to its end.
 fn is_of_model(path: &Path) -> bool {
     const STEMS: [&str; 6] = ["cameras", "images", "points3D", "rigs", "frames", "project"];
-    let word =
-        |part: Option<&std::ffi::OsStr>| part.and_then(|part| part.to_str()).map(String::from).unwrap_or_default();
+    let word = |part: Option<&std::ffi::OsStr>| part.and_then(|part| part.to_str()).unwrap_or_default().to_string();
     let is_numbered = path.parent().is_some_and(|parent| word(Some(parent.as_os_str())).parse::<u32>().is_ok());
+    let name = word(path.file_name());
+    let whole = name.strip_prefix('.').and_then(|name| name.strip_suffix(".part")).unwrap_or(&name);
     is_numbered
-        && STEMS.contains(&word(path.file_stem()).as_str())
-        && ["bin", "ini"].contains(&word(path.extension()).as_str())
+        && whole.split_once('.').is_some_and(|(stem, end)| STEMS.contains(&stem) && ["bin", "ini"].contains(&end))
 }
 
 /// Removes what earlier work left in a folder of ours.
@@ -528,17 +560,40 @@ fn make_folder(folder: &Path) -> InputResult<()> {
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
 }
 
-/// A second name for a photo, or a copy where the drive knows no second names. An existing one stays.
-fn link(photo: &Path, name: &Path) -> InputResult<()> {
-    if name.exists() {
-        return Ok(());
-    }
+/// Whether these are of two names of one file, as far as the system tells.
+#[cfg(unix)]
+fn are_one(a: &Metadata, b: &Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    (a.dev(), a.ino()) == (b.dev(), b.ino())
+}
+
+#[cfg(not(unix))]
+fn are_one(_: &Metadata, _: &Metadata) -> bool {
+    false
+}
+
+/// A second name for a photo of so many bytes, or a copy where the drive knows no second names. Such a name stays, and a whole copy that is
+/// younger than the photo; an earlier photo of the name, or a copy that was cut off, is replaced.
+fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
     // A link's own target, so that moving the link leaves the photo reachable.
     let photo = photo.canonicalize().unwrap_or_else(|_| photo.to_path_buf());
-    if std::fs::hard_link(&photo, name).is_ok() {
+    let stays = |now: Metadata, of_photo: Metadata| {
+        let younger = now.modified().ok().zip(of_photo.modified().ok()).is_some_and(|(now, of_photo)| now > of_photo);
+        now.is_file() && now.len() == bytes && (younger || are_one(&now, &of_photo))
+    };
+    if std::fs::symlink_metadata(name).is_ok_and(|now| std::fs::metadata(&photo).is_ok_and(|of| stays(now, of))) {
         return Ok(());
     }
-    std::fs::copy(&photo, name).map(|_| ()).map_err(|e| InputError::io(name, "copying a photo", &e))
+    let fail = |e: std::io::Error| InputError::io(name, "copying a photo", &e);
+    let part = name.with_file_name(format!(".{}.part", name.file_name().unwrap_or_default().to_string_lossy()));
+    let absent = |done: std::io::Result<()>| done.or_else(|e| if e.kind() == NotFound { Ok(()) } else { Err(e) });
+    absent(std::fs::remove_file(&part)).map_err(fail)?;
+    if std::fs::hard_link(&photo, &part).is_err() {
+        std::fs::copy(&photo, &part).map_err(fail)?;
+    }
+    // Two names of one file: a rename would leave both.
+    absent(std::fs::remove_file(name)).map_err(fail)?;
+    std::fs::rename(&part, name).map_err(fail)
 }
 
 #[cfg(test)]
@@ -587,12 +642,31 @@ mod tests {
     }
 
     #[test]
+    fn a_photo_is_linked_whole_and_again_when_it_has_changed() {
+        let root = tempfile::tempdir().unwrap();
+        let [photo, name] = ["a.jpg", "b.jpg"].map(|name| root.path().join(name));
+        std::fs::write(&photo, b"photo").unwrap();
+        // A copy that was cut off, then one that is whole, then another photo of the same length.
+        std::fs::write(&name, b"ph").unwrap();
+        for content in ["photo", "photo", "other"] {
+            if content == "other" {
+                std::fs::remove_file(&photo).unwrap();
+                std::fs::write(&photo, content).unwrap();
+            }
+            link(&photo, 5, &name).unwrap();
+            assert_eq!(std::fs::read(&name).unwrap(), content.as_bytes());
+        }
+        assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 2, "no part is left");
+    }
+
+    #[test]
     fn only_what_a_search_makes_is_removed() {
         let root = tempfile::tempdir().unwrap();
         let work = root.path();
         for file in [
             "sparse/0/images.bin",
             "sparse/1/project.ini",
+            "sparse/1/.points3D.bin.part",
             "database.db",
             "database.db-wal",
             "photos/000001.jpg",

@@ -85,11 +85,17 @@ pub fn choose_pairs(photos: &[FoundPhoto], alike: impl FnOnce(usize) -> Vec<Vec<
 /// a street. None for one without a place.
 fn nearest(places: &[Option<GpsPlace>]) -> Vec<Vec<usize>> {
     let Some(origin) = places.iter().flatten().next() else { return vec![Vec::new(); places.len()] };
-    let metres: Vec<Option<DVec3>> = places.iter().map(|p| p.as_ref().map(|p| metres_from(origin, p))).collect();
+    // Without the height of a place that states none: it would be that of the sea.
+    let metres: Vec<Option<(DVec3, bool)>> =
+        places.iter().map(|p| p.as_ref().map(|p| (metres_from(origin, p), p.altitude.is_some()))).collect();
     let near = |a: usize| -> Vec<usize> {
-        let Some(at) = metres[a] else { return Vec::new() };
-        let distance =
-            |b: usize| metres[b].filter(|_| a != b).map(|other| (at.distance_squared(other), a.abs_diff(b), b));
+        let Some((at, has_height)) = metres[a] else { return Vec::new() };
+        let distance = |b: usize| {
+            let (other, other_has) = metres[b].filter(|_| a != b)?;
+            let apart = at - other;
+            let apart = if has_height && other_has { apart } else { apart.with_z(0.0) };
+            Some((apart.length_squared(), a.abs_diff(b), b))
+        };
         let mut others: Vec<(f64, usize, usize)> = (0..metres.len()).filter_map(distance).collect();
         let order =
             |x: &(f64, usize, usize), y: &(f64, usize, usize)| x.0.total_cmp(&y.0).then((x.1, x.2).cmp(&(y.1, y.2)));

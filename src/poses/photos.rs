@@ -5,14 +5,18 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::exif::{GpsPlace, camera_and_place};
+use crate::dataset::masks::FOLDERS as MASK_FOLDERS;
 use crate::dataset::photo_header::{PhotoHeader, read_header};
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 /// Folders that hold no photos of the scene, whatever pictures are in them.
-const OTHERS: [&str; 5] = ["sparse", "masks", "mask", "renders", super::WORK_FOLDER];
+const OTHERS: [&str; 3] = ["sparse", "renders", super::WORK_FOLDER];
 const DEEPEST: usize = 8;
+/// What stands around the stem of a photo in the name of its mask.
+const MASK_ENDS: [&str; 3] = [".mask", "_mask", "-mask"];
+const MASK_STARTS: [&str; 2] = ["mask_", "dynamic_mask_"];
 
 #[derive(Debug, Clone)]
 pub struct FoundPhoto {
@@ -26,11 +30,14 @@ pub struct FoundPhoto {
     pub place: Option<GpsPlace>,
 }
 
-/// The photos in `folder` and below it, and one sentence for each that cannot be used.
+/// The photos in `folder` and below it but not in `scene` below it, whose photos are links, and one sentence for each that cannot be used.
 /// Errors: the folder cannot be listed, or holds fewer than three photos that can be read.
-pub fn list_photos(folder: &Path) -> InputResult<(Vec<FoundPhoto>, Vec<String>)> {
+pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>, Vec<String>)> {
     let mut names = Vec::new();
-    add_names(folder, "", 0, &mut names)?;
+    let scene = scene.canonicalize().ok().filter(|scene| folder.canonicalize().is_ok_and(|folder| folder != *scene));
+    let mut others = 0;
+    add_names(folder, scene.as_deref(), "", &mut names, &mut others)?;
+    drop_masks(&mut names);
     names.sort_by_cached_key(|name| natural_order(name));
     let read = |name: &String| {
         let path = folder.join(name);
@@ -43,6 +50,11 @@ pub fn list_photos(folder: &Path) -> InputResult<(Vec<FoundPhoto>, Vec<String>)>
     };
     let read: Vec<Result<FoundPhoto, String>> = names.par_iter().map(read).collect();
     let (mut photos, mut said) = (Vec::new(), Vec::new());
+    if others > 0 {
+        said.push(format!(
+            "{others} files are left out: pictures that are neither JPEG nor PNG (convert them), or names that are not UTF-8"
+        ));
+    }
     for photo in read {
         match photo {
             Ok(photo) => photos.push(photo),
@@ -59,22 +71,57 @@ pub fn list_photos(folder: &Path) -> InputResult<(Vec<FoundPhoto>, Vec<String>)>
     Ok((photos, said))
 }
 
-fn add_names(folder: &Path, prefix: &str, depth: usize, names: &mut Vec<String>) -> InputResult<()> {
+/// Adds the names of photos in `folder`; counts pictures that are not used. `scene` is left out.
+fn add_names(
+    folder: &Path,
+    scene: Option<&Path>,
+    prefix: &str,
+    names: &mut Vec<String>,
+    others: &mut usize,
+) -> InputResult<()> {
     let io = |e: &std::io::Error| InputError::io(folder, "listing the photos", e);
     for entry in std::fs::read_dir(folder).map_err(|e| io(&e))? {
         let entry = entry.map_err(|e| io(&e))?;
-        let Ok(name) = entry.file_name().into_string() else { continue };
         let (path, kind) = (entry.path(), entry.file_type().map_err(|e| io(&e))?);
         let ending = path.extension().map(|ending| ending.to_string_lossy().to_ascii_lowercase());
+        let is_photo = matches!(ending.as_deref(), Some("jpg" | "jpeg" | "png")) && path.is_file();
+        let Ok(name) = entry.file_name().into_string() else {
+            *others += usize::from(is_photo);
+            continue;
+        };
+        let folded = name.to_ascii_lowercase();
+        let is_deep = prefix.matches('/').count() >= DEEPEST;
         if name.starts_with('.') {
             continue;
-        } else if kind.is_dir() && depth < DEEPEST && !OTHERS.contains(&name.to_ascii_lowercase().as_str()) {
-            add_names(&path, &format!("{prefix}{name}/"), depth + 1, names)?;
-        } else if matches!(ending.as_deref(), Some("jpg" | "jpeg" | "png")) && path.is_file() {
+        } else if kind.is_dir() {
+            let is_scene = || scene.is_some_and(|scene| path.canonicalize().is_ok_and(|path| path == scene));
+            if !is_deep && !OTHERS.contains(&folded.as_str()) && !MASK_FOLDERS.contains(&folded.as_str()) && !is_scene()
+            {
+                add_names(&path, scene, &format!("{prefix}{name}/"), names, others)?;
+            }
+        } else if is_photo {
             names.push(format!("{prefix}{name}"));
+        } else if matches!(ending.as_deref(), Some("heic" | "heif" | "tif" | "tiff" | "dng" | "webp" | "avif")) {
+            *others += 1;
         }
     }
     Ok(())
+}
+
+/// Leaves out masks that lie beside their photos: `a.mask.png`, `a_mask.png` and so on beside `a.jpg`.
+fn drop_masks(names: &mut Vec<String>) {
+    let stem = |name: &str| name.rsplit_once('.').map_or(name, |(stem, _)| stem).to_string();
+    let stems: BTreeSet<String> = names.iter().map(|name| stem(name)).collect();
+    let is_mask = |name: &String| {
+        let own = stem(name);
+        let (folder, file) =
+            own.rsplit_once('/').map_or(("", own.as_str()), |(folder, file)| (&own[..=folder.len()], file));
+        let of = |photo: &str| stems.contains(&format!("{folder}{photo}"));
+        MASK_ENDS.iter().any(|end| file.strip_suffix(end).is_some_and(|photo| of(photo) || of(&stem(photo))))
+            || MASK_STARTS.iter().any(|start| file.strip_prefix(start).is_some_and(of))
+    };
+    let kept: Vec<String> = names.iter().filter(|name| !is_mask(name)).cloned().collect();
+    *names = kept;
 }
 
 /// A key that puts `9.jpg` before `10.jpg`: each run of digits begins with its length.
@@ -95,16 +142,19 @@ fn natural_order(name: &str) -> (Vec<u8>, String) {
 }
 
 /// Photos that one camera took at one zoom, which share intrinsics; indices into the photos. Photos without a known camera
-/// share them if they have one size.
+/// share them if they have one size and lie in one folder.
 pub fn camera_groups(photos: &[FoundPhoto]) -> Vec<Vec<usize>> {
-    let mut groups: BTreeMap<(&str, u32, u32), Vec<usize>> = BTreeMap::new();
+    let mut groups: BTreeMap<(&str, &str, u32, u32), Vec<usize>> = BTreeMap::new();
     for (i, photo) in photos.iter().enumerate() {
-        groups.entry((&photo.camera, photo.header.width, photo.header.height)).or_default().push(i);
+        let folder = photo.name.rsplit_once('/').map_or("", |(folder, _)| folder);
+        let folder = if photo.camera.is_empty() { folder } else { "" };
+        groups.entry((&photo.camera, folder, photo.header.width, photo.header.height)).or_default().push(i);
     }
     groups.into_values().collect()
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::dataset::photo_header::PhotoFormat;
@@ -117,8 +167,39 @@ mod tests {
     }
 
     #[test]
+    fn masks_beside_photos_are_no_photos() {
+        let names = [
+            "a.jpg",
+            "a.mask.png",
+            "a.jpg.mask.png",
+            "b/c.png",
+            "b/c_mask.png",
+            "b/mask_c.png",
+            "mask_d.jpg",
+            "c_mask.png",
+        ];
+        let mut names = names.map(String::from).to_vec();
+        drop_masks(&mut names);
+        assert_eq!(names, ["a.jpg", "b/c.png", "mask_d.jpg", "c_mask.png"], "without their photo they are photos");
+    }
+
+    #[test]
+    fn folders_of_masks_and_the_scene_are_left_out() {
+        let root = tempfile::tempdir().unwrap();
+        for name in ["x/1.jpg", "x/2.JPG", "_masks/1.jpg", "out/images/1.jpg", "x/3.heic"] {
+            std::fs::create_dir_all(root.path().join(name).parent().unwrap()).unwrap();
+            std::fs::write(root.path().join(name), b"").unwrap();
+        }
+        let (mut names, mut others) = (Vec::new(), 0);
+        let scene = root.path().join("out").canonicalize().unwrap();
+        add_names(root.path(), Some(&scene), "", &mut names, &mut others).unwrap();
+        names.sort();
+        assert_eq!((names, others), (vec!["x/1.jpg".to_string(), "x/2.JPG".to_string()], 1));
+    }
+
+    #[test]
     fn photos_of_one_camera_one_zoom_and_one_size_are_a_group() {
-        let photo = |camera: &str, width| {
+        let photo_in = |folder: &str, camera: &str, width| {
             let header = PhotoHeader {
                 format: PhotoFormat::Jpeg,
                 width,
@@ -127,10 +208,15 @@ mod tests {
                 has_alpha: false,
                 exif: None,
             };
-            let (name, path, camera) = (String::new(), PathBuf::new(), camera.to_string());
+            let (name, path, camera) = (format!("{folder}/a.jpg"), PathBuf::new(), camera.to_string());
             FoundPhoto { name, path, bytes: 0, header, camera, place: None }
         };
+        let photo = |camera, width| photo_in("x", camera, width);
         let photos = [photo("A 24 mm", 4), photo("A 35 mm", 4), photo("A 24 mm", 4), photo("", 4), photo("A 24 mm", 5)];
         assert_eq!(camera_groups(&photos), [vec![3], vec![0, 2], vec![4], vec![1]]);
+        // Front and rear cameras of a car have the sizes of each other, and their folders.
+        let videos =
+            [photo_in("front", "", 4), photo_in("rear", "", 4), photo_in("rear", "A", 4), photo_in("front", "A", 4)];
+        assert_eq!(camera_groups(&videos), [vec![0], vec![1], vec![2, 3]]);
     }
 }

@@ -1,7 +1,11 @@
 """Runs one phase of COLMAP through pycolmap: what the command of the same name does. gsscale-poses starts it."""
 
-import json
 import sys
+
+# Without the current folder: photos may lie beside a file that is called json.py.
+sys.path[:] = [place for place in sys.path if place]
+
+import json
 
 import pycolmap
 

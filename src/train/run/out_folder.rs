@@ -93,7 +93,7 @@ pub fn scene_name(scene: &Path) -> String {
 
 /// Refuses an output folder in which a run may not begin. Changes nothing, so a dry run asks the same.
 /// Errors: the folder cannot be made, is not empty and `existing` refuses it, is in use, or its checkpoint belongs to another run.
-pub(crate) fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError> {
+pub fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError> {
     if let Some(above) = out.ancestors().find(|above| above.exists()).filter(|above| !above.is_dir()) {
         let problem = format!("the folder cannot be made: {} is a file", above.display());
         return Err(InputError::new(out, problem, "choose another --out").into());
