@@ -4,9 +4,9 @@ use clap::{Parser, Subcommand};
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::units::{format_bytes, format_grouped, format_seconds, parse_count};
-use gsscale::cells::cut::{CellCount, CutRequest, cut};
+use gsscale::cells::cut::{CutRequest, cut};
 use gsscale::cells::merge::{MergeRequest, merge};
-use gsscale::cells::plan::CityPlan;
+use gsscale::cells::plan::{CellCount, CityPlan};
 use gsscale::cells::prior::{PriorRequest, prior};
 use gsscale::cells::seam::seam;
 use gsscale::cells::work::{WorkRequest, code_of, status, work};
@@ -15,7 +15,6 @@ use gsscale::config::values::ByteSize;
 use gsscale::train::error::TrainError;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Duration;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -54,7 +53,7 @@ enum Command {
     Merge {
         /// Folder of the city
         city: PathBuf,
-        /// New folder of the scene
+        /// Folder of the scene
         #[arg(long, short)]
         out: PathBuf,
         /// Memory [default: 70 % of what is free]
@@ -170,7 +169,6 @@ fn start(command: Command) -> Result<i32, TrainError> {
         }
         Command::Run(args) => {
             let RunArgs { city, cell, scene, copy_every, quiet, keys } = *args;
-            let copy_every = Duration::try_from_secs_f64(copy_every).unwrap_or(Duration::from_secs(u32::MAX.into()));
             work(&WorkRequest { city, cell, scene, keys, copy_every, quiet })
         }
         Command::Status { city } => show_status(&city),

@@ -23,6 +23,14 @@ fn cpu_seconds_of(stat: &str) -> Option<[f64; 2]> {
     Some([ticks()? as f64 / 100.0, ticks()? as f64 / 100.0])
 }
 
+/// The name of this machine in its network.
+pub fn host_name() -> String {
+    #[cfg(unix)]
+    return rustix::system::uname().nodename().to_string_lossy().into_owned();
+    #[cfg(not(unix))]
+    std::env::var("COMPUTERNAME").unwrap_or_default()
+}
+
 /// The processor's name as the system gives it, else its architecture.
 pub fn cpu_model() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();

@@ -57,6 +57,11 @@ impl PartFolder {
         Ok(())
     }
 
+    /// The temporary folder, for writers of files with their own protocol. What they write there must be ours.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// Bytes of the files so far.
     pub fn bytes(&self) -> u64 {
         self.bytes

@@ -4,11 +4,11 @@
 //! Invariants: 1. every page has one owner, by its middle; every training view is in some cell; 2. every cell has `VIEWS_LEAST` training
 //! views, or there is only one cell; 3. `plan.toml` is written last; a city is cut once.
 
-use super::plan::{CELL_FILES, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
+use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
 use super::prior::GAUSSIANS_SHARE;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
-use super::{City, check_machine_keys, config_of};
+use super::{City, check_machine_keys, check_range, config_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -27,14 +27,6 @@ const REMEDIES: [&str; 4] = ["appearance", "robust-views", "robust-pixels", "ref
 const VIEWS_LEAST: usize = 8;
 /// Pages are this full on average.
 const FILL: f64 = 0.7;
-
-/// How many cells a city gets.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum CellCount {
-    Cells(usize),
-    /// As many as it takes for none to train more Gaussians than this.
-    MostGaussians(u64),
-}
 
 /// A city to cut.
 #[derive(Debug, Clone)]
@@ -59,17 +51,30 @@ pub(crate) struct Draft {
     pub frozen: Vec<usize>,
 }
 
-/// Cuts the city.
-/// Errors: it is cut already, there is no prior, or it has too few pages.
+/// Cuts the city; returns the plan of one that is cut already in the same way.
+/// Errors: it is cut in another way, there is no prior, or it has too few pages.
 pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
     let city = City(request.city.clone());
     check_machine_keys(&request.keys)?;
+    check_range("--margin", request.margin, 0.0..=10.0)?;
+    check_range("--view-share", request.view_share, 0.0..=1.0)?;
+    if matches!(request.cells, CellCount::Cells(0) | CellCount::MostGaussians(0)) {
+        let problem = "a city has one cell at least, with one Gaussian at least";
+        return Err(InputError::new("--cells", problem, "give a number from 1 on").into());
+    }
     if !request.dry_run && city.plan().exists() {
-        let problem = "the city is cut already";
+        let plan = CityPlan::read(&city)?;
+        if (plan.asked, plan.view_share, plan.margin) == (request.cells, request.view_share, request.margin) {
+            crate::tell!("the city in {} is cut", city.0.display());
+            return Ok(plan);
+        }
+        let problem = "the city is cut already, in another way";
         return Err(InputError::new(city.plan(), problem, "go on with gsscale-cells run, or begin another city").into());
     }
     let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
     keys.extend(remedies_of_prior(&city)?);
+    // The rows of the prior are no poor points.
+    keys.entry("poor-points").or_insert_with(|| "off".into());
     let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
     let seen = see(&request.scene, &city, &request.keys, request.quiet)?;
     let gaussians: u64 = seen.pages.iter().map(|page| page.rows).sum();
@@ -88,9 +93,10 @@ pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
     }
     let plan = CityPlan {
         version: env!("CARGO_PKG_VERSION").to_string(),
-        prior: prior_digest(&city, seen.digest),
+        prior: prior_digest(&city, seen.digest)?,
         gaussians,
         views,
+        asked: request.cells,
         growth,
         view_share: request.view_share,
         margin: request.margin,
@@ -118,7 +124,7 @@ pub(crate) fn remedies_of_prior(city: &City) -> InputResult<toml::Table> {
 /// Cells of the number asked for or, if that is a number of Gaussians, the fewest whose trained rows stay below it.
 fn fitting_cells(seen: &Seen, request: &CutRequest, growth: f64) -> InputResult<(Vec<GroundRect>, Vec<Draft>)> {
     let (mut cells, most) = match request.cells {
-        CellCount::Cells(cells) => (cells.max(1), u64::MAX),
+        CellCount::Cells(cells) => (cells, u64::MAX),
         CellCount::MostGaussians(most) => (1, most),
     };
     loop {
@@ -191,11 +197,11 @@ fn drafts(seen: &Seen, mut leaves: Vec<GroundRect>, request: &CutRequest) -> (Ve
         let cell_at = |at: [f64; 2]| leaves.iter().find(|leaf| leaf.holds(at)).map_or(0, |leaf| leaf.cell);
         let owner: Vec<usize> = seen.pages.iter().map(|page| cell_at(page.middle)).collect();
         let shares: Vec<Vec<f64>> = seen.views.iter().map(|view| shares_of(view, &owner, cells)).collect();
-        let takes = |view: usize, cell: usize| {
-            let of_view = &shares[view];
-            let largest = (0..cells).fold(0, |best, cell| if of_view[cell] > of_view[best] { cell } else { best });
-            of_view[cell] >= request.view_share || cell == largest || cell_at(seen.views[view].at) == cell
-        };
+        let largest = |shares: &Vec<f64>| (0..cells).rev().max_by(|&a, &b| shares[a].total_cmp(&shares[b]));
+        let own: Vec<[Option<usize>; 2]> =
+            shares.iter().zip(&seen.views).map(|(shares, view)| [largest(shares), Some(cell_at(view.at))]).collect();
+        let takes =
+            |view: usize, cell: usize| shares[view][cell] >= request.view_share || own[view].contains(&Some(cell));
         let views = |cell: usize, is_train: bool| -> Vec<usize> {
             (0..seen.views.len()).filter(|&view| seen.views[view].is_train == is_train && takes(view, cell)).collect()
         };

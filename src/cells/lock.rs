@@ -1,20 +1,23 @@
 //! One owner for each cell, on any number of machines that see one folder: a file with the owner's name, held by the system's lock where
 //! the file system has locks, and by a heartbeat where it has none, or other machines do not see them.
 //!
-//! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. who
+//! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. of
+//! several that find no owner one makes the file; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
 //! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
 //! and no result: the bytes are the same.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
+use crate::base::machine::host_name;
 use std::fs::{File, OpenOptions, TryLockError};
+use std::io::{Error, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
-use std::time::{Duration, SystemTime};
+use std::time::Duration;
 
 /// Name of the lock in the folder of a cell.
 const LOCK: &str = "lock";
-/// Time between heartbeats, and the age from which an owner on another machine counts as lost.
+/// Time between heartbeats, and the age from which an owner whose end the system does not tell counts as lost.
 const BEAT: Duration = Duration::from_secs(10);
 const LOST_AFTER: Duration = Duration::from_secs(90);
 
@@ -34,24 +37,38 @@ impl CellLock {
     /// Errors: the folder cannot be written.
     pub fn take(folder: &Path) -> InputResult<Result<CellLock, String>> {
         let path = folder.join(LOCK);
-        let failed = |e: std::io::Error| InputError::io(&path, "taking the cell", &e);
-        let file =
-            OpenOptions::new().read(true).write(true).create(true).truncate(false).open(&path).map_err(failed)?;
-        let owner = std::fs::read_to_string(&path).map_err(failed)?;
-        if matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
-            return Ok(Err(owner));
-        }
-        // The system's lock says nothing about processes of other machines.
-        let is_foreign = !owner.is_empty() && machine_of(&owner) != machine();
-        if is_foreign && age(&path, folder)? < LOST_AFTER {
-            return Ok(Err(owner));
-        }
-        let token = format!("{} process {} {:032x}", machine(), std::process::id(), draw_identity());
-        std::fs::write(&path, &token).map_err(failed)?;
-        if is_foreign {
-            // Another machine may have found the same lost owner: the one that wrote last keeps the cell.
-            std::thread::sleep(BEAT);
-        }
+        let failed = |e: Error| InputError::io(&path, "taking the cell", &e);
+        let token = format!("{} process {} {:032x}", host_name(), std::process::id(), draw_identity());
+        let mut options = OpenOptions::new();
+        options.read(true).write(true);
+        let file = match options.clone().create_new(true).open(&path) {
+            Ok(file) => {
+                write_token(&file, &token).map_err(failed)?;
+                // Who looks at the file may hold it for a moment.
+                let _ = file.lock();
+                file
+            }
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {
+                let file = options.open(&path).map_err(failed)?;
+                let owner = std::fs::read_to_string(&path).map_err(failed)?;
+                let is_gone = match file.try_lock() {
+                    Err(TryLockError::WouldBlock) => return Ok(Err(owner)),
+                    // The system's lock says nothing about processes of other machines.
+                    locked => locked.is_ok() && machine_of(&owner) == host_name(),
+                };
+                if !is_gone && age(&path, folder)? < LOST_AFTER {
+                    return Ok(Err(owner));
+                }
+                file.set_len(0).and_then(|()| write_token(&file, &token)).map_err(failed)?;
+                if !is_gone {
+                    // Another machine may have found the same lost owner: the one that wrote last keeps the cell.
+                    std::thread::sleep(BEAT);
+                }
+                file
+            }
+            Err(error) => return Err(failed(error)),
+        };
+        let beating = file.try_clone().map_err(failed)?;
         let (alive, ended) = channel::<()>();
         let lock = CellLock { path: path.clone(), token: token.clone(), _alive: alive, _file: file };
         if !lock.is_held() {
@@ -61,7 +78,7 @@ impl CellLock {
             while ended.recv_timeout(BEAT) == Err(RecvTimeoutError::Timeout) {
                 // A beat that is missed is made up by the next.
                 if std::fs::read_to_string(&path).is_ok_and(|owner| owner == token) {
-                    let _ = std::fs::write(&path, &token);
+                    let _ = write_token(&beating, &token);
                 }
             }
         });
@@ -77,24 +94,28 @@ impl CellLock {
 impl Drop for CellLock {
     fn drop(&mut self) {
         if self.is_held() {
-            // Emptied, not removed: another process may wait with the file open.
-            let _ = std::fs::write(&self.path, "");
+            let _ = std::fs::remove_file(&self.path);
         }
     }
+}
+
+/// Writes the owner at the beginning of the lock file, whose time changes with it.
+fn write_token(mut file: &File, token: &str) -> std::io::Result<()> {
+    file.rewind().and_then(|()| file.write_all(token.as_bytes()))
 }
 
 /// The owner of a cell that is worked on now, as far as the folder tells.
 pub(crate) fn owner_of(folder: &Path) -> Option<String> {
     let path = folder.join(LOCK);
-    let owner = std::fs::read_to_string(&path).ok().filter(|owner| !owner.is_empty())?;
-    let modified = std::fs::metadata(&path).and_then(|of| of.modified()).ok()?;
-    let is_lost = SystemTime::now().duration_since(modified).is_ok_and(|age| age > LOST_AFTER);
+    let owner = std::fs::read_to_string(&path).ok()?;
+    // In a folder that cannot be written the age is unknown.
+    let is_lost = age(&path, folder).is_ok_and(|age| age > LOST_AFTER);
     (!is_lost).then_some(owner)
 }
 
 /// How long ago a file was written, by the clock that gives files in `folder` their times.
 fn age(path: &Path, folder: &Path) -> InputResult<Duration> {
-    let failed = |e: std::io::Error| InputError::io(folder, "reading the time of the folder", &e);
+    let failed = |e: Error| InputError::io(folder, "reading the time of the folder", &e);
     let probe = folder.join(format!("lock.{:032x}", draw_identity()));
     std::fs::write(&probe, b"?").map_err(failed)?;
     let now = std::fs::metadata(&probe).and_then(|of| of.modified());
@@ -107,10 +128,24 @@ fn machine_of(owner: &str) -> &str {
     owner.split(" process ").next().unwrap_or_default()
 }
 
-/// A name that no other machine of the network has.
-fn machine() -> String {
-    #[cfg(unix)]
-    return rustix::system::uname().nodename().to_string_lossy().into_owned();
-    #[cfg(not(unix))]
-    std::env::var("COMPUTERNAME").unwrap_or_default()
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+
+    #[test]
+    fn of_many_that_start_at_once_one_takes_the_cell() {
+        let folder = tempfile::tempdir().unwrap();
+        for _ in 0..20 {
+            let taken: Vec<Result<CellLock, String>> = std::thread::scope(|scope| {
+                let threads: Vec<_> = (0..4).map(|_| scope.spawn(|| CellLock::take(folder.path()).unwrap())).collect();
+                threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+            });
+            let owners: Vec<&CellLock> = taken.iter().flatten().collect();
+            assert_eq!(owners.len(), 1);
+            assert!(owners[0].is_held());
+            assert_eq!(owner_of(folder.path()), Some(owners[0].token.clone()));
+        }
+        assert_eq!(owner_of(folder.path()), None);
+    }
 }

@@ -6,50 +6,60 @@
 //! that came from growth are told by place alone: their identities say nothing about where they came from. So of a row that two cells have split
 //! in the same round, both may keep a child; that was one row of 4,200.
 //!
-//! Invariants: 1. the result is a function of the cells' copies and the plan; 2. no identity of a prior row comes twice; 3. the PLY appears
-//! as a whole.
+//! Invariants: 1. the result is a function of the cells' copies and the plan; 2. no identity of a prior row comes twice; 3. the folder appears
+//! as a whole; 4. of rows that may be put back only the pages are kept in memory.
 
 use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
-use super::work::{done_of, newest_copy};
+use super::work::{copy_of, done_of};
 use super::{City, config_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
-use crate::base::ids::PageId;
+use crate::base::ids::{PageId, PageNo};
 use crate::base::text::read_text;
-use crate::base::whole_file::write_whole;
+use crate::base::whole_file::{folder_of, part_path};
+use crate::base::whole_folder::PartFolder;
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved, write_config};
 use crate::config::new_run;
 use crate::config::values::Up;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::sink::GaussianSink;
+use crate::exchange::transform::transform_path;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
 use crate::scene::columns::{Column, Columns};
 use crate::scene::page_meta::PageMeta;
 use crate::scene::rotation::Rotation;
 use crate::train::error::TrainError;
+use crate::train::inputs::machine::absolute;
 use crate::train::memory::host_budget;
 use crate::train::stores::StoredStart;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The polish takes one in this many of the steps.
 const POLISH_SHARE: u32 = 20;
+/// What was merged, from which plan.
+const MERGED_FILE: &str = "merged.toml";
+const POLISH_FILE: &str = "polish.toml";
+const POLISH_VIEWS_FILE: &str = "polish_views.txt";
 
 /// Cells to merge.
 #[derive(Debug, Clone)]
 pub struct MergeRequest {
     pub city: PathBuf,
-    /// The folder of the scene, which does not exist.
+    /// The folder of the scene, which does not exist, or holds the same merge.
     pub out: PathBuf,
     /// Memory, bytes; 0 for 70 % of what is free.
     pub host_mem: u64,
 }
 
 /// What a merge took from the cells.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, Serialize, Deserialize)]
 pub struct Merged {
+    /// Digest of the plan.
+    pub plan: String,
     pub gaussians: u64,
     /// Of each cell.
     pub kept: Vec<u64>,
@@ -69,37 +79,42 @@ impl KeptRows {
         KeptRows(vec![0; rows.div_ceil(64) as usize])
     }
 
-    /// The bit of a row of the prior; `None` for a row that came from growth.
-    fn bit(&mut self, uid: u64) -> Option<(&mut u64, u64)> {
-        self.0.get_mut(usize::try_from(uid / 64).ok()?).map(|word| (word, 1 << (uid % 64)))
-    }
-
-    /// Marks a row; false if it was marked before.
+    /// Marks a row; false if it was marked before. Rows that came from growth are never marked.
     fn insert(&mut self, uid: u64) -> bool {
-        self.bit(uid).is_none_or(|(word, bit)| {
-            let is_new = *word & bit == 0;
-            *word |= bit;
-            is_new
-        })
-    }
-
-    fn holds(&mut self, uid: u64) -> bool {
-        self.bit(uid).is_some_and(|(word, bit)| *word & bit != 0)
+        let Some(word) = usize::try_from(uid / 64).ok().and_then(|word| self.0.get_mut(word)) else { return true };
+        let (before, bit) = (*word, 1 << (uid % 64));
+        *word |= bit;
+        before & bit == 0
     }
 }
 
-/// Writes the scene of all cells as a folder that `gsscale-eval`, viewers and `--init-ply` take.
-/// Errors: a cell is not done, or a copy cannot be read, or `out` exists or cannot be written.
+/// Whether a merge writes a file of this name, or the temporary file of one.
+fn is_merged(file: &Path) -> bool {
+    let ply = Path::new(PLY_FILE);
+    let names = [MERGED_FILE, POLISH_FILE, POLISH_VIEWS_FILE, CONFIG_FILE].map(PathBuf::from);
+    let names = names.into_iter().chain([ply.to_path_buf(), transform_path(ply)]);
+    names.into_iter().any(|name| name == file || part_path(&name).is_some_and(|part| part == file))
+}
+
+/// Writes the scene of all cells as a folder that `gsscale-eval`, viewers and `--init-ply` take; of cells that are merged there already it
+/// only says what was.
+/// Errors: a cell is not done, or a copy cannot be read, or `out` holds something else or cannot be written.
 pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     let city = City(request.city.clone());
     let plan = CityPlan::read(&city)?;
+    let digest = plan.digest(&city.plan())?;
     if request.out.exists() {
-        return Err(InputError::new(&request.out, "exists already", "name a folder that does not exist").into());
+        let before = std::fs::read_to_string(request.out.join(MERGED_FILE)).ok();
+        let before =
+            before.and_then(|text| toml::from_str::<Merged>(&text).ok()).filter(|merged| merged.plan == digest);
+        let refused = || InputError::new(&request.out, "exists already", "name a folder that does not exist");
+        return Ok(before.ok_or_else(refused)?);
     }
-    let mut open = Vec::new();
+    let (mut open, mut copies) = (Vec::new(), Vec::new());
     for cell in 0..plan.cells.len() {
-        if done_of(&plan, &city, cell)?.is_none() {
-            open.push(cell.to_string());
+        match done_of(&plan, &city, cell)? {
+            Some(done) => copies.push(copy_of(&city.cell(cell), done.copy)),
+            None => open.push(cell.to_string()),
         }
     }
     if !open.is_empty() {
@@ -109,62 +124,110 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     let keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
     let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
     let facts = read_resolved(&city.prior_run().join(CONFIG_FILE))?;
-    std::fs::create_dir_all(&request.out).map_err(|e| InputError::io(&request.out, "making the folder", &e))?;
-    let meta = meta_of(&plan, &config, &facts);
+    let above = folder_of(&request.out);
+    std::fs::create_dir_all(above).map_err(|e| InputError::io(above, "making the folder", &e))?;
+    let mut folder = PartFolder::create(&request.out, is_merged)?;
+    let (meta, ply) = (meta_of(&plan, &config, &facts), folder.path().join(PLY_FILE));
     let most: u64 = plan.cells.iter().map(|cell| cell.max_gaussians).sum();
-    let mut sink = ExportFormat::Ply.create(&request.out.join(PLY_FILE), config.sh_degree, most, &meta)?;
+    let mut sink = ExportFormat::Ply.create(&ply, config.sh_degree, most, &meta)?;
     let memory = host_budget(request.host_mem).unwrap_or(1 << 30);
-    let mut prior = StoredStart::open(&city.prior_store(), memory, 2)?;
     let owner = |page: &PageMeta| (page.id, plan.cell_at(plan.ground(page.bounds.centre())));
+    let mut prior = StoredStart::open(&city.prior_store(), memory, 2)?;
     let owners = prior.scene().pager.index().iter().map(owner).collect();
     drop(prior);
-    let (kept, astray, done) = (KeptRows::new(plan.gaussians), BTreeMap::new(), Merged::default());
-    let mut merged = Merging { plan: &plan, city: &city, owners, kept, astray, done };
-    for cell in 0..plan.cells.len() {
-        merged.add_cell(cell, memory, &mut *sink)?;
+    let (kept, done) = (KeptRows::new(plan.gaussians), Merged { plan: digest, ..Merged::default() });
+    let mut merging = Merging { plan: &plan, owners, kept, done };
+    let mut astray = Vec::new();
+    for (cell, copy) in copies.iter().enumerate() {
+        let owned = merging.owned_pages(&city.cell(cell), cell)?;
+        astray.push(merging.add_cell(cell, &owned, StoredStart::open(copy, memory, 2)?, &mut *sink)?);
     }
-    merged.put_back(&mut *sink)?;
+    for (cell, (copy, pages)) in copies.iter().zip(astray).enumerate().filter(|(_, (_, pages))| !pages.is_empty()) {
+        merging.put_back(cell, &pages, StoredStart::open(copy, memory, 2)?, &mut *sink)?;
+    }
     let written = sink.finish()?;
-    ExportFormat::Ply.write_transform(&request.out.join(PLY_FILE), &meta, written.frame)?;
+    ExportFormat::Ply.write_transform(&ply, &meta, written.frame)?;
     let facts = Resolved { run: RunId::UNKNOWN, gaussians: written.rows, made_spill_dir: false, ..facts };
-    write_config(&request.out.join(CONFIG_FILE), &config, &facts)?;
-    write_polish(&plan, &city, &request.out)?;
-    Ok(Merged { gaussians: written.rows, ..merged.done })
+    write_config(&folder.path().join(CONFIG_FILE), &config, &facts)?;
+    write_polish(&plan, &city, &request.out, &mut folder)?;
+    let merged = Merged { gaussians: written.rows, ..merging.done };
+    let text = toml::to_string(&merged);
+    let text = text.map_err(|e| InputError::new(MERGED_FILE, e.to_string(), "report this as a bug"))?;
+    folder.write(Path::new(MERGED_FILE), text.as_bytes())?;
+    folder.finish()?;
+    Ok(merged)
 }
 
 struct Merging<'a> {
     plan: &'a CityPlan,
-    city: &'a City,
     /// The cell in whose ground the middle of each page of the prior lies.
     owners: BTreeMap<PageId, usize>,
     kept: KeptRows,
-    /// Rows of the prior that lie beyond the ground of their owner, by identity.
-    astray: BTreeMap<u64, Columns>,
     done: Merged,
 }
 
 impl Merging<'_> {
-    /// Writes the rows that lie in the ground of a cell.
-    fn add_cell(&mut self, cell: usize, memory: u64, sink: &mut dyn GaussianSink) -> Result<(), TrainError> {
-        let folder = self.city.cell(cell);
-        let owned = self.owned_pages(&folder, cell)?;
-        let (_, copy) = newest_copy(&folder).ok_or_else(|| {
-            InputError::new(folder.join("copy"), "the copy of the cell is not there", "run the cell again")
-        })?;
-        let mut store = StoredStart::open(&copy, memory, 2)?;
-        let frame = (self.plan.origin, self.plan.scale);
-        let mut kept_rows = 0;
+    /// Writes the rows that lie in the ground of a cell, which owns some of its first pages (`owned`). Returns the pages with rows of the prior
+    /// that lie beyond the ground of their owner.
+    fn add_cell(
+        &mut self,
+        cell: usize,
+        owned: &[bool],
+        mut store: StoredStart,
+        sink: &mut dyn GaussianSink,
+    ) -> Result<Vec<PageNo>, TrainError> {
+        let (mut kept_rows, mut astray) = (0, Vec::new());
         for (page, id) in store.pages().into_iter().filter(|(_, id)| !id.is_frozen()) {
-            let (uids, mut columns) = store.rows_of(page, frame)?;
+            let (uids, mut columns) = store.rows_of(page, self.frame())?;
             let is_own = owned.get(id.origin() as usize).copied().unwrap_or(false);
-            let keeps: Vec<bool> =
-                uids.iter().enumerate().map(|(row, &uid)| self.keeps(cell, is_own, uid, &columns, row)).collect();
+            let mut has_astray = false;
+            let keeps = |row: usize| {
+                let is_inside = self.lies_in(cell, &columns, row);
+                let is_new = is_inside && self.kept.insert(uids[row]);
+                self.done.beyond += u64::from(!is_inside);
+                self.done.twice += u64::from(is_inside && !is_new);
+                has_astray |= !is_inside && is_own && uids[row] < self.plan.gaussians;
+                is_new
+            };
+            let keeps: Vec<bool> = (0..uids.len()).map(keeps).collect();
+            astray.extend(has_astray.then_some(page));
             columns.retain_rows(|_, row| keeps[row]);
             kept_rows += columns.rows() as u64;
             sink.write(&columns)?;
         }
         self.done.kept.push(kept_rows);
+        Ok(astray)
+    }
+
+    /// Writes the rows of the prior in these pages of their owner that lie beyond its ground and that no cell has kept.
+    fn put_back(
+        &mut self,
+        cell: usize,
+        pages: &[PageNo],
+        mut store: StoredStart,
+        sink: &mut dyn GaussianSink,
+    ) -> Result<(), TrainError> {
+        for &page in pages {
+            let (uids, mut columns) = store.rows_of(page, self.frame())?;
+            let goes_back = |row: usize| {
+                let is_prior = uids[row] < self.plan.gaussians;
+                is_prior && !self.lies_in(cell, &columns, row) && self.kept.insert(uids[row])
+            };
+            let goes_back: Vec<bool> = (0..uids.len()).map(goes_back).collect();
+            columns.retain_rows(|_, row| goes_back[row]);
+            self.done.put_back += columns.rows() as u64;
+            sink.write(&columns)?;
+        }
         Ok(())
+    }
+
+    fn frame(&self) -> ([f64; 3], f64) {
+        (self.plan.origin, self.plan.scale)
+    }
+
+    fn lies_in(&self, cell: usize, columns: &Columns, row: usize) -> bool {
+        let mean = columns.row(Column::Means, row);
+        self.plan.cell_at(self.plan.ground([mean[0], mean[1], mean[2]])) == cell
     }
 
     /// Whether a cell owns each of the pages that it trains, by their numbers in its run.
@@ -173,33 +236,6 @@ impl Merging<'_> {
         let text = read_text(&file, LIST_BYTES_MAX, "restore the files of the cell")?;
         let trained = text.lines().filter_map(|line| line.parse::<PageId>().ok());
         Ok(trained.map(|page| self.owners.get(&page) == Some(&cell)).collect())
-    }
-
-    fn keeps(&mut self, cell: usize, is_own: bool, uid: u64, columns: &Columns, row: usize) -> bool {
-        let mean = columns.row(Column::Means, row);
-        if self.plan.cell_at(self.plan.ground([mean[0], mean[1], mean[2]])) == cell {
-            let is_new = self.kept.insert(uid);
-            self.done.twice += u64::from(!is_new);
-            return is_new;
-        }
-        self.done.beyond += 1;
-        if is_own && uid < self.plan.gaussians {
-            let mut one = Columns::zeros(0, columns.sh_degree);
-            Column::ALL.into_iter().for_each(|c| one.column_mut(c).extend_from_slice(columns.row(c, row)));
-            self.astray.insert(uid, one);
-        }
-        false
-    }
-
-    /// Writes the rows astray that no cell has kept.
-    fn put_back(&mut self, sink: &mut dyn GaussianSink) -> Result<(), TrainError> {
-        for (uid, columns) in std::mem::take(&mut self.astray) {
-            if !self.kept.holds(uid) {
-                sink.write(&columns)?;
-                self.done.put_back += 1;
-            }
-        }
-        Ok(())
     }
 }
 
@@ -219,18 +255,18 @@ fn meta_of(plan: &CityPlan, config: &TrainConfig, facts: &Resolved) -> SceneMeta
     }
 }
 
-/// Writes the config of a short run that polishes the merged scene: the views that several cells trained on, the rates with which the cells
-/// ended, no growth.
-fn write_polish(plan: &CityPlan, city: &City, out: &Path) -> InputResult<()> {
+/// Writes the config of a short run that polishes the merged scene, which will lie in `out`: the views that several cells trained on, or all
+/// if there is none, the rates with which the cells ended, no growth.
+fn write_polish(plan: &CityPlan, city: &City, out: &Path, folder: &mut PartFolder) -> InputResult<()> {
     let mut cells_of: BTreeMap<String, usize> = BTreeMap::new();
     for cell in 0..plan.cells.len() {
         let text = read_text(&city.cell(cell).join("views.txt"), LIST_BYTES_MAX, "restore the files of the cell")?;
         text.lines().for_each(|name| *cells_of.entry(name.to_string()).or_default() += 1);
     }
-    let crossing = cells_of.iter().filter(|(_, cells)| **cells > 1 || plan.cells.len() == 1);
+    let most = cells_of.values().copied().max().unwrap_or(0);
+    let crossing = cells_of.iter().filter(|(_, cells)| **cells > 1 || most == 1);
     let names: String = crossing.map(|(name, _)| format!("{name}\n")).collect();
-    let (views, file) = (out.join("polish_views.txt"), out.join("polish.toml"));
-    write_whole(&views, names.as_bytes())?;
+    folder.write(Path::new(POLISH_VIEWS_FILE), names.as_bytes())?;
     let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
     let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
     let of_cell = new_run::given_keys(Some(&city.cell(0).join("cell.toml")), &TrainOverrides::default())?;
@@ -241,13 +277,12 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path) -> InputResult<()> {
     for (key, word) in [("strategy", "none"), ("schedule", "classic")] {
         keys.insert(key.into(), word.into());
     }
-    let mut paths = vec![("init-ply", out.join(PLY_FILE)), ("views-file", views)];
+    let mut paths = vec![("init-ply", out.join(PLY_FILE)), ("views-file", out.join(POLISH_VIEWS_FILE))];
     if city.prior_appearance().is_file() {
         paths.push(("first-appearance", city.prior_appearance()));
     }
     for (key, path) in paths {
-        let path = std::path::absolute(&path).unwrap_or(path);
-        keys.insert(key.into(), path.to_string_lossy().into_owned().into());
+        keys.insert(key.into(), absolute(&path).to_string_lossy().into_owned().into());
     }
     let others = ended.others_lr_final;
     for (key, rate) in [
@@ -263,6 +298,7 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path) -> InputResult<()> {
         keys.insert(key.into(), rate.into());
     }
     keys.insert("sh-every".into(), 0.into());
-    let text = toml::to_string(&keys).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
-    write_whole(&file, text.as_bytes())
+    let text = toml::to_string(&keys);
+    let text = text.map_err(|e| InputError::new(POLISH_FILE, e.to_string(), "report this as a bug"))?;
+    folder.write(Path::new(POLISH_FILE), text.as_bytes())
 }

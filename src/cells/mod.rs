@@ -32,13 +32,13 @@ mod views;
 pub mod work;
 
 use crate::base::error::{InputError, InputResult};
-use crate::config::file::{Class, ConfigKey, KEYS, TrainConfig, TrainOverrides};
+use crate::config::file::{ConfigKey, KEYS, TrainConfig, TrainOverrides};
 use crate::config::new_run;
 use crate::train::error::TrainError;
 use crate::train::run::begin::run;
-use crate::train::run::out_folder::is_empty;
 use crate::train::run::request::{Existing, RunOutcome, RunRequest};
 use crate::train::run::resume::{ResumeRequest, go_on, resume};
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -49,6 +49,8 @@ const RESTARTS: u32 = 3;
 pub(crate) struct AnyRun<'a> {
     pub scene: &'a Path,
     pub out: &'a Path,
+    /// There is something in `out`, or a commit, to go on from.
+    pub has_begun: bool,
     /// Of a new run.
     pub config: TrainConfig,
     /// Of a resumed run: what may differ from machine to machine.
@@ -60,7 +62,7 @@ pub(crate) struct AnyRun<'a> {
 /// Begins the run, or goes on with it.
 /// Errors: those of a run.
 pub(crate) fn begin_or_resume(any: AnyRun<'_>) -> Result<RunOutcome, TrainError> {
-    let AnyRun { scene, out, config, keys, leg, quiet } = any;
+    let AnyRun { scene, out, has_begun, config, keys, leg, quiet } = any;
     let (out, scene) = (out.to_path_buf(), scene.to_path_buf());
     let again = ResumeRequest {
         out: out.clone(),
@@ -71,7 +73,7 @@ pub(crate) fn begin_or_resume(any: AnyRun<'_>) -> Result<RunOutcome, TrainError>
         live: None,
         leg,
     };
-    let done = match out.exists() && !is_empty(&out) {
+    let done = match has_begun {
         true => resume(&again),
         false => {
             let (existing, dry_run, live) = (Existing::Refuse, false, None);
@@ -81,9 +83,29 @@ pub(crate) fn begin_or_resume(any: AnyRun<'_>) -> Result<RunOutcome, TrainError>
     go_on(done, &again, RESTARTS)
 }
 
-/// Whether a key may differ from machine to machine. The others decide the bytes of a city.
+/// Keys of what a run prints and writes on its way, and of memory for photos.
+const KEYS_OF_WATCHING: [&str; 6] = ["image_cache", "eval_every", "save_every", "log_every", "log", "export"];
+
+/// Whether a key may differ from machine to machine. The others decide the bytes of a city, also those that a resumed run may change
+/// because they act at its beginning or at its end alone, such as `schedule` and `up`.
 pub(crate) fn is_of_machine(key: &ConfigKey) -> bool {
-    key.class.is_free() && key.class != Class::Length
+    let is_listed = ["Memory and disk", "Machine"].contains(&key.heading) || KEYS_OF_WATCHING.contains(&key.field);
+    is_listed && key.class.is_free()
+}
+
+/// The flags that may differ from machine to machine.
+pub(crate) fn machine_keys(keys: &TrainOverrides) -> TrainOverrides {
+    keys.clone().only(|field| KEYS.iter().any(|key| key.field == field && is_of_machine(key)))
+}
+
+/// Refuses a number out of range, and what is no number.
+/// Errors: it is.
+pub(crate) fn check_range(flag: &str, value: f64, range: RangeInclusive<f64>) -> InputResult<()> {
+    if range.contains(&value) {
+        return Ok(());
+    }
+    let remedy = format!("use a number from {} to {}", range.start(), range.end());
+    Err(InputError::new(flag, "the value is out of range", remedy))
 }
 
 /// Refuses flags that decide the bytes of a city.
@@ -103,7 +125,8 @@ pub(crate) fn check_machine_keys(keys: &TrainOverrides) -> InputResult<()> {
 /// Errors: a key is unknown or out of range.
 pub(crate) fn config_of(file: &Path, mut keys: toml::Table, machine: &TrainOverrides) -> InputResult<TrainConfig> {
     keys.extend(new_run::given_keys(None, machine)?);
-    let config = new_run::of_given(keys).map_err(|problem| InputError::new(file, problem, "cut the city again"))?;
+    let config = new_run::of_given(keys)
+        .map_err(|problem| InputError::new(file, problem, "restore the file, or begin another city"))?;
     config.check()?;
     Ok(config)
 }

@@ -7,6 +7,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
 use serde::{Deserialize, Serialize};
+use std::io::ErrorKind;
 use std::path::Path;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
@@ -15,6 +16,15 @@ pub(crate) const LIST_BYTES_MAX: u64 = 4 << 30;
 
 /// The files of a cell that the cut writes.
 pub(crate) const CELL_FILES: [&str; 3] = ["cell.toml", "views.txt", "pages.txt"];
+
+/// How many cells a city gets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum CellCount {
+    Cells(usize),
+    /// As many as it takes for none to train more Gaussians than this.
+    MostGaussians(u64),
+}
 
 /// A city, cut.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -27,6 +37,8 @@ pub struct CityPlan {
     pub gaussians: u64,
     /// Training views.
     pub views: usize,
+    /// What the user asked for. Cells with few views were joined to neighbours.
+    pub asked: CellCount,
     /// How many times the prior's Gaussians the scene may have.
     pub growth: f64,
     /// Least share of the blending weight of a view that makes a cell take it.
@@ -97,7 +109,8 @@ struct Signed {
 }
 
 impl CityPlan {
-    fn digest(&self, file: &Path) -> InputResult<String> {
+    /// Digest of all of it. `file` is for errors.
+    pub(crate) fn digest(&self, file: &Path) -> InputResult<String> {
         let text = toml::to_string(self);
         let text = text.map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))?;
         Ok(hex(xxh3_64(text.as_bytes())))
@@ -162,10 +175,15 @@ pub(crate) fn hex(digest: u64) -> String {
     format!("{digest:016x}")
 }
 
-/// Digest of a prior whose rows have the digest `rows`: of these, and of what it found of photos.
-pub(crate) fn prior_digest(city: &City, rows: u64) -> String {
-    let found = std::fs::read(city.prior_appearance()).unwrap_or_default();
-    format!("{}{}", hex(rows), hex(xxh3_64(&found)))
+/// Digest of a prior whose rows have the digest `rows`: of these, and of what it found of photos, if anything.
+/// Errors: that cannot be read.
+pub(crate) fn prior_digest(city: &City, rows: u64) -> InputResult<String> {
+    let file = city.prior_appearance();
+    let found = match std::fs::read(&file) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Vec::new(),
+        read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
+    };
+    Ok(format!("{}{}", hex(rows), hex(xxh3_64(&found))))
 }
 
 /// Digest of the files of a cell.

@@ -3,14 +3,17 @@
 //!
 //! Invariants: 1. the keys of the city are fixed here; 2. the store appears last, so a city that has it has a finished prior.
 
-use super::{AnyRun, City, begin_or_resume, config_of, is_of_machine};
+use super::work::remove_store;
+use super::{AnyRun, City, begin_or_resume, config_of, is_of_machine, machine_keys};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{KEYS, TrainConfig, TrainOverrides};
 use crate::config::new_run;
 use crate::page::format::codec::Codec;
+use crate::page::tool::new_store::part_of;
 use crate::train::error::TrainError;
 use crate::train::memory::host_budget;
+use crate::train::run::out_folder::is_empty;
 use crate::train::state::trainer::Trainer;
 use crate::train::stores::{ImportRequest, import};
 use std::path::PathBuf;
@@ -43,23 +46,25 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     let of_machine = |name: &str| KEYS.iter().any(|key| key.name() == name && is_of_machine(key));
     let machine: toml::Table = keys.clone().into_iter().filter(|(name, _)| of_machine(name)).collect();
     keys.retain(|name, _| !machine.contains_key(name));
+    let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
+    let of_prior = keys.clone().into_iter().chain(machine).chain(keys_of_prior(&whole)).collect();
+    let config = config_of(&city.keys(), of_prior, &TrainOverrides::default())?;
     fix_keys(&city, &keys)?;
     if city.prior_store().is_dir() {
         crate::say!("the prior in {} is done", city.0.display());
         return Ok(0);
     }
-    let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
-    keys.extend(machine);
-    keys.extend(keys_of_prior(&whole));
-    let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
     let (out, page_rows) = (city.prior_run(), config.page_rows);
     let budget = host_budget(config.host_mem.0);
     let (scene, quiet) = (&request.scene, request.quiet);
-    let any = AnyRun { scene, out: &out, config, keys: machine_keys(&request.keys), leg: None, quiet };
+    let has_begun = out.exists() && !is_empty(&out);
+    let any = AnyRun { scene, out: &out, has_begun, config, keys: machine_keys(&request.keys), leg: None, quiet };
     let outcome = begin_or_resume(any)?;
     if outcome.exit_code != 0 {
         return Ok(outcome.exit_code);
     }
+    // What a killed process has left.
+    remove_store(&part_of(&city.prior_store()))?;
     let rows = import(&ImportRequest {
         file: Trainer::ply_path(&out),
         out: city.prior_store(),
@@ -71,17 +76,12 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     Ok(0)
 }
 
-/// The flags that may be given anew on a resume.
-fn machine_keys(keys: &TrainOverrides) -> TrainOverrides {
-    let (host_mem, threads, device) = (keys.host_mem, keys.threads, keys.device.clone());
-    TrainOverrides { host_mem, threads, device, device_mem: keys.device_mem, ..TrainOverrides::default() }
-}
-
-/// Keeps the keys of the whole scene, or compares them with those that the city has.
+/// Keeps the keys of the whole scene, or compares them with those that the city has. They may change until the prior's run has begun.
+/// Errors: the city was begun with other keys.
 fn fix_keys(city: &City, keys: &toml::Table) -> InputResult<()> {
     let file = city.keys();
     let text = toml::to_string(keys).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
-    if !file.exists() {
+    if !file.exists() || !city.prior_run().exists() {
         std::fs::create_dir_all(&city.0).map_err(|e| InputError::io(&city.0, "making the folder", &e))?;
         return write_whole(&file, text.as_bytes());
     }

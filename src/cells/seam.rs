@@ -5,18 +5,11 @@
 //!
 //! Not here: the figures of whole views (`gsscale-eval`).
 
-use super::City;
 use super::plan::{CityPlan, GroundRect};
-use crate::base::error::{InputError, InputResult};
+use super::{City, check_range};
+use crate::base::error::InputError;
 use crate::config::file::TrainConfig;
-use crate::config::limits::{self, RunOptions};
-use crate::dataset::loader::{Dataset, load_dataset};
-use crate::dataset::read::read_scene;
-use crate::dataset::target_cache::TargetCache;
-use crate::exchange::frames::to_local;
-use crate::exchange::ply::{PlyContent, read_ply};
-use crate::paging::pager::{Pager, PagerConfig};
-use crate::render::RenderOptions;
+use crate::dataset::loader::Dataset;
 use crate::render::metrics::{mean, psnr};
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
 use crate::scene::camera::Camera;
@@ -24,7 +17,8 @@ use crate::scene::columns::Columns;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
-use crate::train::step::pages::{PagedScene, WorkingSet};
+use crate::train::run::eval_file::{Evaluator, Model};
+use crate::train::step::pages::WorkingSet;
 use crate::train::step::view::{SceneNow, draw};
 use glam::DVec3;
 use serde::Serialize;
@@ -33,6 +27,8 @@ use std::path::Path;
 /// Points along a border, and the strips beside it in which Gaussians are counted, as a share of its length.
 const POINTS: usize = 256;
 const STRIP: f64 = 0.1;
+/// How often the part of a piece before the camera is halved.
+const HALVINGS: u32 = 20;
 
 /// The figures of a scene at the borders of a city.
 #[derive(Debug, Clone, Serialize)]
@@ -68,30 +64,32 @@ struct Border {
 /// Measures the scene in the folder `model`, which a merge or a run has written, at the borders of a city, in bands of this width, pixels.
 /// Errors: the plan, the model or its photos cannot be read.
 pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Result<SeamReport, TrainError> {
+    check_range("--band", band, 0.0..=1e6)?;
     let city = City(city.to_path_buf());
     let plan = CityPlan::read(&city)?;
     let config = TrainConfig::read(&model.join(CONFIG_FILE))?;
     machine::set_up(&config)?;
+    let file = model.join(PLY_FILE);
+    let Model::Ply(read) = Model::open(&file)? else {
+        return Err(InputError::new(&file, "it is no PLY", "name the folder of a merge or a run").into());
+    };
     let scene = scene.map_or_else(|| city.scene(), |scene| Ok(scene.to_path_buf()))?;
-    let dataset = load_dataset(read_scene(&scene, &limits::read_options(&config))?, &limits::load_options(&config))?;
-    let columns = read_model(&model.join(PLY_FILE), &dataset)?;
-    let places = places_of(&plan, &dataset, &columns);
+    let mut evaluator = Evaluator::open(&scene, &config, None)?;
+    let (columns, meta) = *read;
+    let columns = evaluator.placed(&file, columns, &meta)?;
+    let places = places_of(&plan, &evaluator.dataset, &columns);
+    let (mut pages, run) = evaluator.pages(&columns)?;
+    drop(columns);
+    let Evaluator { dataset, targets, mut renderer, .. } = evaluator;
     let borders = borders_of(&plan, &places);
     let lines: Vec<Vec<DVec3>> = borders.iter().map(|border| line_of(border, &plan, &places, &dataset)).collect();
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let run = RunOptions::new(&config, dataset.scene_scale);
-    let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
-    let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
-    let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
-    let mut pages = PagedScene::new(&columns, pager, &bands)?;
-    let mut renderer = machine::renderer(&config)?.renderer;
     let (mut crossing, mut banded, mut others) = (Vec::new(), Vec::new(), Vec::new());
     for view in dataset.test_views() {
         let (camera, target) = (&dataset.views[view].camera, targets.get(view)?);
         let image = {
             let working = &mut WorkingSet::default();
             let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *renderer };
-            draw(&mut now, camera, &render)?;
+            draw(&mut now, camera, &run.render)?;
             renderer.image()?
         };
         let mask = band_mask(camera, &lines, 0.5 * band, target.mask.as_deref());
@@ -107,14 +105,6 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     let borders = borders.iter().map(|border| beside(border, &places)).collect();
     let [crossing_psnr, band_psnr, other_psnr] = [&crossing, &banded, &others].map(|values| mean(values));
     Ok(SeamReport { views: [crossing.len(), others.len()], crossing_psnr, band_psnr, other_psnr, borders })
-}
-
-fn read_model(file: &Path, dataset: &Dataset) -> InputResult<Columns> {
-    let PlyContent::Gaussians { mut columns, meta, .. } = read_ply(file)? else {
-        return Err(InputError::new(file, "it holds points, not Gaussians", "name the folder of a merge or a run"));
-    };
-    to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
-    Ok(columns)
 }
 
 /// Each row's place on the ground and its height, in the plan's frame.
@@ -198,22 +188,33 @@ fn band_mask(camera: &Camera, lines: &[Vec<DVec3>], reach: f64, masked: Option<&
     let (width, height) = (camera.width as usize, camera.height as usize);
     let mut mask = vec![0u8; width * height];
     for line in lines {
-        let pixels: Vec<Option<[f64; 2]>> = line.iter().map(|&at| pixel_of(camera, at, reach)).collect();
-        for pair in pixels.windows(2) {
-            let [Some(from), Some(to)] = pair else { continue };
-            mark(&mut mask, [width, height], reach, *from, *to);
+        for pair in line.windows(2) {
+            if let Some([from, to]) = piece_of(camera, pair[0], pair[1]) {
+                mark(&mut mask, [width, height], reach, from, to);
+            }
         }
     }
     masked.into_iter().flatten().zip(&mut mask).for_each(|(of_photo, of_band)| *of_band = (*of_band).min(*of_photo));
     mask
 }
 
-/// Where a position of the local frame is in the picture; `None` behind the camera or far outside.
-fn pixel_of(camera: &Camera, at: DVec3, reach: f64) -> Option<[f64; 2]> {
-    let (pixel, _) = camera.project(at.to_array())?;
-    let is_near =
-        pixel.iter().zip([camera.width, camera.height]).all(|(x, side)| *x > -reach && *x < f64::from(side) + reach);
-    is_near.then_some(pixel)
+/// Where the piece of a line between two positions of the local frame is in the picture, without the part behind the camera.
+fn piece_of(camera: &Camera, from: DVec3, to: DVec3) -> Option<[[f64; 2]; 2]> {
+    let pixel = |at: DVec3| camera.project(at.to_array()).map(|(pixel, _)| pixel);
+    // Halves the way from an end that is seen to one that is not.
+    let last_seen = |mut seen: DVec3, mut unseen: DVec3| {
+        for _ in 0..HALVINGS {
+            let middle = 0.5 * (seen + unseen);
+            *(if pixel(middle).is_some() { &mut seen } else { &mut unseen }) = middle;
+        }
+        pixel(seen)
+    };
+    match (pixel(from), pixel(to)) {
+        (Some(a), Some(b)) => Some([a, b]),
+        (Some(a), None) => last_seen(from, to).map(|b| [a, b]),
+        (None, Some(b)) => last_seen(to, from).map(|a| [a, b]),
+        (None, None) => None,
+    }
 }
 
 /// Marks the pixels within `reach` of a piece of a line.

@@ -5,7 +5,7 @@
 //!
 //! | in `cells/K/` | is |
 //! | --- | --- |
-//! | `run/` | the run's own folder and pages, without `--spill-dir` |
+//! | `run-MACHINE/` | the run's own folder and pages, without `--spill-dir` |
 //! | `copy/N/` | a commit; the largest N that is whole counts |
 //! | `done.toml` | the last step is in the copy |
 //!
@@ -14,21 +14,27 @@
 
 use super::lock::{CellLock, owner_of};
 use super::plan::{CityPlan, prior_digest};
-use super::{AnyRun, City, begin_or_resume, check_machine_keys, config_of};
+use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, config_of};
 use crate::base::error::{InputError, InputResult};
+use crate::base::machine::host_name;
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::new_run;
 use crate::config::values::ByteSize;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::page::tool::new_store::PART_SUFFIX;
+use crate::page::tool::new_store::part_of;
 use crate::page::tool::reading::Access;
+use crate::page::versions::slots::SlotLayout;
 use crate::train::error::TrainError;
-use crate::train::inputs::signals::DEADLINE_CODE;
+use crate::train::inputs::machine::absolute;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::host_budget;
+use crate::train::run::out_folder;
+use crate::train::run::request::Existing;
 use crate::train::stores::ownership::last_state;
 use crate::train::stores::{StoredStart, clone_store, find_store};
 use serde::{Deserialize, Serialize};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -46,8 +52,8 @@ pub struct WorkRequest {
     pub scene: Option<PathBuf>,
     /// Keys of this machine.
     pub keys: TrainOverrides,
-    /// Time between copies.
-    pub copy_every: Duration,
+    /// Seconds between copies.
+    pub copy_every: f64,
     pub quiet: bool,
 }
 
@@ -70,12 +76,15 @@ pub struct Done {
 pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
     let city = City(request.city.clone());
     check_machine_keys(&request.keys)?;
+    check_range("--copy-every", request.copy_every, 0.0..=1e9)?;
     let plan = CityPlan::read(&city)?;
-    plan.cell(&city, request.cell)?;
+    let files = &plan.cell(&city, request.cell)?.files;
     let folder = city.cell(request.cell);
+    let place = WorkPlace::of(request, &plan, &city)?;
     if done_of(&plan, &city, request.cell)?.is_some() {
         crate::say!("cell {} is done", request.cell);
-        return Ok(0);
+        // A process that was killed behind its last word left them.
+        return place.clear().map(|()| 0);
     }
     check_prior(&plan, &city, &request.keys)?;
     let lock = match CellLock::take(&folder)? {
@@ -85,72 +94,80 @@ pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
             return Ok(AGAIN);
         }
     };
-    let place = WorkPlace::of(request, &folder);
-    let files = &plan.cells[request.cell].files;
-    let (scene, keys) =
-        (request.scene.clone().map_or_else(|| city.scene(), Ok)?, place.keys(&city, &folder, &request.keys));
+    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
+    let scene = request.scene.clone().map_or_else(|| city.scene(), Ok)?;
+    let keys = place.keys(&city, &folder, &request.keys);
     let config = config_of(&folder.join("cell.toml"), keys_of_cell(&folder)?, &keys)?;
-    place.fetch(&folder)?;
-    loop {
-        let leg = Some(request.copy_every);
+    let mut has_begun = place.fetch(&folder)?;
+    while stop.exit_code().is_none() {
+        let leg = Some(Duration::from_secs_f64(request.copy_every));
         let (config, keys) = (TrainConfig { keep_checkpoint: true, ..config.clone() }, keys.clone());
         let (out, quiet) = (place.out.as_path(), request.quiet);
-        let outcome = begin_or_resume(AnyRun { scene: &scene, out, config, keys, leg, quiet })?;
+        let outcome = begin_or_resume(AnyRun { scene: &scene, out, has_begun, config, keys, leg, quiet })?;
+        has_begun = true;
         if !lock.is_held() {
-            crate::tell!(
-                "another process has taken cell {} over: {}",
-                request.cell,
-                owner_of(&folder).unwrap_or_default()
-            );
-            return Ok(AGAIN);
+            break;
         }
         let copy = publish(&folder, &place.out)?;
-        match (outcome.summary.filter(|summary| summary.finished), outcome.exit_code) {
-            (Some(summary), _) => {
-                let psnr = summary.test.map(|test| test.psnr);
-                let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
-                write_done(&folder, &Done { files: files.clone(), copy, steps, gaussians, seconds, psnr })?;
-                place.clear()?;
-                return Ok(0);
+        if let Some(summary) = outcome.summary.filter(|summary| summary.finished) {
+            if !lock.is_held() {
+                break;
             }
-            (None, DEADLINE_CODE) => {}
-            (None, _) => return Ok(AGAIN),
+            let psnr = summary.test.map(|test| test.psnr);
+            let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
+            write_done(&folder, &Done { files: files.clone(), copy, steps, gaussians, seconds, psnr })?;
+            place.clear()?;
+            return Ok(0);
         }
     }
+    if !lock.is_held() {
+        let owner = owner_of(&folder).unwrap_or_default();
+        crate::tell!("another process has taken cell {} over: {owner}", request.cell);
+    }
+    Ok(AGAIN)
 }
 
 /// The exit code for an error: [`NEVER`] for bad input and for a run that diverges, which it will do again; [`AGAIN`] for what another
-/// machine, or another hour, may not have.
+/// machine, or another hour, may not have, such as a file that cannot be read.
 pub fn code_of(error: &TrainError) -> i32 {
     match error {
-        TrainError::Input(input) if !input.is_out_of_space() => NEVER,
+        TrainError::Input(input) if input.kind.is_none() => NEVER,
         TrainError::NonFinite { .. } => NEVER,
         _ => AGAIN,
     }
 }
 
-/// What the city knows of a cell that is done; `None` for one that is not.
-/// Errors: it was done under another plan.
+/// What the city knows of a cell that is done; `None` for one that is not, or whose copy is gone.
+/// Errors: it was done under another plan, or the file cannot be read.
 pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<Option<Done>> {
-    let file = city.cell(cell).join("done.toml");
-    let Ok(text) = std::fs::read_to_string(&file) else { return Ok(None) };
+    let folder = city.cell(cell);
+    let file = folder.join("done.toml");
+    let text = match std::fs::read_to_string(&file) {
+        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
+        read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
+    };
     let again = "remove the file and the cell's folder copy, and run the cell again";
     let done: Done = toml::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), again))?;
     if done.files == plan.cells[cell].files {
-        return Ok(Some(done));
+        return Ok(Some(done).filter(|done| copy_of(&folder, done.copy).is_dir()));
     }
     Err(InputError::new(&file, "the cell was trained under another plan", again))
 }
 
+/// The copy of a cell with this number.
+pub(crate) fn copy_of(folder: &Path, number: u32) -> PathBuf {
+    folder.join("copy").join(number.to_string())
+}
+
 /// The newest copy of a cell with its number.
-pub(crate) fn newest_copy(folder: &Path) -> Option<(u32, PathBuf)> {
+fn newest_copy(folder: &Path) -> Option<(u32, PathBuf)> {
     let entries = std::fs::read_dir(folder.join("copy")).ok()?.flatten();
     let number = |entry: std::fs::DirEntry| entry.file_name().to_str()?.parse().ok().map(|n: u32| (n, entry.path()));
     entries.filter_map(number).max()
 }
 
 /// Steps of the newest copy of a cell.
-pub(crate) fn copied_steps(folder: &Path) -> Option<u32> {
+fn copied_steps(folder: &Path) -> Option<u32> {
     let (_, copy) = newest_copy(folder)?;
     last_state(&copy, Access::Map).ok().map(|state| state.trainer.step)
 }
@@ -159,7 +176,7 @@ pub(crate) fn copied_steps(folder: &Path) -> Option<u32> {
 fn check_prior(plan: &CityPlan, city: &City, keys: &TrainOverrides) -> Result<(), TrainError> {
     let memory = host_budget(keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
     let rows = StoredStart::open(&city.prior_store(), memory, 2)?.digest()?;
-    if prior_digest(city, rows) == plan.prior {
+    if prior_digest(city, rows)? == plan.prior {
         return Ok(());
     }
     let problem = "it is not the prior that was cut";
@@ -184,14 +201,14 @@ struct WorkPlace {
 }
 
 impl WorkPlace {
-    fn of(request: &WorkRequest, folder: &Path) -> WorkPlace {
-        match request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) {
-            None => WorkPlace { out: folder.join("run"), pages: None },
-            Some(drive) => {
-                let own = Path::new(drive).join(format!("cell-{}", request.cell));
-                WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) }
-            }
-        }
+    /// Machines that share a folder, and cities that share a drive, have places of their own.
+    fn of(request: &WorkRequest, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
+        let Some(drive) = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) else {
+            let out = city.cell(request.cell).join(format!("run-{}", host_name()));
+            return Ok(WorkPlace { out, pages: None });
+        };
+        let own = absolute(Path::new(drive)).join(format!("cell-{}-{}", request.cell, plan.digest(&city.plan())?));
+        Ok(WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) })
     }
 
     fn store(&self) -> PathBuf {
@@ -211,26 +228,33 @@ impl WorkPlace {
         }
     }
 
-    /// Takes the newest copy of the cell as the checkpoint of this machine, unless it has one that is as new.
+    /// Takes the newest copy of the cell as the checkpoint of this machine, unless it has one that is as new. Returns whether there is
+    /// something to go on from.
     /// Errors: the copy is damaged, or the drive is not there or cannot be written.
-    fn fetch(&self, folder: &Path) -> Result<(), TrainError> {
+    fn fetch(&self, folder: &Path) -> Result<bool, TrainError> {
         let store = self.store();
         let parent = store.parent().unwrap_or(&self.out);
         // Not its parents: the folder that the user named may be a drive that is not mounted.
         if !parent.is_dir() {
             std::fs::create_dir(parent).map_err(|e| InputError::io(parent, "making the folder of the cell", &e))?;
         }
-        let steps = |store: &Path| last_state(store, Access::Map).ok().map(|state| state.trainer.step);
-        let Some((_, copy)) = newest_copy(folder) else { return Ok(()) };
-        if steps(&store) >= steps(&copy) {
-            return Ok(());
+        let steps = |store: &Path| last_state(store, Access::Map).map(|state| state.trainer.step);
+        let copy = newest_copy(folder).map(|(_, copy)| steps(&copy).map(|steps| (steps, copy))).transpose()?;
+        let own = steps(&store).ok();
+        if own.is_some() && own >= copy.as_ref().map(|(steps, _)| *steps) {
+            return Ok(true);
         }
-        remove_store(&store)?;
-        clone_store(&find_store(&copy)?, &store)?;
-        Ok(())
+        // What lies here is of a run that the other machine did not go on with.
+        self.clear()?;
+        if self.out.is_dir() {
+            let _lock = out_folder::lock(&self.out)?;
+            out_folder::make(&self.out, Existing::Overwrite)?;
+        }
+        copy.as_ref().map_or(Ok(()), |(_, copy)| clone_into(copy, &store))?;
+        Ok(copy.is_some())
     }
 
-    /// Removes the pages of a cell that is done; its results stay.
+    /// Removes the pages of the cell; its results stay.
     fn clear(&self) -> Result<(), TrainError> {
         remove_store(&self.store())
     }
@@ -242,25 +266,35 @@ fn publish(folder: &Path, out: &Path) -> Result<u32, TrainError> {
     let copies = folder.join("copy");
     std::fs::create_dir_all(&copies).map_err(|e| InputError::io(&copies, "making the folder of copies", &e))?;
     let number = newest_copy(folder).map_or(0, |(number, _)| number + 1);
-    remove_store(&copies.join(format!("{number}{PART_SUFFIX}")))?;
-    clone_store(&find_store(out)?, &copies.join(number.to_string()))?;
-    (0..number).try_for_each(|older| remove_store(&copies.join(older.to_string())))?;
+    clone_into(out, &copy_of(folder, number))?;
+    for older in (0..number).map(|older| copy_of(folder, older)) {
+        if let Err(error) = remove_store(&older) {
+            crate::tell!("warning: an older copy stays: {error}");
+        }
+    }
     Ok(number)
+}
+
+/// Copies a store to the folder `to`, which does not exist; what a killed process left of such a copy goes.
+/// Errors: the store is damaged or in use, or `to` cannot be written.
+fn clone_into(from: &Path, to: &Path) -> Result<(), TrainError> {
+    remove_store(&part_of(to))?;
+    clone_store(&find_store(from)?, to).map(drop)
 }
 
 /// Removes a store and its folder, if there is one.
 /// Errors: it is no store, or in use.
-fn remove_store(store: &Path) -> Result<(), TrainError> {
+pub(crate) fn remove_store(store: &Path) -> Result<(), TrainError> {
     if !store.is_dir() {
         return Ok(());
     }
-    if SpillDir::exists_in(store) {
-        let mut spill = SpillDir::open(store, true)?;
-        spill.adopt_folder();
-        spill.remove()?;
-    }
-    // Only an empty folder goes.
-    let _ = std::fs::remove_dir(store);
+    let mut spill = match SpillDir::exists_in(store) {
+        true => SpillDir::open(store, true)?,
+        // A process that was killed before it made the first file left a lock at most, which a new store takes.
+        false => SpillDir::create(store, SlotLayout::new(1, 1), true)?,
+    };
+    spill.adopt_folder();
+    spill.remove()?;
     Ok(())
 }
 

@@ -92,6 +92,13 @@ macro_rules! config_keys {
             /// Overrides `config` with the given flags.
             pub fn apply(self, config: &mut TrainConfig) { $($( if let Some(v) = self.$name { config.$name = v; } )+)+ }
 
+            /// Those of the flags whose keys `keeps` accepts, by their fields.
+            #[must_use]
+            pub fn only(mut self, keeps: impl Fn(&str) -> bool) -> TrainOverrides {
+                $($( if !keeps(stringify!($name)) { self.$name = None; } )+)+
+                self
+            }
+
             /// The fields of the given flags.
             pub fn given(&self) -> Vec<&'static str> {
                 let mut fields = Vec::new();

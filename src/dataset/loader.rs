@@ -303,7 +303,10 @@ fn keep_listed(views: Vec<(RawView, Split)>, file: &Path) -> InputResult<Vec<(Ra
         return Ok(kept);
     }
     let (count, total, names) = (lacking.len(), listed.len(), list_names(lacking.into_iter()));
-    let problem = format!("{count} of its {total} photos are not in the scene, or have no usable pose: {names}");
+    let problem = match total {
+        0 => "it lists no photo".to_string(),
+        _ => format!("{count} of its {total} photos are not in the scene, or have no usable pose: {names}"),
+    };
     Err(InputError::new(file, problem, "list names as the model of the scene has them, at least one"))
 }
 

@@ -1,12 +1,12 @@
 //! A city in cells through the program: the bytes of a cell, its failures, the ring, and the merge.
 
 use crate::support::scenes::told;
-use crate::support::workdir::{Running, Workdir, says};
+use crate::support::workdir::{CKPT, Running, Workdir, says};
+use gsscale::exchange::meta::ExportFrame;
 use gsscale::scene::columns::Column;
 use gsscale::train::stores::StoredStart;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
-use std::time::Duration;
 
 const CELLS: &str = env!("CARGO_BIN_EXE_gsscale-cells");
 const GIB: u64 = 1 << 30;
@@ -20,7 +20,7 @@ impl Cells {
     /// A city of this many steps that is cut with these flags.
     fn cut(steps: u32, flags: &str) -> Cells {
         let cells = Cells(Workdir::wide_city(3000));
-        cells.done(&format!("prior scene --out city --steps {steps} {KEYS}"));
+        cells.done(&format!("prior scene --out city --steps {steps} {KEYS} --export-frame local"));
         cells.done(&format!("cut scene --out city {flags}"));
         cells
     }
@@ -46,9 +46,47 @@ impl Cells {
         self.plan()["cells"].as_array().unwrap().len()
     }
 
+    fn refuses(&self, flags: &str, words: &[&str]) {
+        let (code, said) = self.says(flags);
+        assert_eq!(code, Some(2), "{flags}: {said}");
+        says(&said, words);
+        says(&said, &["remedy"]);
+    }
+
+    /// The path in `folder` of the one entry whose name begins so.
+    fn only(&self, folder: &str, begin: &str) -> String {
+        let entries = std::fs::read_dir(self.0.path(folder)).unwrap();
+        let names = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let names: Vec<String> = names.filter(|name| name.starts_with(begin)).collect();
+        assert_eq!(names.len(), 1, "{folder}/{begin}: {names:?}");
+        format!("{folder}/{}", names[0])
+    }
+
+    /// The output folder of a cell's run in the city.
+    fn run_of(&self, cell: usize) -> String {
+        self.only(&format!("city/cells/{cell}"), "run-")
+    }
+
+    /// The folder of the cell on a drive.
+    fn place(&self, drive: &str, cell: usize) -> String {
+        self.only(drive, &format!("cell-{cell}-"))
+    }
+
+    /// The newest whole copy of a cell.
+    fn newest(&self, cell: usize) -> Option<u32> {
+        let copies = std::fs::read_dir(self.0.path(&format!("city/cells/{cell}/copy"))).into_iter().flatten();
+        copies.filter_map(|copy| copy.unwrap().file_name().to_str()?.parse().ok()).max()
+    }
+
     fn copy(&self, cell: usize) -> PathBuf {
-        let mut copies = std::fs::read_dir(self.0.path(&format!("city/cells/{cell}/copy"))).unwrap();
-        copies.next().unwrap().unwrap().path()
+        self.0.path(&format!("city/cells/{cell}/copy/{}", self.newest(cell).unwrap()))
+    }
+
+    /// As if the cell had never been worked on.
+    fn forget(&self, cell: usize) {
+        self.0.remove(&self.run_of(cell));
+        self.0.remove(&format!("city/cells/{cell}/copy"));
+        std::fs::remove_file(self.0.path(&format!("city/cells/{cell}/done.toml"))).unwrap();
     }
 
     fn begin(&self, flags: &str) -> Running<'_> {
@@ -63,13 +101,31 @@ fn one_cell_equals_the_plain_run_from_the_same_prior() {
     says(&cells.done("run city --cell 0"), &["cell 0 is done"]);
     let plain = "--config city/cells/0/cell.toml --schedule run-length --strategy long-axis";
     let plain = cells.0.run("plain", &format!("{plain} --init-ply city/prior/store"));
-    assert!(cells.0.ply("city/cells/0/run") == plain, "the scenes differ");
-    // On a drive and in few frames, too.
-    std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
-    std::fs::remove_dir_all(cells.0.path("city/cells/0/copy")).unwrap();
+    assert!(cells.0.ply(&cells.run_of(0)) == plain, "the scenes differ");
+    // A cell whose copy is gone is not done: on a drive and in few frames, too.
+    cells.0.remove("city/cells/0/copy");
+    says(&cells.done("status city"), &["0 of 1 cells are done"]);
     std::fs::create_dir(cells.0.path("nvme")).unwrap();
     cells.done("run city --cell 0 --spill-dir nvme --frames 60");
-    assert!(cells.0.ply("nvme/cell-0/run") == plain, "the scenes differ");
+    assert!(cells.0.ply(&format!("{}/run", cells.place("nvme", 0))) == plain, "the scenes differ");
+    // One without the file goes on from the copy.
+    std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
+    cells.done("run city --cell 0");
+    says(&cells.done("status city"), &["1 of 1 cells are done"]);
+    another_prior_is_refused(&cells);
+}
+
+/// A prior of as many rows that differ in one bit is another one.
+fn another_prior_is_refused(cells: &Cells) {
+    let ply = "city/prior/run/point_cloud.ply";
+    let mut rows = cells.0.bytes(ply);
+    *rows.last_mut().unwrap() ^= 1;
+    cells.0.write(ply, rows);
+    cells.0.remove("city/prior/store");
+    let imported = cells.0.output(CKPT, &format!("import {ply} --out city/prior/store --page-rows 32"));
+    assert!(imported.status.success(), "{}", told(&imported));
+    std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
+    cells.refuses("run city --cell 0", &["it is not the prior that was cut"]);
 }
 
 #[test]
@@ -78,33 +134,39 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
     for cell in 0..3 {
         cells.done(&format!("run city --cell {cell}"));
     }
-    let alone = cells.0.ply("city/cells/1/run");
+    let alone = cells.0.ply(&cells.run_of(1));
     says(&cells.done("status city"), &["3 of 3 cells are done"]);
-    let merged = cells.done("merge city --out whole");
     ring_is_frozen(&cells, 1);
+    // A merge that fails leaves nothing.
+    let (pages, away) = (cells.copy(2).join("FORMAT"), cells.0.path("away"));
+    std::fs::rename(&pages, &away).unwrap();
+    let (code, said) = cells.says("merge city --out whole");
+    assert!(code != Some(0) && !cells.0.exists("whole") && !cells.0.exists(".whole.part"), "{said}");
+    std::fs::rename(&away, &pages).unwrap();
+    let merged = cells.done("merge city --out whole");
     merge_is_by_place(&cells, &merged);
-    // As if nothing had been done; then two machines in turn, each killed.
-    for gone in ["done.toml", "copy", "run"] {
-        let path = cells.0.path(&format!("city/cells/1/{gone}"));
-        if path.is_dir() { std::fs::remove_dir_all(path) } else { std::fs::remove_file(path) }.unwrap();
-    }
+    assert_eq!(cells.done("merge city --out whole"), merged, "a second merge says what the first one has done");
+    // As if nothing had been done; then machines in turn, each killed once it has copied a commit, the first one before.
+    cells.forget(1);
     ["one", "two"].iter().for_each(|drive| std::fs::create_dir(cells.0.path(drive)).unwrap());
-    let mut lives = 0;
-    let last = loop {
-        let drive = ["one", "two"][lives % 2];
-        let flags = format!("run city --cell 1 --spill-dir {drive} --commit-every 0.02 --copy-every 0.3");
-        if lives == 4 {
-            cells.done(&flags);
-            break drive;
-        }
-        let worker = cells.begin(&flags);
-        std::thread::sleep(Duration::from_millis(350 + 200 * lives as u64));
-        if !worker.kill() {
-            break drive;
-        }
-        lives += 1;
-    };
-    assert!(cells.0.ply(&format!("{last}/cell-1/run")) == alone, "after {lives} lives the scene is another");
+    let run_on = |drive: &str| format!("{}/run", cells.place(drive, 1));
+    let flags = "run city --cell 1 --commit-every 0.01";
+    let committed =
+        || cells.0.path("one").read_dir().unwrap().next().is_some() && cells.0.has_committed(&run_on("one"));
+    let worker = cells.begin(&format!("{flags} --log-every 1 --spill-dir one"));
+    assert!(worker.once(committed).kill());
+    for place in ["--spill-dir two", "", "--spill-dir one"] {
+        let before = cells.newest(1);
+        let worker = cells.begin(&format!("{flags} --copy-every 0.05 {place}"));
+        assert!(worker.once(|| cells.newest(1) > before).kill(), "{place}");
+        // What a copy that is killed at its beginning leaves.
+        let part = format!("city/cells/1/copy/{}.part", cells.newest(1).unwrap() + 1);
+        std::fs::create_dir_all(cells.0.path(&part)).unwrap();
+        cells.0.write(&format!("{part}/LOCK"), "");
+    }
+    cells.done("run city --cell 1 --spill-dir two");
+    assert!(cells.0.ply(&run_on("two")) == alone, "the scene is another");
+    says(&cells.done("merge city --out again"), &[merged.split(": ").nth(1).unwrap()]);
 }
 
 /// The rows of the ring are those of the prior, bit for bit.
@@ -158,7 +220,8 @@ fn merge_is_by_place(cells: &Cells, merged: &str) {
             kept += own.filter(|&row| of_page[row] >= of_prior || uids.insert(of_page[row])).count();
         }
     }
-    let (columns, _) = cells.0.gaussians("whole/point_cloud.ply");
+    let (columns, meta) = cells.0.gaussians("whole/point_cloud.ply");
+    assert_eq!(meta.frame, ExportFrame::Local, "a key of the whole scene that the prior does not have");
     let put_back: usize = merged.split(" put back").next().unwrap().rsplit(' ').next().unwrap().parse().unwrap();
     assert_eq!(columns.rows(), kept + put_back, "{merged}");
     assert!(columns.rows() > 1500, "{merged}");
@@ -168,31 +231,35 @@ fn merge_is_by_place(cells: &Cells, merged: &str) {
 #[test]
 fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     let cells = Cells::cut(800, "--cells 2");
-    let refused = cells.says("run city --cell 0 --optimizer-on host");
-    assert_eq!(refused.0, Some(2), "a key that decides bytes: {}", refused.1);
-    let worker =
-        cells.begin("run city --cell 0 --threads 1 --log-every 1").once(|| cells.0.lines("city/cells/0/run") > 0);
+    for flags in ["--optimizer-on host", "--schedule classic", "--poor-points", "--up keep", "--appearance full"] {
+        cells.refuses(&format!("run city --cell 0 {flags}"), &["it decides what is trained"]);
+    }
+    for flags in ["run city --cell 0 --copy-every 1e19", "run city --cell 0 --copy-every nan", "seam city x --band=-1"]
+    {
+        cells.refuses(flags, &["out of range"]);
+    }
+    for flags in ["--margin nan", "--view-share nan", "--cells 0"] {
+        cells.refuses(&format!("cut scene --out city --cells 2 {flags}"), &[&flags[..flags.find(' ').unwrap()]]);
+    }
+    cells.refuses("prior scene --out other --ssim-lambda 7", &["--ssim-lambda"]);
+    assert!(!cells.0.exists("other"));
+    // Legs of one step: most of the time the worker is between two of them.
+    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > Some(0));
     let (code, said) = cells.says("run city --cell 0");
     assert_eq!(code, Some(75), "{said}");
     says(&said, &["another process works on cell 0"]);
     worker.signal("TERM").ends(75);
     says(&cells.done("status city"), &["cell 0:", "waiting", "0 of 2 cells are done"]);
-    cells.copy(0);
-    let (code, said) = cells.says("merge city --out whole");
-    assert_eq!(code, Some(2), "{said}");
-    says(&said, &["cells 0, 1 are not done"]);
+    cells.refuses("merge city --out whole", &["cells 0, 1 are not done"]);
     for (file, from, to) in [("plan.toml", "steps = ", "steps = 1"), ("cells/1/pages.txt", "\n", " frozen\n")] {
         let file = format!("city/{file}");
         let before = cells.0.text(&file);
         cells.0.write(&file, before.replacen(from, to, 1));
-        let (code, said) = cells.says("run city --cell 1");
-        assert_eq!(code, Some(2), "{said}");
-        says(&said, &["was changed after the cut", "remedy"]);
+        cells.refuses("run city --cell 1", &["was changed after the cut"]);
         cells.0.write(&file, before);
     }
-    let (code, said) = cells.says("cut scene --out city --cells 3");
-    assert_eq!(code, Some(2), "{said}");
-    says(&said, &["the city is cut already"]);
+    cells.refuses("cut scene --out city --cells 3", &["the city is cut already"]);
+    says(&cells.done("cut scene --out city --cells 2"), &["is cut", "2 cells"]);
 }
 
 #[test]
@@ -209,4 +276,8 @@ fn cells_with_few_photos_or_none_are_joined_to_a_neighbour() {
     });
     assert_eq!(names.collect::<BTreeSet<_>>().len(), cells.0.photos().len());
     assert_eq!(plan["leaves"].as_array().unwrap().len(), 16);
+    // However short its legs are, a cell is evaluated and done.
+    cells.done("run city --cell 0 --copy-every 0");
+    let done: toml::Table = cells.0.text("city/cells/0/done.toml").parse().unwrap();
+    assert!(done["psnr"].as_float().is_some_and(|psnr| psnr > 5.0), "{done:?}");
 }

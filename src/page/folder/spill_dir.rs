@@ -7,6 +7,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
+use crate::base::machine::host_name;
 use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
@@ -401,11 +402,6 @@ fn is_same_file(path: &Path, file: &File) -> bool {
 fn is_same_file(_path: &Path, _file: &File) -> bool {
     // These systems do not let anyone remove an open file.
     true
-}
-
-fn host_name() -> String {
-    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").ok().or_else(|| std::env::var("HOSTNAME").ok());
-    name.map_or_else(|| "unknown".to_string(), |n| n.trim().to_string())
 }
 
 /// Content of the FORMAT file; `None` if there is none.

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Suffix of the name of an unfinished store.
-pub const PART_SUFFIX: &str = ".part";
+const PART_SUFFIX: &str = ".part";
 /// Page writes in flight.
 const IN_FLIGHT: usize = 16;
 
@@ -43,26 +43,32 @@ pub struct NewStore {
     changes: BTreeMap<PageId, Option<(SlotRef, Vec<u8>)>>,
 }
 
+/// The `.part` name for `target`.
+pub fn part_of(target: &Path) -> PathBuf {
+    let mut name = target.as_os_str().to_os_string();
+    name.push(PART_SUFFIX);
+    PathBuf::from(name)
+}
+
 /// The `.part` name for `target`, if neither exists.
 /// Errors: one of them exists.
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
-    let mut name = target.as_os_str().to_os_string();
-    name.push(PART_SUFFIX);
-    for path in [target.to_path_buf(), PathBuf::from(&name)] {
+    let part = part_of(target);
+    for path in [target, &part] {
         if std::fs::symlink_metadata(&path).is_ok() {
             let remedy = "name a folder that does not exist; its parent must";
-            return Err(InputError::new(&path, "exists already", remedy));
+            return Err(InputError::new(path, "exists already", remedy));
         }
     }
-    Ok(PathBuf::from(name))
+    Ok(part)
 }
 
 impl NewStore {
-    /// Starts a store for `target`, which does not exist.
+    /// Starts a store for `target`, which does not exist. It may lie on a network drive: its pages are written once, in order.
     /// Errors: `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
         let part = refuse_existing(target)?;
-        let spill = SpillDir::create(&part, layout, false)?;
+        let spill = SpillDir::create(&part, layout, true)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
             let opened: Opened =
                 Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;

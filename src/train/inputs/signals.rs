@@ -1,10 +1,10 @@
 //! Signals: the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) asks the loop to stop after its step, the second ends
-//! the process at once. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
+//! the process at once. The flag is one for the whole process: a signal between two runs stops the second. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
 //! size limit) is ignored.
 
 use signal_hook::consts::{SIGINT, SIGTERM};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 /// Turns writes beyond the file size limit into I/O errors, instead of ending the process.
@@ -14,7 +14,7 @@ pub fn survive_file_size_limit() {
     let _ = signal_hook::flag::register(signal_hook::consts::SIGXFSZ, Arc::default());
 }
 
-/// Exit code of a run that has come to its deadline.
+/// Exit code of a run whose steps were ended by its deadline.
 pub const DEADLINE_CODE: i32 = 75;
 
 /// The stop request of the process, with its signal.
@@ -26,9 +26,17 @@ pub struct StopFlag {
 }
 
 impl StopFlag {
-    /// Installs the handlers. A second signal ends the process with exit code 129, 130 or 143.
+    /// The flag of this process; installs the handlers when first called. A second signal ends the process with exit code 129, 130
+    /// or 143.
     /// Errors: the system refused a handler.
     pub fn listen() -> std::io::Result<StopFlag> {
+        static OF_PROCESS: Mutex<Option<StopFlag>> = Mutex::new(None);
+        let mut of_process = OF_PROCESS.lock().unwrap_or_else(PoisonError::into_inner);
+        let flag = of_process.take().map_or_else(StopFlag::install, Ok)?;
+        Ok(of_process.insert(flag).clone())
+    }
+
+    fn install() -> std::io::Result<StopFlag> {
         let flag = StopFlag::default();
         let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];
         #[cfg(unix)]
@@ -44,18 +52,23 @@ impl StopFlag {
         Ok(flag)
     }
 
-    /// As if a signal came at this time.
+    /// The flag with a time after which no step shall begin.
     #[must_use]
     pub fn with_deadline(self, deadline: Option<Instant>) -> StopFlag {
         StopFlag { deadline, ..self }
     }
 
-    /// Exit code of the stop request, 129, 130 or 143, or [`DEADLINE_CODE`] after the deadline; `None` without a request.
+    /// Exit code of the stop request, 129, 130 or 143; `None` without a request.
     pub fn exit_code(&self) -> Option<i32> {
         match self.signal.load(Ordering::Relaxed) as i32 {
-            0 => self.deadline.filter(|at| Instant::now() >= *at).map(|_| DEADLINE_CODE),
+            0 => None,
             signal => Some(128 + signal),
         }
+    }
+
+    /// Whether the deadline has passed. It ends steps alone: what follows the last step is never cut short by it.
+    pub fn is_late(&self) -> bool {
+        self.deadline.is_some_and(|at| Instant::now() >= at)
     }
 }
 

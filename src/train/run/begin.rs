@@ -227,7 +227,7 @@ pub(super) fn plan_and_train(
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    let stop = stop.with_deadline(request.leg.map(|leg| Instant::now() + leg));
+    let stop = stop.with_deadline(request.leg.and_then(|leg| Instant::now().checked_add(leg)));
     out_folder::make_folder(&request.out)?;
     // Take the lock before removing files; hold it to the end.
     let _lock = out_folder::lock(&request.out)?;
@@ -238,7 +238,8 @@ pub(super) fn plan_and_train(
         out_folder::make(&request.out, request.existing)?;
     }
     let outcome = train_into(request, dataset, trainer, &stop, &mut tiers, begun, &forecast);
-    if tiers.can_resume() {
+    // A leg is followed by the next one.
+    if tiers.can_resume() && request.leg.is_none() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);
         crate::tell!(

@@ -115,13 +115,14 @@ pub fn evaluate_file(
 }
 
 /// Gaussians in a file.
-enum Model {
+pub(crate) enum Model {
     Ply(Box<(Columns, SceneMeta)>),
     Sog(Box<SogReader>),
 }
 
 impl Model {
-    fn open(file: &Path) -> InputResult<Model> {
+    /// Errors: the file cannot be read, or holds points.
+    pub fn open(file: &Path) -> InputResult<Model> {
         if is_tree(file) {
             return Ok(Model::Sog(Box::new(SogReader::open(file)?)));
         }
@@ -136,18 +137,19 @@ impl Model {
 }
 
 /// The held-out photos of a scene, and what draws Gaussians from their places.
-struct Evaluator<'a> {
+pub(crate) struct Evaluator<'a> {
     config: &'a TrainConfig,
-    dataset: Dataset,
-    targets: TargetCache,
-    renderer: Box<dyn Renderer>,
+    pub dataset: Dataset,
+    pub targets: TargetCache,
+    pub renderer: Box<dyn Renderer>,
     lpips: Option<(&'a Lpips, InputRange)>,
     /// Warnings that were printed. Most levels cause the same ones.
     printed: BTreeSet<String>,
 }
 
 impl<'a> Evaluator<'a> {
-    fn open(
+    /// Errors: the scene, its photos or the device cannot be used.
+    pub fn open(
         scene: &Path,
         config: &'a TrainConfig,
         lpips: Option<(&'a Lpips, InputRange)>,
@@ -179,14 +181,9 @@ impl<'a> Evaluator<'a> {
         Ok(levels)
     }
 
-    /// Evaluates Gaussians that were read from `file`.
-    fn evaluate(
-        &mut self,
-        file: &Path,
-        mut columns: Columns,
-        meta: &SceneMeta,
-        pictures: Option<&Path>,
-    ) -> Result<EvalFigures, TrainError> {
+    /// Gaussians that were read from `file`, in the frame of the dataset.
+    /// Errors: none of them lies in it, or they do not fit in memory.
+    pub fn placed(&mut self, file: &Path, mut columns: Columns, meta: &SceneMeta) -> Result<Columns, TrainError> {
         let frame = &self.dataset.frame;
         let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
         let mut sample = PositionSample::default();
@@ -204,13 +201,30 @@ impl<'a> Evaluator<'a> {
             let (cache, network) = (self.config.image_cache.0, self.lpips.map(|(lpips, _)| lpips.network()));
             check_evaluation_fits(file, &columns, &self.dataset, budget, cache, network)?;
         }
-        let run = RunOptions::new(self.config, self.dataset.scene_scale);
-        let render = RenderOptions { sh_degree: columns.sh_degree, ..run.render };
-        let gaussians = columns.rows() as u64;
-        // Evaluate with the file's SH degree; the config's is for training.
-        let bands = RunOptions { sh_degree: columns.sh_degree, sh_degree_start: columns.sh_degree, ..run.clone() };
+        Ok(columns)
+    }
+
+    /// The pages of such Gaussians, and how a run draws them: with their own SH degree; that of the config is for training.
+    /// Errors: they cannot be paged.
+    pub fn pages(&self, columns: &Columns) -> Result<(PagedScene, RunOptions), TrainError> {
+        let (sh_degree, run) = (columns.sh_degree, RunOptions::new(self.config, self.dataset.scene_scale));
+        let render = RenderOptions { sh_degree, ..run.render };
+        let run = RunOptions { sh_degree, sh_degree_start: sh_degree, render, ..run };
         let pager = Pager::in_memory(PagerConfig::in_memory(run.page_rows, columns.sh_degree));
-        let mut pages = PagedScene::new(&columns, pager, &bands)?;
+        Ok((PagedScene::new(columns, pager, &run)?, run))
+    }
+
+    /// Evaluates Gaussians that were read from `file`.
+    fn evaluate(
+        &mut self,
+        file: &Path,
+        columns: Columns,
+        meta: &SceneMeta,
+        pictures: Option<&Path>,
+    ) -> Result<EvalFigures, TrainError> {
+        let columns = self.placed(file, columns, meta)?;
+        let (mut pages, run) = self.pages(&columns)?;
+        let gaussians = columns.rows() as u64;
         drop(columns);
         let views = self.dataset.test_views();
         let shown = Count::new("views compared", views.len() as u32, false);
@@ -226,7 +240,7 @@ impl<'a> Evaluator<'a> {
         };
         let working = &mut WorkingSet::default();
         let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *self.renderer };
-        let test = evaluate(&mut now, &self.dataset, &self.targets, &render, &request)?;
+        let test = evaluate(&mut now, &self.dataset, &self.targets, &run.render, &request)?;
         Ok(EvalFigures { gaussians, test })
     }
 }

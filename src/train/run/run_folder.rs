@@ -38,7 +38,7 @@ use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::{Results, export, save, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
-use crate::train::inputs::signals::StopFlag;
+use crate::train::inputs::signals::{DEADLINE_CODE, StopFlag};
 use crate::train::log::progress::RunProgress;
 use crate::train::log::report::{ExportFacts, MetricsLog, StepCosts, Summary, TestMetrics, write_summary};
 use crate::train::preflight::forecast::Forecast;
@@ -214,9 +214,10 @@ pub(super) fn train_into(
     warn_of_ply(config, &written, &ply);
     let summary = write_results(request, dataset, &targets, results, looped, &written, step_costs)?;
     tiers.is_done = summary.finished;
+    let is_late = summary.steps < config.steps;
     Ok(RunOutcome {
         summary: Some(summary),
-        exit_code: stop.exit_code().unwrap_or(0),
+        exit_code: stop.exit_code().unwrap_or(if is_late { DEADLINE_CODE } else { 0 }),
         out: out.clone(),
         keeps_checkpoint: config.keep_checkpoint,
     })
@@ -239,10 +240,10 @@ fn write_results(
     let exported = export_all(request, dataset, &mut results, &ply, written);
     let mut facts = exported.as_ref().map_or(Vec::new(), Clone::clone).into_iter();
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
-    let asked = results.stop.exit_code();
-    let tested = looped.and_then(|()| match asked {
-        None => evaluate_result(request, dataset, targets, &mut results),
-        Some(_) => Ok(None),
+    let is_stopped = results.stop.exit_code().is_some() || results.trainer.steps_done() < config.steps;
+    let tested = looped.and_then(|()| match is_stopped {
+        false => evaluate_result(request, dataset, targets, &mut results),
+        true => Ok(None),
     });
     if (config.keep_checkpoint || exported.is_err()) && tested.is_ok() {
         // Commit again, with the result of the evaluation. A run whose export failed is resumed from this commit.
@@ -265,7 +266,7 @@ fn write_results(
         version: env!("CARGO_PKG_VERSION").to_string(),
         ssim_variant: config.ssim_variant.to_string(),
         // A run without its evaluation or its export is not finished: a resume makes them.
-        finished: trainer.steps_done() == config.steps && tested.is_ok() && exported.is_ok() && asked.is_none(),
+        finished: tested.is_ok() && exported.is_ok() && !is_stopped,
         rows_skipped_non_finite: rows_skipped,
         steps_skipped_non_finite: steps_skipped,
         photos: trainer.photos.iter().flat_map(|parameter| parameter.figures(dataset)).collect(),

@@ -19,7 +19,7 @@ use crate::report::run_files::saved_ply_name;
 use crate::train::commits::checkpoint::Checkpoint;
 use crate::train::commits::results::save;
 use crate::train::error::TrainError;
-use crate::train::inputs::signals::{DEADLINE_CODE, StopFlag};
+use crate::train::inputs::signals::StopFlag;
 use crate::train::log::progress::{RunProgress, ShownStep};
 use crate::train::log::report::{MetricsLog, StepLine, TestMetrics, json_psnr};
 use crate::train::memory::{HostBudget, PLAN_BYTES};
@@ -58,11 +58,8 @@ impl TrainingLoop<'_> {
             (options.steps, options.eval_every, options.save_every, options.log_every)
         };
         let first = self.trainer.steps_done();
-        let is_stopped = |done: u32| match self.stop.exit_code() {
-            // Or a run of legs that are too short would never end.
-            Some(DEADLINE_CODE) => done > first,
-            asked => asked.is_some(),
-        };
+        // After a step at least: a run of legs that are too short would never end.
+        let is_stopped = |done: u32| self.stop.exit_code().is_some() || (done > first && self.stop.is_late());
         // A step in flight is always finished.
         while self.trainer.steps_done() < steps && (!is_stopped(self.trainer.steps_done()) || self.trainer.is_ahead()) {
             if !self.log_due_events()? {
@@ -122,6 +119,7 @@ impl TrainingLoop<'_> {
             && !is_due
             && !is_shown
             && self.stop.exit_code().is_none()
+            && !self.stop.is_late()
             && !self.trainer.run_memory().is_outgrown()
     }
 

@@ -30,6 +30,7 @@ use crate::scene::partition::first_fill;
 use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
+use crate::train::inputs::dataset_print::GaussiansPrint;
 use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter, PositionSample, file_warnings};
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
@@ -83,7 +84,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
     let space = GaussianSpace { folder: beside, memory };
     let mut rows = GaussianWriter::new(&request.file, space);
-    let (meta, radius) = read_rows(&request.file, &mut rows)?;
+    let (meta, radius, points) = read_rows(&request.file, &mut rows)?;
     file_warnings(&request.file, &meta, 0).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let rows = rows.finish()?;
     let (count, sh_degree) = (rows.rows(), rows.sh_degree);
@@ -103,7 +104,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         Some(error) => return Err(error),
         None => written?,
     }
-    let state = first_state(&config, (&meta, radius), count as u64, sh_degree)?;
+    let state = first_state(&config, (&meta, radius), (count as u64, points), sh_degree)?;
     pages.store.commit(&state, format!("imported from {}", request.file.display()).as_bytes(), &[])?;
     let number = u64::from(pages.pages);
     pages.store.finish()?;
@@ -117,15 +118,16 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     })
 }
 
-/// Streams the Gaussians of `file` into `rows`, in the axes of their dataset. Returns the metadata, and the size of the scene in
-/// the units of the file, which no file states.
-fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMeta, f32)> {
+/// Streams the Gaussians of `file` into `rows`, in the axes of their dataset. Returns the metadata, the size of the scene in
+/// the units of the file, which no file states, and the digest of the Gaussians.
+fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMeta, f32, u64)> {
     let (header, sh_degree) = gaussians_header(file)?;
     let none = || Columns::zeros(0, sh_degree);
-    let (mut some, mut sample) = (none(), PositionSample::default());
+    let (mut some, mut sample, mut print) = (none(), PositionSample::default(), GaussiansPrint::default());
     let mut hand_on = |mut columns: Columns| {
         rotate_back(&mut columns, &header);
         sample.add(&columns.means);
+        print.add(&columns);
         rows.push_all(&columns)
     };
     let meta = stream_gaussians(file, &mut |values| {
@@ -136,7 +138,7 @@ fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMe
         }
     })?;
     hand_on(some)?;
-    Ok((meta, sample.radius().unwrap_or(1.0)))
+    Ok((meta, sample.radius().unwrap_or(1.0), print.digest()))
 }
 
 /// Encodes rows as pages and stores them.
@@ -195,7 +197,7 @@ fn options_for(request: &ImportRequest, sh_degree: u8, meta: &SceneMeta) -> Inpu
 fn first_state(
     config: &TrainConfig,
     (meta, scene_scale): (&SceneMeta, f32),
-    rows: u64,
+    (rows, points): (u64, u64),
     sh_degree: u8,
 ) -> Result<Vec<u8>, TrainError> {
     let (origin, scale) = match meta.frame {
@@ -203,7 +205,7 @@ fn first_state(
         ExportFrame::Dataset => ([0.0; 3], 1.0),
     };
     let text = toml::to_string(config).map_err(|e| CommitError::Contradiction(e.to_string()))?;
-    let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points: 0, scene_scale, origin, scale };
+    let dataset = DatasetPrint { views: Vec::new(), first_rows: rows, points, scene_scale, origin, scale };
     let simd = limits::simd_path(config).name().to_string();
     let origin = Origin { config: text, simd, sh_degree_start: sh_degree, dataset, run: RunIdentity::default() };
     let state = RunState::without_history(origin, "none".to_string(), rows);
