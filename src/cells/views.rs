@@ -12,6 +12,7 @@ use crate::base::ids::{PageId, PageNo};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::RunOptions;
 use crate::config::new_run;
+use crate::config::values::Up;
 use crate::dataset::loader::View;
 use crate::dataset::model::Split;
 use crate::render::RenderOptions;
@@ -64,12 +65,15 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     if !city.prior_store().is_dir() {
         return Err(InputError::new(city.prior_store(), "the city has no finished prior", NO_PRIOR).into());
     }
-    let config = prior_config(city, keys)?;
+    let (config, asked_up) = prior_config(city, keys)?;
     machine::set_up(&config)?;
     let host_mem = host_budget(config.host_mem.0);
     // The points decide the frame, as they did for the prior.
     let start = Start::look(scene, &config, &city.0, host_mem)?;
-    let up = start.up()?.unwrap_or(VIEWER_UP);
+    let up = match asked_up {
+        Up::Along(up) => up,
+        Up::Auto | Up::Keep => start.up()?.unwrap_or(VIEWER_UP),
+    };
     let dataset = start.into_dataset();
     let mut store = StoredStart::open(&city.prior_store(), host_mem.unwrap_or(1 << 30), 2)?;
     let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
@@ -102,12 +106,12 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes })
 }
 
-/// The config of the prior's run with the keys of this machine.
-fn prior_config(city: &City, machine: &TrainOverrides) -> InputResult<TrainConfig> {
+/// The config of the prior's run with the keys of this machine, and what the user says of up.
+fn prior_config(city: &City, machine: &TrainOverrides) -> InputResult<(TrainConfig, Up)> {
     let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
     let whole = config_of(&city.keys(), keys.clone(), machine)?;
     keys.extend(keys_of_prior(&whole));
-    config_of(&city.keys(), keys, machine)
+    Ok((config_of(&city.keys(), keys, machine)?, whole.up))
 }
 
 fn seen_page(id: PageId, bounds: &PageBounds, rows: u32, axes: &[[f64; 3]; 2]) -> SeenPage {

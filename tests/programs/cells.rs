@@ -276,6 +276,8 @@ fn cells_with_few_photos_or_none_are_joined_to_a_neighbour() {
     });
     assert_eq!(names.collect::<BTreeSet<_>>().len(), cells.0.photos().len());
     assert_eq!(plan["leaves"].as_array().unwrap().len(), 16);
+    cells.0.write("none.txt", "\n");
+    cells.0.refuses("scene --out x --views-file none.txt", &["none.txt", "it lists no photo"]);
     // However short its legs are, a cell is evaluated and done.
     cells.done("run city --cell 0 --copy-every 0");
     let done: toml::Table = cells.0.text("city/cells/0/done.toml").parse().unwrap();

@@ -162,8 +162,17 @@ impl SpillDir {
                 return Err(InputError::io(path, "removing", &error));
             }
         }
-        if self.made_folder && foreign.is_empty() {
-            std::fs::remove_dir(&self.folder).map_err(|e| InputError::io(&self.folder, "removing", &e))?;
+        let SpillDir { folder, made_folder, lock, .. } = self;
+        // A network drive keeps a removed file under another name for as long as it is open.
+        drop(lock);
+        if made_folder && foreign.is_empty() {
+            match std::fs::remove_dir(&folder) {
+                // Another process was quick to use the folder, or the drive is slow to forget the lock.
+                Err(e) if e.kind() != io::ErrorKind::DirectoryNotEmpty => {
+                    return Err(InputError::io(&folder, "removing", &e));
+                }
+                _ => {}
+            }
         }
         Ok(foreign)
     }

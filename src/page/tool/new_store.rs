@@ -55,7 +55,7 @@ pub fn part_of(target: &Path) -> PathBuf {
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
     let part = part_of(target);
     for path in [target, &part] {
-        if std::fs::symlink_metadata(&path).is_ok() {
+        if std::fs::symlink_metadata(path).is_ok() {
             let remedy = "name a folder that does not exist; its parent must";
             return Err(InputError::new(path, "exists already", remedy));
         }
