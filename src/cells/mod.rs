@@ -49,7 +49,7 @@ const RESTARTS: u32 = 3;
 pub(crate) struct AnyRun<'a> {
     pub scene: &'a Path,
     pub out: &'a Path,
-    /// There is something in `out`, or a commit, to go on from.
+    /// There is something in `out`, or a commit, to go on from. Otherwise `out` holds no results.
     pub has_begun: bool,
     /// Of a new run.
     pub config: TrainConfig,
@@ -76,7 +76,7 @@ pub(crate) fn begin_or_resume(any: AnyRun<'_>) -> Result<RunOutcome, TrainError>
     let done = match has_begun {
         true => resume(&again),
         false => {
-            let (existing, dry_run, live) = (Existing::Refuse, false, None);
+            let (existing, dry_run, live) = (Existing::BeginAgain, false, None);
             run(&RunRequest { scene, out, config, dry_run, existing, quiet, live, leg })
         }
     };

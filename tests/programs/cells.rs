@@ -105,6 +105,9 @@ fn one_cell_equals_the_plain_run_from_the_same_prior() {
     // A cell whose copy is gone is not done: on a drive and in few frames, too.
     cells.0.remove("city/cells/0/copy");
     says(&cells.done("status city"), &["0 of 1 cells are done"]);
+    cells.done("run city --cell 0");
+    assert!(cells.0.ply(&cells.run_of(0)) == plain, "the scenes differ");
+    cells.0.remove("city/cells/0/copy");
     std::fs::create_dir(cells.0.path("nvme")).unwrap();
     cells.done("run city --cell 0 --spill-dir nvme --frames 60");
     assert!(cells.0.ply(&format!("{}/run", cells.place("nvme", 0))) == plain, "the scenes differ");
