@@ -14,12 +14,15 @@ import os
 import pathlib
 import subprocess
 import sys
+import time
 import tomllib
 
 import ray
 
 PROGRAM = os.environ.get("GSSCALE_CELLS", "gsscale-cells")
 AGAIN = 75
+# Seconds between attempts where another process has the cell: the lock of a machine that is lost counts for 90.
+PAUSE = 30
 
 
 class TryAgain(Exception):
@@ -28,6 +31,8 @@ class TryAgain(Exception):
 
 def run_cell(city: str, cell: int, flags: list[str]) -> int:
     code = subprocess.run([PROGRAM, "run", city, "--cell", str(cell), "--quiet", *flags], check=False).returncode
+    if code == AGAIN:
+        time.sleep(PAUSE)
     # A signal that nobody handled, such as that of a machine without memory, gives a negative code.
     if code == AGAIN or code < 0:
         raise TryAgain(f"cell {cell}: exit code {code}")

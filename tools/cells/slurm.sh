@@ -4,7 +4,8 @@
 #   bash slurm.sh city runs/city --mem=24G --cpus-per-task=16        flags after the second folder are those of sbatch
 #
 # GSSCALE_FLAGS holds flags for `gsscale-cells run`, such as "--host-mem 20GiB"; SPILL_DIR a folder on a fast drive of each node.
-# A task that is preempted, or comes to its time limit, commits, copies the commit into the city and is queued again.
+# A task that is preempted, or comes to its time limit, commits, copies the commit into the city and is queued again; one whose worker is
+# killed, such as for want of memory, is queued again too, ten times in all.
 #SBATCH --job-name=gsscale-cells
 #SBATCH --requeue
 #SBATCH --signal=B:TERM@120
@@ -32,7 +33,7 @@ if [ $code -gt 128 ]; then
     wait $worker
     code=$?
 fi
-if [ $code -eq 75 ]; then
+if [ $code -eq 75 ] || { [ $code -gt 128 ] && [ "${SLURM_RESTART_COUNT:-0}" -lt 10 ]; }; then
     scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"
 fi
 exit $code
