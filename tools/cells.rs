@@ -4,12 +4,13 @@ use clap::{Parser, Subcommand};
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::units::{format_bytes, format_grouped, format_seconds, parse_count};
+use gsscale::cells::costs::{AsIf, PhaseCost};
 use gsscale::cells::cut::{CutRequest, cut};
 use gsscale::cells::merge::{MergeRequest, merge};
 use gsscale::cells::plan::{CellCount, CityPlan};
 use gsscale::cells::prior::{PriorRequest, prior};
 use gsscale::cells::seam::seam;
-use gsscale::cells::work::{WorkRequest, code_of, status, work};
+use gsscale::cells::work::{COPY_EVERY, WorkRequest, code_of, status, work};
 use gsscale::config::file::{TrainOverrides, parse_command_line};
 use gsscale::config::values::ByteSize;
 use gsscale::train::error::TrainError;
@@ -114,6 +115,16 @@ struct CutArgs {
     /// Print the cells, bytes and seconds; write nothing
     #[arg(long)]
     dry_run: bool,
+    /// Bytes a second of the network behind the folder of the city and the scene, for the costs
+    #[arg(long, default_value = "125MB")]
+    network: ByteSize,
+    /// Machines that work on cells, for the costs; 0 = one for each cell
+    #[arg(long, default_value_t = 0)]
+    machines: usize,
+    /// With --dry-run, plan as if the scene was a larger one of the same kind: photos, Gaussians at the end, bytes of a photo and
+    /// seconds of a step of the prior, such as 40000,100M,8MB,0.05
+    #[arg(long, requires = "dry_run", value_name = "PHOTOS,GAUSSIANS,BYTES,SECONDS")]
+    as_if: Option<AsIf>,
     /// Print only warnings and errors
     #[arg(long, short)]
     quiet: bool,
@@ -132,7 +143,7 @@ struct RunArgs {
     #[arg(long)]
     scene: Option<PathBuf>,
     /// Seconds between copies of the cell's commits into the folder of the city
-    #[arg(long, default_value_t = 900.0)]
+    #[arg(long, default_value_t = COPY_EVERY)]
     copy_every: f64,
     /// Print only warnings and errors
     #[arg(long, short)]
@@ -162,9 +173,12 @@ fn start(command: Command) -> Result<i32, TrainError> {
         Command::Cut(args) => {
             let most = args.max_gaussians_per_cell.map(CellCount::MostGaussians);
             let cells = args.cells.map(CellCount::Cells).or(most).unwrap_or(CellCount::Cells(1));
-            let CutArgs { scene, out: city, view_share, margin, dry_run, quiet, keys, .. } = *args;
-            let request = CutRequest { scene, city, cells, view_share, margin, keys, dry_run, quiet };
-            gsscale::say!("{}", text_of(&cut(&request)?));
+            let CutArgs { scene, out: city, view_share, margin, machines, as_if, dry_run, quiet, keys, .. } = *args;
+            let network = args.network.0;
+            let request =
+                CutRequest { scene, city, cells, view_share, margin, network, machines, as_if, keys, dry_run, quiet };
+            let (plan, costs) = cut(&request)?;
+            gsscale::say!("{}{}", text_of(&plan), text_of_costs(&costs));
             Ok(0)
         }
         Command::Run(args) => {
@@ -213,6 +227,23 @@ fn text_of(plan: &CityPlan) -> String {
         ));
     }
     text
+}
+
+/// What the phases cost; empty without phases.
+fn text_of_costs(costs: &[PhaseCost]) -> String {
+    if costs.is_empty() {
+        return String::new();
+    }
+    let line = |phase: &str, machines: &str, seconds: f64, bytes: [f64; 2]| {
+        let (time, [all, photos]) = (format_seconds(seconds), bytes.map(|bytes| format_bytes(bytes as u64)));
+        format!("\n{phase:6}  {machines:>8}  {time:>8}  {all:>10}  {photos:>10}")
+    };
+    let of_phase =
+        |cost: &PhaseCost| line(cost.phase, &cost.machines.to_string(), cost.seconds, [cost.network, cost.photos]);
+    let sum = |of: fn(&PhaseCost) -> f64| costs.iter().map(of).sum();
+    let all = line("all", "", sum(|cost| cost.seconds), [sum(|cost| cost.network), sum(|cost| cost.photos)]);
+    let lines: String = costs.iter().map(of_phase).chain([all]).collect();
+    format!("\n\nphase   machines      time     network  photos of it   (modelled){lines}")
 }
 
 fn show_status(city: &std::path::Path) -> Result<i32, TrainError> {

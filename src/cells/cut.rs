@@ -4,10 +4,12 @@
 //! Invariants: 1. every page has one owner, by its middle; every training view is in some cell; 2. every cell has `VIEWS_LEAST` training
 //! views, or there is only one cell; 3. `plan.toml` is written last; a city is cut once.
 
+use super::costs::{AsIf, Basis, PhaseCost};
 use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
 use super::prior::GAUSSIANS_SHARE;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
+use super::work::COPY_EVERY;
 use super::{City, check_machine_keys, check_range, config_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
@@ -36,6 +38,12 @@ pub struct CutRequest {
     pub cells: CellCount,
     pub view_share: f64,
     pub margin: f64,
+    /// Bytes a second of the network, for the costs.
+    pub network: u64,
+    /// Machines that work on cells, for the costs; 0 for one for each cell.
+    pub machines: usize,
+    /// Plan for this larger scene of the same kind; with `dry_run`.
+    pub as_if: Option<AsIf>,
     /// Keys of this machine.
     pub keys: TrainOverrides,
     pub dry_run: bool,
@@ -51,9 +59,9 @@ pub(crate) struct Draft {
     pub frozen: Vec<usize>,
 }
 
-/// Cuts the city; returns the plan of one that is cut already in the same way.
+/// Cuts the city; returns the plan, and what the city costs by phase. Of a city that is cut already in the same way only the plan.
 /// Errors: it is cut in another way, there is no prior, or it has too few pages.
-pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
+pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainError> {
     let city = City(request.city.clone());
     check_machine_keys(&request.keys)?;
     check_range("--margin", request.margin, 0.0..=10.0)?;
@@ -66,7 +74,7 @@ pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
         let plan = CityPlan::read(&city)?;
         if (plan.asked, plan.view_share, plan.margin) == (request.cells, request.view_share, request.margin) {
             crate::tell!("the city in {} is cut", city.0.display());
-            return Ok(plan);
+            return Ok((plan, Vec::new()));
         }
         let problem = "the city is cut already, in another way";
         return Err(InputError::new(city.plan(), problem, "go on with gsscale-cells run, or begin another city").into());
@@ -91,7 +99,7 @@ pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
         }
         cells.push(planned);
     }
-    let plan = CityPlan {
+    let mut plan = CityPlan {
         version: env!("CARGO_PKG_VERSION").to_string(),
         prior: prior_digest(&city, seen.digest)?,
         gaussians,
@@ -110,7 +118,21 @@ pub fn cut(request: &CutRequest) -> Result<CityPlan, TrainError> {
     if !request.dry_run {
         plan.write(&city)?;
     }
-    Ok(plan)
+    let mut basis = Basis {
+        whole: &whole,
+        photo: seen.photo,
+        step_seconds: past,
+        steps: whole.steps.into(),
+        prior_degree: seen.sh_degree,
+        network: request.network.max(1) as f64,
+        machines: if request.machines == 0 { plan.cells.len() } else { request.machines },
+        copy_every: COPY_EVERY,
+    };
+    if let Some(larger) = request.as_if.filter(|_| request.dry_run) {
+        basis.enlarge(&mut plan, larger);
+    }
+    let phases = basis.phases(&plan);
+    Ok((plan, phases))
 }
 
 /// The remedies that the prior has decided on: its diagnosis saw all photos, and every cell shall have the same.

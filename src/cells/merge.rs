@@ -39,7 +39,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// The polish takes one in this many of the steps.
-const POLISH_SHARE: u32 = 20;
+pub(crate) const POLISH_SHARE: u32 = 20;
 /// What was merged, from which plan.
 const MERGED_FILE: &str = "merged.toml";
 const POLISH_FILE: &str = "polish.toml";

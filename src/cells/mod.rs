@@ -20,6 +20,7 @@
 //! 2. a command that is repeated goes on or says that it is done; 3. nothing is published in the city but under the lock of its cell, and
 //! only complete: `done.toml` is the last.
 
+pub mod costs;
 pub mod cut;
 pub mod lock;
 pub mod merge;

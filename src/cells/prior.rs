@@ -19,7 +19,7 @@ use crate::train::stores::{ImportRequest, import};
 use std::path::PathBuf;
 
 /// The prior takes this part of the steps, and of the Gaussians.
-const STEPS_SHARE: u32 = 4;
+pub(crate) const STEPS_SHARE: u32 = 4;
 pub(crate) const GAUSSIANS_SHARE: u64 = 5;
 /// Longest side of its photos, pixels.
 const RESOLUTION_MOST: u32 = 800;

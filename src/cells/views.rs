@@ -3,6 +3,7 @@
 //!
 //! Invariant: the weights are those of the prior's rows at the prior's photo sizes, whatever machine measures them, up to rounding.
 
+use super::costs::PhotoBytes;
 use super::plan::ground;
 use super::prior::keys_of_prior;
 use super::{City, NO_PRIOR, config_of};
@@ -39,6 +40,8 @@ pub(crate) struct Seen {
     /// The direction of the dataset that is up.
     pub up: [f64; 3],
     pub axes: [[f64; 3]; 2],
+    pub photo: PhotoBytes,
+    pub sh_degree: u8,
 }
 
 pub(crate) struct SeenPage {
@@ -90,12 +93,18 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
         ids.iter().map(|&(no, id)| seen_page(id, &index[no.index()].bounds, index[no.index()].rows, &axes)).collect();
     let mut place = vec![usize::MAX; index.len()];
     ids.iter().enumerate().for_each(|(at, (no, _))| place[no.index()] = at);
-    let render = RenderOptions { sh_degree: store.sh_degree(), ..RunOptions::new(&config, dataset.scene_scale).render };
+    let sh_degree = store.sh_degree();
+    let render = RenderOptions { sh_degree, ..RunOptions::new(&config, dataset.scene_scale).render };
     let mut renderer = machine::renderer(&config)?.renderer;
     let (mut views, mut working) = (Vec::new(), WorkingSet::default());
+    let mut photo = PhotoBytes { file: 0.0, decoded: 0.0 };
+    let share = 1.0 / dataset.views.len() as f64;
     let shown = Count::new("views weighed", dataset.views.len() as u32, quiet);
     let step = store.state().trainer.step;
-    for View { name, split, camera, .. } in &dataset.views {
+    for View { name, split, camera, photo: source } in &dataset.views {
+        let file = std::fs::metadata(&source.image_path).map_or(0, |of| of.len());
+        photo.file += file as f64 * share;
+        photo.decoded += source.target_bytes() as f64 * share;
         let mut now = SceneNow { scene: store.scene(), step, working: &mut working, renderer: &mut *renderer };
         let weights = weigh_pages(&mut now, camera, &render)?.into_iter().filter(|(_, weight)| *weight > 0.0);
         let weights = weights.map(|(page, weight)| (place[page.index()], weight)).collect();
@@ -103,7 +112,7 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
         views.push(SeenView { name, is_train, at, weights });
         shown.show(views.len() as u32);
     }
-    Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes })
+    Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes, photo, sh_degree })
 }
 
 /// The config of the prior's run with the keys of this machine, and what the user says of up.

@@ -43,6 +43,9 @@ pub const AGAIN: i32 = 75;
 /// Exit code: no further attempt will succeed.
 pub const NEVER: i32 = 2;
 
+/// Usual seconds between copies.
+pub const COPY_EVERY: f64 = 900.0;
+
 /// Work on a cell.
 #[derive(Debug, Clone)]
 pub struct WorkRequest {

@@ -244,6 +244,13 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     for flags in ["--margin nan", "--view-share nan", "--cells 0"] {
         cells.refuses(&format!("cut scene --out city --cells 2 {flags}"), &[&flags[..flags.find(' ').unwrap()]]);
     }
+    // A dry run plans for a larger scene, and writes nothing.
+    let plan = cells.0.text("city/plan.toml");
+    let larger = "--dry-run --cells 5 --machines 3 --as-if 40000,100M,8MB,0.05";
+    let said = cells.done(&format!("cut scene --out city {larger}"));
+    says(&said, &["40000 training photos", "modelled", "merge"]);
+    let machines = said.lines().find_map(|line| line.strip_prefix("cells ")).unwrap().split_whitespace().next();
+    assert!(machines == Some("3") && cells.0.text("city/plan.toml") == plan, "{said}");
     cells.refuses("prior scene --out other --ssim-lambda 7", &["--ssim-lambda"]);
     assert!(!cells.0.exists("other"));
     // Legs of one step: most of the time the worker is between two of them.
