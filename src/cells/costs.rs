@@ -4,7 +4,6 @@
 //! A step of a cell takes the time of one of the prior, times half of what the scene grows by. A photo is read for each step, or once for each
 //! leg where `--image-cache` holds the cell's photos. A copy has half of the bytes by which its cell grows. All machines share the network.
 
-use super::merge::POLISH_SHARE;
 use super::plan::{CellPlan, CityPlan};
 use super::prior::STEPS_SHARE;
 use crate::base::units::{parse_bytes, parse_count};
@@ -12,6 +11,8 @@ use crate::config::file::TrainConfig;
 use crate::scene::state::row_bytes;
 use serde::Serialize;
 
+/// The polish takes one in this many of the steps.
+pub(crate) const POLISH_SHARE: u32 = 20;
 /// A view is drawn without its gradient in this part of a step.
 const DRAWING_SHARE: f64 = 1.0 / 3.0;
 

@@ -9,6 +9,7 @@
 //! Invariants: 1. the result is a function of the cells' copies and the plan; 2. no identity of a prior row comes twice; 3. the folder appears
 //! as a whole; 4. of rows that may be put back only the pages are kept in memory.
 
+use super::costs::POLISH_SHARE;
 use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
 use super::work::{copy_of, done_of};
@@ -38,8 +39,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// The polish takes one in this many of the steps.
-pub(crate) const POLISH_SHARE: u32 = 20;
 /// What was merged, from which plan.
 const MERGED_FILE: &str = "merged.toml";
 const POLISH_FILE: &str = "polish.toml";
