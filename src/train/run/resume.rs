@@ -160,7 +160,10 @@ impl Earlier {
             let remedy = "name that output folder, or one that does not exist yet";
             return Err(InputError::new(&request.out, problem, remedy).into());
         }
-        crate::tell!("warning: {} is missing: restoring it from the checkpoint", path.display());
+        // The leg of a run that came from another machine has none.
+        if request.leg.is_none() {
+            crate::tell!("warning: {} is missing: restoring it from the checkpoint", path.display());
+        }
         // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
         let scene = request.scene.clone().unwrap_or_else(|| PathBuf::from(&state.origin.run.scene));
