@@ -67,7 +67,8 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     check_range("--band", band, 0.0..=1e6)?;
     let city = City(city.to_path_buf());
     let plan = CityPlan::read(&city)?;
-    let config = TrainConfig::read(&model.join(CONFIG_FILE))?;
+    // All photos, also where the model was polished on some.
+    let config = TrainConfig { views_file: String::new(), ..TrainConfig::read(&model.join(CONFIG_FILE))? };
     machine::set_up(&config)?;
     let file = model.join(PLY_FILE);
     let Model::Ply(read) = Model::open(&file)? else {
