@@ -13,7 +13,7 @@ use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::poses::{MORE_OVERLAP, PoseSearch, PosesRequest};
 use gsscale::report::live::{Live, parse_address};
-use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE};
+use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE, SETTINGS_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::begin::run;
 use gsscale::train::run::out_folder::{check_usable_out, default_out, is_trace, remedy_of_existing};
@@ -285,7 +285,14 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         );
         let out = &outcome.out;
         gsscale::tell!("  quality     {test}");
-        gsscale::tell!("  Gaussians   {}", out.join(PLY_FILE).display());
+        let left_out = match summary.gaussians_left_out {
+            0 => String::new(),
+            count => format!(" (without {} that too few photos hold in place)", format_grouped(count)),
+        };
+        gsscale::tell!("  Gaussians   {}{left_out}", out.join(PLY_FILE).display());
+        if out.join(SETTINGS_FILE).is_file() {
+            gsscale::tell!("  start view  {} (for viewers)", out.join(SETTINGS_FILE).display());
+        }
         gsscale::tell!("  report      {}", out.join(REPORT_FILE).display());
         gsscale::tell!("  look        gsscale-view {}", out.display());
         if summary.finished {

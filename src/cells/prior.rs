@@ -99,6 +99,7 @@ pub(crate) fn keys_of_prior(whole: &TrainConfig) -> toml::Table {
         Some(whole.max_resolution).filter(|&most| most > 0).map_or(RESOLUTION_MOST, |most| most.min(RESOLUTION_MOST));
     let mut keys = toml::toml! {
         export-frame = "local"
+        export-clean = "off"
         up = "keep"
         keep-checkpoint = false
     };

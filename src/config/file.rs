@@ -295,6 +295,9 @@ config_keys! {
         /// Files of the result: ply, spz, sog or several (spz,sog). A PLY is always written; spz adds a file of about a tenth of its
         /// bytes, sog a folder with levels of detail, which web viewers load in parts
         export: Exports = Exports { spz: false, sog: false } => Free common;
+        /// Leave Gaussians that fewer than two photos hold in place out of the result files (the checkpoint keeps them): auto, on or off.
+        /// Where photos overlap little, auto leaves out only those that no photo holds
+        export_clean: Chosen<bool> = Chosen(None) => Free;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
         /// Up in the exported files: auto (from cameras and points), keep (the axes of the dataset) or X,Y,Z (this direction

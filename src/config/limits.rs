@@ -55,6 +55,8 @@ pub struct RunOptions {
     pub color_correct: Option<ColorCorrect>,
     pub photos: PhotoOptions,
     pub export_frame: ExportFrame,
+    /// Whether result files leave out Gaussians that few photos hold; `None` decides by their share.
+    pub export_clean: Option<bool>,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
     /// `--up auto` is unresolved.
     pub up: Option<[f64; 3]>,
@@ -107,6 +109,7 @@ impl RunOptions {
                 scene_scale,
             },
             export_frame: config.export_frame,
+            export_clean: config.export_clean.0,
             up: match config.up {
                 Up::Along(up) => Some(up),
                 Up::Auto | Up::Keep => None,

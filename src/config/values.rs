@@ -214,8 +214,8 @@ impl Chosen<bool> {
     }
 }
 
-/// The keys of remedies that a run may switch on by itself.
-const REMEDIES: [&str; 4] = ["poor-points", "robust-views", "robust-pixels", "refine-poses"];
+/// The keys of what a run may switch on by itself.
+const REMEDIES: [&str; 5] = ["poor-points", "robust-views", "robust-pixels", "refine-poses", "export-clean"];
 
 /// Every key whose value is a word, with the words that a user may write.
 pub fn choices() -> impl Iterator<Item = (&'static str, &'static [&'static str])> {
@@ -364,7 +364,7 @@ open_choices! {
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
 }
 
-/// A remedy that a run may switch on by itself. Several keys have values of this type, so a message about a file names none: it shows the
+/// What a run may switch on by itself. Several keys have values of this type, so a message about a file names none: it shows the
 /// line.
 impl Choice for Chosen<bool> {
     const KEY: &'static str = "";

@@ -55,13 +55,17 @@ impl ExportRows {
         self.frame
     }
 
+    /// A position of the local frame in that of the file.
+    pub fn position(&self, local: [f64; 3]) -> [f64; 3] {
+        let is_local = self.frame == ExportFrame::Local;
+        let at = |i: usize| if is_local { local[i] } else { local[i] * self.scale + self.origin[i] };
+        self.turning.position([at(0), at(1), at(2)])
+    }
+
     /// A row in the file's frame; `None` if a value is not finite.
     pub fn row(&self, c: &Columns, row: usize) -> Option<ExportRow> {
         let is_local = self.frame == ExportFrame::Local;
         let (mean, scales, quat) = (c.row(Column::Means, row), c.row(Column::Scales, row), c.row(Column::Quats, row));
-        let at = |i: usize| {
-            if is_local { f64::from(mean[i]) } else { f64::from(mean[i]) * self.scale + self.origin[i] }
-        };
         let log_scale = |i: usize| if is_local { scales[i] } else { (f64::from(scales[i]) + self.log_scale) as f32 };
         let (sh0, given) = (c.row(Column::Sh0, row), c.row(Column::ShN, row));
         let mut sh_n = [0.0; BANDS_MAX];
@@ -71,7 +75,7 @@ impl ExportRows {
         let unit = unit_quat([quat[0], quat[1], quat[2], quat[3]]);
         let turned = if self.turning.is_identity() { unit } else { unit_quat(self.turning.orientation(unit)) };
         let exported = ExportRow {
-            position: self.turning.position([at(0), at(1), at(2)]).map(|x| x as f32),
+            position: self.position([mean[0], mean[1], mean[2]].map(f64::from)).map(|x| x as f32),
             log_scales: [0, 1, 2].map(log_scale),
             quat: turned,
             opacity: c.opacities[row],

@@ -17,6 +17,8 @@ pub const SUMMARY_FILE: &str = "summary.json";
 pub const PLY_FILE: &str = "point_cloud.ply";
 /// The way from the coordinates of the Gaussians to those of the dataset, and back.
 pub const TRANSFORM_FILE: &str = "point_cloud.transform.json";
+/// The camera with which viewers start.
+pub const SETTINGS_FILE: &str = "point_cloud.settings.json";
 pub const REPORT_FILE: &str = "report.html";
 /// The pages seen from above, for the report: a JSON list of [`super::page_map::PageTile`].
 pub const PAGES_FILE: &str = "pages.json";
@@ -26,9 +28,9 @@ pub const PICTURES_FOLDER: &str = "renders/test";
 pub const VIEWS_FILE: &str = "renders/test/views.json";
 /// Output of `gsscale-eval --json`, in place of the figures of the summary.
 pub const EVALUATED_FILE: &str = "evaluated.json";
-/// Config of that evaluation.
 /// What the photos said before training.
 pub const DIAGNOSIS_FILE: &str = "diagnosis.json";
+/// Config of that evaluation.
 pub const EVALUATED_AS_FILE: &str = "evaluated-as.toml";
 
 /// What stands under a name in the output folder.
@@ -59,7 +61,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 16] = [
+pub const RUN_FILES: [(RunFile, Tells); 17] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(DIAGNOSIS_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
@@ -67,6 +69,7 @@ pub const RUN_FILES: [(RunFile, Tells); 16] = [
     (RunFile::File(SUMMARY_FILE), Tells::Result),
     (RunFile::File(PLY_FILE), Tells::Result),
     (RunFile::File(TRANSFORM_FILE), Tells::Result),
+    (RunFile::File(SETTINGS_FILE), Tells::Result),
     (RunFile::Exports, Tells::Result),
     (RunFile::File(REPORT_FILE), Tells::Result),
     (RunFile::File(PAGES_FILE), Tells::Result),

@@ -42,7 +42,11 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
     let more = summary["more_exports"].as_array().map_or(&[][..], Vec::as_slice);
-    let texts: Vec<String> = [&summary["export"]].into_iter().chain(more).filter_map(export_text).collect();
+    let mut texts: Vec<String> = [&summary["export"]].into_iter().chain(more).filter_map(export_text).collect();
+    if let Some(left_out @ 1..) = summary["gaussians_left_out"].as_u64() {
+        let count = format_grouped(left_out);
+        texts.push(format!("{count} Gaussians that too few photos hold in place are left out (--export-clean)."));
+    }
     if !texts.is_empty() {
         page.heading("For viewers");
         texts.iter().for_each(|text| page.paragraph(text));

@@ -9,14 +9,20 @@
 //! Invariants: 1. waiting does not change the results; 2. a step that failed half-way is never saved.
 
 use super::checkpoint::{Checkpoint, POLL};
-use crate::base::error::InputError;
+use crate::base::error::{InputError, InputResult};
+use crate::base::even_sample::EvenSample;
 use crate::base::units::format_bytes;
+use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
+use crate::exchange::clean::{HoldingPhotos, photos_required};
 use crate::exchange::format::ExportFormat;
+use crate::exchange::frames::ExportRows;
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::sink::Written;
+use crate::exchange::start_view::{StartView, settings_path};
 use crate::page::folder::file_system::free_bytes;
 use crate::report::run_files::PLY_FILE;
+use crate::scene::camera::Camera;
 use crate::scene::rotation::Rotation;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
@@ -24,6 +30,11 @@ use crate::train::log::report::MetricsLog;
 use crate::train::state::trainer::Trainer;
 use std::path::Path;
 use std::time::{Duration, Instant};
+
+/// Pages by whose rows exports decide, and means among them by which they know the depth of the scene: enough for shares of a
+/// thousandth, and read in a second.
+const SAMPLE_PAGES: usize = 512;
+const SAMPLE_ROWS: usize = 8192;
 
 /// What the results of a run are written with.
 pub(crate) struct Results<'a> {
@@ -149,31 +160,93 @@ impl Results<'_> {
     }
 }
 
-/// Writes the rows at the current step as a PLY; returns what was written and in which coordinates.
+/// Writes all rows at the current step as a PLY; returns what was written and in which coordinates.
 /// Errors: the folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
 pub fn save(trainer: &mut Trainer, dataset: &Dataset, path: &Path) -> Result<Written, TrainError> {
-    export(trainer, dataset, path, ExportFormat::Ply)
+    Ok(export(trainer, dataset, path, ExportFormat::Ply, &ExportChoice::default())?.0)
 }
 
-/// Like [`save`], in another format.
-/// Errors: as [`save`].
+/// Like [`save`], in any format and without the rows that `choice` leaves out; returns also how many these are.
+/// Errors: as [`save`]; or `choice` leaves out all.
 pub(crate) fn export(
     trainer: &mut Trainer,
     dataset: &Dataset,
     path: &Path,
     format: ExportFormat,
-) -> Result<Written, TrainError> {
+    choice: &ExportChoice,
+) -> Result<(Written, u64), TrainError> {
+    settle(trainer, path)?;
+    let meta = scene_meta(trainer, dataset);
+    let rows_at_most = trainer.scene.rows_bound();
+    let mut sink = format.create(path, trainer.options.sh_degree, rows_at_most, &meta)?;
+    let (mut given, mut left_out) = (0, 0);
+    trainer.scene.for_all_rows(trainer.steps_done(), &mut |rows| {
+        given += rows.rows() as u64;
+        let Some((photos, required)) = &choice.required else { return Ok::<(), TrainError>(sink.write(rows)?) };
+        let (counts, mut kept) = (photos.of_rows(rows), rows.clone());
+        left_out += kept.retain_rows(|_, row| counts[row] >= *required);
+        Ok(sink.write(&kept)?)
+    })?;
+    if given == left_out {
+        let problem = format!("fewer than two photos hold each of the {given} Gaussians");
+        return Err(InputError::new(path, problem, "use --export-clean off").into());
+    }
+    Ok((sink.finish()?, left_out))
+}
+
+/// Makes the rows ready to be read.
+/// Errors: a failed step left pages of two steps, so no file `path` can be written; or the device failed.
+fn settle(trainer: &mut Trainer, path: &Path) -> Result<(), TrainError> {
     if trainer.is_torn {
         let problem = "the last step failed half-way, so some Gaussians belong to the step before";
         let remedy = "resume the run from its last commit with gsscale-train --resume and the output folder";
         return Err(InputError::new(path, problem, remedy).into());
     }
-    trainer.drain()?;
-    let meta = scene_meta(trainer, dataset);
-    let rows_at_most = trainer.scene.rows_bound();
-    let mut sink = format.create(path, trainer.options.sh_degree, rows_at_most, &meta)?;
-    trainer.scene.for_all_rows(trainer.steps_done(), &mut |rows| Ok::<(), TrainError>(sink.write(rows)?))?;
-    Ok(sink.finish()?)
+    trainer.drain()
+}
+
+/// What result files hold of the rows, and from where viewers see them first. The default: all rows.
+#[derive(Default)]
+pub(crate) struct ExportChoice {
+    /// The photos of which so many must hold a row.
+    required: Option<(HoldingPhotos, u8)>,
+    start: Option<StartView>,
+}
+
+impl ExportChoice {
+    /// Decides by the rows of at most [`SAMPLE_PAGES`] pages.
+    /// Errors: as [`settle`], or pages could not be pinned.
+    pub fn of_rows(trainer: &mut Trainer, dataset: &Dataset, path: &Path) -> Result<ExportChoice, TrainError> {
+        settle(trainer, path)?;
+        let (pages, now) = (trainer.scene.some_pages(SAMPLE_PAGES), trainer.steps_done());
+        let mut sample = EvenSample::new(SAMPLE_ROWS);
+        trainer.scene.for_rows_of(&pages, now, &mut |rows| {
+            let means = rows.means.as_chunks::<3>().0.iter();
+            means.filter(|mean| mean.iter().all(|x| x.is_finite())).for_each(|mean| sample.add(mean.map(f64::from)));
+            Ok::<(), TrainError>(())
+        })?;
+        let cameras: Vec<Camera> = dataset.train_views().iter().map(|&view| dataset.views[view].camera).collect();
+        let start = StartView::choose(&cameras, &sample.kept);
+        let photos = HoldingPhotos::new(&cameras, &sample.kept);
+        let mut counts = Vec::new();
+        if trainer.options.export_clean != Some(false) {
+            trainer.scene.for_rows_of(&pages, now, &mut |rows| {
+                counts.extend(photos.of_rows(rows));
+                Ok::<(), TrainError>(())
+            })?;
+        }
+        let required = photos_required(trainer.options.export_clean, &counts);
+        Ok(ExportChoice { required: (required > 0).then_some((photos, required)), start })
+    }
+
+    /// Writes the settings of viewers beside the PLY, if a photo sees any Gaussian.
+    /// Errors: the folder cannot be written.
+    pub fn write_settings(&self, trainer: &Trainer, dataset: &Dataset, ply: &Path) -> InputResult<()> {
+        let Some(start) = &self.start else { return Ok(()) };
+        let settings =
+            start.settings(&ExportRows::new(&scene_meta(trainer, dataset)), trainer.options.render.background);
+        write_whole(&settings_path(ply), format!("{settings:#}\n").as_bytes())
+    }
 }
 
 /// The metadata of a file of the rows at the current step.

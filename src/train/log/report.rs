@@ -195,8 +195,11 @@ pub struct Foreseen {
 pub struct Summary {
     /// Steps done.
     pub steps: u32,
-    /// Gaussians in the result.
+    /// Gaussians of the scene.
     pub gaussians: u64,
+    /// Those among them that result files leave out, because too few photos hold them.
+    #[serde(default)]
+    pub gaussians_left_out: u64,
     /// Seconds spent in training steps, without evaluation.
     pub train_seconds: f64,
     /// Largest resident size of the process, bytes.

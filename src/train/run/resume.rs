@@ -486,7 +486,10 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
         return Ok(format!("resume  {out} is finished: all {steps} steps, with results; --steps N continues it"));
     }
     if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
-        let from = format!("{} Gaussians of {PLY_FILE}", format_grouped(summary.gaussians));
+        let from = format!(
+            "{} Gaussians of {PLY_FILE}",
+            format_grouped(summary.gaussians.saturating_sub(summary.gaussians_left_out))
+        );
         return Ok(steps_to_do(&request.out, &from, summary.steps, &config));
     }
     match state {

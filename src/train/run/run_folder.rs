@@ -35,7 +35,7 @@ use crate::report::run_files::{
 use crate::report::run_report::write_run_report;
 use crate::scene::page_meta::PageBounds;
 use crate::train::commits::checkpoint::Checkpoint;
-use crate::train::commits::results::{Results, export, save, scene_meta};
+use crate::train::commits::results::{ExportChoice, Results, export, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
 use crate::train::inputs::signals::{DEADLINE_CODE, StopFlag};
@@ -204,15 +204,15 @@ pub(super) fn train_into(
     let ply = Trainer::ply_path(out);
     let saved = save_result(dataset, &mut results, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
-    let (looped, written) = match (looped, saved) {
+    let (looped, saved) = match (looped, saved) {
         (Err(error), Err(other)) => {
             crate::tell!("warning: {} cannot be written: {other}", ply.display());
             return Err(error);
         }
         (looped, saved) => (looped, saved?),
     };
-    warn_of_ply(config, &written, &ply);
-    let summary = write_results(request, dataset, &targets, results, looped, &written, step_costs)?;
+    warn_of_ply(config, &saved.written, &ply);
+    let summary = write_results(request, dataset, &targets, results, looped, &saved, step_costs)?;
     tiers.is_done = summary.finished;
     let is_late = summary.steps < config.steps;
     Ok(RunOutcome {
@@ -232,12 +232,12 @@ fn write_results(
     targets: &TargetCache,
     mut results: Results<'_>,
     looped: Result<(), TrainError>,
-    written: &Written,
+    saved: &SavedPly,
     costs: StepCosts,
 ) -> Result<Summary, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let ply = Trainer::ply_path(out);
-    let exported = export_all(request, dataset, &mut results, &ply, written);
+    let exported = export_all(request, dataset, &mut results, &ply, saved);
     let mut facts = exported.as_ref().map_or(Vec::new(), Clone::clone).into_iter();
     // A stopped run writes its files at once, without evaluation; gsscale-eval can evaluate it later.
     let is_stopped = results.stop.exit_code().is_some() || results.trainer.steps_done() < config.steps;
@@ -258,7 +258,8 @@ fn write_results(
     let (rows_skipped, steps_skipped) = trainer.skipped();
     let summary = Summary {
         steps: trainer.steps_done(),
-        gaussians: written.rows + written.skipped,
+        gaussians: saved.written.rows + saved.written.skipped + saved.left_out,
+        gaussians_left_out: saved.left_out,
         train_seconds: trainer.train_seconds(),
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
         test: tested.as_ref().ok().copied().flatten(),
@@ -293,15 +294,28 @@ fn write_results(
     Ok(summary)
 }
 
-/// Writes the Gaussians at the current step as a PLY, and its transform to the dataset's coordinates.
-fn save_result(dataset: &Dataset, results: &mut Results<'_>, ply: &Path) -> Result<Written, TrainError> {
-    let written = results.write(|results| save(results.trainer, dataset, ply))?;
+/// The PLY of a result.
+struct SavedPly {
+    written: Written,
+    /// Gaussians that too few photos hold.
+    left_out: u64,
+    choice: ExportChoice,
+}
+
+/// Writes the Gaussians at the current step as a PLY, its transform to the dataset's coordinates, and the settings of viewers.
+fn save_result(dataset: &Dataset, results: &mut Results<'_>, ply: &Path) -> Result<SavedPly, TrainError> {
+    let saved = results.write(|results| {
+        let choice = ExportChoice::of_rows(results.trainer, dataset, ply)?;
+        let (written, left_out) = export(results.trainer, dataset, ply, ExportFormat::Ply, &choice)?;
+        Ok(SavedPly { written, left_out, choice })
+    })?;
     results.has_ply = true;
     results.write(|results| {
         let meta = scene_meta(results.trainer, dataset);
-        Ok(ExportFormat::Ply.write_transform(ply, &meta, written.frame)?)
+        ExportFormat::Ply.write_transform(ply, &meta, saved.written.frame)?;
+        Ok(saved.choice.write_settings(results.trainer, dataset, ply)?)
     })?;
-    Ok(written)
+    Ok(saved)
 }
 
 /// Writes the Gaussians of the PLY also in the other formats that were asked for.
@@ -310,11 +324,11 @@ fn export_all(
     dataset: &Dataset,
     results: &mut Results<'_>,
     ply: &Path,
-    written: &Written,
+    saved: &SavedPly,
 ) -> Result<Vec<ExportFacts>, TrainError> {
     let formats = request.config.export.formats().filter_map(|format| Some((format, format.beside(ply)?)));
     let exported = formats.map(|(format, file)| {
-        results.write(|results| export_beside(request, dataset, results.trainer, format, &file, written))
+        results.write(|results| export_beside(request, dataset, results.trainer, format, &file, saved))
     });
     let exported: Result<_, _> = exported.collect();
     if exported.is_err() {
@@ -332,11 +346,11 @@ fn export_beside(
     trainer: &mut Trainer,
     format: ExportFormat,
     other: &Path,
-    written: &Written,
+    saved: &SavedPly,
 ) -> Result<ExportFacts, TrainError> {
-    let exported = export(trainer, dataset, other, format)?;
+    let (exported, _) = export(trainer, dataset, other, format, &saved.choice)?;
     format.write_transform(other, &scene_meta(trainer, dataset), exported.frame)?;
-    let left_out = written.rows.saturating_sub(exported.rows);
+    let left_out = saved.written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
         crate::tell!(
             "warning: {} cannot hold {left_out} Gaussians: they lie outside the range of its format",

@@ -351,6 +351,13 @@ impl PagedScene {
         pages
     }
 
+    /// At most `most` of the pages with rows, evenly spaced in the order of their ids.
+    pub fn some_pages(&self, most: usize) -> Vec<PageNo> {
+        let pages = self.pages_with_rows();
+        let stride = pages.len().div_ceil(most).max(1);
+        pages.into_iter().step_by(stride).collect()
+    }
+
     /// Gathers into `working` the rows of these pages that `camera` may draw after `now` steps, with pending events applied to
     /// copies. Begins to read the pages `next`. Stored pages stay unchanged.
     /// Errors: pages could not be pinned.
