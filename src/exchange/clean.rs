@@ -111,3 +111,79 @@ pub fn photos_required(is_on: Option<bool>, counts: &[u8]) -> u8 {
         None => (1..=PHOTOS_LEAST).rev().find(leaves_few).unwrap_or(0),
     }
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::base::rng::{Purpose, Stream};
+
+    /// At `x`, y = z = 0, looking along z. The picture shows |x|, |y| < depth / 2.
+    fn camera(x: f32) -> Camera {
+        let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+        Camera::pinhole(viewmat, [100.0, 100.0, 50.0, 50.0], [100, 100])
+    }
+
+    /// Rows of these means and largest sigmas.
+    fn rows(of: &[([f32; 3], f32)]) -> Columns {
+        let mut rows = Columns::zeros(of.len(), 0);
+        for (row, (mean, sigma)) in of.iter().enumerate() {
+            rows.means[3 * row..][..3].copy_from_slice(mean);
+            rows.scales[3 * row..][..3].copy_from_slice(&[-9.0, sigma.ln(), -8.0]);
+        }
+        rows
+    }
+
+    #[test]
+    fn photos_hold_what_their_pictures_reach_beyond_the_lens() {
+        // A wall at depth 10, so that the scene of a photo begins there.
+        let wall: Vec<[f64; 3]> = (0..20).map(|i| [f64::from(i) - 8.0, 0.0, 10.0]).collect();
+        let photos = HoldingPhotos::new(&[camera(0.0), camera(4.0)], &wall);
+        let cases = [
+            (([2.0, 0.0, 10.0], 0.1), 2, "in both pictures"),
+            (([-3.0, 0.0, 10.0], 0.1), 1, "in the left picture"),
+            (([-3.0, 0.0, 10.0], 2.1), 2, "its disc reaches the right picture"),
+            (([-7.0, 0.0, 10.0], 0.1), 0, "beside both"),
+            (([2.0, 6.0, 10.0], 0.9), 0, "below both, and its disc ends before"),
+            (([2.0, 0.0, -10.0], 99.0), 0, "behind both"),
+            (([2.0, 0.0, 2.9], 2.0), 0, "before the lenses"),
+            (([2.0, 0.0, 3.1], 2.0), 2, "far enough from the lenses"),
+            (([2.0, 0.0, 1e4], 1e3), 2, "a giant behind the scene"),
+            (([f32::NAN, 0.0, 10.0], 0.1), 2, "not finite"),
+            (([-7.0, 0.0, 10.0], f32::INFINITY), 2, "not finite either"),
+        ];
+        let counts = photos.of_rows(&rows(&cases.map(|(row, ..)| row)));
+        for ((_, count, what), found) in cases.iter().zip(&counts) {
+            assert_eq!(count, found, "{what}");
+        }
+        // Without a sample, nothing is known of depths.
+        assert_eq!(HoldingPhotos::new(&[camera(2.0)], &[]).of_rows(&rows(&[([2.0, 0.0, 1.0], 0.1)])), [1]);
+    }
+
+    #[test]
+    fn parts_and_threads_change_no_answer() {
+        let mut stream = Stream::new(7, Purpose::Test, 0, 0);
+        let mut normal = || stream.normal() as f32;
+        let many: Vec<([f32; 3], f32)> =
+            (0..3000).map(|_| ([9.0 * normal(), 4.0 * normal(), 9.0 + 2.0 * normal()], 0.1 * normal().exp())).collect();
+        let sample: Vec<[f64; 3]> = many.iter().map(|(mean, _)| mean.map(f64::from)).collect();
+        let cameras: Vec<Camera> = (-2..3).map(|x| camera(6.0 * x as f32)).collect();
+        let photos = HoldingPhotos::new(&cameras, &sample);
+        let whole = photos.of_rows(&rows(&many));
+        let parts: Vec<u8> = many.chunks(700).flat_map(|part| photos.of_rows(&rows(part))).collect();
+        let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+        assert_eq!(whole, parts);
+        assert_eq!(whole, alone.install(|| HoldingPhotos::new(&cameras, &sample).of_rows(&rows(&many))));
+        assert!((0..=2).all(|count| whole.iter().filter(|&&found| found == count).count() > 100));
+    }
+
+    #[test]
+    fn auto_leaves_out_few() {
+        let of = |none: usize, one: usize| [vec![0; none], vec![1; one], vec![2; 1000 - none - one]].concat();
+        for ((none, one), required) in [((0, 5), 2), ((2, 3), 2), ((0, 6), 1), ((5, 900), 1), ((6, 0), 0)] {
+            assert_eq!(photos_required(None, &of(none, one)), required, "{none} {one}");
+        }
+        assert_eq!((photos_required(Some(true), &of(9, 9)), photos_required(Some(false), &of(9, 9))), (2, 0));
+        assert_eq!(photos_required(None, &[]), 2);
+    }
+}

@@ -85,3 +85,46 @@ impl StartView {
 pub fn settings_path(ply: &Path) -> PathBuf {
     ply.with_extension("settings.json")
 }
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
+mod tests {
+    use super::*;
+    use crate::exchange::meta::{ExportFrame, SceneMeta};
+    use crate::scene::rotation::{Rotation, VIEWER_UP};
+
+    #[test]
+    fn the_photo_that_sees_most_before_its_walls_starts() {
+        // Looking along z from x, with a field of view of 90 degrees across and less along.
+        let camera = |x: f32| {
+            let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
+            Camera::pinhole(viewmat, [100.0, 100.0, 100.0, 20.0], [200, 60])
+        };
+        let row =
+            |from: i32, step: f64, depth: f64, to: i32| (from..to).map(move |x| [step * f64::from(x), 0.0, depth]);
+        // Before the first camera a wall of 10 points hides 18 behind it; the second sees 10, and one far ahead; the third, none.
+        let scene = row(-5, 0.1, 1.0, 5).chain(row(-9, 1.0, 10.0, 9)).chain(row(13, 1.0, 5.0, 23));
+        let scene: Vec<[f64; 3]> = scene.collect();
+        let cameras = [camera(0.0), camera(18.0), camera(900.0)];
+        let view = StartView::choose(&cameras, &scene).unwrap();
+        assert_eq!((view.camera, view.position, view.target), (1, [18.0, 0.0, 0.0], [18.0, 0.0, 5.0]));
+        assert!((view.field - 90.0).abs() < 1e-5, "{view:?}");
+        assert_eq!(StartView::choose(&cameras[2..], &scene), None);
+
+        // In the viewer, half a turn about z from the file: up is y in an upright file.
+        let meta = SceneMeta {
+            origin: [5.0, 6.0, 7.0],
+            scale: 2.0,
+            frame: ExportFrame::Dataset,
+            upright: Rotation::upright([0.0, 0.0, 1.0]),
+            ..SceneMeta::default()
+        };
+        let settings = view.settings(&ExportRows::new(&meta), [0.0; 3]);
+        let of = |name: &str| [0, 1, 2].map(|i| settings["cameras"][0]["initial"][name][i].as_f64().unwrap());
+        let shift = [0, 1, 2].map(|i| of("target")[i] - of("position")[i]);
+        // The camera looks up in the dataset, five local units of two each.
+        let want = VIEWER_UP.map(|x| -10.0 * x);
+        assert!(shift.iter().zip(want).all(|(a, b)| (a - b).abs() < 1e-5), "{shift:?}");
+        assert!((of("position")[1] - 7.0).abs() < 1e-5, "its height is z of the dataset: {:?}", of("position"));
+    }
+}

@@ -3,6 +3,8 @@
 
 use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{EVAL, TRAIN, Workdir, says};
+use glam::DVec3;
+use gsscale::dataset::model::RawView;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::fs;
 
@@ -104,4 +106,45 @@ fn a_run_in_memory_whose_export_fails_has_its_report_and_can_be_resumed() {
     work.remove("out/point_cloud.spz");
     work.train("--resume out --quiet");
     assert!(work.exists("out/point_cloud.spz") && work.summary("out")["finished"] == true && work.ply("out") == before);
+}
+
+#[test]
+fn clean_results_and_the_start_view_are_those_of_any_budget() {
+    let work = Workdir::city(4, 96, 64, 500);
+    work.run("out", "--steps 40 --export spz,sog --export-clean on");
+    let left_out = work.count("out", "gaussians_left_out");
+    let (kept, meta) = work.gaussians("out/point_cloud.ply");
+    assert_eq!(kept.rows() as u64 + left_out, work.count("out", "gaussians"));
+    for export in [&work.summary("out")["export"], &work.summary("out")["more_exports"][0]] {
+        assert_eq!(export["gaussians"].as_u64(), Some(kept.rows() as u64), "{export}");
+    }
+    work.run("whole", "--steps 40 --export-clean off");
+    let whole = work.gaussians("whole/point_cloud.ply").0;
+    assert!(left_out > 0 && 2 * left_out < whole.rows() as u64, "{left_out} Gaussians that one of three photos sees");
+    assert_eq!(whole.rows() as u64, work.count("whole", "gaussians"));
+    work.run("paged", "--steps 40 --export-clean on --page-rows 64 --spill-dir pages --frames 12 --threads 1");
+    work.run("rows", "--steps 40 --export-clean on --page-rows 64 --threads 2");
+    for name in ["point_cloud.ply", "point_cloud.settings.json"] {
+        assert!(work.bytes(&format!("paged/{name}")) == work.bytes(&format!("rows/{name}")), "{name}");
+    }
+
+    // The start view is a photo that was trained on, in the axes of the viewer: half a turn about z from those of the file.
+    let start = &work.json("out/point_cloud.settings.json")["cameras"][0]["initial"];
+    let to_dataset = &work.json("out/point_cloud.transform.json")["file_to_dataset"];
+    let in_dataset = |name: &str| {
+        let of = |i: usize| start[name][i].as_f64().unwrap();
+        let file = [-of(0), -of(1), of(2), 1.0];
+        DVec3::from_array([0, 1, 2].map(|i| (0..4).map(|j| to_dataset[i][j].as_f64().unwrap() * file[j]).sum::<f64>()))
+    };
+    let (position, target) = (in_dataset("position"), in_dataset("target"));
+    let scene = read_scene(&work.scene(), &ReadOptions::default()).unwrap();
+    // Rounded to f32 in the local frame, whose unit is about that of the flight.
+    let off = 1e-5 * meta.scene_radius.max(1.0);
+    let at = |(_, view): &(usize, &RawView)| (view.pose.centre() - position).length() < off;
+    let (number, view) = scene.views.iter().enumerate().find(at).expect("a photo stands there");
+    assert_ne!(number % 8, 0, "every eighth photo is held out");
+    let seen = view.pose.rotation * target + view.pose.translation;
+    assert!(seen.x.abs() + seen.y.abs() < 10.0 * off && seen.z > 0.0, "the target is before the photo: {seen}");
+    let refused = work.refuses("scene --out no --export-clean sometimes", &["export-clean", "auto, on, off"]);
+    assert!(!work.exists("no"), "{refused}");
 }
