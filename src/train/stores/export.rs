@@ -1,7 +1,8 @@
 //! The Gaussians of a generation, page by page: as a PLY, SPZ or SOG with the writers of the trainer and the file of its transform, or as
 //! the start of a new run, in its local frame, without moments, statistics and events.
 //!
-//! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY after the generation's step; 2.
+//! Invariants: 1. without selection the file equals, byte for byte, the trainer's PLY of all rows (`--export-clean off`, which needs
+//! the photos' cameras) after the generation's step; 2.
 //! memory is bounded by the budget for any size of scene; 3. the file is written whole or not at all; 4. the selection
 //! depends on the rows alone.
 
