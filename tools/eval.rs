@@ -5,9 +5,10 @@ use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::InputError;
-use gsscale::base::whole_file::write_whole;
+use gsscale::base::whole_file::{folder_of, write_whole};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::exchange::sog::is_tree;
+use gsscale::photos::exposure::FILE as APPEARANCE_FILE;
 use gsscale::render::lpips::InputRange;
 use gsscale::report::chart::{Chart, Mark};
 use gsscale::report::html::{Cell, Page};
@@ -74,6 +75,7 @@ fn start(args: Args) -> Result<(), TrainError> {
         let remedy = "give the lod-meta.json of a folder of SOGs (--export sog), or leave --page out";
         return Err(InputError::new("--page", format!("{} has no levels of detail", ply.display()), remedy).into());
     }
+    let values = run_config.as_deref().map(|config| folder_of(config).join(APPEARANCE_FILE));
     let file = args.config.as_deref().or(run_config.as_deref());
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.apply(&mut config);
@@ -81,6 +83,7 @@ fn start(args: Args) -> Result<(), TrainError> {
     let extras = EvalExtras {
         pictures: args.renders.as_deref(),
         lpips: args.lpips.as_deref().map(|weights| (weights, args.lpips_range)),
+        appearance: values.as_deref().filter(|file| file.is_file()),
     };
     let report = evaluate_file(&ply, &scene, &config, &extras)?;
     let text = serde_json::to_string_pretty(&report)

@@ -84,11 +84,18 @@ fn exposures_that_change_are_found_and_cost_little() {
     assert!(work.summary("plain")["test"].get("half_fitted").is_none() && !work.exists("plain/appearance.json"));
     let report = work.text("exposure/report.html");
     assert!(report.contains("Appearance") && report.contains("fitted on the left"));
-    // An evaluation of any PLY gives the figure too, and the same one.
+    // An evaluation of the run gives the figures too, and the same ones.
     let again = work.json_of(crate::support::workdir::EVAL, "exposure scene");
-    let [was, is] = [test, &again["test"]].map(|t| t["half_fitted"]["fitted_right_psnr"].as_f64().unwrap());
-    // The PLY holds the same Gaussians in another order.
-    assert!((was - is).abs() < 0.01, "{was} {is}");
+    for (part, figure) in [
+        ("half_fitted", "fitted_right_psnr"),
+        ("predicted", "predicted_psnr"),
+        ("predicted", "predicted_ssim"),
+        ("color_corrected", "cc_psnr"),
+    ] {
+        let [was, is] = [test, &again["test"]].map(|t| t[part][figure].as_f64().unwrap());
+        // The PLY holds the same Gaussians in another order.
+        assert!((was - is).abs() < 0.01, "{figure}: {was} {is}");
+    }
 }
 
 #[test]

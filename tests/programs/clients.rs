@@ -157,6 +157,11 @@ fn splat_transform_reads_results() {
     convert(&work, &program, &format!("{ply} copy.ply"));
     // It takes the axes of an SPZ for those of a PLY. Ours are those of the specification: right, up, back.
     convert(&work, &program, "run/point_cloud.spz -r 180,0,0 from_spz.ply");
+    // It refuses settings of viewers that are not theirs. Without harmonics a page takes a second.
+    let page = "-H 0 run/page.html --viewer-settings run/point_cloud.settings.json -i 1 -g cpu";
+    convert(&work, &program, &format!("{ply} {page}"));
+    let start = &work.json("run/point_cloud.settings.json")["cameras"][0]["initial"];
+    assert!(work.text("run/page.html").contains(&start["fov"].to_string()), "{start}");
     // It keeps f32 as they are, but forgets our comments: the city lies at its origin. SPZ rounds colours to 1/255 and scales to 6 %:
     // half a decibel on a picture of some 20 dB.
     for (file, off) in [("copy.ply", 0.01), ("from_spz.ply", 0.5)] {

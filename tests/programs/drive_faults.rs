@@ -42,7 +42,8 @@ const PAGE_ROWS: u32 = 32;
 const FIRST_STEPS: u32 = 16;
 
 const CONFIG: &str = r#"steps = 60, page-rows = 32, grow-grad2d = 0.001, refine-start = 20, refine-every = 10, reset-every = 25,
-    sh-every = 15, view-order = "groups:4", log-every = 7, test-every = 24, device = "cpu", spill-codec = "raw", up = "keep""#;
+    sh-every = 15, view-order = "groups:4", log-every = 7, test-every = 24, device = "cpu", spill-codec = "raw", up = "keep",
+    export-clean = "off""#;
 
 fn make_scene() -> Workdir {
     Workdir::city_of(24, [64, 48], 6000, 20)

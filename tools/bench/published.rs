@@ -283,7 +283,8 @@ fn read_summary(out: &Path) -> InputResult<Summary> {
 fn measure(args: &Args, out: &Path, config: &TrainConfig, summary: Summary) -> Result<Ours, TrainError> {
     let mut ours = Ours::new(summary, config);
     if args.lpips.is_some() || args.no_train {
-        let extras = EvalExtras { pictures: None, lpips: args.lpips.as_deref().map(|file| (file, args.lpips_range)) };
+        let extras =
+            EvalExtras { lpips: args.lpips.as_deref().map(|file| (file, args.lpips_range)), ..EvalExtras::default() };
         let report = evaluate_file(&Trainer::ply_path(out), &args.data, config, &extras)?;
         (ours.test, ours.lpips_variant) = (report.test, report.lpips_variant);
     }

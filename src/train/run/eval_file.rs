@@ -14,6 +14,9 @@ use crate::exchange::meta::SceneMeta;
 use crate::exchange::ply::{PlyContent, read_ply};
 use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::{Pager, PagerConfig};
+use crate::photos::exposure::{AppearanceMode, read_values};
+use crate::photos::{PhotoOptions, PhotoParameters, first_parameters};
+use crate::render::color_correct::ColorCorrect;
 use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::{RenderOptions, Renderer};
@@ -74,6 +77,8 @@ pub struct EvalExtras<'a> {
     pub pictures: Option<&'a Path>,
     /// LPIPS weights and the input range of the network.
     pub lpips: Option<(&'a Path, InputRange)>,
+    /// The `appearance.json` of the run that made the Gaussians: from it follow the exposures of held-out photos.
+    pub appearance: Option<&'a Path>,
 }
 
 /// Evaluates the Gaussians of `file`, a PLY or a `lod-meta.json`, on the held-out views of the scene in the folder `scene`. All rows of a
@@ -93,6 +98,9 @@ pub fn evaluate_file(
     // The file is opened before the photos, so that an unusable file is reported at once.
     let model = Model::open(file)?;
     let mut evaluator = Evaluator::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
+    if let Some(values) = extras.appearance {
+        evaluator.take_exposures(values)?;
+    }
     let (finest, levels) = match model {
         Model::Ply(read) => {
             let (rows, meta) = *read;
@@ -143,6 +151,8 @@ pub(crate) struct Evaluator<'a> {
     pub targets: TargetCache,
     pub renderer: Box<dyn Renderer>,
     lpips: Option<(&'a Lpips, InputRange)>,
+    /// What the run of the Gaussians has learnt of the photos, if that predicts held-out ones.
+    photos: PhotoParameters,
     /// Warnings that were printed. Most levels cause the same ones.
     printed: BTreeSet<String>,
 }
@@ -162,7 +172,20 @@ impl<'a> Evaluator<'a> {
         if let Some(word) = word {
             crate::tell!("{word}");
         }
-        Ok(Evaluator { config, dataset, targets, renderer, lpips, printed: BTreeSet::new() })
+        let (photos, printed) = (PhotoParameters::new(), BTreeSet::new());
+        Ok(Evaluator { config, dataset, targets, renderer, lpips, photos, printed })
+    }
+
+    /// Takes exposures from the file of a run. Not of a run with `--appearance full`, whose vignetting is more than an exposure.
+    fn take_exposures(&mut self, values: &Path) -> InputResult<()> {
+        let run = RunOptions::new(self.config, self.dataset.scene_scale);
+        if run.photos.appearance == AppearanceMode::Exposure {
+            let options = PhotoOptions { first_appearance: Some(read_values(values)?), ..run.photos };
+            self.photos = first_parameters(&options, &self.dataset);
+            // Its warnings are those of a run that begins.
+            self.photos.iter_mut().for_each(|parameter| drop(parameter.start(&self.dataset)));
+        }
+        Ok(())
     }
 
     /// Evaluates every level of a folder of SOGs, the finest first. Pictures go to a folder for each level.
@@ -228,13 +251,16 @@ impl<'a> Evaluator<'a> {
         drop(columns);
         let views = self.dataset.test_views();
         let shown = Count::new("views compared", views.len() as u32, false);
+        let predicted = self.photos.iter().find_map(|parameter| parameter.predict(&self.dataset, &views));
+        // Beside predicted colours, the best that a correction could do.
+        let color_correct = run.color_correct.or(predicted.is_some().then_some(ColorCorrect::Affine));
         let request = EvalRequest {
             views: &views,
-            predicted: None,
+            predicted,
             ssim: run.ssim_variant,
             pictures,
             lpips: self.lpips,
-            color_correct: run.color_correct,
+            color_correct,
             appearance: run.photos.appearance,
             progress: &|done| shown.show(done),
         };
