@@ -39,14 +39,14 @@ pub(super) fn first_depth(depths: &mut [f64]) -> f64 {
     depths.get(depths.len() / 10).copied().unwrap_or(0.0)
 }
 
-struct Photo {
+struct HoldingPhoto {
     camera: Camera,
     planes: PagePlanes,
     nearest: f64,
 }
 
 /// The photos that hold Gaussians in place.
-pub struct HoldingPhotos(Vec<Photo>);
+pub struct HoldingPhotos(Vec<HoldingPhoto>);
 
 impl HoldingPhotos {
     /// Of the cameras of training photos, for a scene of which `sample` are means (both in the local frame).
@@ -54,7 +54,7 @@ impl HoldingPhotos {
         let photo = |camera: &Camera| {
             let mut depths: Vec<f64> = in_picture(camera, sample).map(|(_, depth)| depth).collect();
             let nearest = NEAR_SHARE * first_depth(&mut depths);
-            Photo { camera: *camera, planes: Frustum::new(camera).planes(), nearest }
+            HoldingPhoto { camera: *camera, planes: Frustum::new(camera).planes(), nearest }
         };
         HoldingPhotos(cameras.par_iter().map(photo).collect())
     }
@@ -76,7 +76,7 @@ impl HoldingPhotos {
                 bounds.hi = [0, 1, 2].map(|i| bounds.hi[i].max(mean[i]));
                 bounds.sigma_max = bounds.sigma_max.max(sigma);
             }
-            let near: Vec<&Photo> = self.0.iter().filter(|photo| photo.planes.may_intersect(&bounds)).collect();
+            let near: Vec<&HoldingPhoto> = self.0.iter().filter(|photo| photo.planes.may_intersect(&bounds)).collect();
             for (row, count) in (first..).zip(counts) {
                 let Some((mean, sigma)) = of_row(row) else { continue };
                 let holding = near.iter().filter(|photo| photo.holds(mean.map(f64::from), f64::from(sigma)));
@@ -87,7 +87,7 @@ impl HoldingPhotos {
     }
 }
 
-impl Photo {
+impl HoldingPhoto {
     fn holds(&self, mean: [f64; 3], sigma: f64) -> bool {
         let Camera { fx, fy, width, height, .. } = self.camera;
         let inside = |at: f64, size: u32, f: f32, depth: f64| {
