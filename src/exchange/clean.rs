@@ -2,7 +2,7 @@
 //!
 //! A photo holds a Gaussian if its disc of one sigma, the largest, reaches into the picture, and if it does not hang before the lens:
 //! nearer than [`NEAR_SHARE`] of the depth at which the photo's scene begins. Giants that many photos see stay whatever their size:
-//! on three aerial scenes they are the ground behind gaps, and without them held-out photos lose 2 to 4 dB.
+//! they are the ground behind gaps; without 19 to 78 of them held-out photos of one aerial scene lose 2.5 to 10.6 dB.
 //!
 //! Not here: reading the rows, writing the files.
 //!
