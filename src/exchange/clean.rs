@@ -1,7 +1,7 @@
 //! Which Gaussians exports leave out (`--export-clean`): those that too few training photos hold in place.
 //!
 //! A photo holds a Gaussian if its disc of one sigma, the largest, reaches into the picture, and if it does not hang before the lens:
-//! nearer than [`NEAR_SHARE`] of the depth at which the photo's scene begins. Giants that many photos see stay whatever their size:
+//! nearer than `NEAR_SHARE` of the depth at which the photo's scene begins. Giants that many photos see stay whatever their size:
 //! they are the ground behind gaps; without 19 to 78 of them held-out photos of one aerial scene lose 2.5 to 10.6 dB.
 //!
 //! Not here: reading the rows, writing the files.
@@ -59,7 +59,7 @@ impl HoldingPhotos {
         HoldingPhotos(cameras.par_iter().map(photo).collect())
     }
 
-    /// The number of photos that hold each row, at most [`PHOTOS_LEAST`].
+    /// The number of photos that hold each row, at most `PHOTOS_LEAST`.
     pub fn of_rows(&self, rows: &Columns) -> Vec<u8> {
         let mut counts = vec![PHOTOS_LEAST; rows.rows()];
         counts.par_chunks_mut(BLOCK_ROWS).enumerate().for_each(|(block, counts)| {

@@ -3,7 +3,7 @@
 //! The store is built beside its target under another name and renamed when complete.
 //!
 //! Invariants: 1. the target is a complete store or nothing: a tool that fails or is killed leaves at most a folder
-//! with suffix [`PART_SUFFIX`], which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and
+//! with suffix `PART_SUFFIX`, which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and
 //! by sixteen more if they are encoded.
 
 use crate::base::error::{InputError, InputResult};

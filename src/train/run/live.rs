@@ -1,4 +1,4 @@
-//! The live page of a run ([`crate::report::live`]), whose pictures ([`super::scene_picture`]) are drawn between steps.
+//! The live page of a run ([`crate::report::live`]), whose pictures (`scene_picture`) are drawn between steps.
 //!
 //! Invariants: 1. a picture changes no bit of the result: it is drawn like an evaluation, which stores nothing; 2. pictures take at
 //! most 5 % of the time before each is begun; the steps after a picture load again what it evicted, which is not counted; 3. a picture that
