@@ -2,7 +2,7 @@
 //! the file system has locks, and by a heartbeat where it has none, or other machines do not see them.
 //!
 //! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. of
-//! several that find no owner one makes the file; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
+//! several that find no owner one makes the file, which has its owner and his lock from its first moment; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
 //! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
 //! and no result: the bytes are the same.
 
@@ -41,13 +41,20 @@ impl CellLock {
         let token = format!("{} process {} {:032x}", host_name(), std::process::id(), draw_identity());
         let mut options = OpenOptions::new();
         options.read(true).write(true);
-        let file = match options.clone().create_new(true).open(&path) {
-            Ok(file) => {
-                write_token(&file, &token).map_err(failed)?;
-                // Who looks at the file may hold it for a moment.
-                let _ = file.lock();
-                file
-            }
+        // The file appears under its name when it has its owner and is locked: who finds it unlocked knows that its owner is gone.
+        let made = folder.join(format!("{LOCK}.{:032x}", draw_identity()));
+        let file = options.clone().create_new(true).open(&made).map_err(failed)?;
+        write_token(&file, &token).map_err(failed)?;
+        let _ = file.try_lock();
+        let named = std::fs::hard_link(&made, &path).or_else(|error| match error.kind() {
+            ErrorKind::AlreadyExists => Err(error),
+            // The folder knows no second names.
+            _ if path.exists() => Err(ErrorKind::AlreadyExists.into()),
+            _ => std::fs::rename(&made, &path),
+        });
+        let _ = std::fs::remove_file(&made);
+        let file = match named {
+            Ok(()) => file,
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                 let file = options.open(&path).map_err(failed)?;
                 let owner = std::fs::read_to_string(&path).map_err(failed)?;

@@ -263,7 +263,10 @@ impl PoseSearch {
             done: Vec::new(),
         };
         let images = self.scene.join("images");
-        if !work.exists() {
+        let entries = || std::fs::read_dir(work).into_iter().flatten().flatten();
+        // A search that was killed before its first word leaves its lock.
+        let is_only_lock = entries().any(|_| true) && entries().all(|entry| entry.file_name() == "lock");
+        if !work.exists() || is_only_lock {
             if self.links_photos && images.exists() {
                 return Err(InputError::new(images, "exists already", "name a new folder with --out"));
             }
@@ -273,13 +276,6 @@ impl PoseSearch {
             return Ok((new, lock));
         }
         let file = work.join(STATE_FILE);
-        let entries = || std::fs::read_dir(work).into_iter().flatten().flatten();
-        if !file.exists() && entries().all(|entry| entry.file_name() == "lock") {
-            // A search was killed before its first word.
-            let lock = lock(work)?;
-            new.write(work)?;
-            return Ok((new, lock));
-        }
         let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<SearchState>(&text).ok());
         let Some(old) = old.filter(|old| old.made_by == MADE_BY) else {
             let problem = "exists already, and is not a work folder of gsscale-poses";
@@ -299,6 +295,7 @@ impl PoseSearch {
             _ => ("of other photos", "of these"),
         };
         crate::tell!("warning: the search begins again: it was {was}, and is {is} now");
+        self.unlink_changed(&old, work)?;
         clear(work)?;
         new.write(work)?;
         Ok((new, lock))
@@ -308,25 +305,44 @@ impl PoseSearch {
     fn link_photos(&self, work: &Path) -> InputResult<()> {
         make_folder(&work.join(PHOTOS))?;
         for (i, photo) in self.photos.iter().enumerate() {
-            let plain = work.join(PHOTOS).join(self.plain_name(i));
+            let plain = work.join(PHOTOS).join(plain_name(i, &photo.name));
+            let target = self.scene.join("images").join(&photo.name);
+            let is_ours = are_one_file(&target, &plain);
             link(&photo.path, photo.bytes, &plain)?;
-            if self.links_photos {
-                let target = self.scene.join("images").join(&photo.name);
-                make_folder(target.parent().unwrap_or(&target))?;
-                // From the copy, if it is one: the photos may lie on a slow card.
-                link(&plain, photo.bytes, &target)?;
+            if !self.links_photos || are_one_file(&target, &plain) {
+                continue;
+            }
+            match std::fs::symlink_metadata(&target) {
+                // A copy, or what somebody has made of it.
+                Ok(now) if !is_ours && now.len() == photo.bytes => continue,
+                Ok(_) if !is_ours => {
+                    let remedy = "move it away, or name a new folder with --out";
+                    return Err(InputError::new(target, "another file has the name of a photo", remedy));
+                }
+                _ => {}
+            }
+            make_folder(target.parent().unwrap_or(&target))?;
+            // From the copy, if it is one: the photos may lie on a slow card.
+            link(&plain, photo.bytes, &target)?;
+        }
+        Ok(())
+    }
+
+    /// Removes our links in `images` to earlier photos of names that are other photos now.
+    fn unlink_changed(&self, old: &SearchState, work: &Path) -> InputResult<()> {
+        for (i, (name, ..)) in old.photos.iter().enumerate() {
+            let (plain, target) = (work.join(PHOTOS).join(plain_name(i, name)), self.scene.join("images").join(name));
+            let changed = |photo: &FoundPhoto| photo.name == *name && !are_one_file(&photo.path, &target);
+            if self.links_photos && are_one_file(&plain, &target) && self.photos.iter().any(changed) {
+                std::fs::remove_file(&target).map_err(|e| InputError::io(&target, "replacing a photo", &e))?;
             }
         }
         Ok(())
     }
 
-    fn plain_name(&self, i: usize) -> String {
-        let ending = self.photos[i].path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
-        format!("{i:06}.{}", ending.unwrap_or_default())
-    }
-
     fn lines_of(&self, pairs: &[(u32, u32)]) -> String {
-        let line = |&(a, b): &(u32, u32)| format!("{} {}\n", self.plain_name(a as usize), self.plain_name(b as usize));
+        let name = |i: u32| plain_name(i as usize, &self.photos[i as usize].name);
+        let line = |&(a, b): &(u32, u32)| format!("{} {}\n", name(a), name(b));
         pairs.iter().map(line).collect()
     }
 
@@ -351,7 +367,7 @@ impl PoseSearch {
             }
             let is_enough = one_camera && group.len() >= PHOTOS_FOR_OPENCV;
             let camera_model = if is_enough { "OPENCV" } else { "SIMPLE_RADIAL" };
-            let names: String = group.iter().map(|&i| self.plain_name(i) + "\n").collect();
+            let names: String = group.iter().map(|&i| plain_name(i, &self.photos[i].name) + "\n").collect();
             write_whole(&work.join("list.txt"), names.as_bytes())?;
             let mut in_group = 0;
             let mut show = |line: &str| {
@@ -558,6 +574,18 @@ fn lock(work: &Path) -> InputResult<File> {
 
 fn make_folder(folder: &Path) -> InputResult<()> {
     std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
+}
+
+/// The name in the work folder of the photo with this number.
+fn plain_name(i: usize, name: &str) -> String {
+    let ending = Path::new(name).extension().map(|ending| ending.to_string_lossy().to_lowercase());
+    format!("{i:06}.{}", ending.unwrap_or_default())
+}
+
+/// Whether two names are of one file, as far as the system tells.
+fn are_one_file(a: &Path, b: &Path) -> bool {
+    let facts = |path: &Path| std::fs::metadata(path);
+    facts(a).is_ok_and(|a| facts(b).is_ok_and(|b| are_one(&a, &b)))
 }
 
 /// Whether these are of two names of one file, as far as the system tells.

@@ -271,7 +271,7 @@ fn a_drive_that_fails_ends_the_run_and_its_last_commit_stands() {
         let life = world.live(&name, &Faults::new(), |faults| {
             faults.add(on, faults.count(on) + after, true, fault);
         });
-        let error = life.expect_err("the drive fails for ever").to_string();
+        let error = life.expect_err(&format!("the drive fails for ever: {on:?} {after} {fault:?}")).to_string();
         let names = match (on, fault) {
             (Operation::Write, _) => ["writing page", "check the drive"],
             (Operation::Read, Fault::FlipBit(_) | Fault::Torn) => ["is damaged", "seg-"],

