@@ -31,6 +31,7 @@ mod sweep_page;
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::say::exit_code;
 use gsscale::config::file::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
@@ -90,13 +91,7 @@ fn main() -> ExitCode {
     } else {
         run::start(&parse_arguments(&arguments), &mut print)
     };
-    match done {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(done)
 }
 
 #[cfg(feature = "gpu")]

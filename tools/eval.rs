@@ -5,6 +5,7 @@ use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::InputError;
+use gsscale::base::say::exit_code;
 use gsscale::base::whole_file::{folder_of, write_whole};
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::exchange::sog::is_tree;
@@ -59,13 +60,7 @@ struct Args {
 fn main() -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    match start(parse_command_line()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(start(parse_command_line()))
 }
 
 fn start(args: Args) -> Result<(), TrainError> {

@@ -3,6 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::say::exit_code;
 use gsscale::base::units::{format_bytes, parse_bytes};
 use gsscale::page::engine::open::IoEngine;
 use gsscale::page::folder::file_system::FileSystem;
@@ -58,13 +59,7 @@ struct Flags {
 }
 
 fn main() -> ExitCode {
-    match run(&Flags::parse()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(run(&Flags::parse()))
 }
 
 fn run(flags: &Flags) -> InputResult<()> {

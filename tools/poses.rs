@@ -2,6 +2,7 @@
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
+use gsscale::base::say::exit_code;
 use gsscale::poses::program::{FeatureOptions, ProgramPaths};
 use gsscale::poses::{PoseSearch, PosesRequest};
 use std::path::PathBuf;
@@ -47,13 +48,7 @@ struct Flags {
 }
 
 fn main() -> ExitCode {
-    match start(&Flags::parse()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(start(&Flags::parse()))
 }
 
 fn start(flags: &Flags) -> InputResult<()> {

@@ -3,6 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
+use gsscale::base::say::exit_code;
 use gsscale::base::units::format_bytes;
 use gsscale::dataset::layout::Layout;
 use gsscale::dataset::lookalike::write_lookalike;
@@ -96,13 +97,7 @@ fn parse_offset(text: &str) -> Result<[f64; 3], String> {
 
 fn main() -> ExitCode {
     let flags = Flags::parse();
-    match run(&flags) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(run(&flags))
 }
 
 fn run(flags: &Flags) -> InputResult<()> {

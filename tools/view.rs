@@ -3,6 +3,7 @@
 use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
+use gsscale::base::say::exit_code;
 use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::METRICS_FILE;
@@ -42,13 +43,7 @@ struct Args {
 fn main() -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    match start(parse_command_line()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(start(parse_command_line()))
 }
 
 fn start(args: Args) -> Result<(), TrainError> {

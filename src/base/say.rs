@@ -68,6 +68,17 @@ fn is_hidden(char: char) -> bool {
     is_direction || (char.is_control() && !matches!(char, '\n' | '\t'))
 }
 
+/// The exit code of a program that has ended so; an error is printed with its remedy.
+pub fn exit_code(done: Result<(), impl std::fmt::Display>) -> std::process::ExitCode {
+    match done {
+        Ok(()) => std::process::ExitCode::SUCCESS,
+        Err(error) => {
+            crate::tell!("error: {error}");
+            std::process::ExitCode::FAILURE
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -120,8 +120,7 @@ mod tests {
 
     /// At `x`, y = z = 0, looking along z. The picture shows |x|, |y| < depth / 2.
     fn camera(x: f32) -> Camera {
-        let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        Camera::pinhole(viewmat, [100.0, 100.0, 50.0, 50.0], [100, 100])
+        Camera::along_z(x, [100.0, 100.0, 50.0, 50.0], [100, 100])
     }
 
     /// Rows of these means and largest sigmas.

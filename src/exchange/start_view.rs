@@ -96,10 +96,7 @@ mod tests {
     #[test]
     fn the_photo_that_sees_most_before_its_walls_starts() {
         // Looking along z from x, with a field of view of 90 degrees across and less along.
-        let camera = |x: f32| {
-            let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-            Camera::pinhole(viewmat, [100.0, 100.0, 100.0, 20.0], [200, 60])
-        };
+        let camera = |x: f32| Camera::along_z(x, [100.0, 100.0, 100.0, 20.0], [200, 60]);
         let row =
             |from: i32, step: f64, depth: f64, to: i32| (from..to).map(move |x| [step * f64::from(x), 0.0, depth]);
         // Before the first camera a wall of 10 points hides 18 behind it; the second sees 10, and one far ahead; the third, none.

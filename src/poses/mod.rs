@@ -455,7 +455,7 @@ impl PoseSearch {
             }
             None => {
                 said.push(
-                    "the photos' GPS places are too few or lie on a line, so the model has no metres and no north"
+                    "the photos' GPS places are too few, too coarse or on a line, so the model has no metres and no north"
                         .to_string(),
                 );
                 None
@@ -685,6 +685,50 @@ mod tests {
             assert_eq!(std::fs::read(&name).unwrap(), content.as_bytes());
         }
         assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 2, "no part is left");
+    }
+
+    /// A second search after the photos of the first have changed replaces its links, and no file of others.
+    #[test]
+    fn files_of_others_in_the_scene_stay() {
+        let root = tempfile::tempdir().unwrap();
+        let (from, scene) = (root.path().join("card"), root.path().join("scene"));
+        std::fs::create_dir_all(&from).unwrap();
+        let work = scene.join(WORK_FOLDER);
+        let image = |name: &str| scene.join("images").join(name);
+        let read = |name: &str| std::fs::read_to_string(image(name)).unwrap();
+        let search = |photos: [(&str, &str); 3]| {
+            let photos = photos.map(|(name, content)| {
+                std::fs::remove_file(from.join(name)).ok();
+                std::fs::write(from.join(name), content).unwrap();
+                photos::tests::photo_at(&from, name)
+            });
+            let (photos, groups, features) = (photos.to_vec(), vec![vec![0, 1, 2]], PosesRequest::of(&from).features);
+            let (scene, program, warnings) = (scene.clone(), Program::unused(), Vec::new());
+            PoseSearch { scene, links_photos: true, photos, groups, program, features, warnings }
+        };
+        let first = search([("a.jpg", "first"), ("b.jpg", "b"), ("c.jpg", "c")]);
+        let (state, lock) = first.begin(&work).unwrap();
+        first.link_photos(&work).unwrap();
+        drop(lock);
+        assert_eq!([read("a.jpg"), read("b.jpg")], ["first", "b"]);
+        // Somebody edits one of them, and takes another photo of the same name.
+        std::fs::remove_file(image("b.jpg")).unwrap();
+        std::fs::write(image("b.jpg"), "edited").unwrap();
+        let second = search([("a.jpg", "the second"), ("b.jpg", "b"), ("c.jpg", "c")]);
+        let (again, lock) = second.begin(&work).unwrap();
+        assert_ne!(state.photos, again.photos);
+        let refused = second.link_photos(&work).unwrap_err();
+        assert!(refused.problem.contains("another file") && refused.remedy.contains("--out"), "{refused}");
+        assert_eq!([read("a.jpg"), read("b.jpg")], ["the second", "edited"]);
+        // Of the same length it stays as well.
+        std::fs::write(image("b.jpg"), "e").unwrap();
+        second.link_photos(&work).unwrap();
+        assert_eq!(read("b.jpg"), "e");
+        // A search that was killed before its first word does not take a folder of photos over.
+        drop(lock);
+        std::fs::remove_file(work.join(STATE_FILE)).unwrap();
+        std::fs::remove_dir_all(work.join(PHOTOS)).unwrap();
+        assert!(second.begin(&work).unwrap_err().problem.contains("exists already"));
     }
 
     #[test]

@@ -102,7 +102,9 @@ fn add_names(
         } else if is_photo {
             names.push(format!("{prefix}{name}"));
         } else if matches!(ending.as_deref(), Some("heic" | "heif" | "tif" | "tiff" | "dng" | "webp" | "avif")) {
-            *others += 1;
+            // Drones write a DNG beside each JPEG.
+            let has_twin = ["jpg", "JPG", "jpeg", "png"].iter().any(|end| path.with_extension(end).is_file());
+            *others += usize::from(!has_twin);
         }
     }
     Ok(())
@@ -155,9 +157,17 @@ pub fn camera_groups(photos: &[FoundPhoto]) -> Vec<Vec<usize>> {
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
-mod tests {
+pub(super) mod tests {
     use super::*;
     use crate::dataset::photo_header::PhotoFormat;
+
+    /// A file that counts as a photo, whatever is in it.
+    pub(in crate::poses) fn photo_at(folder: &Path, name: &str) -> FoundPhoto {
+        let (path, format) = (folder.join(name), PhotoFormat::Jpeg);
+        let bytes = std::fs::metadata(&path).unwrap().len();
+        let header = PhotoHeader { format, width: 4, height: 3, decode_bytes: 0, has_alpha: false, exif: None };
+        FoundPhoto { name: name.to_string(), path, bytes, header, camera: String::new(), place: None }
+    }
 
     #[test]
     fn names_are_in_the_order_of_a_cameras_numbers() {
@@ -186,7 +196,7 @@ mod tests {
     #[test]
     fn folders_of_masks_and_the_scene_are_left_out() {
         let root = tempfile::tempdir().unwrap();
-        for name in ["x/1.jpg", "x/2.JPG", "_masks/1.jpg", "out/images/1.jpg", "x/3.heic"] {
+        for name in ["x/1.jpg", "x/2.JPG", "_masks/1.jpg", "out/images/1.jpg", "x/3.heic", "x/1.dng"] {
             std::fs::create_dir_all(root.path().join(name).parent().unwrap()).unwrap();
             std::fs::write(root.path().join(name), b"").unwrap();
         }

@@ -80,6 +80,12 @@ enum CalledAs {
 }
 
 impl Program {
+    /// A program that is never started.
+    #[cfg(test)]
+    pub(super) fn unused() -> Program {
+        Program { path: PathBuf::new(), name: String::new(), uses_gpu: false, called_as: CalledAs::Pycolmap }
+    }
+
     /// The program that `places` names; otherwise the best of COLMAP with a GPU, pycolmap, COLMAP on the CPU.
     /// Errors: none is there, which says how to install one; or the named one does not run or is too old.
     pub fn find(places: &ProgramPaths) -> InputResult<Program> {

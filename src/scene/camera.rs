@@ -41,6 +41,12 @@ impl Camera {
         (z > f64::from(self.near_plane)).then(|| ([fx * x / z + cx, fy * y / z + cy], z))
     }
 
+    /// A camera of tests: at `x` on the first axis, looking along the third.
+    #[cfg(test)]
+    pub(crate) fn along_z(x: f32, intrinsics: [f32; 4], size: [u32; 2]) -> Camera {
+        Camera::pinhole([[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]], intrinsics, size)
+    }
+
     /// The point in the world that pixel position `[u, v]` shows at depth `z`.
     pub fn unproject(&self, [u, v]: [f64; 2], z: f64) -> [f32; 3] {
         let x = (u - f64::from(self.cx)) / f64::from(self.fx) * z;

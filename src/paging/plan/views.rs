@@ -159,8 +159,7 @@ mod tests {
     use crate::scene::page_meta::PageBounds;
 
     fn camera(x: f32) -> Camera {
-        let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        Camera::pinhole(viewmat, [100.0, 100.0, 50.0, 50.0], [100, 100])
+        Camera::along_z(x, [100.0, 100.0, 50.0, 50.0], [100, 100])
     }
 
     fn page(number: u32, x: f32) -> PageMeta {

@@ -121,24 +121,46 @@ pub(super) fn first_trainer(
     host_mem: Option<u64>,
 ) -> Result<FirstTrainer, TrainError> {
     let config = &request.config;
-    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !request.dry_run)
+    let (print, sh_degree_start) = (dataset_print(&start)?, start.sh_degree_start);
+    let PagedStart { dataset, trainer, mut tiers, driver } =
+        page_start(config, [request.quiet, request.dry_run], start, host_mem)?;
+    if !request.dry_run {
+        tiers.commit_in(&request.out, config);
+    }
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw(), diagnosis: None };
+    Ok(FirstTrainer { dataset, trainer, tiers, begun })
+}
+
+/// First Gaussians in pages, and what draws them. The pages may lie in the tiers, so drop the tiers last.
+pub(super) struct PagedStart {
+    pub dataset: Dataset,
+    pub trainer: Trainer,
+    pub tiers: Tiers,
+    /// Bytes allocated by the graphics driver.
+    pub driver: u64,
+}
+
+/// Opens the tiers, the renderer and the first pages. A dry run keeps its pages in memory.
+/// Errors: the drive or the device cannot be used, or the source of the Gaussians cannot be read again.
+pub(super) fn page_start(
+    config: &TrainConfig,
+    [quiet, dry_run]: [bool; 2],
+    start: Start,
+    host_mem: Option<u64>,
+) -> Result<PagedStart, TrainError> {
+    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !dry_run)
         && remove_uncommitted(spill_dir, false)?
     {
         crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     check_first_drive(config, start.rows)?;
-    let (renderer, options, driver) = begin(request.quiet, config, &start)?;
+    let (renderer, options, driver) = begin(quiet, config, &start)?;
     let [pages, _] = first_pages(config, rows_at_most(config, start.rows));
-    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), request.dry_run)?;
+    let (pager, tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), dry_run)?;
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
-    if !request.dry_run {
-        tiers.commit_in(&request.out, config);
-    }
-    let (print, sh_degree_start) = (dataset_print(&start)?, start.sh_degree_start);
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw(), diagnosis: None };
     let (dataset, scene) = start.into_pages(pager, &options, config, host_mem)?;
     let trainer = Trainer::of_scene(scene, &dataset, renderer, options);
-    Ok(FirstTrainer { dataset, trainer, tiers, begun })
+    Ok(PagedStart { dataset, trainer, tiers, driver })
 }
 
 /// Common start of all runs after reading the scene: warnings, options, the renderer and its memory.

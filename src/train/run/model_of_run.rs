@@ -19,8 +19,15 @@ pub struct ModelOfRun {
 
 impl ModelOfRun {
     /// `model` is the output folder of a run, a file of Gaussians, or a store. Without `scene`, the run names it. Remedies name `program`.
-    /// Errors: no run names the scene, or the scene is not there.
+    /// Errors: the model or the scene is not there, or no run names the scene.
     pub fn find(program: &str, model: &Path, scene: Option<PathBuf>) -> InputResult<ModelOfRun> {
+        if !model.exists() {
+            return Err(InputError::new(
+                model,
+                "does not exist",
+                "name the output folder of a run, or a file of Gaussians",
+            ));
+        }
         let is_run = model.is_dir() && (model.join(CONFIG_FILE).is_file() || model.join(PLY_FILE).is_file());
         let file = if is_run { model.join(PLY_FILE) } else { model.to_path_buf() };
         if let Some(scene) = scene {

@@ -6,7 +6,7 @@
 //! Invariants: 1. nothing is written but pages in a spill directory, which is removed at the end; 2. a picture that cannot be drawn is an
 //! error of the page alone.
 
-use super::begin::begin;
+use super::begin::{PagedStart, page_start};
 use super::out_folder::scene_name;
 use super::scene_picture::{overview, picture};
 use crate::base::error::InputError;
@@ -25,11 +25,8 @@ use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::host_budget;
-use crate::train::preflight::forecast::{first_pages, plan_run};
-use crate::train::preflight::plan::rows_at_most;
+use crate::train::preflight::forecast::plan_run;
 use crate::train::start::first_scene::Start;
-use crate::train::start::tiers;
-use crate::train::state::trainer::Trainer;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -81,15 +78,10 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     let ShowRequest { scene, config, live, .. } = request;
     machine::set_up(config)?;
     config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
-    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(scene, config, host_mem)?;
-    let (renderer, options, driver) = begin(false, config, &start)?;
-    let [pages, _] = first_pages(config, rows_at_most(config, start.rows));
-    let (pager, mut tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), false)?;
+    let PagedStart { dataset, mut trainer, mut tiers, driver } = page_start(config, [false, false], start, host_mem)?;
     tiers.is_done = true;
-    let (dataset, gaussians) = start.into_pages(pager, &options, config, host_mem)?;
-    let mut trainer = Trainer::of_scene(gaussians, &dataset, renderer, options);
     plan_run(config, &dataset, &tiers, &mut trainer, host_mem, driver, DriveRate::COMMON)?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     let rows = trainer.scene.rows();
@@ -102,6 +94,8 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
         picture_percent: 100,
         ..Status::default()
     });
+    // Until here, Ctrl-C ends the program at once; the pages go at the next start.
+    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     crate::tell!("{} Gaussians are shown until Ctrl-C", format_grouped(rows));
     while stop.exit_code().is_none() {
         match live.wanted() {
