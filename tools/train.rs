@@ -287,7 +287,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         gsscale::tell!("  quality     {test}");
         let left_out = match summary.gaussians_left_out {
             0 => String::new(),
-            count => format!(" (without {} that too few photos hold in place)", format_grouped(count)),
+            count => format!(" (without {} that too few photos see)", format_grouped(count)),
         };
         gsscale::tell!("  Gaussians   {}{left_out}", out.join(PLY_FILE).display());
         if out.join(SETTINGS_FILE).is_file() {

@@ -1,8 +1,8 @@
 //! One owner for each cell, on any number of machines that see one folder: a file with the owner's name, held by the system's lock where
 //! the file system has locks, and by a heartbeat where it has none, or other machines do not see them.
 //!
-//! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. of
-//! several that find no owner one makes the file, which has its owner and his lock from its first moment; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
+//! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. if
+//! several processes find no owner, one of them makes the lock file, which appears with the owner's name in it and the system's lock held; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
 //! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
 //! and no result: the bytes are the same.
 

@@ -295,8 +295,8 @@ config_keys! {
         /// Files of the result: ply, spz, sog or several (spz,sog). A PLY is always written; spz adds a file of about a tenth of its
         /// bytes, sog a folder with levels of detail, which web viewers load in parts
         export: Exports = Exports { spz: false, sog: false } => Free common;
-        /// Leave Gaussians that fewer than two photos hold in place out of the result files (the checkpoint keeps them): auto, on or off.
-        /// Where photos overlap little, auto leaves out only those that no photo holds
+        /// Leave Gaussians that fewer than two photos see out of the result files (the checkpoint keeps them): auto, on or off.
+        /// Where photos overlap little, auto leaves out only those that no photo sees
         export_clean: Chosen<bool> = Chosen(None) => Free;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;

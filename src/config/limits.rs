@@ -55,7 +55,7 @@ pub struct RunOptions {
     pub color_correct: Option<ColorCorrect>,
     pub photos: PhotoOptions,
     pub export_frame: ExportFrame,
-    /// Whether result files leave out Gaussians that few photos hold; `None` decides by their share.
+    /// Whether result files leave out Gaussians that few photos see; `None` decides by their share.
     pub export_clean: Option<bool>,
     /// The direction of the dataset that is up in PLY files; `None` where they keep the axes of the dataset, and while
     /// `--up auto` is unresolved.

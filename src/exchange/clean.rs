@@ -1,13 +1,13 @@
-//! Which Gaussians exports leave out (`--export-clean`): those that too few training photos hold in place.
+//! Which Gaussians exports leave out (`--export-clean`): those that fewer than two training photos see.
 //!
-//! A photo holds a Gaussian if its disc of one sigma, the largest, reaches into the picture, and if it does not hang before the lens:
-//! nearer than `NEAR_SHARE` of the depth at which the photo's scene begins. Giants that many photos see stay whatever their size:
-//! they are the ground behind gaps; without 19 to 78 of them held-out photos of one aerial scene lose 2.5 to 10.6 dB.
+//! A photo sees a Gaussian if the disc of its largest sigma reaches into the picture, and if the Gaussian is no floater: a floater is
+//! nearer to the camera than `NEAR_SHARE` of the depth at which the photo's scene begins. Large Gaussians stay: they are the background
+//! in the gaps of a scene; without 19 to 78 of them held-out photos of one aerial scene lose 2.5 to 10.6 dB.
 //!
 //! Not here: reading the rows, writing the files.
 //!
 //! Invariants: 1. the answer for a row is a function of the row, the cameras and the sample alone; 2. a row with a position or
-//! scale that is not finite counts as held: sinks count such rows.
+//! scale that is not finite counts as seen: sinks count such rows.
 
 use crate::base::math::exp32;
 use crate::scene::camera::Camera;
@@ -16,9 +16,9 @@ use crate::scene::frustum::{Frustum, PagePlanes};
 use crate::scene::page_meta::PageBounds;
 use rayon::prelude::*;
 
-/// Photos that must hold a Gaussian.
+/// Photos that must see a Gaussian.
 const PHOTOS_LEAST: u8 = 2;
-/// Share of the depth at which a photo's scene begins. Nearer Gaussians hang before the lens.
+/// A Gaussian nearer than this share of the depth at which a photo's scene begins is a floater of that photo.
 const NEAR_SHARE: f64 = 0.3;
 /// `auto` leaves out at most this share. Where more Gaussians have a single photo, photos overlap little, and held-out photos need
 /// these Gaussians: .5 dB of brighton's 18 photos.
@@ -39,27 +39,27 @@ pub(super) fn first_depth(depths: &mut [f64]) -> f64 {
     depths.get(depths.len() / 10).copied().unwrap_or(0.0)
 }
 
-struct HoldingPhoto {
+struct SeeingPhoto {
     camera: Camera,
     planes: PagePlanes,
     nearest: f64,
 }
 
-/// The photos that hold Gaussians in place.
-pub struct HoldingPhotos(Vec<HoldingPhoto>);
+/// The training photos of a scene, to count those that see a Gaussian.
+pub struct SeeingPhotos(Vec<SeeingPhoto>);
 
-impl HoldingPhotos {
+impl SeeingPhotos {
     /// Of the cameras of training photos, for a scene of which `sample` are means (both in the local frame).
-    pub fn new(cameras: &[Camera], sample: &[[f64; 3]]) -> HoldingPhotos {
+    pub fn new(cameras: &[Camera], sample: &[[f64; 3]]) -> SeeingPhotos {
         let photo = |camera: &Camera| {
             let mut depths: Vec<f64> = in_picture(camera, sample).map(|(_, depth)| depth).collect();
             let nearest = NEAR_SHARE * first_depth(&mut depths);
-            HoldingPhoto { camera: *camera, planes: Frustum::new(camera).planes(), nearest }
+            SeeingPhoto { camera: *camera, planes: Frustum::new(camera).planes(), nearest }
         };
-        HoldingPhotos(cameras.par_iter().map(photo).collect())
+        SeeingPhotos(cameras.par_iter().map(photo).collect())
     }
 
-    /// The number of photos that hold each row, at most `PHOTOS_LEAST`.
+    /// The number of photos that see each row, at most `PHOTOS_LEAST`.
     pub fn of_rows(&self, rows: &Columns) -> Vec<u8> {
         let mut counts = vec![PHOTOS_LEAST; rows.rows()];
         counts.par_chunks_mut(BLOCK_ROWS).enumerate().for_each(|(block, counts)| {
@@ -76,19 +76,19 @@ impl HoldingPhotos {
                 bounds.hi = [0, 1, 2].map(|i| bounds.hi[i].max(mean[i]));
                 bounds.sigma_max = bounds.sigma_max.max(sigma);
             }
-            let near: Vec<&HoldingPhoto> = self.0.iter().filter(|photo| photo.planes.may_intersect(&bounds)).collect();
+            let near: Vec<&SeeingPhoto> = self.0.iter().filter(|photo| photo.planes.may_intersect(&bounds)).collect();
             for (row, count) in (first..).zip(counts) {
                 let Some((mean, sigma)) = of_row(row) else { continue };
-                let holding = near.iter().filter(|photo| photo.holds(mean.map(f64::from), f64::from(sigma)));
-                *count = holding.take(usize::from(PHOTOS_LEAST)).count() as u8;
+                let seeing = near.iter().filter(|photo| photo.sees(mean.map(f64::from), f64::from(sigma)));
+                *count = seeing.take(usize::from(PHOTOS_LEAST)).count() as u8;
             }
         });
         counts
     }
 }
 
-impl HoldingPhoto {
-    fn holds(&self, mean: [f64; 3], sigma: f64) -> bool {
+impl SeeingPhoto {
+    fn sees(&self, mean: [f64; 3], sigma: f64) -> bool {
         let Camera { fx, fy, width, height, .. } = self.camera;
         let inside = |at: f64, size: u32, f: f32, depth: f64| {
             let reach = sigma * f64::from(f) / depth;
@@ -100,7 +100,7 @@ impl HoldingPhoto {
     }
 }
 
-/// The photos that must hold an exported Gaussian, at least: 0 exports all. `is_on` is `None` for `auto`, which takes the
+/// How many photos must see a Gaussian for it to be exported; 0 exports all. `is_on` is `None` for `auto`, which takes the
 /// strictest limit that leaves out few of the rows with these `counts`.
 pub fn photos_required(is_on: Option<bool>, counts: &[u8]) -> u8 {
     let lacks = |least: u8| counts.iter().filter(|&&count| count < least).count() as f64;
@@ -134,10 +134,10 @@ mod tests {
     }
 
     #[test]
-    fn photos_hold_what_their_pictures_reach_beyond_the_lens() {
+    fn photos_see_what_reaches_their_pictures_but_no_floaters() {
         // A wall at depth 10, so that the scene of a photo begins there.
         let wall: Vec<[f64; 3]> = (0..20).map(|i| [f64::from(i) - 8.0, 0.0, 10.0]).collect();
-        let photos = HoldingPhotos::new(&[camera(0.0), camera(4.0)], &wall);
+        let photos = SeeingPhotos::new(&[camera(0.0), camera(4.0)], &wall);
         let cases = [
             (([2.0, 0.0, 10.0], 0.1), 2, "in both pictures"),
             (([-3.0, 0.0, 10.0], 0.1), 1, "in the left picture"),
@@ -156,7 +156,7 @@ mod tests {
             assert_eq!(count, found, "{what}");
         }
         // Without a sample, nothing is known of depths.
-        assert_eq!(HoldingPhotos::new(&[camera(2.0)], &[]).of_rows(&rows(&[([2.0, 0.0, 1.0], 0.1)])), [1]);
+        assert_eq!(SeeingPhotos::new(&[camera(2.0)], &[]).of_rows(&rows(&[([2.0, 0.0, 1.0], 0.1)])), [1]);
     }
 
     #[test]
@@ -167,12 +167,12 @@ mod tests {
             (0..3000).map(|_| ([9.0 * normal(), 4.0 * normal(), 9.0 + 2.0 * normal()], 0.1 * normal().exp())).collect();
         let sample: Vec<[f64; 3]> = many.iter().map(|(mean, _)| mean.map(f64::from)).collect();
         let cameras: Vec<Camera> = (-2..3).map(|x| camera(6.0 * x as f32)).collect();
-        let photos = HoldingPhotos::new(&cameras, &sample);
+        let photos = SeeingPhotos::new(&cameras, &sample);
         let whole = photos.of_rows(&rows(&many));
         let parts: Vec<u8> = many.chunks(700).flat_map(|part| photos.of_rows(&rows(part))).collect();
         let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
         assert_eq!(whole, parts);
-        assert_eq!(whole, alone.install(|| HoldingPhotos::new(&cameras, &sample).of_rows(&rows(&many))));
+        assert_eq!(whole, alone.install(|| SeeingPhotos::new(&cameras, &sample).of_rows(&rows(&many))));
         assert!((0..=2).all(|count| whole.iter().filter(|&&found| found == count).count() > 100));
     }
 

@@ -600,8 +600,9 @@ fn are_one(_: &Metadata, _: &Metadata) -> bool {
     false
 }
 
-/// A second name for a photo of so many bytes, or a copy where the drive knows no second names. Such a name stays, and a whole copy that is
-/// younger than the photo; an earlier photo of the name, or a copy that was cut off, is replaced.
+/// Makes `name` a hard link to a photo of so many bytes, or a copy where the drive has no hard links. A link to the photo stays, and so does
+/// a complete copy that is younger than the photo. Anything else under `name` is replaced, so the caller must know that it is ours.
+/// Errors: the photo cannot be read, or the folder cannot be written.
 fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
     // A link's own target, so that moving the link leaves the photo reachable.
     let photo = photo.canonicalize().unwrap_or_else(|_| photo.to_path_buf());

@@ -45,7 +45,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     let mut texts: Vec<String> = [&summary["export"]].into_iter().chain(more).filter_map(export_text).collect();
     if let Some(left_out @ 1..) = summary["gaussians_left_out"].as_u64() {
         let count = format_grouped(left_out);
-        texts.push(format!("{count} Gaussians that too few photos hold in place are left out (--export-clean)."));
+        texts.push(format!("{count} Gaussians that too few photos see are left out (--export-clean)."));
     }
     if !texts.is_empty() {
         page.heading("For viewers");

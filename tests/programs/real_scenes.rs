@@ -19,7 +19,7 @@ fn a_real_scene_trains_to_a_known_quality() {
     assert_eq!(summary["test"]["views"], 22);
     assert_eq!(summary["gaussians"], 41_321);
     let ply = work.ply("run");
-    // 62 floats a Gaussian (normals included) after the header, without the few that less than two photos hold.
+    // 62 floats a Gaussian (normals included) after the header, without the few that fewer than two photos see.
     let left_out = work.count("run", "gaussians_left_out");
     assert!(left_out < 200 && ply.len() as u64 > (41_321 - left_out) * 62 * 4, "{left_out}");
     assert!(ply.starts_with(b"ply\nformat binary_little_endian 1.0\n"));

@@ -169,8 +169,9 @@ fn a_finished_run_is_shown_beside_its_photos() {
         assert!(!work.exists("spill"), "{flags}: the pages are removed");
     }
     assert!(work.files("out") == before && work.json_of(EVAL, "out") == held_out, "a viewer changes nothing of a run");
-    work.refuses_with(VIEW, "out/point_cloud.spz", &["point_cloud.spz"]);
-    work.refuses_with(VIEW, "scene/points.ply", &["name the scene"]);
+    work.refuses_with(VIEW, "out/point_cloud.spz", &["point_cloud.spz", "does not exist"]);
+    work.write("bare.ply", work.bytes("out/point_cloud.ply"));
+    work.refuses_with(VIEW, "bare.ply", &["bare.ply", "name the scene: gsscale-view FILE SCENE"]);
 }
 
 #[test]

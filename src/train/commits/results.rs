@@ -14,7 +14,7 @@ use crate::base::even_sample::EvenSample;
 use crate::base::units::format_bytes;
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
-use crate::exchange::clean::{HoldingPhotos, photos_required};
+use crate::exchange::clean::{SeeingPhotos, photos_required};
 use crate::exchange::format::ExportFormat;
 use crate::exchange::frames::ExportRows;
 use crate::exchange::meta::SceneMeta;
@@ -188,7 +188,7 @@ pub(crate) fn export(
         Ok(sink.write(&kept)?)
     })?;
     if given == left_out {
-        let problem = format!("fewer than two photos hold each of the {given} Gaussians");
+        let problem = format!("fewer than two photos see each of the {given} Gaussians");
         return Err(InputError::new(path, problem, "use --export-clean off").into());
     }
     Ok((sink.finish()?, left_out))
@@ -205,11 +205,11 @@ fn settle(trainer: &mut Trainer, path: &Path) -> Result<(), TrainError> {
     trainer.drain()
 }
 
-/// What result files hold of the rows, and from where viewers see them first. The default: all rows.
+/// Which Gaussians the result files contain, and the camera with which viewers start. The default: all Gaussians, no camera.
 #[derive(Default)]
 pub(crate) struct ExportChoice {
-    /// The photos of which so many must hold a row.
-    required: Option<(HoldingPhotos, u8)>,
+    /// The photos, and how many of them must see a Gaussian.
+    required: Option<(SeeingPhotos, u8)>,
     start: Option<StartView>,
 }
 
@@ -227,7 +227,7 @@ impl ExportChoice {
         })?;
         let cameras: Vec<Camera> = dataset.train_views().iter().map(|&view| dataset.views[view].camera).collect();
         let start = StartView::choose(&cameras, &sample.kept);
-        let photos = HoldingPhotos::new(&cameras, &sample.kept);
+        let photos = SeeingPhotos::new(&cameras, &sample.kept);
         let mut counts = Vec::new();
         if trainer.options.export_clean != Some(false) {
             trainer.scene.for_rows_of(&pages, now, &mut |rows| {

@@ -197,7 +197,7 @@ pub struct Summary {
     pub steps: u32,
     /// Gaussians of the scene.
     pub gaussians: u64,
-    /// Those among them that result files leave out, because too few photos hold them.
+    /// Those among them that result files leave out, because too few photos see them.
     #[serde(default)]
     pub gaussians_left_out: u64,
     /// Seconds spent in training steps, without evaluation.

@@ -123,7 +123,7 @@ pub(super) fn first_trainer(
     let config = &request.config;
     let (print, sh_degree_start) = (dataset_print(&start)?, start.sh_degree_start);
     let PagedStart { dataset, trainer, mut tiers, driver } =
-        page_start(config, [request.quiet, request.dry_run], start, host_mem)?;
+        page_start(config, request.quiet, request.dry_run, start, host_mem)?;
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
     }
@@ -144,7 +144,8 @@ pub(super) struct PagedStart {
 /// Errors: the drive or the device cannot be used, or the source of the Gaussians cannot be read again.
 pub(super) fn page_start(
     config: &TrainConfig,
-    [quiet, dry_run]: [bool; 2],
+    quiet: bool,
+    dry_run: bool,
     start: Start,
     host_mem: Option<u64>,
 ) -> Result<PagedStart, TrainError> {

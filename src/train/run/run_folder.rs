@@ -297,7 +297,7 @@ fn write_results(
 /// The PLY of a result.
 struct SavedPly {
     written: Written,
-    /// Gaussians that too few photos hold.
+    /// Gaussians that too few photos see.
     left_out: u64,
     choice: ExportChoice,
 }

@@ -80,7 +80,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(scene, config, host_mem)?;
-    let PagedStart { dataset, mut trainer, mut tiers, driver } = page_start(config, [false, false], start, host_mem)?;
+    let PagedStart { dataset, mut trainer, mut tiers, driver } = page_start(config, false, false, start, host_mem)?;
     tiers.is_done = true;
     plan_run(config, &dataset, &tiers, &mut trainer, host_mem, driver, DriveRate::COMMON)?;
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
