@@ -36,6 +36,8 @@ pub enum PictureKind {
     Photo,
     /// The absolute difference of the photo and the scene from the photo's place, four times as bright.
     Difference,
+    /// The mean of that difference around each pixel, as heat: black, blue, red, yellow, white.
+    Error,
 }
 
 /// A camera on an orbit around the point that a training view looks at.

@@ -20,6 +20,9 @@ use glam::{Mat3, Vec3};
 const PICTURE_SHARE: u64 = 8;
 /// A difference of a quarter is white.
 const DIFFERENCE_FACTOR: f32 = 4.0;
+/// Pixels to each side over which [`PictureKind::Error`] takes its mean, and its colours, evenly from 0 to 1.
+const HEAT_RADIUS: usize = 4;
+const HEAT: [[f32; 3]; 5] = [[0.0; 3], [0.1, 0.1, 0.7], [0.85, 0.15, 0.1], [1.0, 0.85, 0.1], [1.0; 3]];
 /// Most views that are looked at for an overview.
 const OVERVIEWS_MOST: usize = 64;
 
@@ -41,7 +44,7 @@ fn draw_orbit(
     let view = views[orbit.view as usize % views.len().max(1)];
     let base = dataset.views[view].camera;
     let photo = match orbit.show {
-        PictureKind::Photo | PictureKind::Difference => Some(targets.get(view)?),
+        PictureKind::Photo | PictureKind::Difference | PictureKind::Error => Some(targets.get(view)?),
         PictureKind::Scene | PictureKind::Depth => None,
     };
     if let (PictureKind::Photo, Some(photo)) = (orbit.show, &photo) {
@@ -63,8 +66,37 @@ fn draw_orbit(
         each_value(&mut image, &photo, |value, byte| {
             DIFFERENCE_FACTOR * (value.clamp(0.0, 1.0) - f32::from(byte) / 255.0).abs()
         });
+        if orbit.show == PictureKind::Error {
+            return Ok(heat(&image));
+        }
     }
     Ok(image)
+}
+
+/// The mean of the values in a square of [`HEAT_RADIUS`] around each pixel, as a colour of [`HEAT`].
+fn heat(image: &Image) -> Image {
+    let (width, height) = (image.width as usize, image.height as usize);
+    let mut sums = vec![0.0f64; (width + 1) * (height + 1)];
+    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+        let of_pixel: f32 = (0..3).map(|plane| image.rgb[(plane * height + y) * width + x].min(1.0)).sum();
+        let at = (y + 1) * (width + 1) + x + 1;
+        sums[at] = f64::from(of_pixel) / 3.0 + sums[at - 1] + sums[at - width - 1] - sums[at - width - 2];
+    }
+    let mut drawn = Image::new(image.width, image.height);
+    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
+        let span = |at: usize, size: usize| (at.saturating_sub(HEAT_RADIUS), (at + HEAT_RADIUS + 1).min(size));
+        let ((left, right), (top, bottom)) = (span(x, width), span(y, height));
+        let sum = |y: usize, x: usize| sums[y * (width + 1) + x];
+        let inside = sum(bottom, right) - sum(bottom, left) - sum(top, right) + sum(top, left);
+        let place = inside / ((right - left) * (bottom - top)) as f64 * (HEAT.len() - 1) as f64;
+        let below = (place.max(0.0) as usize).min(HEAT.len() - 2);
+        let share = (place - below as f64).clamp(0.0, 1.0) as f32;
+        for plane in 0..3 {
+            let [from, to] = [HEAT[below][plane], HEAT[below + 1][plane]];
+            drawn.rgb[(plane * height + y) * width + x] = from + share * (to - from);
+        }
+    }
+    drawn
 }
 
 /// Replaces each value of an image by one that follows from it and from the value of a photo of the same size.
