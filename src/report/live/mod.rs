@@ -36,7 +36,7 @@ pub enum PictureKind {
     Photo,
     /// The absolute difference of the photo and the scene from the photo's place, four times as bright.
     Difference,
-    /// The mean of that difference around each pixel, as heat: black, blue, red, yellow, white.
+    /// The root of the mean of that difference around each pixel, as heat: black, blue, red, yellow, white.
     Error,
 }
 

@@ -73,7 +73,8 @@ fn draw_orbit(
     Ok(image)
 }
 
-/// The mean of the values in a square of [`HEAT_RADIUS`] around each pixel, as a colour of [`HEAT`].
+/// The mean of the values in a square of [`HEAT_RADIUS`] around each pixel, as a colour of [`HEAT`]. The root of the mean
+/// is shown: errors of good pictures are small.
 fn heat(image: &Image) -> Image {
     let (width, height) = (image.width as usize, image.height as usize);
     let mut sums = vec![0.0f64; (width + 1) * (height + 1)];
@@ -88,8 +89,9 @@ fn heat(image: &Image) -> Image {
         let ((left, right), (top, bottom)) = (span(x, width), span(y, height));
         let sum = |y: usize, x: usize| sums[y * (width + 1) + x];
         let inside = sum(bottom, right) - sum(bottom, left) - sum(top, right) + sum(top, left);
-        let place = inside / ((right - left) * (bottom - top)) as f64 * (HEAT.len() - 1) as f64;
-        let below = (place.max(0.0) as usize).min(HEAT.len() - 2);
+        let mean = inside / ((right - left) * (bottom - top)) as f64;
+        let place = mean.max(0.0).sqrt() * (HEAT.len() - 1) as f64;
+        let below = (place as usize).min(HEAT.len() - 2);
         let share = (place - below as f64).clamp(0.0, 1.0) as f32;
         for plane in 0..3 {
             let [from, to] = [HEAT[below][plane], HEAT[below + 1][plane]];
