@@ -56,6 +56,9 @@ struct Flags {
     /// Seed of the city
     #[arg(long, default_value_t = 1, help_heading = "Size")]
     seed: u64,
+    /// Angle of the cameras to the vertical, degrees: beyond some 60 they see the sky [default: 40, or less for tall photos]
+    #[arg(long, value_name = "DEGREES", help_heading = "Camera")]
+    tilt: Option<f64>,
     /// Standard deviation of the photos' brightness: 0.03 is 3 %
     #[arg(long, default_value_t = 0.0, help_heading = "Camera")]
     exposure: f64,
@@ -110,6 +113,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         views: flags.views,
         overviews: flags.overviews,
         overview_area: flags.overview_area,
+        tilt: flags.tilt,
         width: flags.resolution.0,
         height: flags.resolution.1,
         points: flags.points,

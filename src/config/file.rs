@@ -212,7 +212,8 @@ config_keys! {
         init_scale: f64 = 1.0 => Numbers;
         /// For few or random first points: --growth-score mixed, --recycle 0.05, --init-scale 2 and 6.7 times the --means-lr of
         /// --schedule, where they are not given. Photos that overlap little lose by it. auto is on where the first points have
-        /// not the colours that photos show there, and photos overlap much. A resumed run keeps its values
+        /// not the colours that photos show there, photos overlap much, and --max-gaussians is given: a count that the run decides
+        /// itself does better without. A resumed run keeps its values
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers hidden;

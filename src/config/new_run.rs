@@ -203,7 +203,9 @@ pub fn adapt_schedule(config: &mut TrainConfig, photos: usize) -> Option<u32> {
 pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
     let is_on_host = config.optimizer_on != Chosen(Some(OptimizerPlace::Device));
     let grows_by_score = config.strategy == StrategyName::LongAxis && is_on_host;
-    if config.poor_points.0.is_none() && asked.poor_points && grows_by_score {
+    // A count that the run decides itself makes up for poor points better than these keys do.
+    let is_capped = config.max_gaussians > 0;
+    if config.poor_points.0.is_none() && asked.poor_points && grows_by_score && is_capped {
         // As if no key was given.
         let mut usual = config.clone();
         set_open_keys(&mut usual, &BTreeSet::new());
@@ -299,6 +301,16 @@ mod tests {
         let given = TrainOverrides { means_lr: Some(1e-4), recycle: Some(0.0), ..poor };
         let config = of_flags(&given);
         assert_eq!((config.means_lr, config.init_scale, config.recycle), (1e-4, 2.0, 0.0));
+    }
+
+    #[test]
+    fn poor_points_get_their_keys_by_themselves_where_the_count_is_capped() {
+        let asked = Remedies { poor_points: true, ..Remedies::default() };
+        for (max_gaussians, scale) in [(0, 1.0), (1000, POOR_INIT_SCALE)] {
+            let mut config = TrainConfig { max_gaussians, ..TrainConfig::default() };
+            adapt_to_photos(&mut config, &asked);
+            assert_eq!((config.poor_points.is_on(), config.init_scale), (max_gaussians > 0, scale));
+        }
     }
 
     #[test]

@@ -44,7 +44,7 @@ fn each_fault_of_a_capture_switches_its_remedy_on_and_a_clean_one_none() {
         ("exposure", Disturbance::Exposure { stops: 0.5 }, &["--appearance", "exposure"]),
         ("colors", Disturbance::WhiteBalance { stops: 0.3 }, &["--appearance", "full"]),
         ("swapped", swapped, &["--robust-views"]),
-        ("poses", Disturbance::PoseNoise { share: 0.02 }, &["--refine-poses"]),
+        ("poses", Disturbance::PoseNoise { share: 0.005 }, &["--refine-poses"]),
         ("jpeg", Disturbance::Jpeg { quality: 20 }, &[]),
         ("few", Disturbance::FewPhotos { one_in: 3 }, &[]),
         // Photos of this scene do not overlap enough for a remedy.

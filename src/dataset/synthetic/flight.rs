@@ -138,6 +138,8 @@ fn fly_pass(options: &CityOptions, pass: u32, views: u32, side: f64, tilt: f64, 
     }
     let strips = ((f64::from(views) * ratio).sqrt() + 0.5).clamp(1.0, f64::from(views)) as u32;
     let back = ALTITUDE * libm::tan(tilt);
+    // Cameras that look higher stand where the others do, and see what lies behind their aims.
+    let tilt = options.tilt.map_or(tilt, f64::to_radians);
     for strip in 0..strips {
         let (from, to) = (views * strip / strips, views * (strip + 1) / strips);
         let across = (f64::from(strip) + 0.5) / f64::from(strips) * side - 0.5 * side;
@@ -193,6 +195,17 @@ mod tests {
                 let ground = ray.at(-ray.from.z * ray.inverse.z);
                 assert!(ground.x.abs().max(ground.y.abs()) <= 0.5 * side * 1.0001, "{ground} lies in the first copy");
             }
+        }
+    }
+
+    #[test]
+    fn cameras_that_look_higher_stand_where_the_others_do_and_see_the_sky() {
+        let shots = |tilt| plan(&CityOptions { tilt, ..CityOptions::default() });
+        let (level, high) = (shots(None), shots(Some(80.0)));
+        for (level, shot) in level.shots.iter().zip(&high.shots) {
+            let k = &high.intrinsics;
+            let [top, bottom] = [0.0, 2.0 * k.cy].map(|y| shot.ray(k, k.cx, y).inverse.z);
+            assert!(shot.centre == level.centre && top > 0.0 && bottom < 0.0, "{shot:?}");
         }
     }
 

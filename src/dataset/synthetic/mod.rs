@@ -45,6 +45,8 @@ pub struct CityOptions {
     pub width: u32,
     /// Height of a photo, pixels, 16 to 16,384.
     pub height: u32,
+    /// Angle of the cameras of the flight to the vertical, degrees, 0 to 80; `None`: 40, or as much as keeps the horizon outside.
+    pub tilt: Option<f64>,
     /// Number of points, up to 50 million.
     pub points: u32,
     /// Side of the city in blocks of 60 m, 1 to 150 (a block takes about 0.15 MB of memory); `None`: the largest city
@@ -74,6 +76,7 @@ impl Default for CityOptions {
             overview_area: 0.4,
             width: 480,
             height: 320,
+            tilt: None,
             points: 20_000,
             blocks: None,
             exposure: 0.0,
@@ -118,6 +121,7 @@ fn check(options: &CityOptions) -> InputResult<()> {
     in_range("--views", f64::from(options.views), 1.0, 100_000.0)?;
     in_range("--overviews", f64::from(options.overviews), 0.0, 100_000.0 - f64::from(options.views))?;
     in_range("--overview-area", options.overview_area, 1e-4, 1.0)?;
+    in_range("--tilt", options.tilt.unwrap_or(0.0), 0.0, 80.0)?;
     in_range("--resolution", f64::from(options.width), 16.0, 16_384.0)?;
     in_range("--resolution", f64::from(options.height), 16.0, 16_384.0)?;
     in_range("--points", f64::from(options.points), 0.0, 50e6)?;
@@ -270,7 +274,8 @@ mod tests {
 
     #[test]
     fn options_out_of_range_are_refused_by_flag() {
-        let cases: [(CityOptions, &str); 7] = [
+        let cases: [(CityOptions, &str); 8] = [
+            (CityOptions { tilt: Some(81.0), ..Default::default() }, "--tilt"),
             (CityOptions { overview_area: 0.0, ..Default::default() }, "--overview-area"),
             (CityOptions { overviews: 99_950, ..Default::default() }, "--overviews"),
             (CityOptions { views: 0, ..Default::default() }, "--views"),
