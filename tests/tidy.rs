@@ -63,6 +63,7 @@ const UNSAFE_FILES: &[&str] = &[
     "src/page/engine/mmap.rs",
     "src/page/engine/registered.rs",
     "src/page/engine/uring.rs",
+    "src/poses/program.rs",
     "src/train/inputs/signals.rs",
 ];
 

@@ -42,6 +42,7 @@ pub const WORK_FOLDER: &str = "poses";
 /// Where the origin of a model in metres lies, as OpenSfM names it.
 pub const ORIGIN_FILE: &str = "reference_lla.json";
 const STATE_FILE: &str = "state.json";
+const PAIRS_FILE: &str = "pairs.json";
 /// What marks a work folder as ours.
 const MADE_BY: &str = "gsscale-poses 1";
 /// Photos of a camera from which all its lens parameters follow well; below, one parameter of distortion is sought.
@@ -49,9 +50,10 @@ const PHOTOS_FOR_OPENCV: usize = 10;
 /// Chunks of pairs: progress is known between them.
 const CHUNKS: usize = 50;
 const CHUNK_LEAST: usize = 200;
-/// Seconds of one core: features a megapixel, likeness a photo, the model a photo of a small scene.
+/// Seconds of one core: features a megapixel, likeness a photo and a comparison of two, the model a photo of a small scene.
 const FEATURES_SECONDS: f64 = 1.6;
 const LIKENESS_SECONDS: f64 = 0.3;
+const COMPARISON_SECONDS: f64 = 0.0007;
 const MODEL_SECONDS: f64 = 0.5;
 /// Photos from which a model takes noticeably longer for each photo.
 const MODEL_GROWTH: f64 = 500.0;
@@ -110,13 +112,13 @@ pub struct FoundPoses {
 }
 
 /// How far the work is, and for which photos and options.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct SearchState {
     made_by: String,
     program: String,
     options: String,
-    /// Names with bytes and camera group.
-    photos: Vec<(String, u64, usize)>,
+    /// Names with bytes, times of the last change, and camera groups.
+    photos: Vec<(String, u64, u64, usize)>,
     /// Finished phases.
     done: Vec<String>,
 }
@@ -140,14 +142,24 @@ impl PoseSearch {
             );
             return Err(InputError::new(sparse, "a model is here already", remedy));
         }
-        let (photos, warnings) = list_photos(&folder, &scene)?;
+        let (photos, warnings) = list_photos(&folder, &scene).map_err(|error| {
+            let is_empty_beside_photos = folder != request.photos && list_photos(&request.photos, &scene).is_ok();
+            if is_empty_beside_photos {
+                return InputError::new(
+                    folder.clone(),
+                    "holds no photos, but photos lie beside it",
+                    "move them into it",
+                );
+            }
+            error
+        })?;
         let is_flat = !links_photos && same(&folder, &scene);
         if let Some(below) = photos.iter().find(|photo| is_flat && photo.name.contains('/')) {
             let problem = format!("photos lie in sub-folders ({})", below.name);
             return Err(InputError::new(
                 folder,
                 problem,
-                "name a new folder with --out; its images/ will hold links to the photos",
+                "name a new folder, whose images/ will hold links to them: gsscale-poses PHOTOS --out FOLDER",
             ));
         }
         let program = Program::find(&request.places)?;
@@ -169,8 +181,12 @@ impl PoseSearch {
             let [width, height] = [photo.header.width, photo.header.height].map(f64::from);
             width * height * (f64::from(self.features.max_image_size) / width.max(height)).min(1.0).powi(2) / 1e6
         };
-        let likeness =
-            if way_of(&self.photos) == ChosenBy::SequenceAndLikeness { LIKENESS_SECONDS * n as f64 } else { 0.0 };
+        let likeness = match way_of(&self.photos) {
+            ChosenBy::SequenceAndLikeness => {
+                LIKENESS_SECONDS * n as f64 + COMPARISON_SECONDS * similar::comparisons(n) as f64
+            }
+            _ => 0.0,
+        };
         let features = self.photos.iter().map(megapixels).sum::<f64>() * FEATURES_SECONDS;
         let of_features = (f64::from(self.features.max_features) / 8192.0).powi(2);
         let matches = pairs as f64 * self.program.seconds_a_pair() * of_features;
@@ -210,8 +226,11 @@ impl PoseSearch {
         let found = found?;
         if !quiet {
             crate::tell!("{found}");
-        } else if found.registered < found.photos * 9 / 10 {
-            crate::tell!("warning: {} of {} photos have poses", found.registered, found.photos);
+        } else {
+            found.said.iter().for_each(|sentence| crate::tell!("warning: {sentence}"));
+            if found.registered < found.photos * 9 / 10 {
+                crate::tell!("warning: {} of {} photos have poses", found.registered, found.photos);
+            }
         }
         Ok(found)
     }
@@ -225,7 +244,7 @@ impl PoseSearch {
         self.link_photos(&work)?;
         self.find_features(place, &mut state, watch)?;
         if !state.is_done("matches") {
-            let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most));
+            let pairs = self.pairs(&work, &mut state, watch)?;
             let size = CHUNK_LEAST.max(pairs.len().div_ceil(CHUNKS));
             let mut done = 0;
             for chunk in pairs.chunks(size) {
@@ -254,7 +273,8 @@ impl PoseSearch {
         for (g, group) in self.groups.iter().enumerate() {
             group.iter().for_each(|&i| group_of[i] = g);
         }
-        let of_photo = |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, group_of[i]);
+        let of_photo =
+            |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, photo.modified, group_of[i]);
         let new = SearchState {
             made_by: MADE_BY.to_string(),
             program: self.program.name.clone(),
@@ -268,24 +288,24 @@ impl PoseSearch {
         let is_only_lock = entries().any(|_| true) && entries().all(|entry| entry.file_name() == "lock");
         if !work.exists() || is_only_lock {
             if self.links_photos && images.exists() {
-                return Err(InputError::new(images, "exists already", "name a new folder with --out"));
+                let remedy = "name a new folder: gsscale-poses PHOTOS --out FOLDER";
+                return Err(InputError::new(images, "exists already", remedy));
             }
             make_folder(work)?;
             let lock = lock(work)?;
             new.write(work)?;
             return Ok((new, lock));
         }
-        let file = work.join(STATE_FILE);
-        let old = std::fs::read(&file).ok().and_then(|text| serde_json::from_slice::<SearchState>(&text).ok());
-        let Some(old) = old.filter(|old| old.made_by == MADE_BY) else {
+        if SearchState::read(work).is_none() {
             let problem = "exists already, and is not a work folder of gsscale-poses";
-            return Err(InputError::new(
-                work,
-                problem,
-                "name a new folder for the scene with --out, or move that one away",
-            ));
-        };
+            let remedy = "move it away, or name a new folder for the scene: gsscale-poses PHOTOS --out FOLDER";
+            return Err(InputError::new(work, problem, remedy));
+        }
         let lock = lock(work)?;
+        // Another search may have changed it until now.
+        let Some(old) = SearchState::read(work) else {
+            return Err(InputError::new(work, "another search has just begun here", "start this one again"));
+        };
         if (SearchState { done: Vec::new(), ..old.clone() }) == new {
             return Ok((old, lock));
         }
@@ -316,7 +336,7 @@ impl PoseSearch {
                 // A copy, or what somebody has made of it.
                 Ok(now) if !is_ours && now.len() == photo.bytes => continue,
                 Ok(_) if !is_ours => {
-                    let remedy = "move it away, or name a new folder with --out";
+                    let remedy = "move it away, or name a new folder: gsscale-poses PHOTOS --out FOLDER";
                     return Err(InputError::new(target, "another file has the name of a photo", remedy));
                 }
                 _ => {}
@@ -338,6 +358,22 @@ impl PoseSearch {
             }
         }
         Ok(())
+    }
+
+    /// The pairs to compare: those that an interrupted search has chosen, if it did.
+    fn pairs(&self, work: &Path, state: &mut SearchState, watch: &mut Watch<'_>) -> InputResult<Vec<(u32, u32)>> {
+        let file = work.join(PAIRS_FILE);
+        let is_pair = |&(a, b): &(u32, u32)| a < b && (b as usize) < self.photos.len();
+        let chosen = || serde_json::from_slice::<Vec<(u32, u32)>>(&std::fs::read(&file).ok()?).ok();
+        if let Some(pairs) = chosen().filter(|pairs| state.is_done("pairs") && pairs.iter().all(is_pair)) {
+            return Ok(pairs);
+        }
+        let total = self.photos.len() as u32;
+        let mut show = |done: usize| watch("photos compared by likeness", done as u32, total);
+        let pairs = choose_pairs(&self.photos, |most| similar::look_alikes(&self.photos, most, &mut show));
+        write_whole(&file, serde_json::json!(pairs).to_string().as_bytes())?;
+        state.finish("pairs", work)?;
+        Ok(pairs)
     }
 
     fn lines_of(&self, pairs: &[(u32, u32)]) -> String {
@@ -412,6 +448,8 @@ impl PoseSearch {
                 "latitude": origin.latitude, "longitude": origin.longitude, "altitude": origin.altitude,
             });
             write_whole(&self.scene.join(ORIGIN_FILE), format!("{text:#}\n").as_bytes())?;
+        } else if self.scene.join(ORIGIN_FILE).is_file() {
+            said.push(format!("{ORIGIN_FILE} is of an earlier model, not of this one: remove it"));
         }
         let sparse = self.scene.join(SPARSE);
         std::fs::rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
@@ -496,10 +534,19 @@ impl SearchState {
         self.write(work)
     }
 
+    /// That of a work folder of ours.
+    fn read(work: &Path) -> Option<SearchState> {
+        let text = std::fs::read(work.join(STATE_FILE)).ok()?;
+        // An older program may have kept less of each photo: then its search begins again.
+        let state: serde_json::Value = serde_json::from_slice(&text).ok()?;
+        (state["made_by"] == MADE_BY).then(|| serde_json::from_value(state).unwrap_or_default())
+    }
+
     fn write(&self, work: &Path) -> InputResult<()> {
         let file = work.join(STATE_FILE);
-        let text = serde_json::to_vec(self)
-            .map_err(|e| InputError::new(&file, e.to_string(), "name another folder with --out"))?;
+        let text = serde_json::to_vec(self).map_err(|e| {
+            InputError::new(&file, e.to_string(), "name another folder: gsscale-poses PHOTOS --out FOLDER")
+        })?;
         write_whole(&file, &text)
     }
 }

@@ -119,6 +119,7 @@ mod tests {
             name: String::new(),
             path: PathBuf::new(),
             bytes: 0,
+            modified: 0,
             header: PhotoHeader {
                 format: PhotoFormat::Png,
                 width: 4,

@@ -10,6 +10,7 @@ use crate::dataset::photo_header::{PhotoHeader, read_header};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+use std::time::UNIX_EPOCH;
 
 /// Folders that hold no photos of the scene, whatever pictures are in them.
 const OTHERS: [&str; 3] = ["sparse", "renders", super::WORK_FOLDER];
@@ -24,6 +25,8 @@ pub struct FoundPhoto {
     pub name: String,
     pub path: PathBuf,
     pub bytes: u64,
+    /// When its file was changed, nanoseconds since 1970; 0 where the drive does not say.
+    pub modified: u64,
     pub header: PhotoHeader,
     /// Camera, lens and zoom as the EXIF data name them; empty if they do not.
     pub camera: String,
@@ -42,11 +45,14 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
     let read = |name: &String| {
         let path = folder.join(name);
         let header = read_header(&path).map_err(|e| format!("{name} is left out: {}", e.problem))?;
-        let bytes = std::fs::metadata(&path).map_or(0, |facts| facts.len());
+        let facts = std::fs::metadata(&path).ok();
+        let bytes = facts.as_ref().map_or(0, |facts| facts.len());
+        let modified = facts.and_then(|facts| facts.modified().ok()?.duration_since(UNIX_EPOCH).ok());
+        let modified = modified.map_or(0, |since| since.as_nanos() as u64);
         // Without readable EXIF data, a photo is as one of an unknown camera at an unknown place.
         let facts = header.exif.and_then(|exif| camera_and_place(&path, exif).ok());
         let (camera, place) = facts.unwrap_or_default();
-        Ok(FoundPhoto { name: name.clone(), path, bytes, header, camera, place })
+        Ok(FoundPhoto { name: name.clone(), path, bytes, modified, header, camera, place })
     };
     let read: Vec<Result<FoundPhoto, String>> = names.par_iter().map(read).collect();
     let (mut photos, mut said) = (Vec::new(), Vec::new());
@@ -166,7 +172,7 @@ pub(super) mod tests {
         let (path, format) = (folder.join(name), PhotoFormat::Jpeg);
         let bytes = std::fs::metadata(&path).unwrap().len();
         let header = PhotoHeader { format, width: 4, height: 3, decode_bytes: 0, has_alpha: false, exif: None };
-        FoundPhoto { name: name.to_string(), path, bytes, header, camera: String::new(), place: None }
+        FoundPhoto { name: name.to_string(), path, bytes, modified: 0, header, camera: String::new(), place: None }
     }
 
     #[test]
@@ -219,7 +225,7 @@ pub(super) mod tests {
                 exif: None,
             };
             let (name, path, camera) = (format!("{folder}/a.jpg"), PathBuf::new(), camera.to_string());
-            FoundPhoto { name, path, bytes: 0, header, camera, place: None }
+            FoundPhoto { name, path, bytes: 0, modified: 0, header, camera, place: None }
         };
         let photo = |camera, width| photo_in("x", camera, width);
         let photos = [photo("A 24 mm", 4), photo("A 35 mm", 4), photo("A 24 mm", 4), photo("", 4), photo("A 24 mm", 5)];

@@ -22,10 +22,10 @@ const LAST_LINES: usize = 6;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
 const INSTALL: &str = "install one of them, and name this folder again:\n  \
-    any system:     pip install pycolmap    (or name another Python that has it: --python PATH)\n  \
+    any system:     pip install pycolmap    (or name another Python that has it: gsscale-poses PHOTOS --python PATH)\n  \
     Debian, Ubuntu: apt-get install colmap\n  \
     macOS:          brew install colmap\n  \
-    Windows:        https://github.com/colmap/colmap/releases, then --colmap PATH";
+    Windows:        https://github.com/colmap/colmap/releases, then gsscale-poses PHOTOS --colmap PATH";
 
 /// One run of the program. Paths are below the folder it works in.
 #[derive(Debug, Clone)]
@@ -129,7 +129,7 @@ impl Program {
             features_help: said_by(path, &["feature_extractor", "-h"])?,
             matches_help: said_by(path, &["matches_importer", "-h"])?,
         };
-        let uses_gpu = has_cuda && said_by(Path::new("nvidia-smi"), &["-L"]).is_ok_and(|said| said.starts_with("GPU"));
+        let uses_gpu = has_cuda && has_gpu();
         Ok(Program { path: path.to_path_buf(), name: format!("COLMAP {major}.{minor}"), uses_gpu, called_as })
     }
 
@@ -144,7 +144,8 @@ impl Program {
             ));
         };
         let (path, name) = (python.to_path_buf(), name.trim().to_string());
-        Ok(Program { path, uses_gpu: name.ends_with("CUDA"), name, called_as: CalledAs::Pycolmap })
+        let uses_gpu = name.ends_with("CUDA") && has_gpu();
+        Ok(Program { path, uses_gpu, name, called_as: CalledAs::Pycolmap })
     }
 
     /// About how many seconds of one core a pair of photos takes to compare, for 8,192 features each.
@@ -159,7 +160,7 @@ impl Program {
     }
 
     /// Runs a phase in the folder `work` and waits for it. `watch` gets every line that it prints. `lock` is the locked file of the folder:
-    /// the program gets it as its input, so that the folder stays locked while the program outlives this process.
+    /// the program gets it as its input, so that the folder stays locked should the program outlive this process.
     /// Errors: the program cannot be started, or says that it failed: then the error shows its last lines.
     pub fn run(
         &self,
@@ -177,6 +178,7 @@ impl Program {
         // Of Qt, on which COLMAP's window is built.
         command.env("QT_QPA_PLATFORM", "offscreen").env("PYTHONUNBUFFERED", "1");
         command.stdin(lock.try_clone().map_err(|e| io(&e))?).stdout(file).stderr(twin);
+        end_with_this_process(&mut command);
         let mut child = command.spawn().map_err(|e| InputError::io(&self.path, "starting the program", &e))?;
         let mut lines = GrowingLog::of(&log).map_err(|e| io(&e))?;
         let status = loop {
@@ -194,7 +196,7 @@ impl Program {
         }
         let last: Vec<&str> = text.lines().filter(|line| !line.trim().is_empty()).collect();
         let last = last[last.len().saturating_sub(LAST_LINES)..].join("\n    ");
-        let remedy = "name the folder again to go on with this phase; with less memory, use --max-resolution 1000";
+        let remedy = "name the folder again to go on with this phase; for less memory: gsscale-poses PHOTOS --max-resolution 1000";
         let problem = format!("{} stopped with {status}; its last lines:\n    {last}", self.name);
         Err(InputError::new(log, problem, remedy))
     }
@@ -211,10 +213,13 @@ impl Program {
                             "database": DATABASE, "photos": PHOTOS, "list_file": list,
                             "camera_model": camera_model, "one_camera": one_camera,
                             "max_image_size": features.max_image_size, "max_num_features": features.max_features,
+                            "uses_gpu": self.uses_gpu,
                         });
                         ("features", values)
                     }
-                    Phase::Matches { pairs } => ("matches", json!({ "database": DATABASE, "pairs": pairs })),
+                    Phase::Matches { pairs } => {
+                        ("matches", json!({ "database": DATABASE, "pairs": pairs, "uses_gpu": self.uses_gpu }))
+                    }
                     Phase::Model => ("model", json!({ "database": DATABASE, "photos": PHOTOS, "model": SPARSE })),
                 };
                 ["-c", SCRIPT, name, &values.to_string()].map(String::from).to_vec()
@@ -272,6 +277,11 @@ impl Program {
     }
 }
 
+/// Whether a GPU of NVIDIA answers.
+fn has_gpu() -> bool {
+    said_by(Path::new("nvidia-smi"), &["-L"]).is_ok_and(|said| said.starts_with("GPU"))
+}
+
 /// What a program prints, whatever it says of its success: COLMAP's help does not agree with itself.
 fn said_by(path: &Path, arguments: &[&str]) -> InputResult<String> {
     let mut command = Command::new(path);
@@ -293,6 +303,20 @@ fn option_of(help: &str, name: &str) -> Option<String> {
     let words = help.split_whitespace().filter(|word| word.starts_with("--"));
     words.into_iter().find(|word| word.ends_with(&format!(".{name}"))).map(String::from)
 }
+
+/// Lets the system end the program when the thread that starts it has ended, also by SIGKILL. Elsewhere than on Linux the program works
+/// on, and its lock keeps others out of the folder.
+#[cfg(target_os = "linux")]
+#[allow(unsafe_code)]
+fn end_with_this_process(command: &mut Command) {
+    use rustix::process::{Signal, set_parent_process_death_signal};
+    use std::os::unix::process::CommandExt;
+    // SAFETY: between fork and exec the closure makes one system call, and neither allocates nor takes a lock.
+    unsafe { command.pre_exec(|| set_parent_process_death_signal(Some(Signal::TERM)).map_err(std::io::Error::from)) };
+}
+
+#[cfg(not(target_os = "linux"))]
+fn end_with_this_process(_: &mut Command) {}
 
 /// The lines of a file that another process writes.
 struct GrowingLog {

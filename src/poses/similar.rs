@@ -46,24 +46,54 @@ struct Corner {
     bits: [u64; 4],
 }
 
-/// For each photo up to `most` others that look alike, best first.
+/// Beyond so many comparisons of two photos, each photo is compared with some that are spread evenly.
+const COMPARISONS_MOST: usize = 3_000_000;
+/// Photos between two words about progress.
+const PHOTOS_AT_ONCE: usize = 64;
+
+/// Every how many photos one is compared with all others.
+fn stride(photos: usize) -> usize {
+    let of_pairs = |stride: usize| photos * photos / 2 * (2 * stride - 1) / (stride * stride);
+    (1..).find(|&stride| of_pairs(stride) <= COMPARISONS_MOST).unwrap_or(1)
+}
+
+/// About how many comparisons of two photos [`look_alikes`] makes.
+pub fn comparisons(photos: usize) -> usize {
+    let stride = stride(photos);
+    photos * photos / 2 * (2 * stride - 1) / (stride * stride)
+}
+
+/// For each photo up to `most` others that look alike, best first. `watch` gets how many photos are done.
 /// A photo that cannot be decoded looks like none: the program that computes poses leaves it out as well.
-pub fn look_alikes(photos: &[FoundPhoto], most: usize) -> Vec<Vec<u32>> {
+pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &mut dyn FnMut(usize)) -> Vec<Vec<u32>> {
     let pattern = pattern();
     let describe = |photo: &FoundPhoto| match reduced(photo) {
         Ok((gray, size)) => corners(&gray, size, &pattern),
         Err(_) => Vec::new(),
     };
     let corners: Vec<Vec<Corner>> = photos.par_iter().map(describe).collect();
-    let best = |a: usize| {
-        let score =
-            |b: usize| (if a < b { agreeing(&corners[a], &corners[b]) } else { agreeing(&corners[b], &corners[a]) }, b);
-        let others = (0..corners.len()).filter(|&b| a != b).map(score);
-        let mut found: Vec<(u16, usize)> = others.filter(|(score, _)| *score >= AGREEING).collect();
-        found.sort_by_key(|&(score, b)| (u16::MAX - score, b));
-        found.into_iter().take(most).map(|(_, b)| b as u32).collect()
+    let (n, stride) = (corners.len(), stride(photos.len()));
+    let of_row = |a: usize| {
+        let is_compared = |b: &usize| a.is_multiple_of(stride) || b.is_multiple_of(stride);
+        let score = |b: usize| (agreeing(&corners[a], &corners[b]), b);
+        (a + 1..n).filter(is_compared).map(score).filter(|(score, _)| *score >= AGREEING).collect::<Vec<_>>()
     };
-    (0..corners.len()).into_par_iter().map(best).collect()
+    let mut found: Vec<Vec<(u16, usize)>> = vec![Vec::new(); n];
+    for begin in (0..n).step_by(PHOTOS_AT_ONCE) {
+        watch(begin);
+        let rows: Vec<_> = (begin..n.min(begin + PHOTOS_AT_ONCE)).into_par_iter().map(of_row).collect();
+        for (a, row) in (begin..).zip(rows) {
+            for (score, b) in row {
+                found[a].push((score, b));
+                found[b].push((score, a));
+            }
+        }
+    }
+    let best = |mut others: Vec<(u16, usize)>| {
+        others.sort_by_key(|&(score, b)| (u16::MAX - score, b));
+        others.into_iter().take(most).map(|(_, b)| b as u32).collect()
+    };
+    found.into_iter().map(best).collect()
 }
 
 /// The photo in gray, reduced.
@@ -268,12 +298,29 @@ mod tests {
             .save(&path)
             .unwrap();
             let header = read_header(&path).unwrap();
-            FoundPhoto { name: k.to_string(), path, bytes: 0, header, camera: String::new(), place: None }
+            FoundPhoto { name: k.to_string(), path, bytes: 0, modified: 0, header, camera: String::new(), place: None }
         };
         let photos: Vec<FoundPhoto> = views.iter().enumerate().map(take).collect();
-        let mut alike = look_alikes(&photos, 4);
+        let mut alike = look_alikes(&photos, 4, &mut |_| ());
         alike.iter_mut().for_each(|others| others.sort_unstable());
         assert_eq!(alike, [vec![1, 2], vec![0, 2], vec![0, 1], vec![4], vec![3]]);
-        assert_eq!(look_alikes(&photos, 1)[3], [4]);
+        let mut done = Vec::new();
+        assert_eq!(look_alikes(&photos, 1, &mut |n| done.push(n))[3], [4]);
+        assert_eq!(done, [0]);
+    }
+
+    #[test]
+    fn comparisons_are_bounded() {
+        for photos in [2, 100, 2449, 2450, 5000, 40_000] {
+            let compared = |a: usize, b: usize| a.is_multiple_of(stride(photos)) || b.is_multiple_of(stride(photos));
+            assert_eq!(stride(photos) == 1, photos < 2450, "{photos}");
+            assert!(comparisons(photos) <= COMPARISONS_MOST && comparisons(photos) >= photos / 2, "{photos}");
+            if photos <= 5000 {
+                let pairs = (0..photos).flat_map(|a| (a + 1..photos).map(move |b| (a, b)));
+                let count = pairs.filter(|&(a, b)| compared(a, b)).count();
+                // Pairs of a photo with itself, and the photos after the last that is compared with all.
+                assert!(count.abs_diff(comparisons(photos)) <= 2 * photos, "{photos}: {count}");
+            }
+        }
     }
 }

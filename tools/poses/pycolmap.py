@@ -10,7 +10,11 @@ import json
 import pycolmap
 
 
-def extract(database, photos, list_file, camera_model, one_camera, max_image_size, max_num_features):
+def device(uses_gpu):
+    return pycolmap.Device.auto if uses_gpu else pycolmap.Device.cpu
+
+
+def extract(database, photos, list_file, camera_model, one_camera, max_image_size, max_num_features, uses_gpu):
     with open(list_file) as file:
         names = file.read().splitlines()
     reader = pycolmap.ImageReaderOptions()
@@ -20,14 +24,20 @@ def extract(database, photos, list_file, camera_model, one_camera, max_image_siz
     extraction.sift.max_num_features = max_num_features
     mode = pycolmap.CameraMode.SINGLE if one_camera else pycolmap.CameraMode.PER_IMAGE
     pycolmap.extract_features(
-        database, photos, names, camera_mode=mode, reader_options=reader, extraction_options=extraction
+        database,
+        photos,
+        names,
+        camera_mode=mode,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=device(uses_gpu),
     )
 
 
-def match(database, pairs):
+def match(database, pairs, uses_gpu):
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = pairs
-    pycolmap.match_image_pairs(database, pairing_options=pairing)
+    pycolmap.match_image_pairs(database, pairing_options=pairing, device=device(uses_gpu))
 
 
 def reconstruct(database, photos, model):
