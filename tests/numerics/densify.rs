@@ -1,76 +1,35 @@
 //! Densification rounds and resets: decisions equal a plain second implementation, the cap holds. (Late events: `storage::pages`.)
 
 use crate::support::apply_event::apply_event;
-use gsscale::base::rng::{Purpose, Stream, hash64};
+use crate::support::rounds::{SEED, adam, scene, touch};
+use gsscale::base::rng::hash64;
 use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::ops::child_uid;
-use gsscale::densify::stats::{DrawnRows, GradHistogram, accumulate};
+use gsscale::densify::stats::GradHistogram;
 use gsscale::densify::strategy::{RowCount, Strategy};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
-use gsscale::optim::row_kernels::take_step;
-use gsscale::scene::columns::{Column, Columns, Gradients};
+use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
 use gsscale::train::step::catch_up;
 use std::collections::HashMap;
 
-const SEED: u64 = 11;
-
-fn adam() -> DeferredAdam {
-    DeferredAdam::new(Rates::new(1.0, 5000), AdamConfig::default(), SimdPath::best())
-}
-
-fn scene(rows: usize, sh_degree: u8) -> SceneState {
-    let mut columns = Columns::zeros(rows, sh_degree);
-    let mut draws = Stream::new(3, Purpose::Test, rows as u64, 0);
-    for column in Column::ALL {
-        columns.column_mut(column).iter_mut().for_each(|x| *x = draws.normal() as f32);
-    }
-    // Sigmas around the split size of 0.01; opacities around the pruning limit (logit -5.3).
-    columns.scales.iter_mut().for_each(|x| *x = *x * 1.2 - 5.5);
-    columns.opacities.iter_mut().for_each(|x| *x = *x * 1.5 - 4.0);
-    SceneState::from_columns(columns)
-}
-
 /// All rows after `now` steps.
 fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
     catch_up::evaluate_all(&[state.view()], state.sh_degree(), adam, now)
 }
 
-/// One optimizer step and its statistics for the rows that `is_drawn` names; both depend on uid and step alone.
-fn touch(
-    state: &mut SceneState,
-    adam: &DeferredAdam,
-    step: u32,
-    histogram: &mut GradHistogram,
-    is_drawn: impl Fn(u64) -> bool,
-) {
-    let rows: Vec<u32> = (0..state.rows() as u32).filter(|&r| is_drawn(state.uid[r as usize])).collect();
-    let mut grads = Columns::zeros(rows.len(), state.sh_degree());
-    let mut gradients = Gradients::default();
-    for (i, &row) in rows.iter().enumerate() {
-        let mut draws = Stream::new(4, Purpose::Test, state.uid[row as usize], u64::from(step));
-        for column in Column::ALL {
-            grads.row_mut(column, i).iter_mut().for_each(|x| *x = (draws.normal() * 1e-4) as f32);
-        }
-        gradients.means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
-        gradients.radii.push([draws.below(8) as u32, draws.below(8) as u32]);
-    }
-    take_step(adam, state, &rows, &grads, step);
-    let drawn = DrawnRows { step, rows: &rows, gradients: &gradients, first: 0, image_size: [20, 30] };
-    accumulate(&mut state.view_mut(), &drawn, histogram);
-}
-
 #[test]
 fn a_round_does_what_a_plain_implementation_does() {
-    let (adam, mut state, mut histogram) = (adam(), scene(3000, 1), GradHistogram::default());
+    let strategy = DefaultStrategy::default();
+    let (adam, mut state, mut histogram) = (adam(1.0), scene(3000, 1), GradHistogram::default());
     for step in 0..30 {
-        touch(&mut state, &adam, step, &mut histogram, |uid| hash64(&[uid, u64::from(step)]) % 5 < 2);
+        touch(&mut state, (&adam, &strategy), step, &mut histogram, |uid| hash64(&[uid, u64::from(step)]) % 5 < 2);
     }
     let thresholds = RoundThresholds { grow_grad2d: 3e-4, split_scale: 0.01, prune_opacity: 0.005, prune_scale: 0.05 };
     let event = Event { step: 80, kind: EventKind::Densify(thresholds) };
@@ -138,16 +97,16 @@ fn histogram_of(state: &SceneState) -> GradHistogram {
 #[test]
 fn the_cap_is_reached_and_never_exceeded() {
     for max_gaussians in [500, 2000, 2001, 2040, 2300] {
-        let (adam, mut state, mut histogram) = (adam(), scene(2000, 0), GradHistogram::default());
+        let (adam, mut state, mut histogram) = (adam(1.0), scene(2000, 0), GradHistogram::default());
         // Nothing is pruned, so that only the cap limits.
-        let config = DefaultStrategy { prune_opa: 0.0, reset_every: 0, max_gaussians, ..DefaultStrategy::default() };
+        let strategy = DefaultStrategy { prune_opa: 0.0, reset_every: 0, max_gaussians, ..DefaultStrategy::default() };
         for (index, step) in [600u32, 700, 800].into_iter().enumerate() {
             for s in step - 5..step {
-                touch(&mut state, &adam, s, &mut histogram, |uid| row_is_drawn(uid, s));
+                touch(&mut state, (&adam, &strategy), s, &mut histogram, |uid| row_is_drawn(uid, s));
             }
             assert_eq!(histogram, histogram_of(&state));
             let rows = state.rows() as u64;
-            let kind = config.events_after(step, 1.0, RowCount::unlimited(rows), &histogram)[0];
+            let kind = strategy.events_after(step, 1.0, RowCount::unlimited(rows), &histogram)[0];
             apply_event(&mut state, &adam, SEED, index, &Event { step, kind });
             histogram.clear();
             assert!(state.rows() as u64 <= max_gaussians.max(2000), "{} of {max_gaussians}", state.rows());
@@ -160,9 +119,10 @@ fn the_cap_is_reached_and_never_exceeded() {
 
 #[test]
 fn a_reset_caps_opacities_for_good_and_spares_rows_that_it_does_not_change() {
-    let (adam, mut state, mut histogram) = (adam(), scene(400, 0), GradHistogram::default());
+    let strategy = DefaultStrategy::default();
+    let (adam, mut state, mut histogram) = (adam(1.0), scene(400, 0), GradHistogram::default());
     for step in 0..20 {
-        touch(&mut state, &adam, step, &mut histogram, |uid| uid < 200 && row_is_drawn(uid, step));
+        touch(&mut state, (&adam, &strategy), step, &mut histogram, |uid| uid < 200 && row_is_drawn(uid, step));
     }
     let (before, now) = (state.clone(), evaluate_all(&state, &adam, 31));
     let event = Event { step: 30, kind: EventKind::ResetOpacity { max_opacity: 0.01 } };

@@ -1,40 +1,11 @@
-//! Runs with steps in flight on a device that end all at once: killed, or with the device lost. Through the real binary; what is left
-//! ends with the bytes of a run that nothing disturbed.
+//! Runs whose device is lost with steps in flight. Through the real binary; what is left ends with the bytes of a run that nothing
+//! disturbed. (Runs that are killed: `matrix`.)
 
-use super::gpu_flights::{Bench, Span, recorded_behind, same};
+use super::gpu_flights::{Bench, Span, same};
 use crate::support::scenes::stderr;
-use crate::support::workdir::{Running, TRAIN};
-use std::process::Command;
 
 /// A run whose pages are newer in their slots than in frames and on the drive, most of the time.
 const SELDOM: &str = "--commit-every 0.5";
-
-/// Steps at which a run has another step in flight, and at the next step too.
-fn in_flight(spans: &[Span]) -> Vec<u64> {
-    let behind = recorded_behind(spans);
-    (0..90).filter(|step| [step + 1, step + 2].iter().all(|more| behind.contains(more))).collect()
-}
-
-#[test]
-fn a_run_that_is_killed_with_steps_in_flight_ends_with_the_same_bytes() {
-    let Some(bench) = Bench::new() else { return };
-    assert!(bench.run("alone", "2", "", SELDOM));
-    let want = bench.result("alone");
-    let steps = in_flight(&bench.spans("alone"));
-    assert!(steps.len() > 10, "{steps:?}");
-    let part = |tenths: usize| steps[steps.len() * tenths / 10] as usize;
-    let begin = |mut run: Command| {
-        // Most of the time of a step passes while it is in flight.
-        Running::spawn(&bench, run.env("GSSCALE_EMULATE_BUS", "200MB/s,300us"))
-    };
-    let mut run = begin(bench.command_of("killed", SELDOM));
-    for step in [part(2), part(5), part(8)] {
-        assert!(run.after_lines("killed.out", step).kill(), "the run ended before step {step}");
-        run = begin(bench.command(TRAIN, "--resume killed.out --quiet --keep-checkpoint"));
-    }
-    run.ends(0);
-    same(&bench.result("killed"), &want, "killed");
-}
 
 /// Submissions in the middle of the three longest stretches, and then at their quarters, of steps that are recorded behind another one, late enough for a restart to come
 /// some steps farther. Commits come by time, so another run may be some submissions off.

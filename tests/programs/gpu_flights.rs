@@ -105,13 +105,6 @@ pub(super) fn same(one: &Result, other: &Result, name: &str) {
     assert!(one.pages == other.pages, "{name}: other pages are stored");
 }
 
-/// Steps that were recorded while another one was in flight.
-pub(super) fn recorded_behind(spans: &[Span]) -> Vec<u64> {
-    let recorded =
-        spans.iter().filter(|s| s.name == "record step").filter_map(|s| Some((s.step, s.args["recorded"].as_u64()?)));
-    recorded.filter(|(now, recorded)| recorded > now).map(|(_, recorded)| recorded).collect()
-}
-
 /// Lists without room and closed gates, at steps that are recorded alone, behind another one, and before one.
 #[test]
 fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it() {

@@ -46,7 +46,6 @@ mod plan_tool;
 mod poses;
 mod published;
 mod real_scenes;
-mod regions;
 mod report;
 #[cfg(unix)]
 mod resume;

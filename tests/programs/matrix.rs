@@ -161,25 +161,6 @@ features! {
         without ["--appearance off", "--appearance exposure"],
         shows |work| assert_eq!(work.json("alone/appearance.json")["exposures_from_exif"], 22);
 
-    poses: || Workdir::city_of(24, [64, 48], 3000, 8),
-        "--refine-poses --refine-start 60 --refine-every 30 --grow-grad2d 0.001",
-        without ["--refine-poses=false"],
-        shows |work| {
-            let poses = work.json("alone/poses.json");
-            assert!(poses["refined"].as_u64() > Some(10) && poses["shift"]["largest"].as_f64() > Some(0.0), "{poses}");
-        };
-
-    robust_views: with_negatives,
-        "--robust-views --refine-start 60 --refine-every 30 --grow-grad2d 0.001 --steps 160 --reset-every 80",
-        without ["--robust-views=false"],
-        shows |work| assert!(work.summary("alone")["outlier_views"].as_array().is_some_and(|views| !views.is_empty()));
-
-    // A negative differs in its blocks too.
-    robust_pixels: with_negatives,
-        "--robust-pixels --refine-start 60 --refine-every 30 --grow-grad2d 0.001 --steps 160 --reset-every 80",
-        without ["--robust-pixels=false"],
-        shows |work| assert!(work.summary("alone")["masked_share"].as_f64() > Some(0.01));
-
     // All that the results of a run may be, upright, of a scene in the axes of structure from motion; and all remedies for photos at once.
     exports: || {
             let work = with_negatives();
@@ -188,20 +169,21 @@ features! {
             model.write(&work.scene());
             work
         },
-        "--export spz,sog --strategy long-axis --max-gaussians 2000 --robust-views --robust-pixels --refine-poses --appearance full",
-        without ["--up keep"],
-        shows |work| assert!(work.exists("alone/point_cloud.spz") && work.exists("alone/point_cloud_sog/lod-meta.json"));
+        "--export spz,sog --strategy long-axis --max-gaussians 2000 --robust-views --robust-pixels --refine-poses --appearance full \
+         --refine-start 60 --refine-every 30 --steps 160 --reset-every 80",
+        without ["--robust-views=false", "--robust-pixels=false", "--refine-poses=false", "--up keep"],
+        shows |work| {
+            assert!(work.exists("alone/point_cloud.spz") && work.exists("alone/point_cloud_sog/lod-meta.json"));
+            let (summary, poses) = (work.summary("alone"), work.json("alone/poses.json"));
+            assert!(summary["outlier_views"].as_array().is_some_and(|views| !views.is_empty()), "{summary}");
+            assert!(summary["masked_share"].as_f64() > Some(0.01), "{summary}");
+            assert!(poses["refined"].as_u64() > Some(10) && poses["shift"]["largest"].as_f64() > Some(0.0), "{poses}");
+        };
 
     gpu: || Workdir::wide_city(6000),
         "--device gpu --optimizer-on host --steps 60 --refine-start 20 --refine-every 15 --grow-grad2d 0.001 --reset-every 25",
         without ["--refine-every 1000"],
         shows |_| ();
-
-    gpu_mcmc: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on host --strategy mcmc --steps 60 --refine-start 10 --refine-every 8 --prune-opa 0.03 \
-         --max-gaussians 6100 --init-opacity 0.05",
-        without [],
-        shows |work| assert!(work.count("alone", "gaussians") > 6000, "nothing was copied");
 
     // Rounds, resets, raises and a cap with pages that are newer on the device than in memory.
     gpu_pages: || Workdir::wide_city(6000),

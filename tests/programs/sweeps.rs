@@ -1,6 +1,5 @@
 //! `gsscale-bench sweep`, which trains runs in child processes, and `gsscale-bench compare` of its runs.
 
-use crate::support::a_device;
 use crate::support::bench::{number, parse};
 use crate::support::browser::check_page;
 use crate::support::scenes::stderr;
@@ -83,30 +82,6 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let (converted, measured) = (said(&work, &plain), said(&work, &flags));
     assert!(converted.contains(" 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
     assert!(measured.contains(" 90.0 |") && measured.contains("times as measured"), "{measured}");
-}
-
-/// Pages on a device give the same bits whatever lies there, and other bits than the host's optimizer.
-#[test]
-fn rungs_on_a_device_end_alike() {
-    let Some(()) = a_device() else { return };
-    let work = large_city();
-    let flags = sweep("ladder-gpu", "--steps 30 --share 70");
-    let records = lines(&work, &format!("{flags} --device-mem 6MiB --device gpu"));
-    let [overlap, memory, pages, ahead, split, resident] =
-        ["overlap", "memory", "pages", "ahead", "split", "resident"].map(|name| of(&records, name, 42));
-    assert!(
-        overlap["ply"] == memory["ply"] && [ahead, split, resident].iter().all(|r| r["ply"] == pages["ply"]),
-        "{records:?}"
-    );
-    assert!(records.iter().all(|r| r["pace"].is_null()), "no pace was wanted");
-    assert!(number(split, "device_bytes_peak") <= 3.0 * 1048576.0, "{split}");
-    assert_ne!(memory["ply"], pages["ply"], "the device rounds as the host does");
-    assert!((number(pages, "psnr") - number(memory, "psnr")).abs() < 0.1, "{records:?}");
-    assert!(number(pages, "device_bytes_peak") < number(resident, "device_bytes_peak"), "{records:?}");
-    let words =
-        ["The results of overlap, memory are the same", "The results of pages, ahead, split, resident are the same"];
-    check_page(&work, "out/scene/sweep.html", &words);
-    work.refuses_with(BENCH, &format!("{flags} --device cpu"), &["use --device auto or gpu"]);
 }
 
 #[test]
@@ -196,6 +171,9 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     ] {
         refuses(flags, words);
     }
+    let on_device = sweep("ladder-gpu", "--share 70 --device-mem 6MiB --list-runs --device");
+    assert_eq!(said(&work, &format!("{on_device} gpu")).matches("to do").count(), 6);
+    refuses(&format!("{on_device} cpu"), "use --device auto or gpu");
     let list = "seeds = [1]\n[base]\nsteps = 4\n[view]\ntitle = \"own\"\nreference = \"plain\"\nfigures = [\"psnr\"]\n\
                 charts = []\n[[group]]\nname = \"\"\nruns = [{ name = \"plain\" }, RUN]\n";
     let with = |run: &str| list.replace("RUN", run);

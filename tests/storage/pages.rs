@@ -2,9 +2,9 @@
 //! bounds of a page stay valid until the page is changed.
 
 use crate::support::apply_event::apply_event;
+use crate::support::rounds::{SEED, adam, scene, touch};
 use gsscale::base::ids::PageId;
 use gsscale::base::rng::{Purpose, Stream, hash64};
-use gsscale::base::simd::SimdPath;
 use gsscale::densify::default::DefaultStrategy;
 use gsscale::densify::long_axis::{GrowthScore, LongAxisStrategy};
 use gsscale::densify::mcmc::McmcStrategy;
@@ -12,11 +12,9 @@ use gsscale::densify::ops::child_uid;
 use gsscale::densify::replay::{PageEdit, PageFacts, PendingEvents};
 use gsscale::densify::stats::{DrawnRows, GradHistogram, WEIGHED_VIEWS, accumulate};
 use gsscale::densify::strategy::{Effect, Extremes, RoundSteps, RowCount, Strategy, effect_of};
-use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, lowest_opacity, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::moments::Moments;
-use gsscale::optim::rates::Rates;
 use gsscale::optim::row_kernels::take_step;
 use gsscale::scene::columns::{Column, Columns, Gradients};
 use gsscale::scene::events::{Event, EventKind, EventLog, LongAxisRound, RelocationRound, RoundThresholds};
@@ -28,51 +26,7 @@ use gsscale::scene::state::SceneState;
 use gsscale::train::step::catch_up::evaluate_all;
 use std::collections::{BTreeMap, HashMap};
 
-const SEED: u64 = 11;
 const STEPS: u32 = 260;
-
-fn adam(scene_scale: f64) -> DeferredAdam {
-    DeferredAdam::new(Rates::new(scene_scale, 5000), AdamConfig::default(), SimdPath::best())
-}
-
-fn scene(rows: usize) -> SceneState {
-    let mut columns = Columns::zeros(rows, 0);
-    let mut draws = Stream::new(3, Purpose::Test, rows as u64, 0);
-    for column in Column::ALL {
-        columns.column_mut(column).iter_mut().for_each(|x| *x = draws.normal() as f32);
-    }
-    // Sigmas around the split size of 0.01; opacities around the pruning limit (logit -5.3).
-    columns.scales.iter_mut().for_each(|x| *x = *x * 1.2 - 5.5);
-    columns.opacities.iter_mut().for_each(|x| *x = *x * 1.5 - 3.5);
-    SceneState::from_columns(columns)
-}
-
-/// One optimizer step and its statistics for the rows that `is_drawn` names; both depend on uid and step alone.
-fn touch(
-    state: &mut SceneState,
-    (adam, strategy): (&DeferredAdam, &dyn Strategy),
-    step: u32,
-    histogram: &mut GradHistogram,
-    is_drawn: impl Fn(u64) -> bool,
-) {
-    let rows: Vec<u32> = (0..state.rows() as u32).filter(|&r| is_drawn(state.uid[r as usize])).collect();
-    let mut grads = Columns::zeros(rows.len(), state.sh_degree());
-    let mut gradients = Gradients::default();
-    for (i, &row) in rows.iter().enumerate() {
-        let mut draws = Stream::new(4, Purpose::Test, state.uid[row as usize], u64::from(step));
-        for column in Column::ALL {
-            grads.row_mut(column, i).iter_mut().for_each(|x| *x = (draws.normal() * 1e-4) as f32);
-        }
-        gradients.means2d.push([(draws.normal() * 2e-5) as f32, (draws.normal() * 2e-5) as f32]);
-        gradients.radii.push([draws.below(8) as u32, draws.below(8) as u32]);
-        let weights = [(draws.uniform() * 9.0) as f32, draws.uniform() as f32];
-        gradients.weights.extend(strategy.needs_weights().then_some(weights));
-    }
-    take_step(adam, state, &rows, &grads, step);
-    strategy.after_update(&mut state.view_mut(), &rows, step);
-    let drawn = DrawnRows { step, rows: &rows, gradients: &gradients, first: 0, image_size: [20, 30] };
-    strategy.collect(&mut state.view_mut(), &drawn, histogram);
-}
 
 /// Every row as (values, moments, stamp, statistics) by uid: these must agree bit for bit.
 fn by_uid<'s>(states: impl IntoIterator<Item = &'s SceneState>) -> BTreeMap<u64, Vec<u32>> {
@@ -355,7 +309,7 @@ fn so_they_do_with_moments_in_sixteen_bits() {
 /// Each case gives the rows of a page, the rows of a first page, and unneeded acquisitions per 1,000 pages and steps.
 /// Returns the rows.
 fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, usize, u64)]) -> SceneState {
-    let start = scene(2000);
+    let start = scene(2000, 0);
     let whole = on_time(&start, adam, by);
     let grown = whole.state.uid.iter().filter(|&&uid| uid >= 2000).count();
     assert!(whole.log.len() >= 10 && grown > 300, "{} events, {grown} new rows: too easy", whole.log.len());
@@ -402,7 +356,7 @@ fn late_equals_at_once(adam: &DeferredAdam, by: &dyn Strategy, cases: &[(usize, 
 #[test]
 fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_applied_at_once() {
     let adam = adam(1.0);
-    let start = scene(2000);
+    let start = scene(2000, 0);
     let mut decided_otherwise = 0;
     let cases = [(2040, 128, 100, 0), (2150, 90, 90, 30), (2150, 40, 40, 1000), (2400, 7, 5, 10), (1000, 64, 60, 0)];
     for ((cap, page_rows, first_rows, chance), is_long) in cases.into_iter().flat_map(|c| [(c, false), (c, true)]) {
@@ -459,7 +413,7 @@ fn a_cap_by_which_pages_decide_is_never_exceeded_and_gives_the_rows_of_events_ap
 /// Rows with moments of a few steps, down to sizes where eps matters, and statistics.
 fn moving_page(rows: usize, adam: &DeferredAdam, key: u64) -> SceneState {
     let mut draws = Stream::new(9, Purpose::Test, key, 0);
-    let mut state = scene(rows);
+    let mut state = scene(rows, 0);
     let mut histogram = GradHistogram::default();
     let first = draws.below(300) as u32;
     for step in first..first + 6 {

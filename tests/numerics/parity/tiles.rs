@@ -459,7 +459,8 @@ fn bits(outcome: &Outcome) -> Vec<u32> {
 /// More than 65,535 workgroups of 256 intersections, more than 2^24 keys, all with the plain counts of a CPU.
 #[test]
 fn dispatches_beyond_65_535_workgroups_fold() {
-    for gpu in devices() {
+    // One kind of subgroups: all stages fold by `linear_index`.
+    for gpu in devices().into_iter().take(1) {
         let mut stages = TileStages::new(&gpu).unwrap();
         // A column of 4095 tiles and 4,150 Gaussians that cover all of it.
         let mut scene = Scene::empty(16, 65_520);

@@ -9,6 +9,8 @@ pub mod fixture;
 #[path = "../../support/gpu.rs"]
 pub mod gpu;
 pub mod reference64;
+#[path = "../../support/rounds.rs"]
+pub mod rounds;
 #[allow(dead_code)] // no photo scenes are read here
 #[path = "../../support/shared.rs"]
 mod shared;

@@ -106,77 +106,63 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
 }
 
 #[test]
-fn a_run_and_an_export_write_the_same_spz() {
+fn a_run_and_an_export_write_the_same_files_in_memory_or_spilled_or_resumed() {
     let bench = Bench::new();
-    bench.stopped("--export spz");
-    let (spz, transform) = ("point_cloud.spz", "point_cloud.spz.transform.json");
-    let files = |folder: &str| [spz, transform].map(|name| bench.bytes(&format!("{folder}/{name}")));
-    let want = files("out");
-    let ply = bench.ply("out").len();
-    assert!(want[0].len() < ply / 4, "{} of {ply} bytes", want[0].len());
-    bench.ckpt(&format!("export out --out {spz}"));
-    assert!(files(".") == want, "the export is not what the trainer wrote");
-    let up = bench.json(transform)["up_in_file"].clone();
-    assert_eq!(up, serde_json::json!([0.0, 1.0, 0.0]));
-    bench.fails("export out --out a.splat", &["use .ply, .spz, or lod-meta.json in a folder of its own"]);
-    assert!(!bench.exists("a.splat"));
-    let block = |name: &str| {
-        let path = bench.path("out").join(name);
-        std::fs::remove_file(&path).unwrap();
-        std::fs::create_dir(&path).unwrap();
+    bench.alone("--export spz,sog");
+    bench.stopped("--export spz,sog");
+    let [spz, transform] = ["point_cloud.spz", "point_cloud.spz.transform.json"];
+    let files = |folder: &str, sog: &str| {
+        let of_spz = [spz, transform].map(|name| bench.bytes(&format!("{folder}/{name}")));
+        (of_spz, bench.files(&format!("{folder}/{sog}")))
     };
-    // A folder stands where the file is to be written: refused before the first step.
-    block(spz);
-    bench.refuses("--resume out --quiet", &["is a folder where a file"]);
-    assert!(bench.summary("out")["test"].is_null(), "no step was trained");
-    bench.remove(&format!("out/{spz}"));
-    // The export fails at the end, at its transform: the run still has its evaluation and its report, and can be resumed.
-    block(transform);
-    bench.refuses("--resume out --quiet", &[spz]);
-    let done = bench.summary("out");
-    assert!(done["finished"] == false && done["test"]["psnr"].is_number() && bench.exists("out/report.html"), "{done}");
-    bench.remove(&format!("out/{transform}"));
-    // A new start in the folder removes the files of the run before.
-    bench.go_on("");
-    assert_eq!(bench.summary("out")["finished"], true);
-    assert!(files("out")[0] != want[0], "the end of the run wrote its own");
-}
-
-#[test]
-fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
-    let bench = Bench::new();
-    bench.alone("--export sog");
-    bench.stopped("--export sog");
-    let early = bench.files("out/point_cloud_sog");
+    let (ply, early) = (bench.ply("out").len(), files("out", "point_cloud_sog"));
+    assert!(early.0[0].len() < ply / 4, "{} of {ply} bytes", early.0[0].len());
     let export = bench.summary("out")["export"].clone();
     assert_eq!(export["file"], "point_cloud_sog/lod-meta.json");
     let finest = export["levels"][0].as_u64().unwrap();
     assert_eq!(finest + number(&export, "always_shown"), number(&export, "gaussians"), "{export}");
     let report = bench.text("out/report.html");
     assert!(report.contains("For viewers") && report.contains("point_cloud_sog/lod-meta.json: "));
+    bench.ckpt(&format!("export out --out {spz}"));
     let said = bench.ckpt("export out --out sog/lod-meta.json");
     assert!(said.contains("levels of "), "{said}");
-    assert!(bench.files("sog") == early, "the export is not what the trainer wrote");
+    assert!(files(".", "sog") == early, "the exports are not what the trainer wrote");
+    assert_eq!(bench.json(transform)["up_in_file"], serde_json::json!([0.0, 1.0, 0.0]));
+    bench.fails("export out --out a.splat", &["use .ply, .spz, or lod-meta.json in a folder of its own"]);
     bench.fails("export out --out lod-meta.json", &["city/lod-meta.json"]);
     // The writer's memory counts.
     bench.fails("export out --out sog/lod-meta.json --host-mem 25MiB", &["give at least"]);
+    assert!(!bench.exists("a.splat"));
     // A PLY beside the folder has a transform of its own.
     bench.ckpt("export out --out sog.ply");
     assert_eq!(bench.json("sog/transform.json")["file"], "lod-meta.json");
     assert_eq!(bench.json("sog.transform.json")["file"], "sog.ply");
-    // A folder that could not be replaced at the end is refused before the first step.
+    // What could not be replaced at the end is refused before the first step: a folder where the file is to be written, and a folder that holds
+    // a file of others.
+    let block = |name: &str| {
+        let path = bench.path("out").join(name);
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+    };
     let foreign = || bench.write("out/point_cloud_sog/mine.txt", "");
     let remove_foreign = || std::fs::remove_file(bench.path("out/point_cloud_sog/mine.txt")).unwrap();
-    foreign();
     let before = bench.bytes("out/metrics.jsonl");
+    block(spz);
+    bench.refuses("--resume out --quiet", &["is a folder where a file"]);
+    bench.remove(&format!("out/{spz}"));
+    foreign();
     bench.refuses("--resume out --quiet", &["mine.txt"]);
     assert!(bench.bytes("out/metrics.jsonl") == before, "it trained before it refused");
     remove_foreign();
+    // The export fails at the end, at its transform: the run still has its evaluation and its report, and can be resumed.
+    block(transform);
+    bench.refuses("--resume out --quiet", &[spz]);
+    let done = bench.summary("out");
+    assert!(done["finished"] == false && done["test"]["psnr"].is_number() && bench.exists("out/report.html"), "{done}");
+    bench.remove(&format!("out/{transform}"));
     bench.go_on("");
-    assert!(
-        bench.files("out/point_cloud_sog") == bench.files("alone/point_cloud_sog"),
-        "the resumed run ended with other files"
-    );
+    let late = files("out", "point_cloud_sog");
+    assert!(late == files("alone", "point_cloud_sog") && late != early, "the resumed run ended with other files");
     // A new run in the folder removes them, and nothing of others.
     let again = "scene --out out --overwrite --steps 1 --quiet --device cpu";
     foreign();
@@ -184,7 +170,7 @@ fn a_run_and_an_export_write_the_same_sog_in_memory_or_spilled_or_resumed() {
     assert!(said.contains("mine.txt"), "{said}");
     remove_foreign();
     bench.train(again);
-    assert!(!bench.exists("out/point_cloud_sog"));
+    assert!(!bench.exists("out/point_cloud_sog") && !bench.exists(&format!("out/{spz}")));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! kill -9 at random moments, in memory and at several numbers of frames.
 //!
-//! `GSSCALE_KILLS=1000` sets the number of kills (default 20).
+//! `GSSCALE_KILLS=1000` sets the number of kills (default 8).
 
 use super::bench::{Bench, Place};
 use super::events;
@@ -20,7 +20,7 @@ const KILL_WITHIN: u64 = 200;
 /// pages of the largest view.
 #[test]
 fn a_run_that_is_killed_at_any_time_ends_with_the_same_bytes() {
-    let kills: u32 = std::env::var("GSSCALE_KILLS").ok().map_or(20, |n| n.parse().unwrap());
+    let kills: u32 = std::env::var("GSSCALE_KILLS").ok().map_or(8, |n| n.parse().unwrap());
     let bench = Bench::new();
     let alone = bench.alone(OFTEN);
     let (all, fewest) = (alone.pages, alone.fewest);

@@ -8,3 +8,5 @@ pub mod child;
 #[path = "../../support/faulty_engine.rs"]
 pub mod faulty_engine;
 pub mod guarded;
+#[path = "../../support/rounds.rs"]
+pub mod rounds;
