@@ -3,7 +3,6 @@
 
 #[path = "bench/compare.rs"]
 mod compare;
-#[cfg(feature = "gpu")]
 #[path = "bench/doctor.rs"]
 mod doctor;
 #[path = "bench/facts.rs"]
@@ -80,7 +79,7 @@ fn main() -> ExitCode {
     } else if named("sweep") {
         sweep::start(&parse_arguments(&arguments), &mut print)
     } else if named("doctor") {
-        doctor(&arguments, &mut print)
+        doctor::start(&doctor::Args::parse_from(&arguments), &mut print)
     } else if named("compare") {
         compare::start(&compare::Args::parse_from(&arguments))
     } else if named("run") && published::is_published_run(&arguments) {
@@ -92,16 +91,6 @@ fn main() -> ExitCode {
         run::start(&parse_arguments(&arguments), &mut print)
     };
     exit_code(done)
-}
-
-#[cfg(feature = "gpu")]
-fn doctor(arguments: &[OsString], print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
-    doctor::start(&doctor::Args::parse_from(arguments), print)
-}
-
-#[cfg(not(feature = "gpu"))]
-fn doctor(_: &[OsString], _: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
-    Err(InputError::new("doctor", "this program was built without GPU support", "build with the feature gpu").into())
 }
 
 /// The checked config of a measurement; starts the worker threads.

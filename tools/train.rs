@@ -141,9 +141,6 @@ fn list_devices() {
     for adapter in gsscale::gpu::list_adapters() {
         gsscale::say!("{adapter}");
     }
-    if cfg!(not(feature = "gpu")) {
-        gsscale::say!("no GPU: this program was built without the feature gpu");
-    }
     gsscale::say!("cpu: the CPU renderer");
 }
 

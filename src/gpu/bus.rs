@@ -6,18 +6,14 @@
 //!
 //! Invariants: 1. a copy takes no less than the latency plus its bytes over the rate; 2. nothing but time changes.
 
-#[cfg(feature = "gpu")]
 use super::error::{GpuError, GpuResult};
 use crate::base::units::parse_bytes;
 use std::time::Duration;
-#[cfg(feature = "gpu")]
 use std::time::Instant;
 
 /// Environment variable that emulates a bus for any program: `12GB/s,20us`.
-#[cfg(feature = "gpu")]
 const VARIABLE: &str = "GSSCALE_EMULATE_BUS";
 /// How much longer than asked the system may sleep; the rest is waited actively.
-#[cfg(feature = "gpu")]
 const SLEEP_SLACK: Duration = Duration::from_micros(100);
 
 /// Rate and latency of a bus.
@@ -51,7 +47,6 @@ impl EmulatedBus {
 
     /// The bus that the environment requests.
     /// Errors: the variable is set to something else than a rate and a latency.
-    #[cfg(feature = "gpu")]
     pub(super) fn from_environment() -> GpuResult<Option<EmulatedBus>> {
         match std::env::var_os(VARIABLE) {
             None => Ok(None),
@@ -71,7 +66,6 @@ impl EmulatedBus {
     }
 
     /// Waits until a copy of `bytes` bytes that began at `began` has crossed the bus.
-    #[cfg(feature = "gpu")]
     pub(super) fn cross(&self, began: Instant, bytes: u64) {
         let time = self.time(bytes);
         while let Some(rest) = time.checked_sub(began.elapsed()) {
@@ -83,7 +77,7 @@ impl EmulatedBus {
     }
 }
 
-#[cfg(all(test, feature = "gpu"))]
+#[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;

@@ -64,7 +64,6 @@ pub enum GpuError {
     DeviceLost { stage: String, message: String },
 }
 
-#[cfg(feature = "gpu")]
 impl GpuError {
     /// The API refused the work of `stage`.
     pub(super) fn validation(stage: &str, message: impl ToString) -> GpuError {

@@ -23,67 +23,41 @@
 //!    arbitrary too: a stage writes a word before it reads the word.
 //! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
 //!
-//! Without the feature `gpu` (`--no-default-features`) only the types remain that configs and reports name, and there is no
-//! adapter.
-//!
 //! Files import each other in one direction: `error` <- `bus`, `faults` <- `submitter` <- `driver` (the wgpu device that the others
 //! share) <- `buffers`, `belt`, `shader` <- `readback` <- `profile` <- `device` <- `record`.
 
-#[cfg(feature = "gpu")]
 mod adapter;
-#[cfg(feature = "gpu")]
 mod belt;
-#[cfg(feature = "gpu")]
 mod buffers;
 mod bus;
-#[cfg(feature = "gpu")]
 mod device;
-#[cfg(feature = "gpu")]
 mod driver;
 mod error;
-#[cfg(feature = "gpu")]
 mod faults;
-#[cfg(feature = "gpu")]
 mod injected;
 mod layout;
-#[cfg(feature = "gpu")]
 mod profile;
-#[cfg(feature = "gpu")]
 mod readback;
-#[cfg(feature = "gpu")]
 mod record;
-#[cfg(feature = "gpu")]
 mod shader;
-#[cfg(feature = "gpu")]
 mod sources;
-#[cfg(feature = "gpu")]
 mod submitter;
 
-#[cfg(feature = "gpu")]
 pub use adapter::{AdapterSummary, DeviceKind, STORAGE_BUFFERS_MOST, WORKGROUP, list_adapters};
-#[cfg(feature = "gpu")]
 pub use belt::staging_bytes;
-#[cfg(feature = "gpu")]
 pub use buffers::{Buffer, BufferView};
 pub use bus::EmulatedBus;
-#[cfg(feature = "gpu")]
 pub use device::{Gpu, GpuOptions, Subgroups, budget_for_buffers, bytes_for_buffers};
 pub use error::{GpuError, GpuResult};
-#[cfg(feature = "gpu")]
 pub use injected::{FaultKind, InjectedFault};
 pub use layout::StructLayout;
-#[cfg(feature = "gpu")]
 pub use profile::StageTime;
-#[cfg(feature = "gpu")]
 pub use readback::Readback;
-#[cfg(feature = "gpu")]
 pub use record::{Recorder, Recording, Submission, groups_1d};
-#[cfg(feature = "gpu")]
 pub use shader::{Pipeline, validate};
-#[cfg(feature = "gpu")]
 pub use sources::{Defines, SOURCES, Source, preprocess, variants};
 
-/// The device that the user requests. Exists in programs without GPU support too: configs name it.
+/// The device that the user requests.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum DeviceChoice {
     /// The best hardware GPU; [`GpuError::NoHardwareGpu`] if there is none.
@@ -94,7 +68,7 @@ pub enum DeviceChoice {
     Named(String),
 }
 
-/// Traffic over the bus and work since the device was opened, and memory, for reports; zeros in programs without GPU support.
+/// Traffic over the bus and work since the device was opened, and memory, for reports.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Traffic {
     /// Bytes from the host to the device: uploads and uniforms.
@@ -121,10 +95,4 @@ pub struct Work {
     pub workgroups: u64,
     /// Bytes of all storage bindings of all dispatches. Most stages read or write each byte of a binding once.
     pub bytes_bound: u64,
-}
-
-/// No adapter: this program was built without the feature `gpu`.
-#[cfg(not(feature = "gpu"))]
-pub fn list_adapters() -> Vec<String> {
-    Vec::new()
 }

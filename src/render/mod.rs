@@ -8,43 +8,24 @@
 pub mod color_correct;
 pub mod cpu;
 pub mod device_check;
-#[cfg(feature = "gpu")]
 pub mod device_needs;
-#[cfg(feature = "gpu")]
 pub mod gpu;
-#[cfg(feature = "gpu")]
 mod gpu_back;
-#[cfg(feature = "gpu")]
 pub mod gpu_frame;
-#[cfg(feature = "gpu")]
 mod gpu_gradients;
-#[cfg(feature = "gpu")]
 pub mod gpu_loss;
-#[cfg(feature = "gpu")]
 mod gpu_paged;
-#[cfg(feature = "gpu")]
 pub mod gpu_pages;
-#[cfg(feature = "gpu")]
 mod gpu_picture;
-#[cfg(feature = "gpu")]
 mod gpu_range_plan;
-#[cfg(feature = "gpu")]
 mod gpu_ranges;
-#[cfg(feature = "gpu")]
 mod gpu_recorded;
-#[cfg(feature = "gpu")]
 pub mod gpu_rows;
-#[cfg(feature = "gpu")]
 mod gpu_segments;
-#[cfg(feature = "gpu")]
 pub mod gpu_slots;
-#[cfg(feature = "gpu")]
 pub mod gpu_tiles;
-#[cfg(feature = "gpu")]
 pub mod gpu_tiles_bwd;
-#[cfg(feature = "gpu")]
 mod gpu_update;
-#[cfg(feature = "gpu")]
 mod gpu_view;
 pub mod lpips;
 pub mod metrics;

@@ -67,18 +67,15 @@ impl Sequence {
     }
 
     /// How the rows of the view come; `None` without a view.
-    #[cfg(feature = "gpu")]
     pub fn batches(&self) -> Option<RowBatches> {
         self.current.as_ref().map(|current| current.batches)
     }
 
     /// Camera and options of the view; `None` without a view.
-    #[cfg(feature = "gpu")]
     pub fn view(&self) -> Option<ViewOptions> {
         self.current.as_ref().map(|current| current.view)
     }
 
-    #[cfg(feature = "gpu")]
     pub fn drop_view(&mut self) {
         self.current = None;
     }

@@ -9,20 +9,14 @@
 //! longer than the payload; 3. the same payload gives the same bytes on every machine and for any number of threads.
 
 use crate::page::format::slot_header::StoredAs;
-#[cfg(feature = "zstd")]
 use std::cell::RefCell;
 use std::io;
-#[cfg(feature = "zstd")]
 use zstd::zstd_safe::CParameter;
 
 /// Bytes per word of the shuffle: payloads are mostly 32-bit floats.
-#[cfg(feature = "zstd")]
 const WORD: usize = 4;
 /// The zstd levels on offer.
 const LEVELS: std::ops::RangeInclusive<i32> = 1..=19;
-
-/// What a program without zstd says of it.
-const WITHOUT_ZSTD: &str = "this program was built without zstd: build it with the feature zstd (it is on by default)";
 
 /// The codec of new versions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -41,12 +35,8 @@ pub enum Codec {
 }
 
 impl Codec {
-    /// How people write the codecs. The word for zstd says why it is refused where it is missing.
-    pub const WORDS: [&str; 3] = [
-        "raw",
-        "halves",
-        if cfg!(feature = "zstd") { "zstd:LEVEL" } else { "zstd:LEVEL (this program was built without zstd)" },
-    ];
+    /// How people write the codecs.
+    pub const WORDS: [&str; 3] = ["raw", "halves", "zstd:LEVEL"];
 }
 
 /// The codec that writes this form, where its settings are not known.
@@ -68,8 +58,7 @@ impl std::str::FromStr for Codec {
         match (text, level) {
             ("raw", _) => Ok(Codec::Raw),
             ("halves", _) => Ok(Codec::Halves),
-            (_, Some(level)) if LEVELS.contains(&level) && cfg!(feature = "zstd") => Ok(Codec::Zstd { level }),
-            (_, Some(_)) if cfg!(not(feature = "zstd")) => Err(WITHOUT_ZSTD.to_string()),
+            (_, Some(level)) if LEVELS.contains(&level) => Ok(Codec::Zstd { level }),
             _ => Err(format!("unknown codec `{text}`: write raw, halves, or zstd:1 to zstd:{}", LEVELS.end())),
         }
     }
@@ -86,7 +75,6 @@ impl std::fmt::Display for Codec {
 }
 
 /// Scratch memory of one thread, reused by encoding and decoding.
-#[cfg(feature = "zstd")]
 #[derive(Default)]
 struct CodecBuffers {
     shuffled: Vec<u8>,
@@ -94,7 +82,6 @@ struct CodecBuffers {
     decompressor: Option<zstd::bulk::Decompressor<'static>>,
 }
 
-#[cfg(feature = "zstd")]
 thread_local! {
     static SCRATCH: RefCell<CodecBuffers> = RefCell::default();
 }
@@ -114,7 +101,6 @@ pub fn encode_as(codec: Codec, payload: &[u8], stored: &mut [u8]) -> io::Result<
 /// Shuffles and compresses `payload` into `stored`, which is at least as long; returns the length. `None` if the result
 /// would not be shorter (`stored` then holds garbage).
 /// Errors: zstd refuses the level, or runs out of memory.
-#[cfg(feature = "zstd")]
 fn encode(payload: &[u8], level: i32, stored: &mut [u8]) -> io::Result<Option<usize>> {
     SCRATCH.with_borrow_mut(|scratch| {
         scratch.shuffled.resize(payload.len(), 0);
@@ -146,7 +132,6 @@ pub fn decode(stored: &[u8], codec: StoredAs, payload: &mut [u8]) -> io::Result<
     Ok(())
 }
 
-#[cfg(feature = "zstd")]
 fn decode_zstd(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
     SCRATCH.with_borrow_mut(|scratch| {
         let decompressor = match &mut scratch.decompressor {
@@ -164,19 +149,7 @@ fn decode_zstd(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
     })
 }
 
-#[cfg(not(feature = "zstd"))]
-fn decode_zstd(_: &[u8], _: &mut [u8]) -> io::Result<()> {
-    Err(io::Error::new(io::ErrorKind::Unsupported, WITHOUT_ZSTD))
-}
-
-/// A program without zstd makes no value that asks for it (its `FromStr`).
-#[cfg(not(feature = "zstd"))]
-fn encode(_: &[u8], _: i32, _: &mut [u8]) -> io::Result<Option<usize>> {
-    Err(io::Error::new(io::ErrorKind::Unsupported, WITHOUT_ZSTD))
-}
-
 /// The first bytes of all words, then all second bytes, and so on; a remainder shorter than a word stays at the end.
-#[cfg(feature = "zstd")]
 fn shuffle(from: &[u8], to: &mut [u8]) {
     let words = from.len() / WORD;
     for (lane, lane_bytes) in to[..words * WORD].chunks_exact_mut(words.max(1)).enumerate() {
@@ -188,7 +161,6 @@ fn shuffle(from: &[u8], to: &mut [u8]) {
 }
 
 /// The inverse of [`shuffle`].
-#[cfg(feature = "zstd")]
 fn unshuffle(from: &[u8], to: &mut [u8]) {
     let words = from.len() / WORD;
     let (lanes, rest) = from.split_at(words * WORD);
@@ -281,7 +253,7 @@ fn unhalve(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
     Ok(())
 }
 
-#[cfg(all(test, feature = "zstd"))]
+#[cfg(test)]
 #[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;

@@ -9,7 +9,6 @@
 //! Invariants: 1. a page can only request pictures, so no request changes a result; 2. the server reads one file, the metrics; 3. each
 //! request gets the picture of its own camera; 4. the run never draws for a page that was closed before the picture was begun.
 
-#[cfg(feature = "serve")]
 mod server;
 
 use crate::base::error::{InputError, InputResult};
@@ -142,7 +141,7 @@ pub struct Live(Arc<Shared>);
 
 impl Live {
     /// Starts the server of a page at `address`; port 0 takes a free one.
-    /// Errors: the address cannot be used, or the program was built without the feature `serve`.
+    /// Errors: the address cannot be used.
     pub fn begin(address: SocketAddr) -> InputResult<Live> {
         let remedy = "choose another port, or leave --serve out";
         let fail = |e: std::io::Error| InputError::new("--serve", format!("{address} cannot be served: {e}"), remedy);
@@ -150,20 +149,10 @@ impl Live {
         listener.set_nonblocking(true).map_err(fail)?;
         let address = listener.local_addr().map_err(fail)?;
         let live = Live(Arc::new(Shared { address, state: Mutex::default() }));
-        live.serve(listener)?;
+        let started = server::spawn(live.clone(), listener);
+        started
+            .map_err(|e| InputError::new("--serve", format!("the server cannot start: {e}"), "leave --serve out"))?;
         Ok(live)
-    }
-
-    #[cfg(feature = "serve")]
-    fn serve(&self, listener: std::net::TcpListener) -> InputResult<()> {
-        server::spawn(self.clone(), listener)
-            .map_err(|e| InputError::new("--serve", format!("the server cannot start: {e}"), "leave --serve out"))
-    }
-
-    #[cfg(not(feature = "serve"))]
-    fn serve(&self, _: std::net::TcpListener) -> InputResult<()> {
-        let problem = "this program was built without the feature serve";
-        Err(InputError::new("--serve", problem, "build it with the default features, or leave --serve out"))
     }
 
     pub fn address(&self) -> SocketAddr {

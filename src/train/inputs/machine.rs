@@ -7,15 +7,11 @@ use crate::config::file::TrainConfig;
 use crate::config::limits::simd_path;
 use crate::config::values::Device;
 use crate::gpu::DeviceChoice;
-#[cfg(feature = "gpu")]
 use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions};
-#[cfg(feature = "gpu")]
 use crate::render::RenderError;
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
-#[cfg(feature = "gpu")]
 use crate::render::device_check::{self, DeviceVerdict};
-#[cfg(feature = "gpu")]
 use crate::render::gpu::GpuRenderer;
 use crate::train::error::TrainError;
 use std::path::{Path, PathBuf};
@@ -78,18 +74,6 @@ pub fn renderer(config: &TrainConfig) -> Result<OpenedDevice, TrainError> {
     }
 }
 
-/// Without GPU support `auto` means the CPU.
-#[cfg(not(feature = "gpu"))]
-fn of_gpu(_: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
-    if *choice == DeviceChoice::Auto {
-        return Ok(OpenedDevice::cpu(None));
-    }
-    let problem = "this program was built without GPU support";
-    let remedy = "use --device cpu, or build with the feature gpu (it is on by default)";
-    Err(InputError::new("--device", problem, remedy).into())
-}
-
-#[cfg(feature = "gpu")]
 fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
     match difference_from_cpu(choice) {
@@ -119,7 +103,6 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, T
 
 /// In place of a device that differs from the CPU: the CPU for `auto`, with a warning.
 /// Errors: the user asked for the device.
-#[cfg(feature = "gpu")]
 fn without_device(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, TrainError> {
     let problem = format!("the GPU did not pass the comparison with the CPU: {difference}");
     if *choice == DeviceChoice::Auto {
@@ -135,7 +118,6 @@ fn without_device(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevic
 /// `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software drivers. A device that cannot be opened is not
 /// compared: opening it for the run says why.
 /// Errors: those of the device, which say nothing about its results.
-#[cfg(feature = "gpu")]
 fn difference_from_cpu(choice: &DeviceChoice) -> Result<Option<String>, RenderError> {
     let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(None) };
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
@@ -164,7 +146,7 @@ pub(crate) fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 
-#[cfg(all(test, feature = "gpu"))]
+#[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;

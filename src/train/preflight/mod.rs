@@ -2,7 +2,6 @@
 //!
 //! [`plan`] holds the verdict on memory, [`forecast`] that on drives and what the run will take.
 
-#[cfg_attr(not(feature = "gpu"), path = "device_memory_absent.rs")]
 pub(crate) mod device_memory;
 pub mod first_look;
 pub mod forecast;
