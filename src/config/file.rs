@@ -41,8 +41,6 @@ use std::path::{Path, PathBuf};
 
 /// Tables of a config file that hold facts instead of settings.
 pub(super) const TABLES: [&str; 3] = ["resolved", "published", "tier"];
-/// A key that configs may still have: it never had an effect.
-const WITHOUT_EFFECT: &str = "deterministic";
 
 /// Longest config file, bytes; a file with every key has some 8 KB.
 pub const FILE_BYTES_MAX: u64 = 1 << 20;
@@ -379,7 +377,7 @@ impl TrainConfig {
     /// As [`TrainConfig::parse`], with the fields of the keys that the text gives. Errors: as [`TrainConfig::parse`].
     pub fn parse_with_keys(text: &str) -> Result<(TrainConfig, BTreeSet<String>), String> {
         let mut table: toml::Table = text.parse().map_err(|e: toml::de::Error| e.to_string())?;
-        for name in TABLES.into_iter().chain([WITHOUT_EFFECT]) {
+        for name in TABLES {
             table.remove(name);
         }
         let given = table.keys().map(|key| key.replace('-', "_")).collect();
@@ -706,9 +704,7 @@ mod tests {
 
     #[test]
     fn files_override_defaults_and_unknown_keys_are_refused() {
-        let config = TrainConfig::parse(
-            "steps = 7\ndeterministic = true\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n",
-        );
+        let config = TrainConfig::parse("steps = 7\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n");
         let config = config.unwrap_or_default();
         assert_eq!((config.steps, config.image_cache), (7, ByteSize(64 << 20)));
         let error = TrainConfig::parse("stepz = 7").err().unwrap_or_default();

@@ -256,21 +256,8 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
     }))
 }
 
-/// Saved values, also those of programs that did not keep the measures of the last steps.
-fn decoded(saved: &Encoded) -> Result<ViewOutliers, ValuesError> {
-    match saved.decoded(ViewOutliers::check) {
-        Err(ValuesError::Encoding(_)) => {
-            let views = saved.decoded(|_: &Vec<ViewState>| Ok(()))?;
-            let outliers = ViewOutliers { views, recent: Vec::new() };
-            outliers.check().map_err(ValuesError::Impossible)?;
-            Ok(outliers)
-        }
-        decoded => decoded,
-    }
-}
-
 fn check(saved: &Encoded) -> Result<(), ValuesError> {
-    decoded(saved).map(drop)
+    saved.decoded(ViewOutliers::check).map(drop)
 }
 
 impl PhotoParameter for OutlierViews {
@@ -283,11 +270,7 @@ impl PhotoParameter for OutlierViews {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        let saved = decoded(saved)?;
-        if saved.views.len() == self.state.views.len() {
-            self.state = saved;
-        }
-        Ok(())
+        saved.restore(&mut self.state, ViewOutliers::check, |a, b| a.views.len() == b.views.len())
     }
 
     fn leaves_out(&self, view: usize) -> bool {
@@ -539,11 +522,10 @@ mod tests {
     }
 
     fn outliers(named: &[usize]) -> OutlierViews {
-        let is_named = |view: usize| named.contains(&view);
-        // As a commit holds a view: measure, whether it is measured, strikes, whether it is an outlier.
-        let views: Vec<(i32, bool, u8, bool)> =
-            (0..10).map(|v| (5, false, 2 * u8::from(is_named(v)), is_named(v))).collect();
-        let state = decoded(&Encoded::of(&views).unwrap()).unwrap();
+        let mut state = ViewOutliers::new(10);
+        for &view in named {
+            state.views[view] = ViewState { strikes: STRIKES_NAMED, is_named: true, ..ViewState::default() };
+        }
         OutlierViews {
             state,
             are_left_out: true,
@@ -554,20 +536,6 @@ mod tests {
             steps: 400,
             told: Vec::new(),
         }
-    }
-
-    #[test]
-    fn values_without_the_last_steps_are_read_and_saved_with_them() {
-        let mut first = outliers(&[3]);
-        assert!(first.leaves_out(3) && !first.leaves_out(4));
-        let saved = first.save().unwrap();
-        assert_eq!(decoded(&saved).unwrap(), first.state);
-        first.restore(&Encoded::of(&vec![(0, false, 0u8, false); 10]).unwrap()).unwrap();
-        assert!(!first.leaves_out(3));
-        first.restore(&Encoded::of(&vec![(0, false, 2u8, true); 11]).unwrap()).unwrap();
-        assert!(!first.leaves_out(3), "of other photos");
-        assert!(check(&Encoded::of(&vec![(0, false, 9u8, false); 10]).unwrap()).is_err(), "nine strikes");
-        assert!(check(&Encoded::of(&7u8).unwrap()).is_err());
     }
 
     #[test]
