@@ -2,9 +2,11 @@
 
 use super::pages::{PAGE_ROWS, label_of_a_page, payload_bytes_of_a_page};
 use super::with_mode;
-use crate::Target;
+use crate::{ONE_AT_A_TIME, Target};
 use gsscale::base::ids::PageId;
-use gsscale::checkpoint::run_state::{DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, ViewPrint};
+use gsscale::checkpoint::run_state::{
+    DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, VERSION, ViewPrint,
+};
 use gsscale::densify::growth::{GrowthCheck, GrowthDecision, GrowthState};
 use gsscale::densify::stats::GradHistogram;
 use gsscale::page::engine::memory::MemoryEngine;
@@ -25,16 +27,17 @@ use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::prefetch::Transfers;
 use gsscale::paging::stats::PagerStats;
 use gsscale::photos::exposure::state::AppearanceState;
-use gsscale::photos::outlier::blocks::BlockState;
+use gsscale::photos::outlier::blocks::look;
 use gsscale::photos::outlier::views::ViewOutliers;
-use gsscale::photos::parameter::Encoded;
+use gsscale::photos::parameter::{Encoded, SavedValues};
 use gsscale::photos::pose::PoseState;
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
+use gsscale::scene::image;
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
 use std::collections::BTreeMap;
 use std::io;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
 const STORE: u128 = 0xf00d;
 const CONFIG: CommitConfig = CommitConfig { store: STORE, cache_bytes: 1 << 18, reserve_bytes: 0 };
@@ -206,19 +209,37 @@ fn use_pages(mut opened: Opened, without: bool) {
     }
 }
 
+/// Values of every kind: of two photos, the second of which has moved, and was looked at: it is black, and its picture has one white block.
+fn photos() -> SavedValues {
+    let mut poses = PoseState::new(2);
+    poses.learn(1, &[0.0, 1.0, -0.5, 0.25, 0.25, 0.25], 1.5, 1e-3);
+    let photo = image::Target::new([8, 32], vec![0; 3 * 256]);
+    let picture: Vec<f32> = (0..3 * 256).map(|i| f32::from(u8::from(i % 256 / 8 < 4 && i % 8 < 4))).collect();
+    let values = [
+        ("appearance", Encoded::of(&(AppearanceState::new(&[0, 1]), 2u32))),
+        ("outliers", Encoded::of(&ViewOutliers::new(2))),
+        ("blocks", Encoded::of(&vec![Vec::new(), look(&[], &picture, &photo).unwrap()])),
+        ("poses", Encoded::of(&poses)),
+    ];
+    values.map(|(name, values)| (name.to_string(), values.unwrap())).into()
+}
+
 fn sample() -> RunState {
-    let thresholds = RoundThresholds { grow_grad2d: 0.1, split_scale: 0.5, prune_opacity: 0.01, prune_scale: 2.0 };
+    let thresholds =
+        RoundThresholds { grow_grad2d: f32::INFINITY, split_scale: 0.5, prune_opacity: -0.0, prune_scale: 2.0 };
     let events = vec![
         Event { step: 4, kind: EventKind::RaiseShDegree { degree: 1 } },
         Event { step: 4, kind: EventKind::Densify(thresholds) },
         Event { step: 8, kind: EventKind::ResetOpacity { max_opacity: 0.01 } },
     ];
-    let values = [
-        ("appearance", Encoded::of(&(AppearanceState::new(&[0, 0]), 2u32))),
-        ("outliers", Encoded::of(&ViewOutliers::new(2))),
-        ("blocks", Encoded::of(&vec![Vec::<BlockState>::new(); 2])),
-        ("poses", Encoded::of(&PoseState::new(2))),
-    ];
+    let check = |step, gaussians, decision| GrowthCheck {
+        step,
+        gaussians,
+        psnr: 20.0,
+        trained_psnr: 20.0,
+        decision,
+        allowed: 10,
+    };
     RunState {
         origin: Origin {
             config: "steps = 20\n".to_string(),
@@ -248,17 +269,10 @@ fn sample() -> RunState {
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
             growth: GrowthState {
                 first: 7,
-                checks: vec![GrowthCheck {
-                    step: 5,
-                    gaussians: 7,
-                    psnr: 20.0,
-                    trained_psnr: 20.0,
-                    decision: GrowthDecision::Doubles,
-                    allowed: 10,
-                }],
+                checks: vec![check(5, 7, GrowthDecision::Doubles), check(8, 10, GrowthDecision::Ends)],
             },
         },
-        photos: values.map(|(name, values)| (name.to_string(), values.unwrap())).into(),
+        photos: photos(),
         events,
         histogram: vec![(3, 1), (32767, 9)],
         rows: 10,
@@ -303,4 +317,55 @@ fn run_run_state(input: &[u8]) {
         Ok(state) => check_state(&state),
         Err(error) => assert!(!error.to_string().is_empty()),
     }
+}
+
+#[test]
+fn states_come_back_and_other_versions_do_not() {
+    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut bytes = sample().to_bytes().unwrap();
+    assert_eq!(RunState::from_bytes(&bytes).unwrap(), sample());
+    assert!((0..bytes.len()).all(|cut| RunState::from_bytes(&bytes[..cut]).is_err()));
+    for other in [0, VERSION - 1, VERSION + 1] {
+        bytes[..4].copy_from_slice(&other.to_le_bytes());
+        assert!(RunState::from_bytes(&bytes).is_err_and(|e| e.contains(&format!("version {other};"))));
+    }
+}
+
+/// Values of appearance after a change.
+fn appearance(change: fn(&mut AppearanceState)) -> SavedValues {
+    let mut state = AppearanceState::new(&[0, 1]);
+    change(&mut state);
+    [("appearance".to_string(), Encoded::of(&(state, 0u32)).unwrap())].into()
+}
+
+#[test]
+fn impossible_states_are_refused() {
+    let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let refused = |change: fn(&mut RunState)| {
+        let mut state = sample();
+        change(&mut state);
+        let bytes = state.to_bytes().unwrap();
+        assert!(RunState::from_bytes(&bytes).is_err_and(|e| e.contains("inconsistent")));
+    };
+    refused(|s| s.trainer.step = 8);
+    refused(|s| s.events.reverse());
+    refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 0.0 });
+    refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 1.0 });
+    refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: f32::NAN });
+    refused(|s| s.origin.sh_degree_start = 4);
+    refused(|s| s.histogram.reverse());
+    refused(|s| s.trainer.train_seconds = f64::NAN);
+    refused(|s| s.traffic.stall_seconds = -1.0);
+    refused(|s| s.traffic.other_stall_seconds = f64::INFINITY);
+    refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { step: 10, ..t }));
+    refused(|s| s.trainer.test = s.trainer.test.map(|t| LastTest { psnr: f64::NAN, ..t }));
+    refused(|s| s.photos = appearance(|state| state.images[0].values[0] = i32::MIN));
+    refused(|s| s.photos = appearance(|state| state.images[0].sightings = 1));
+    refused(|s| s.photos = appearance(|state| state.cameras[1].falloff[0][0] = f64::NAN));
+    refused(|s| s.photos = [("of a later program".to_string(), Encoded::default())].into());
+    refused(|s| s.trainer.growth.checks.reverse());
+    refused(|s| s.trainer.growth.checks[1].step = 10);
+    refused(|s| s.trainer.growth.checks[0].psnr = f64::NAN);
+    refused(|s| s.origin.dataset.scale = 0.0);
+    refused(|s| s.origin.dataset.origin[1] = f64::INFINITY);
 }

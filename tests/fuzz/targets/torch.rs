@@ -43,7 +43,27 @@ pub fn torch() -> Target {
         seeds.push(with_mode(mode, &file));
         seeds.push(with_mode(mode + 1, &pickle_of(&file)));
     }
-    seeds.push(with_mode(1, &[b"\x80\x02]".as_slice(), &b"Na\x94".repeat(3000), b"."].concat()));
+    // Memoising a list repeatedly while it grows would keep every version of it: 200 MB from 9 KB.
+    let grown = [b"\x80\x02]".as_slice(), &b"Na\x94".repeat(3000), b"."].concat();
+    // Numbers ahead of the values: each would grow the table by as many entries as there are values.
+    let ahead: Vec<u8> = (1..100u32).flat_map(|i| [&b"r"[..], &(i * 1000).to_le_bytes()].concat()).collect();
+    let ahead = [b"N".repeat(1000), ahead].concat();
+    let nested = [b"]".repeat(200), b"a".repeat(199), b".".to_vec()].concat();
+    seeds.extend([grown, ahead, nested, b"(".repeat(20_000), b"N".repeat(20_000)].map(|text| with_mode(1, &text)));
+    for text in [
+        &b"cos\nsystem\n."[..],
+        b"cbuiltins\neval\n(X\x01\x00\x00\x001tR.",
+        b"X\xff\xff\xff\xffabc.",
+        b"r\xff\xff\xff\xff.",
+        b"Nr\xff\xff\xff\x7f.",
+        b"h\x05.",
+        b"]q\x00h\x00.",
+        b"t.",
+        b"(.",
+        b"I1\n.",
+    ] {
+        seeds.push(with_mode(1, text));
+    }
     let words = &["ctorch\nFloatStorage\n", "]", "(", "}", "\u{94}", "q", "h", "a", "u", "t", "R", "Q", "N", "."];
     Target { name: "torch", run, seeds, words, cases: 1_500, memory: [3 << 20, 64] }
 }
