@@ -38,6 +38,16 @@ pub struct FootprintGradients {
     pub v_opacities: Vec<f32>,
 }
 
+/// Adds `partials` to `sums`, one after the other.
+fn fold<const N: usize>(mut sums: [f32; N], partials: &[[AtomicU32; N]]) -> [f32; N] {
+    for partial in partials {
+        for (sum, part) in sums.iter_mut().zip(partial) {
+            *sum += f32::from_bits(part.load(Relaxed));
+        }
+    }
+    sums
+}
+
 /// Folds the weights of each row as [`fold_rows`] folds the nine sums, into `[weight, weight times error]` for each of
 /// `rows` rows; zeros for rows that are not drawn.
 pub fn fold_weights(
@@ -52,13 +62,8 @@ pub fn fold_weights(
         let mut first = chunk_offsets[chunk] as usize;
         for (out, &count) in out.iter_mut().zip(&counts[chunk * ROWS_PER_CHUNK..]) {
             let last = first + count as usize;
-            let mut sums = if is_first { [0.0f32; 2] } else { *out };
-            for partial in &partials[first..last] {
-                for (sum, part) in sums.iter_mut().zip(partial) {
-                    *sum += f32::from_bits(part.load(Relaxed));
-                }
-            }
-            (first, *out) = (last, sums);
+            *out = fold(if is_first { [0.0; 2] } else { *out }, &partials[first..last]);
+            first = last;
         }
     });
 }
@@ -108,13 +113,8 @@ pub fn fold_rows(
                 let [red, green, blue] = v_colors[i];
                 sums = [v_opacities[i], hx, hy, hxx, hxy, hyy, red, green, blue];
             }
-            for partial in &partials[first..last] {
-                for (sum, part) in sums.iter_mut().zip(partial) {
-                    *sum += f32::from_bits(part.load(Relaxed));
-                }
-            }
+            let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = fold(sums, &partials[first..last]);
             first = last;
-            let [h, hx, hy, hxx, hxy, hyy, red, green, blue] = sums;
             v_colors[i] = [red, green, blue];
             if !part.is_last {
                 (v_means2d[i], v_conics[i], v_opacities[i]) = ([hx, hy], [hxx, hxy, hyy], h);

@@ -123,15 +123,14 @@ impl Tile {
     }
 }
 
-/// The way back through one tile.
-struct BackTile<'a> {
+/// The way back through any tile.
+#[derive(Clone, Copy)]
+struct Back<'a> {
     lists: &'a Lists<'a>,
     chunk_offsets: &'a [u64],
     raster: &'a Raster,
     upstream: &'a Upstream<'a>,
-    tile: usize,
     cap: f32,
-    state: &'a mut Tile,
     partials: &'a [Partial],
     /// Empty unless weights are collected.
     errors: &'a [f32],
@@ -139,12 +138,19 @@ struct BackTile<'a> {
     weighs: bool,
 }
 
+/// The way back through one tile.
+struct BackTile<'a> {
+    back: Back<'a>,
+    tile: usize,
+    state: &'a mut Tile,
+}
+
 impl Kernel for BackTile<'_> {
     type Out = ();
 
     #[inline(always)]
     fn run<const FMA: bool>(self) {
-        if self.weighs { self.go_back::<FMA, true>() } else { self.go_back::<FMA, false>() }
+        if self.back.weighs { self.go_back::<FMA, true>() } else { self.go_back::<FMA, false>() }
     }
 }
 
@@ -152,19 +158,8 @@ impl BackTile<'_> {
     /// Goes back to front; `WEIGHS` collects weights.
     #[inline(always)]
     fn go_back<const FMA: bool, const WEIGHS: bool>(self) {
-        let BackTile {
-            lists,
-            chunk_offsets,
-            raster,
-            upstream,
-            tile,
-            cap,
-            state,
-            partials,
-            errors,
-            weight_partials,
-            ..
-        } = self;
+        let BackTile { back, tile, state } = self;
+        let Back { lists, chunk_offsets, raster, upstream, cap, partials, errors, weight_partials, .. } = back;
         state.load(lists, raster, upstream, errors, tile);
         let Tile { rows, row_stop, block, sums, weights, halves } = state;
         let (tx, ty) = lists.grid.position(tile);
@@ -365,7 +360,7 @@ pub fn rasterize_bwd(
 ) {
     let cap = log2_max_alpha(lists.max_alpha, lists.simd);
     reset(partials, lists.isects.len());
-    let (partials, weighs) = (&partials[..], weighing.is_some());
+    let weighs = weighing.is_some();
     let (errors, weight_partials) = match weighing {
         Some(Weighing { errors, partials }) => {
             reset(partials, lists.isects.len());
@@ -374,25 +369,9 @@ pub fn rasterize_bwd(
         None => (&[][..], &[][..]),
     };
     let tiles = (0..lists.grid.tiles()).into_par_iter().filter(|tile| lists.range.contains(lists.grid, *tile));
+    let back = Back { lists, chunk_offsets, raster, upstream, cap, partials, errors, weight_partials, weighs };
     tiles.for_each(|tile| {
-        SCRATCH.with_borrow_mut(|state| {
-            dispatch(
-                lists.simd,
-                BackTile {
-                    lists,
-                    chunk_offsets,
-                    raster,
-                    upstream,
-                    tile,
-                    cap,
-                    state,
-                    partials,
-                    errors,
-                    weight_partials,
-                    weighs,
-                },
-            );
-        });
+        SCRATCH.with_borrow_mut(|state| dispatch(lists.simd, BackTile { back, tile, state }));
     });
 }
 
