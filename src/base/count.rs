@@ -51,7 +51,6 @@ impl Drop for Count {
     }
 }
 
-/// A bar for `total` parts.
 pub fn new_bar(total: u64, template: &str) -> ProgressBar {
     let bar = ProgressBar::new(total);
     bar.set_style(ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar()));

@@ -23,7 +23,6 @@ pub struct AsIf {
     pub photos: u64,
     /// Gaussians of the whole scene at its end.
     pub gaussians: u64,
-    /// Bytes of a photo.
     pub photo_bytes: u64,
     /// Seconds of a step of the prior.
     pub step_seconds: f64,
@@ -57,7 +56,6 @@ pub(crate) struct Basis<'a> {
     pub step_seconds: f64,
     /// Steps of the whole scene.
     pub steps: f64,
-    /// SH degree of the prior.
     pub prior_degree: u8,
     /// Bytes a second; machines that work on cells; seconds between copies.
     pub network: f64,
@@ -65,7 +63,6 @@ pub(crate) struct Basis<'a> {
     pub copy_every: f64,
 }
 
-/// What a phase costs.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct PhaseCost {
     pub phase: &'static str,

@@ -30,7 +30,6 @@ const VIEWS_LEAST: usize = 8;
 /// Pages are this full on average.
 const FILL: f64 = 0.7;
 
-/// A city to cut.
 #[derive(Debug, Clone)]
 pub struct CutRequest {
     pub scene: PathBuf,

@@ -44,7 +44,6 @@ const MERGED_FILE: &str = "merged.toml";
 const POLISH_FILE: &str = "polish.toml";
 const POLISH_VIEWS_FILE: &str = "polish_views.txt";
 
-/// Cells to merge.
 #[derive(Debug, Clone)]
 pub struct MergeRequest {
     pub city: PathBuf,

@@ -26,7 +26,6 @@ pub enum CellCount {
     MostGaussians(u64),
 }
 
-/// A city, cut.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CityPlan {
     /// Version of the program that cut it.

@@ -23,10 +23,8 @@ pub(crate) const STEPS_SHARE: u32 = 4;
 pub(crate) const GAUSSIANS_SHARE: u64 = 5;
 /// Longest side of its photos, pixels.
 const RESOLUTION_MOST: u32 = 800;
-/// Its highest SH degree.
 const SH_DEGREE_MOST: u8 = 1;
 
-/// A prior to train.
 #[derive(Debug, Clone)]
 pub struct PriorRequest {
     pub scene: PathBuf,

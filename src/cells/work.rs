@@ -65,7 +65,6 @@ pub struct WorkRequest {
 pub struct Done {
     /// Digest of the cell's files.
     pub files: String,
-    /// Number of the copy.
     pub copy: u32,
     pub steps: u32,
     pub gaussians: u64,
@@ -157,7 +156,6 @@ pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<
     Err(InputError::new(&file, "the cell was trained under another plan", again))
 }
 
-/// The copy of a cell with this number.
 pub(crate) fn copy_of(folder: &Path, number: u32) -> PathBuf {
     folder.join("copy").join(number.to_string())
 }

@@ -31,7 +31,6 @@ const BYTES_PER_HOUR_SMALL: f64 = 16.0 * GIB as f64;
 /// Weight of the last commit in the expected cost of the next.
 const LAST_WEIGHT: f64 = 0.5;
 
-/// The value of `--commit-every`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum CommitEvery {
     /// By the cost of commits; see the module page.
@@ -93,7 +92,6 @@ pub fn bytes_per_hour(state_bytes: Option<u64>) -> f64 {
     state_bytes.map_or(BYTES_PER_HOUR, of_state)
 }
 
-/// Cost of one commit.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CommitCost {
     /// Seconds that training waited for the commit.
@@ -126,7 +124,6 @@ pub struct CommitReport {
 #[derive(Debug, Clone)]
 pub struct CommitInterval {
     every: CommitEvery,
-    /// Expected cost of the next commit.
     expected: Option<CommitCost>,
     /// Most bytes that commits write per hour.
     bytes_per_hour: f64,

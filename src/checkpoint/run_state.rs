@@ -59,10 +59,8 @@ pub struct LastTest {
     pub ssim: f64,
 }
 
-/// Identity and paths of a run.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RunIdentity {
-    /// Its identity.
     pub id: RunId,
     /// Its output folder, absolute; empty if unknown.
     pub out: String,
@@ -80,7 +78,6 @@ pub struct Origin {
     /// SH degree of the first step.
     pub sh_degree_start: u8,
     pub dataset: DatasetPrint,
-    /// Identity and paths of the run.
     pub run: RunIdentity,
 }
 

@@ -30,7 +30,6 @@ use std::sync::Arc;
 pub struct RunOptions {
     pub steps: u32,
     pub seed: u64,
-    /// Highest SH degree.
     pub sh_degree: u8,
     /// Steps between raises of the SH degree; 0 = full degree from the start.
     pub sh_every: u32,

@@ -389,7 +389,6 @@ fn blur(photo: &mut Target) {
     }
 }
 
-/// A picture as a PNG.
 fn png(pixels: &[u8], width: u32, height: u32, color: ExtendedColorType) -> InputResult<Vec<u8>> {
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes).write_image(pixels, width, height, color).map_err(|e| not_encoded(&e))?;

@@ -31,7 +31,6 @@ const FORMS: [(&str, &str, bool); 6] = [
 ];
 const SHOWN: usize = 3;
 
-/// The mask of a photo.
 #[derive(Debug, Clone, PartialEq)]
 pub struct MaskSource {
     pub path: PathBuf,

@@ -315,7 +315,6 @@ mod tests {
         assert_eq!(round.remove_below_bin, 0);
     }
 
-    /// The steps of the rounds.
     fn rounds(strategy: &dyn Strategy) -> Vec<u32> {
         (0..4000).filter(|&step| strategy.reads_histogram(step)).collect()
     }

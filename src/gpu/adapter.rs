@@ -40,11 +40,8 @@ pub struct AdapterSummary {
     pub kind: DeviceKind,
     /// Graphics API and driver.
     pub backend: String,
-    /// Largest binding, bytes.
     pub max_binding_bytes: u64,
-    /// Largest buffer, bytes.
     pub max_buffer_bytes: u64,
-    /// Workgroup memory, bytes.
     pub workgroup_storage_bytes: u32,
     /// Smallest and largest subgroup, if subgroup operations exist.
     pub subgroup_sizes: Option<(u32, u32)>,

@@ -115,7 +115,6 @@ impl Drop for Buffer {
     }
 }
 
-/// The pool with its accounting.
 #[derive(Debug)]
 pub(super) struct Pool {
     driver: Arc<Driver>,

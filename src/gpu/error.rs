@@ -33,7 +33,6 @@ pub enum GpuError {
     /// The device itself has no memory left.
     #[error("{stage}: the device is out of memory ({message})\n  remedy: lower --device-mem")]
     OutOfMemory { stage: String, message: String },
-    /// The device has no memory for a buffer.
     #[error(
         "the device has no memory for {what}: {need} bytes beside the {in_use} in use\n  remedy: close other programs that \
          use the device"
@@ -70,7 +69,6 @@ impl GpuError {
         GpuError::Validation { stage: stage.into(), message: message.to_string() }
     }
 
-    /// A fault of a shader.
     pub(super) fn shader(shader: &str, problem: impl Into<String>) -> GpuError {
         GpuError::Shader { shader: shader.into(), problem: problem.into() }
     }

@@ -49,7 +49,6 @@ impl InjectedFault {
         Some(InjectedFault { kind, submission: at.parse().ok()? })
     }
 
-    /// The fault that the environment requests.
     pub(super) fn from_environment() -> Option<InjectedFault> {
         InjectedFault::parse(std::env::var(VARIABLE).ok()?.as_str())
     }

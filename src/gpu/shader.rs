@@ -30,7 +30,6 @@ pub(super) enum BindingKind {
 pub(super) struct Binding {
     /// Number in group 0.
     pub(super) number: u32,
-    /// Name of the variable.
     pub(super) name: String,
     pub(super) kind: BindingKind,
     /// Least bytes that a view must span; for a runtime-sized array, one element.

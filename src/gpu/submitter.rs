@@ -99,7 +99,6 @@ pub(super) struct Job {
     pub(super) commands: wgpu::CommandBuffer,
     /// Staging memory to map when the commands are done.
     pub(super) mappings: Vec<Mapping>,
-    /// The submission.
     pub(super) waker: Waker,
 }
 

@@ -15,7 +15,6 @@ pub struct DeferredTables {
 }
 
 impl DeferredTables {
-    /// The tables with these numbers.
     pub fn new(numbers: &RunNumbers) -> DeferredTables {
         let mut words = vec![0; HEADER_WORDS];
         let mut put = |place: usize, entries: usize, floats: &[f32]| {
@@ -34,7 +33,6 @@ impl DeferredTables {
         DeferredTables { words }
     }
 
-    /// The words, for a device.
     pub fn words(&self) -> &[u32] {
         &self.words
     }

@@ -8,7 +8,6 @@
 //! the gate, had it waited for all numbers of the step.
 
 crate::wgsl_struct! {
-    /// Uniform of `gate.wgsl`.
     pub struct GateUniforms {
         pub rows_room: u32,
         pub isects_room: u32,
@@ -34,11 +33,8 @@ crate::wgsl_struct! {
         pub unusable: u32,
         /// The sums of the loss, bits of floats.
         pub sums: [u32; 4],
-        /// Unused.
         pub pad0: u32,
-        /// Unused.
         pub pad1: u32,
-        /// Unused.
         pub pad2: u32,
     }
 }

@@ -21,7 +21,6 @@ const CHUNKS_MAX: usize = 32;
 /// One intersection, packed in 64 bits: row (32), first pixel row in the tile (4), last pixel row (4), k (24).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Isect {
-    /// The row of the Gaussian.
     pub row: u32,
     /// First and last pixel row of the tile, 0 to 15, that it can reach.
     pub pixel_rows: [u8; 2],

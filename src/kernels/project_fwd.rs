@@ -126,7 +126,6 @@ pub struct Geometry {
     pub scale_sq: [f32; 3],
     /// Blurred covariance xx, xy, yy, px^2.
     pub cov2d: [f32; 3],
-    /// Its determinant.
     pub det: f32,
 }
 

@@ -8,7 +8,6 @@ use super::tile_range::TileRange;
 use crate::base::simd::{Kernel, LANES, SimdPath, dispatch, fma};
 use std::sync::atomic::AtomicU64;
 
-/// Pixels of a tile.
 pub const TILE_PIXELS: usize = (TILE * TILE) as usize;
 /// Stop position of a pixel that processed its whole list.
 pub const NEVER: u32 = u32::MAX;

@@ -394,7 +394,6 @@ impl BandKernel<'_> {
     }
 }
 
-/// Adds the sums of a row.
 #[inline(always)]
 fn add_row(sums: &mut [f64; LANES], of_row: &Lane) {
     for l in 0..LANES {

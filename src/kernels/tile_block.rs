@@ -31,7 +31,6 @@ pub(super) struct Local {
     /// Upper bound of the exponent: the opacity's, or that of the clamp if lower.
     pub top: f32,
     pub color: [f32; 3],
-    /// The row of the Gaussian.
     pub row: u32,
     /// Emit index of this intersection, relative to its chunk of rows.
     pub emit: u64,
@@ -45,7 +44,6 @@ pub(super) struct Block<const N: usize> {
     pub reach: [u64; ROWS],
 }
 
-/// Prefetches a list.
 #[inline(always)]
 pub(super) fn prefetch_list(list: &[AtomicU64]) {
     for at in (0..list.len()).step_by(CACHE_LINE / size_of::<AtomicU64>()) {

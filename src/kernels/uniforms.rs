@@ -113,7 +113,6 @@ pub const FOLD_WITHOUT_LISTS: u32 = 32;
 pub const DEPTH_BINS: u32 = 1 << 10;
 
 crate::wgsl_struct! {
-    /// Uniform of `scan.wgsl`.
     pub struct ScanUniforms {
         pub count: u32,
         pub values_of_sum: u32,
@@ -190,7 +189,6 @@ pub fn grid_words(grid: Grid) -> [u32; 4] {
 }
 
 crate::wgsl_struct! {
-    /// Uniform of `gather.wgsl`.
     pub struct GatherUniforms {
         pub world_to_camera: [[f32; 4]; 3],
         pub slopes: [f32; 4],
@@ -211,7 +209,6 @@ crate::wgsl_struct! {
         pub pad: u32,
     }
 
-    /// Uniform of `update.wgsl`.
     pub struct UpdateUniforms {
         pub slab: u32,
         pub row_count: u32,
@@ -285,7 +282,6 @@ crate::wgsl_struct! {
         pub first_row: u32,
         /// Number, in the batch, of the page's first listed row.
         pub first_listed: u32,
-        /// Unused.
         pub pad: [u32; 2],
     }
 
@@ -305,7 +301,6 @@ crate::wgsl_struct! {
         pub high: [u32; 3],
         /// Largest standard deviation, bits.
         pub sigma_max: u32,
-        /// Unused.
         pub pad: u32,
     }
 
@@ -317,7 +312,6 @@ crate::wgsl_struct! {
         pub lowest_opacity: u32,
         /// Least mean blending weight of the rows that are judged by it, bits; a number above 1e30 without such rows.
         pub least_weight: u32,
-        /// Unused.
         pub pad: u32,
     }
 }

@@ -37,7 +37,6 @@ impl OfLanes {
         OfLanes { narrow, sh_n: of(Column::ShN) }
     }
 
-    /// The value of a column.
     #[inline(always)]
     pub fn of(&self, column: Column) -> f32 {
         if column == Column::ShN { self.sh_n } else { self.narrow[first_lane(column)] }
@@ -106,12 +105,10 @@ impl DeferredAdam {
         DeferredAdam { tables: self.tables.still(), ..self }
     }
 
-    /// The rates of the run.
     pub fn rates(&self) -> &Rates {
         self.tables.rates()
     }
 
-    /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
         self.tables.bytes() + self.decays.len() * size_of::<Decay>()
     }

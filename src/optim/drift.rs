@@ -22,7 +22,6 @@ use crate::scene::columns::Column;
 
 /// From this gap on the term r^k S(s+k) is below a rounding of S(s).
 pub(super) const RECENT: usize = 400;
-/// Terms of the direct sum.
 const DIRECT_TERMS: usize = 200;
 /// After this many steps every bias correction is 1 in f64 (0.999^40000 = 4e-18).
 const BIAS_STEPS: u32 = 40_000;
@@ -112,7 +111,6 @@ impl DriftTables {
         self.is_still
     }
 
-    /// The rates of the tables.
     pub fn rates(&self) -> &Rates {
         &self.rates
     }
@@ -122,7 +120,6 @@ impl DriftTables {
         self.config
     }
 
-    /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
         self.series.len() * 48
             + self.limits.len() * 32

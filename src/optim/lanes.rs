@@ -31,7 +31,6 @@ impl LaneDrifts {
         LaneDrifts { sums }
     }
 
-    /// The sums for a column.
     #[inline(always)]
     fn of(&self, column: Column) -> [&[f32; LANES]; 3] {
         let s = &self.sums;

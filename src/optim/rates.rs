@@ -14,7 +14,6 @@ use crate::scene::columns::Column;
 /// Share of the steps after which the rates of all columns but the means fall.
 const SETTLES_FROM: f64 = 0.9;
 
-/// Rates of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rates {
     /// Positions at step 0, in units of the scene: the nominal rate times the scene scale.
@@ -91,7 +90,6 @@ impl Rates {
         [self.means_factor(step), self.others_factor(step)]
     }
 
-    /// Rate of a column at a step.
     pub fn at(&self, column: Column, step: u32) -> f64 {
         match column {
             Column::Means => self.means * self.means_factor(step),

@@ -21,7 +21,6 @@ impl PageIndex {
         &self.metas
     }
 
-    /// The entry of a page.
     pub fn meta(&self, page: PageNo) -> &PageMeta {
         &self.metas[page.index()]
     }

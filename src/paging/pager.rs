@@ -446,7 +446,6 @@ impl Pager {
         self.tier.counters.total(self.tier.mover.traffic())
     }
 
-    /// Frames in use.
     pub fn frames(&self) -> usize {
         self.tier.frames.frames()
     }

@@ -13,13 +13,10 @@ use serde::{Deserialize, Serialize};
 pub struct PagerStats {
     /// Bytes read from the store.
     pub bytes_read: u64,
-    /// Bytes written to the store.
     pub bytes_written: u64,
     /// Pages read from the store.
     pub pages_read: u64,
-    /// Pages written to the store.
     pub pages_written: u64,
-    /// Pages that steps needed.
     pub pages_needed: u64,
     /// Needed pages that were in memory.
     #[serde(rename = "page_hits")]
@@ -80,7 +77,6 @@ impl Counters {
     }
 }
 
-/// Slots of a store.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SlotSpace {
     pub total: u64,

@@ -41,7 +41,6 @@ pub fn meta_from_label(id: PageId, bytes: &[u8]) -> Option<PageMeta> {
 /// Limits of the pages of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageLimits {
-    /// Rows that a page holds.
     pub page_rows: usize,
     /// Degree of the scene.
     pub sh_degree: u8,

@@ -48,7 +48,6 @@ impl ColorCorrect {
         }
     }
 
-    /// The fit with this name.
     pub fn from_name(name: &str) -> Option<ColorCorrect> {
         [ColorCorrect::Affine, ColorCorrect::Quadratic].into_iter().find(|c| c.name() == name)
     }

@@ -29,7 +29,6 @@ const RADIUS_ONE_OF: usize = 500;
 const VIEWS: [(usize, [u32; 2], u8); 4] =
     [(4000, [160, 112], 3), (3, [65, 47], 2), (20_000, [123, 77], 1), (900, [40, 9], 0)];
 
-/// Outputs of a view.
 pub struct View {
     pub image: Image,
     pub loss: LossValue,

@@ -117,7 +117,6 @@ impl GpuRenderer {
         })
     }
 
-    /// The device.
     pub fn gpu(&self) -> &Gpu {
         &self.stages.gpu
     }

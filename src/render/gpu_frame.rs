@@ -43,7 +43,6 @@ pub struct Pairs {
 /// The rows of a view in depth order, with the offsets of their intersections.
 #[derive(Debug)]
 pub struct Ranks {
-    /// Rows of the view.
     pub rows: u32,
     /// `[rows]` u32: row of each rank; rows that are not drawn come last.
     pub order: Buffer,
@@ -138,7 +137,6 @@ pub struct Demand {
 }
 
 impl DemandReadback {
-    /// Waits for the device.
     pub fn wait(self) -> GpuResult<Demand> {
         let (mut isects, mut list_max) = ([0u32], [0u32]);
         self.total.copy_to(&mut isects)?;

@@ -361,7 +361,6 @@ pub struct UpdateBuffers<'a> {
 /// The listed rows of a batch, as a source of columns.
 #[derive(Clone, Copy)]
 pub struct PageRows<'a> {
-    /// The pages of the run.
     pub(super) pages: &'a DevicePages,
     view: &'a PagesView,
     batch: &'a PageBatch,

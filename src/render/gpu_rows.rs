@@ -151,7 +151,6 @@ pub fn put_bands(bands: &[f32], width: usize, rows: &mut [f32], row_width: usize
 
 /// Where the columns of the rows of a batch come from.
 pub trait RowSource {
-    /// Rows of the batch.
     fn rows(&self) -> usize;
 
     /// Records what fills means, quats, scales and opacities of `columns` with the rows `part` of the batch, and
@@ -168,9 +167,7 @@ pub trait RowSource {
     fn colors(&mut self, recorder: &mut Recorder<'_>, columns: &DeviceColumns, part: &Range<usize>) -> GpuResult<()>;
 }
 
-/// Rows that the host gives.
 pub(super) struct HostRows<'a> {
-    /// The rows of the batch.
     pub rows: &'a Columns,
     /// Memory for the SH bands in use.
     pub bands: &'a mut Vec<f32>,

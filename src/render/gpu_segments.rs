@@ -98,7 +98,6 @@ pub(super) fn zero_gradients(gpu: &Gpu, segments: &mut [Segment]) -> GpuResult<(
     gpu.submit(recorder).map(|_| ())
 }
 
-/// The gradients of the splats of a segment.
 pub(super) fn gradients_of(segment: &Segment) -> GpuResult<&Buffer> {
     segment.v_splats.as_ref().ok_or_else(|| GpuError::Bindings {
         stage: "backward".into(),

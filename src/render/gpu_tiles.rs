@@ -63,7 +63,6 @@ pub struct TileStages {
 }
 
 impl TileStages {
-    /// Compiles the stages.
     pub fn new(gpu: &Gpu) -> GpuResult<TileStages> {
         let get = |stage: &str, entry: &str| gpu.pipeline(&format!("{stage}.wgsl"), entry, &[]);
         let pipelines = Pipelines {

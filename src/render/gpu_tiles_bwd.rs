@@ -83,7 +83,6 @@ pub struct BackStages {
 }
 
 impl BackStages {
-    /// Compiles the stages.
     pub(super) fn new(gpu: &Gpu) -> GpuResult<BackStages> {
         let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &[]);
         let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);

@@ -75,7 +75,6 @@ pub struct StepDone {
     pub rows: u32,
     /// Rows with unusable gradients.
     pub unusable: u32,
-    /// Loss of the view.
     pub loss: LossValue,
     /// What the update did to each page.
     pub pages: Vec<PageResult>,

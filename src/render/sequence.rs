@@ -12,14 +12,12 @@ use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 use std::ops::Range;
 
-/// Camera and options of a view.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct ViewOptions {
     pub camera: Camera,
     pub options: RenderOptions,
 }
 
-/// Progress of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Progress {
     /// Batches of rows are being added.

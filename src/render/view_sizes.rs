@@ -5,7 +5,6 @@ const ISECTS_PER_ROW: u64 = 32;
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct ViewSizes {
-    /// Rows in view.
     pub rows: u64,
     /// Intersections of splats and tiles.
     pub isects: u64,

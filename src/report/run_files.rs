@@ -9,7 +9,6 @@ pub const CONFIG_FILE: &str = "config.toml";
 pub const BEGUN_FILE: &str = ".gsscale-begun.toml";
 /// One line of JSON per logged step.
 pub const METRICS_FILE: &str = "metrics.jsonl";
-/// Folder of the curves for TensorBoard.
 pub const EVENTS_FOLDER: &str = "tensorboard";
 /// Figures of the whole run, written at its end.
 pub const SUMMARY_FILE: &str = "summary.json";

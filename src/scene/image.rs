@@ -92,7 +92,6 @@ impl PictureGradient {
         self.v_alpha = None;
     }
 
-    /// Bytes held.
     pub fn bytes(&self) -> u64 {
         let floats = self.v_rgb.capacity() + self.v_alpha.as_ref().map_or(0, Vec::capacity);
         (4 * floats) as u64

@@ -10,7 +10,6 @@
 //! statistics until the next round; 3. weights only add up, in the order of the steps, so the word is a function of
 //! these steps alone.
 
-/// Bits of the number of views.
 const VIEWS_BITS: u32 = 12;
 /// The most views that a row counts between two rounds.
 pub const VIEWS_MOST: u32 = (1 << VIEWS_BITS) - 1;
@@ -21,7 +20,6 @@ pub const WEIGHT_MOST: f32 = 1e30;
 /// Bits of an f32 that the sum of weights drops.
 const DROPPED_BITS: u32 = 11;
 
-/// Number of views in a word.
 #[inline(always)]
 pub fn views(word: u32) -> u32 {
     word & VIEWS_MOST

@@ -27,7 +27,6 @@ const PLAY: f64 = 0.5;
 /// A resolved order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
-    /// Uniform shuffle.
     Shuffle,
     /// This many groups (at least 1).
     Groups(u32),

@@ -46,7 +46,6 @@ pub enum TrainError {
     /// The scene has outgrown its frames.
     #[error("{source}")]
     Outgrown {
-        /// The error of the pager.
         source: PagingError,
         /// Least budget with which the step fits, bytes; `None` if frames do not follow from a budget.
         least: Option<u64>,
@@ -69,7 +68,6 @@ pub enum TrainError {
         problem: String,
         /// The last of these steps.
         step: u32,
-        /// View of that step.
         view: String,
         /// Consecutive steps.
         count: u32,

@@ -91,7 +91,6 @@ pub struct ImportSummary {
     pub rows: u64,
     /// Including those of giants.
     pub pages: u64,
-    /// Points read.
     pub points: u64,
 }
 

@@ -19,7 +19,6 @@ compile_error!("slots are little-endian; nothing was tested on big-endian machin
 
 /// Bytes before the payload of every slot, and of every frame in memory.
 pub const HEADER_BYTES: usize = 4096;
-/// Longest label, bytes.
 pub const LABEL_BYTES_MAX: usize = 512;
 /// Version of the slot layout. A store of a newer version is refused.
 pub const FORMAT_VERSION: u32 = 1;

@@ -62,7 +62,6 @@ impl SlotLayout {
         self.slot_bytes * u64::from(self.slots_per_segment)
     }
 
-    /// Place of slot number `slot`.
     pub fn place(&self, slot: u64) -> Place {
         let per = u64::from(self.slots_per_segment);
         Place { segment: (slot / per) as u32, offset: slot % per * self.slot_bytes }

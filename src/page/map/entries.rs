@@ -328,7 +328,6 @@ pub struct SealScope {
 }
 
 impl SealScope {
-    /// Checksum of `body` under `key`.
     pub fn checksum(self, key: &[u8], body: &[u8]) -> u64 {
         let mut hash = Xxh3::with_seed(u64::from(self.table));
         hash.update(&self.store.to_le_bytes());

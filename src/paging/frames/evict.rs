@@ -80,7 +80,6 @@ pub struct EvictOrder {
 }
 
 impl EvictOrder {
-    /// An empty order.
     pub fn new(policy: EvictPolicy) -> EvictOrder {
         EvictOrder { policy, uses: Vec::new(), len: 0, heap: BinaryHeap::new() }
     }

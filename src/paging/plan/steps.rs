@@ -45,7 +45,6 @@ impl Plan {
         self.uses_held > self.uses_max
     }
 
-    /// The planned steps.
     pub fn steps(&self) -> Range<u32> {
         self.first_step..self.first_step + self.steps.len() as u32
     }

@@ -32,7 +32,6 @@ pub const WINDOW_STEPS: usize = 20;
 /// The run to simulate.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ReplayOptions {
-    /// Frames of the cache.
     pub frames: usize,
     /// Which page is evicted first.
     pub policy: EvictPolicy,

@@ -11,7 +11,6 @@ use std::collections::VecDeque;
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-/// Columns of a line.
 const COLUMNS: usize = 80;
 /// Columns of the text beside `done/total`: see the test.
 const WORDS: usize = 54;
@@ -27,7 +26,6 @@ const PSNR_WEIGHT: f64 = 0.05;
 /// What a step shows.
 #[derive(Debug, Clone, Copy)]
 pub struct ShownStep {
-    /// Gaussians in the scene.
     pub gaussians: u64,
     /// PSNR of the step's view, dB.
     pub psnr: f64,

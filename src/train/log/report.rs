@@ -26,7 +26,6 @@ use std::path::{Path, PathBuf};
 /// Most pictures for TensorBoard, which keeps ten of a tag and all tags.
 const PICTURES_MAX: usize = 12;
 
-/// PSNR of a perfect image.
 pub const PSNR_PERFECT: f64 = 100.0;
 
 /// The counters of the pager, with frames and pages.
@@ -34,9 +33,7 @@ pub const PSNR_PERFECT: f64 = 100.0;
 pub struct TierTraffic {
     #[serde(flatten)]
     pub stats: PagerStats,
-    /// Frames in use.
     pub frames: u64,
-    /// Pages of the scene.
     pub pages: u64,
 }
 
@@ -135,7 +132,6 @@ pub struct HalfFitted {
 /// Mean PSNR after fitting the colours of each render to its photo.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ColorCorrected {
-    /// Method of the fit.
     pub method: ColorCorrect,
     /// Mean over the views, dB.
     pub cc_psnr: f64,
@@ -195,7 +191,6 @@ pub struct Foreseen {
 pub struct Summary {
     /// Steps done.
     pub steps: u32,
-    /// Gaussians of the scene.
     pub gaussians: u64,
     /// Those among them that result files leave out, because too few photos see them.
     #[serde(default)]
@@ -208,7 +203,6 @@ pub struct Summary {
     pub test: Option<TestMetrics>,
     /// The scene that was trained.
     pub scene: PathBuf,
-    /// Version of the program.
     pub version: String,
     /// Variant of `test.ssim`: same, valid or reflect.
     pub ssim_variant: String,

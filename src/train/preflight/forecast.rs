@@ -155,7 +155,6 @@ fn guess(rows: u64, rounds: u32, every: u32) -> u64 {
     now as u64
 }
 
-/// The forecast of a run.
 #[derive(Debug, Clone)]
 pub struct Forecast {
     /// Gaussians now and at the end.
@@ -181,7 +180,6 @@ pub struct Forecast {
     pub ply_bytes: u64,
     /// Bytes that import and steps write to the drive; 0 for a run in memory.
     pub bytes_written: f64,
-    /// Most bytes that commits write.
     pub commit_bytes_most: f64,
     /// Seconds of all steps.
     pub seconds: f64,
@@ -408,7 +406,6 @@ fn slots_of(pages: u64, of_all: u64, changed_share: f64) -> u64 {
     pages + (changed_share * of_all.saturating_sub(pages) as f64).ceil() as u64
 }
 
-/// Bytes of a PLY of `rows` Gaussians.
 fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
     rows * (PLY_ROW_BYTES + 12 * (u64::from(config.sh_degree) + 1).pow(2))
 }

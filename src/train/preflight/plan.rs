@@ -202,11 +202,9 @@ fn plan_frames(
 #[derive(Debug, Clone, Copy)]
 struct LargestNeed {
     pub frame_bytes: u64,
-    /// Pages of the view.
     pub pages: u64,
 }
 
-/// Frames at the start.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct FirstFrames {
     pub frames: u64,
@@ -524,7 +522,6 @@ pub(super) struct Probe {
     pub views: Vec<usize>,
     /// Gaussians of the scene.
     pub rows: u64,
-    /// Pages of the scene.
     pub pages: usize,
     /// Bytes that the graphics driver allocated during the search for a device.
     pub driver: u64,

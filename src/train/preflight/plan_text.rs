@@ -23,7 +23,6 @@ const ENDURANCE_BYTES: f64 = 300e12;
 /// Share of the time that steps wait for the drive from which the plan names it.
 const WAITS_WORTH_A_WORD: f64 = 0.1;
 
-/// Columns of a terminal.
 const COLUMNS: usize = 80;
 /// Indent of wrapped lines: the width of the first column.
 const INDENT: &str = "        ";

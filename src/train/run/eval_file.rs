@@ -32,12 +32,10 @@ use crate::train::step::view::SceneNow;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-/// Report of `gsscale-eval`.
 #[derive(Debug, Clone, serde::Serialize, serde::Deserialize)]
 pub struct EvalReport {
     /// The PLY, or the `lod-meta.json` of SOGs.
     pub ply: PathBuf,
-    /// Folder of the scene.
     pub scene: PathBuf,
     /// Gaussians in the file; of the finest level.
     pub gaussians: u64,

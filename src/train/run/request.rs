@@ -17,7 +17,6 @@ pub enum Existing {
     BeginAgain,
 }
 
-/// The run to start.
 #[derive(Debug, Clone)]
 pub struct RunRequest {
     /// Scene folder (or transforms.json).

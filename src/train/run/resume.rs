@@ -309,7 +309,6 @@ fn keep_rates(config: &mut TrainConfig, keys: &TrainOverrides, then: &TrainConfi
     }
 }
 
-/// Prints the resume and its differences.
 fn print_resume(
     request: &ResumeRequest,
     state: &RunState,

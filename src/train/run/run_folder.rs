@@ -49,11 +49,9 @@ use std::cell::OnceCell;
 use std::path::Path;
 use std::time::Duration;
 
-/// The past of a resumed run.
 pub(super) struct PastRun {
     /// The config to keep from now on.
     pub config: TrainConfig,
-    /// Length of its metrics.
     pub metrics_bytes: u64,
     /// Steps done.
     pub step: u32,
@@ -71,13 +69,11 @@ pub(super) struct Begun {
     pub print: DatasetPrint,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
-    /// The past of a resumed run.
     pub past: Option<PastRun>,
     /// Budget, bytes.
     pub host_mem: Option<u64>,
     /// Bytes allocated by the graphics driver.
     pub driver: u64,
-    /// Identity of the run.
     pub run: RunId,
     /// What the photos of a new run said before training, if anything.
     pub diagnosis: Option<Diagnosis>,
@@ -294,7 +290,6 @@ fn write_results(
     Ok(summary)
 }
 
-/// The PLY of a result.
 struct SavedPly {
     written: Written,
     /// Gaussians that too few photos see.

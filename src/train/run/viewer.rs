@@ -44,7 +44,6 @@ pub struct ShowRequest {
     pub config: TrainConfig,
     /// The metrics of the run, if there are any.
     pub metrics: Option<PathBuf>,
-    /// The page.
     pub live: Live,
 }
 

@@ -33,7 +33,6 @@ const FIRST_FRAMES: usize = 64;
 /// 1/8 of the frames may be prefetched.
 const PREFETCH_SHARE: usize = 8;
 
-/// The tiers of a run.
 #[derive(Debug, Default)]
 pub struct Tiers {
     spill: Option<SpillDir>,

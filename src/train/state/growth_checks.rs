@@ -19,7 +19,6 @@ use crate::train::step::view::{SceneNow, ViewPass};
 pub(super) struct Comparing<'a> {
     pub targets: &'a TargetCache,
     pub render: &'a RenderOptions,
-    /// Most pages of a batch.
     pub pages_most: usize,
     /// A correction of the pictures before they are compared.
     pub correct: Option<ColorCorrect>,

@@ -64,7 +64,6 @@ pub(crate) struct RunMemory<'a> {
     pub photos: &'a mut PhotoParameters,
     /// Steps done.
     pub step: u32,
-    /// SH degree of the last step.
     pub sh_degree_last: u8,
 }
 

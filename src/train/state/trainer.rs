@@ -168,7 +168,6 @@ impl Trainer {
         SceneNow { scene, step: state.step, working, renderer: &mut **renderer }
     }
 
-    /// The memory of the run, to be fitted.
     pub(crate) fn run_memory(&mut self) -> RunMemory<'_> {
         let sh_degree_last = self.sh_degrees().1;
         let Trainer { scene, working, renderer, photos, memory, state, .. } = self;

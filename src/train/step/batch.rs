@@ -36,17 +36,14 @@ pub struct UpdateCounts {
 pub struct AtStep<'a> {
     /// 0-based step.
     pub step: u32,
-    /// Camera of the view.
     pub camera: &'a Camera,
 }
 
 /// Where the rows of a step are gathered and updated. Calls come in the order of the methods, for each batch; the renderer's own
 /// stages (`begin_view`, `picture`, loss) lie between them.
 pub trait RowBackend {
-    /// The renderer of the view.
     fn renderer(&mut self) -> &mut dyn Renderer;
 
-    /// The most pages of a batch.
     fn pages_most(&self) -> usize {
         usize::MAX
     }
@@ -126,7 +123,6 @@ pub trait RowBackend {
     }
 }
 
-/// Rows in host memory.
 pub struct RowsInHost<'a> {
     renderer: &'a mut dyn Renderer,
 }

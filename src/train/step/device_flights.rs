@@ -91,7 +91,6 @@ pub struct StepToRecord<'a> {
     pub rows_before: u32,
     /// The largest share of the rows in its pages that a view has listed so far.
     pub share: f64,
-    /// The most pages of a batch.
     pub pages_most: usize,
 }
 
@@ -160,7 +159,6 @@ impl Flights {
         }
     }
 
-    /// Steps in flight.
     pub fn in_flight(&self) -> usize {
         self.steps.len()
     }

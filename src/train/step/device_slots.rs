@@ -100,7 +100,6 @@ struct SlotInUse {
     pub bytes: usize,
 }
 
-/// A page that is leaving.
 #[derive(Debug)]
 struct Leaving {
     pub page: PageNo,
@@ -172,7 +171,6 @@ pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
 }
 
-/// Bytes of a page's payload.
 pub(super) fn payload_bytes(page: &PinnedPage) -> usize {
     page.layout().bytes()
 }

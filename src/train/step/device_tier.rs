@@ -117,7 +117,6 @@ pub struct DeviceRows<'a> {
     tier: &'a mut DeviceTier,
     renderer: &'a mut dyn Renderer,
     step: u32,
-    /// The camera of the next step.
     next: Option<&'a Camera>,
     /// The pages that the next step needs, by the bounds before this step; known in the last batch of the pass out.
     of_next: Option<Vec<PageNo>>,

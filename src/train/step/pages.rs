@@ -40,7 +40,6 @@ pub(crate) const PAGES_PER_BATCH: usize = 32;
 
 /// State shared by all pages.
 pub struct SceneRules {
-    /// The optimizer.
     pub adam: DeferredAdam,
     events: EventLog,
     seed: u64,
@@ -126,7 +125,6 @@ impl PagedScene {
         Ok(scene)
     }
 
-    /// A scene without pages.
     pub fn empty(pager: Pager, options: &RunOptions) -> PagedScene {
         let (rules, histogram) = (SceneRules::new(options), GradHistogram::default());
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
@@ -525,7 +523,6 @@ pub struct WorkingSet {
     pub row_from_working: Vec<u32>,
     /// Values at this step; input of the renderer and of the update.
     pub columns: Columns,
-    /// Gradients of the step.
     pub gradients: Gradients,
 }
 

@@ -169,7 +169,6 @@ const FAULTS: &str = "GSSCALE_STEP_FAULT";
 /// Environment variable of the steps in flight: 0 for steps that wait for each of their numbers, 1, or 2.
 const IN_FLIGHT: &str = "GSSCALE_STEPS_IN_FLIGHT";
 
-/// A fault of a recorded step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StepFault {
     /// Its list of rows has room for one row.
@@ -180,7 +179,6 @@ pub(super) enum StepFault {
     Closed,
 }
 
-/// Faults of the steps of a run.
 #[derive(Debug, Clone, Default)]
 pub(super) struct StepFaults(Vec<(StepFault, u32)>);
 
@@ -200,12 +198,10 @@ impl StepFaults {
         StepFaults(text.split(',').filter_map(fault).collect())
     }
 
-    /// The faults that the environment requests.
     pub fn from_environment() -> StepFaults {
         std::env::var(FAULTS).map_or(StepFaults::default(), |text| StepFaults::parse(&text))
     }
 
-    /// Whether a fault is injected at a step.
     pub fn is_injected_at(&self, fault: StepFault, step: u32) -> bool {
         self.0.contains(&(fault, step))
     }

@@ -41,18 +41,13 @@ pub enum Skipped {
     Gradients(u64),
 }
 
-/// The outcome of a step.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct StepOutcome {
-    /// Loss of the view.
     pub loss: LossValue,
-    /// Rows of the view.
     pub rows: usize,
     /// Rows in the pages of the view.
     pub rows_pinned: usize,
-    /// Pages of the view.
     pub pages: usize,
-    /// Batches of the view.
     pub batches: usize,
     /// Rows that the optimizer rewrote.
     pub updated: u64,
@@ -73,7 +68,6 @@ impl StepOutcome {
     }
 }
 
-/// The view of a step.
 #[derive(Debug, Clone, Copy)]
 pub struct StepView<'a> {
     /// 0-based step.
@@ -82,7 +76,6 @@ pub struct StepView<'a> {
     pub render: &'a RenderOptions,
     /// Whether the step collects statistics for densification.
     pub collects: bool,
-    /// The most pages of a batch.
     pub pages_most: usize,
 }
 

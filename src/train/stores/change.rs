@@ -30,7 +30,6 @@ pub struct RolledBack {
     pub step: u32,
     /// Dropped later generations.
     pub dropped: Vec<u64>,
-    /// Names of the dropped generations.
     pub dropped_names: Vec<String>,
     /// Whether the rollback was done.
     pub is_done: bool,
@@ -72,7 +71,6 @@ fn open_same(place: &StorePlace, store: u128) -> Result<SpillDir, InputError> {
 /// Names to remove.
 #[derive(Debug, Clone, Default)]
 pub struct PruneRequest {
-    /// These names.
     pub names: Vec<String>,
     /// All names except those of this many newest named generations.
     pub keep: Option<usize>,
@@ -152,7 +150,6 @@ pub struct ClonedStore {
     pub generations: Vec<u64>,
     /// Versions of pages.
     pub versions: u64,
-    /// Bytes of slots read.
     pub bytes_read: u64,
 }
 

@@ -66,13 +66,11 @@ pub struct ExportRequest {
     pub sh_degree: Option<u8>,
 }
 
-/// Result of an export.
 #[derive(Debug, Clone, Serialize)]
 pub struct Exported {
     pub file: PathBuf,
     pub generation: u64,
     pub step: u32,
-    /// Gaussians in the file.
     pub gaussians: u64,
     /// Dropped Gaussians with non-finite values.
     pub skipped: u64,
@@ -84,7 +82,6 @@ pub struct Exported {
     pub always_shown: u64,
     /// Whether the file holds local coordinates because f32 cannot hold the dataset's.
     pub is_local: bool,
-    /// Bytes of pages read.
     pub bytes_read: u64,
     /// Peak memory of the process, bytes.
     pub host_bytes_peak: u64,
@@ -393,7 +390,6 @@ impl StoredStart {
         &mut self.scene
     }
 
-    /// SH degree of its Gaussians.
     pub fn sh_degree(&self) -> u8 {
         self.scene.rules.sh_degree
     }

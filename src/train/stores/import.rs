@@ -42,7 +42,6 @@ const FIXED_BYTES: u64 = 48 * MIB;
 /// Gaussians turned back together.
 const ROWS_AT_ONCE: usize = 1024;
 
-/// Options of an import.
 #[derive(Debug, Clone)]
 pub struct ImportRequest {
     /// The PLY of Gaussians.
@@ -53,11 +52,9 @@ pub struct ImportRequest {
     pub host_mem: u64,
     /// Capacity of a page, rows.
     pub page_rows: u32,
-    /// Codec of the pages.
     pub codec: Codec,
 }
 
-/// Result of an import.
 #[derive(Debug, Clone, Serialize)]
 pub struct Imported {
     /// The new folder.
@@ -66,7 +63,6 @@ pub struct Imported {
     /// Dropped Gaussians with non-finite values.
     pub dropped: u64,
     pub pages: u64,
-    /// SH degree of the file.
     pub sh_degree: u8,
     /// Peak memory of the process, bytes.
     pub host_bytes_peak: u64,

@@ -40,13 +40,10 @@ pub struct Inspected {
     pub slot_bytes: u64,
     pub slots_per_segment: u32,
     pub segments: u64,
-    /// Bytes of the segment files.
     pub segment_bytes: u64,
-    /// Transactions of the map.
     pub transactions: u64,
     /// The generation to which the following fields belong.
     pub generation: u64,
-    /// Pages of the generation.
     pub pages: u64,
     /// Pages by stored form, in the order of [`StoredAs::ALL`].
     pub pages_by_codec: [u64; StoredAs::ALL.len()],
@@ -102,7 +99,6 @@ pub fn inspect(place: &StorePlace, generation: Option<&str>) -> Result<Inspected
     })
 }
 
-/// The run state as text.
 fn words_of(state: &RunState, config: &TrainConfig) -> Vec<String> {
     let count = |is: fn(Effect<'_>) -> bool| state.events.iter().filter(|e| is(effect_of(&e.kind))).count();
     let rounds = count(|effect| matches!(effect, Effect::Round(_)));
@@ -148,10 +144,8 @@ pub struct ValueSpread {
     pub most: f64,
 }
 
-/// One page.
 #[derive(Debug, Clone, Serialize)]
 pub struct PageInspected {
-    /// Its name.
     pub page: String,
     /// The first generation with this version.
     pub since: u64,
@@ -166,7 +160,6 @@ pub struct PageInspected {
     /// xxh3-128 of the stored payload, hexadecimal.
     pub checksum: String,
     pub rows: u32,
-    /// SH degree of the page.
     pub sh_degree: u8,
     /// Events applied, and all events.
     pub events: [u32; 2],
@@ -259,7 +252,6 @@ fn rows_without_moments(rows: &Rows<'_>) -> u64 {
 /// A kept generation.
 #[derive(Debug, Clone, Serialize)]
 pub struct GenerationLine {
-    /// Its number.
     pub generation: u64,
     pub names: Vec<String>,
     /// Whether `--resume` continues from it.
@@ -285,7 +277,6 @@ pub struct Listed {
     pub store: std::path::PathBuf,
     /// The process that writes to it, if any.
     pub used_by: Option<String>,
-    /// Bytes of its segment files.
     pub segment_bytes: u64,
     /// Generations, ascending.
     pub generations: Vec<GenerationLine>,
@@ -329,7 +320,6 @@ pub fn list(place: &StorePlace) -> Result<Listed, TrainError> {
     Ok(Listed { store: place.folder.clone(), used_by, segment_bytes, generations })
 }
 
-/// One fault of a store.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct StoreFault {
     /// The faulty part: map, state, segment, entry, header, payload, values.
@@ -354,7 +344,6 @@ pub struct Verdict {
     pub generations: u64,
     /// Versions of pages checked.
     pub versions: u64,
-    /// Bytes of slots read.
     pub bytes_read: u64,
     /// All faults, in the order map, states, segments, slots by place.
     pub faults: Vec<StoreFault>,

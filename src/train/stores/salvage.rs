@@ -41,7 +41,6 @@ use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-/// Options of a salvage.
 #[derive(Debug, Clone)]
 pub struct SalvageRequest {
     /// The new store, a folder that does not exist.
