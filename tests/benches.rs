@@ -9,38 +9,22 @@ mod bounded;
 #[path = "../benches/bus.rs"]
 mod bus;
 #[allow(dead_code)] // its `main`
-#[path = "../benches/commit.rs"]
-mod commit;
-#[allow(dead_code)] // its `main`
 #[path = "../benches/gpu.rs"]
 mod gpu;
-#[allow(dead_code)] // its `main`
-#[path = "../benches/image_loss.rs"]
-mod image_loss;
 #[allow(dead_code)] // the tests of programs use all of it
 #[path = "support/bench.rs"]
 mod lines_of_a_bench;
-#[allow(dead_code)] // its `main`
-#[path = "../benches/render.rs"]
-mod render;
 #[allow(dead_code)] // the tests of programs use all of it
 #[path = "support/scenes.rs"]
 mod scenes;
 #[allow(dead_code)] // its `main`
-#[path = "../benches/sizes.rs"]
-mod sizes;
-#[allow(dead_code)] // its `main`
 #[path = "../benches/step.rs"]
 mod step;
-#[allow(dead_code)] // its `main`
-#[path = "../benches/tiers.rs"]
-mod tiers;
 #[allow(dead_code)] // its `main`
 #[path = "../benches/view_memory.rs"]
 mod view_memory;
 
 use clap::Parser;
-use gsscale::config::file::parse_arguments;
 use gsscale::train::error::TrainError;
 use lines_of_a_bench::number;
 use scenes::{city, text};
@@ -59,14 +43,6 @@ fn arguments(args: &[&str]) -> Vec<OsString> {
 fn collected(start: impl FnOnce(&mut dyn FnMut(&Value)) -> Result<(), TrainError>) -> Lines {
     let mut lines = Vec::new();
     start(&mut |line| lines.push(line.clone())).map(|()| lines)
-}
-
-fn tiers(args: &[&str]) -> Lines {
-    collected(|print| tiers::start(&parse_arguments(&arguments(args)), print))
-}
-
-fn sizes(args: &[&str]) -> Lines {
-    collected(|print| sizes::start(&parse_arguments(&arguments(args)), print))
 }
 
 fn bounded(args: &[&str]) -> Lines {
@@ -102,10 +78,8 @@ fn buses_slow_steps_and_change_no_loss() {
 
 #[test]
 fn benchmarks_of_parts_run() {
-    assert!(commit::tiny() && view_memory::tiny() != 0);
+    assert!(view_memory::tiny() != 0);
     assert_eq!(gpu::tiny(), gpu::tiny());
-    assert_eq!(image_loss::tiny(), image_loss::tiny());
-    assert_eq!(render::tiny(), render::tiny());
 }
 
 #[test]
@@ -130,48 +104,6 @@ fn touched_rows_are_timed_beside_a_copy() {
     }
 }
 
-#[test]
-fn shares_of_the_state_train_to_the_bits_of_the_run_in_memory() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 150, 48, 32, 8000);
-    let spill = folder.path().join("spill");
-    let sizes = ["--steps", "100", "--turn", "7", "--warm-up", "60", "--page-rows", "16", "--strategy", "none"];
-    let more = ["--spill-dir", text(&spill), "--shares", "70,0.1", "--view-order", "groups:9"];
-    let lines = tiers(&[&[text(&scene)][..], &sizes, &more].concat()).unwrap();
-    let [too_small, in_memory, share] = &lines[..] else { panic!("{lines:?}") };
-    assert!(number(too_small, "frames") < number(too_small, "pages_of_largest_view"));
-    assert_eq!((number(in_memory, "ratio_of_sums"), &in_memory["frames"]), (1.0, &Value::Null));
-    assert_eq!(share["same_last_loss"], true);
-    for key in ["steps", "pages", "overfetch", "rows_per_step", "view_order"] {
-        assert_eq!(share[key], in_memory[key], "{key}");
-    }
-    assert!(number(share, "overfetch") >= 1.0 && number(share, "seconds_per_step_median") > 0.0);
-    assert!((0.0..1e6).contains(&number(share, "stall_seconds_predicted")), "{share}");
-    // The bound covers the measured steps; only prefetched pages at either end may differ, at most an eighth of the
-    // frames.
-    let reads = number(share, "pages_read_per_step") * 40.0;
-    let bound = number(share, "belady_pages_per_step") * 40.0;
-    assert!(bound > 0.0 && reads + number(share, "frames") / 8.0 >= bound, "{reads} pages read, {bound} at least");
-    assert!(spill.is_dir() && spill.read_dir().unwrap().next().is_none(), "scratch is removed");
-}
-
-#[test]
-fn sizes_see_the_same_rows_whatever_lies_behind_them() {
-    let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 150, 48, 32, 8000);
-    let spill = folder.path().join("spill");
-    let options = ["--steps", "60", "--turn", "7", "--page-rows", "16", "--strategy", "none", "--copies", "1,3"];
-    let lines = sizes(&[&[text(&scene), "--spill-dir", text(&spill)][..], &options].concat()).unwrap();
-    let [one, three] = &lines[..] else { panic!("{lines:?}") };
-    assert_eq!(number(three, "gaussians"), 3.0 * number(one, "gaussians"));
-    assert_eq!((&one["frames"], number(one, "ratio_of_medians")), (&three["frames"], 1.0));
-    // Neighbours at the ends of a copy may differ, and so may a few initial scales.
-    assert!((number(three, "rows_ratio") - 1.0).abs() < 0.01, "{three}");
-    assert!((number(three, "pages_per_step") / number(one, "pages_per_step") - 1.0).abs() < 0.2, "{one} {three}");
-    assert!(number(three, "pages") > 2.5 * number(one, "pages") && number(three, "seconds_per_step_median") > 0.0);
-    assert!(spill.read_dir().unwrap().next().is_none(), "scratch is removed");
-}
-
 /// A control group is created if this user may create one; otherwise the line gives the reason.
 #[test]
 #[cfg(unix)]
@@ -192,18 +124,11 @@ fn a_city_larger_than_memory_trains_under_a_hard_limit() {
 #[test]
 fn benchmarks_that_train_refuse_wrong_input() {
     let folder = TempDir::new().unwrap();
-    let scene = city(folder.path(), 10, 64, 48, 300);
-    let (scene, spill) = (text(&scene), text(folder.path()));
     let refused = |lines: Lines, words: &str| {
         let error = lines.unwrap_err().to_string();
         assert!(error.contains(words) && error.contains("remedy"), "{error}");
     };
-    refused(tiers(&[scene]), "--spill-dir");
-    refused(tiers(&[scene, "--spill-dir", spill, "--shares", "0"]), "--shares");
-    refused(tiers(&[scene, "--spill-dir", spill, "--device", "gpu"]), "--device");
-    refused(sizes(&[scene]), "--spill-dir");
-    refused(sizes(&[scene, "--spill-dir", spill, "--copies", "1,0"]), "--copies");
-    refused(bounded(&["--dir", spill]), "already exists");
+    refused(bounded(&["--dir", text(folder.path())]), "already exists");
     let new = folder.path().join("new");
     refused(bounded(&["--dir", text(&new), "--gaussians", "lots"]), "--gaussians");
     refused(bounded(&["--dir", text(&new), "--gaussians", "999"]), "fewer than");

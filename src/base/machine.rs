@@ -6,12 +6,7 @@ use std::path::{Path, PathBuf};
 ///
 /// From /proc/self/stat, whose ticks are hundredths of a second on every Linux (USER_HZ).
 pub fn process_cpu_seconds() -> Option<f64> {
-    process_cpu_split().map(|[user, system]| user + system)
-}
-
-/// As [`process_cpu_seconds`], user and system separately.
-pub fn process_cpu_split() -> Option<[f64; 2]> {
-    cpu_seconds_of(&std::fs::read_to_string("/proc/self/stat").ok()?)
+    cpu_seconds_of(&std::fs::read_to_string("/proc/self/stat").ok()?).map(|[user, system]| user + system)
 }
 
 /// Fields 14 and 15 are the ticks. The second field is the program's name in parentheses, which may contain anything,
