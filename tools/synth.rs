@@ -1,13 +1,10 @@
-//! `gsscale-synth`: writes a generated city as a COLMAP scene, or in the layout of a published dataset. Parses flags, calls
-//! the library, prints.
+//! `gsscale-synth`: writes a generated city as a COLMAP scene. Parses flags, calls the library, prints.
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
 use gsscale::base::say::exit_code;
 use gsscale::base::units::format_bytes;
-use gsscale::dataset::layout::Layout;
-use gsscale::dataset::lookalike::write_lookalike;
-use gsscale::dataset::synthetic::{CityOptions, CitySummary};
+use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -20,7 +17,6 @@ Examples:
   gsscale-synth hard --exposure 0.03 --noise 0.01     exposure changes by 3 %, sensor noise of 1 %
   gsscale-synth metropolis --points 1000000 --tile 4x5  20 copies of a city side by side, 20 million points
   gsscale-synth utm --offset 500000,4600000,120       coordinates as large as UTM's
-  gsscale-synth rubble --layout colmap-merged         a look-alike of Mill-19, for gsscale-bench run rubble
 
 The same flags give the same bytes for any number of threads.
 Next: gsscale-train city --out runs/city";
@@ -29,7 +25,7 @@ Next: gsscale-train city --out runs/city";
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-synth", version, after_help = EXAMPLES)]
 struct Flags {
-    /// Folder to write: images/ and sparse/0/, or the layout of --layout
+    /// Folder to write: images/ and sparse/0/
     dir: PathBuf,
     /// Number of photos; the city grows with it
     #[arg(long, default_value_t = 60, help_heading = "Size")]
@@ -71,13 +67,6 @@ struct Flags {
     /// Offset added to all coordinates, metres
     #[arg(long, default_value = "0,0,0", value_name = "X,Y,Z", value_parser = parse_offset, allow_hyphen_values = true, help_heading = "Output")]
     offset: [f64; 3],
-    /// Layout of the files, as in a published dataset: colmap, colmap-merged (Mill-19 with COLMAP models in train and
-    /// val), mega-nerf (Mill-19), gauu (GauU-Scene) or matrixcity
-    #[arg(long, default_value = "colmap", help_heading = "Output")]
-    layout: Layout,
-    /// Hold out every N-th photo, in layouts with a held-out folder (--layout)
-    #[arg(long, default_value_t = 8, value_name = "N", help_heading = "Output")]
-    test_every: usize,
     /// Threads [default: all]
     #[arg(long, value_name = "N", help_heading = "Output")]
     threads: Option<usize>,
@@ -130,8 +119,7 @@ fn run(flags: &Flags) -> InputResult<()> {
     if let Ok(style) = ProgressStyle::with_template("{bar:32} {pos}/{len} photos  {per_sec}  {eta} left") {
         bar.set_style(style);
     }
-    let layout = (flags.layout, flags.test_every);
-    let summary = write_lookalike(&flags.dir, &options, layout, &|done, _| bar.set_position(u64::from(done)))?;
+    let summary = write_city(&flags.dir, &options, &|done, _| bar.set_position(u64::from(done)))?;
     bar.finish_and_clear();
     report(flags, &options, &summary, start.elapsed().as_secs_f64());
     Ok(())
@@ -151,21 +139,15 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
     if options.tiles != [1, 1] {
         gsscale::say!("in {}x{} copies side by side", options.tiles[0], options.tiles[1]);
     }
-    if flags.layout == Layout::Colmap {
-        gsscale::say!("{}/", dir.display());
-        gsscale::say!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
-        let sparse = size("sparse/0");
-        gsscale::say!(
-            "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
-            s.views,
-            s.points,
-            s.observations
-        );
-    } else {
-        let (width, height, layout) = (options.width, options.height, flags.layout.name());
-        gsscale::say!("{} photos of {width}x{height} in {}, laid out as {layout}", s.views, dir.display());
-        gsscale::say!("{}", flags.layout.tree());
-    }
+    gsscale::say!("{}/", dir.display());
+    gsscale::say!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
+    let sparse = size("sparse/0");
+    gsscale::say!(
+        "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
+        s.views,
+        s.points,
+        s.observations
+    );
     gsscale::say!("{seconds:.1} s, {rate:.1} million camera rays per second");
     gsscale::say!("next: gsscale-train {} --out <run>", dir.display());
 }

@@ -5,7 +5,7 @@
 //! [`target_cache`].
 
 pub mod colmap;
-mod colmap_write;
+pub mod colmap_write;
 pub mod disturb;
 pub mod exif;
 pub mod frame;
@@ -13,7 +13,6 @@ mod gathered;
 pub mod import;
 pub mod layout;
 pub mod loader;
-pub mod lookalike;
 mod loose_json;
 pub mod masks;
 pub mod mega_nerf;

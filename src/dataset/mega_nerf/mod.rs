@@ -16,7 +16,6 @@
 
 mod pickle;
 mod torch_file;
-pub mod write;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::gathered::{Gathered, RefusalWords, checked_intrinsics};

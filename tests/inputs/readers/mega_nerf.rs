@@ -1,7 +1,7 @@
 //! Mega-NeRF's layout: files written by PyTorch, a generated city in that layout, and hostile files.
 
+use crate::support::lookalike::write_mega_nerf;
 use glam::DVec3;
-use gsscale::dataset::mega_nerf::write::write_mega_nerf;
 use gsscale::dataset::model::Split;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
@@ -58,7 +58,7 @@ fn a_city_in_this_layout_reads_as_the_same_scene() {
     let options = CityOptions { views: 6, width: 48, height: 32, points: 50, ..CityOptions::default() };
     write_city(folder.path(), &options, &|_, _| {}).unwrap();
     let colmap = read_scene(folder.path(), &ReadOptions::default()).unwrap();
-    write_mega_nerf(folder.path(), &colmap, 3).unwrap();
+    write_mega_nerf(folder.path(), &colmap, 3);
     std::fs::remove_dir_all(folder.path().join("sparse")).unwrap();
     let scene = read_scene(folder.path(), &ReadOptions::default()).unwrap();
     assert_eq!(scene.views.iter().filter(|v| v.split == Some(Split::Test)).count(), 2);

@@ -1,8 +1,10 @@
-//! Where the photo scenes are, EXIF data, rows of exported files.
+//! Where the photo scenes are, EXIF data, look-alikes of published datasets, rows of exported files.
 
 #[allow(dead_code)] // the programs use all of it
 #[path = "../../support/exif.rs"]
 pub mod exif;
+#[path = "../../support/lookalike.rs"]
+pub mod lookalike;
 #[path = "../../support/shared.rs"]
 pub mod shared;
 

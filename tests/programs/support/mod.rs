@@ -11,6 +11,8 @@ pub mod exif;
 pub mod faulty_engine;
 #[path = "../../support/gpu.rs"]
 pub mod gpu;
+#[path = "../../support/lookalike.rs"]
+pub mod lookalike;
 #[path = "../../support/lpips.rs"]
 pub mod lpips;
 #[cfg(target_os = "linux")]
