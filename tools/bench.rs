@@ -28,7 +28,7 @@ mod sweep;
 #[path = "bench/sweep_page.rs"]
 mod sweep_page;
 
-use clap::Parser;
+use clap::{Command, CommandFactory, Parser};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::say::exit_code;
 use gsscale::config::file::parse_arguments;
@@ -56,25 +56,29 @@ Measures training.
                                        or a file
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
-Published scenes:";
+Published scenes: ";
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(mut arguments: Vec<OsString>) -> ExitCode {
     gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
-    let mut arguments: Vec<OsString> = std::env::args_os().collect();
     let name = arguments.get(1).and_then(|a| a.to_str()).map(str::to_string);
     let mut named = |known: &str| {
         let is = name.as_deref() == Some(known);
         if is {
-            // The remaining arguments are parsed as those of a program of its own, whose usage line names the
-            // measurement.
-            arguments.remove(1);
+            // The remaining arguments are parsed as those of a program of its own, whose name is that of both.
+            let both = format!("{} {known}", arguments[0].to_string_lossy());
+            arguments.splice(..2, [both.into()]);
         }
         is
     };
     let mut print = |line: &Value| gsscale::say!("{line}");
     let done = if named("help") || named("--help") || named("-h") {
-        gsscale::say!("{HELP} {}", BUILT_IN.map(|(name, _)| name).join(", "));
+        gsscale::say!("{HELP}{}", published_names());
         Ok(())
     } else if named("sweep") {
         sweep::start(&parse_arguments(&arguments), &mut print)
@@ -91,6 +95,21 @@ fn main() -> ExitCode {
         run::start(&parse_arguments(&arguments), &mut print)
     };
     exit_code(done)
+}
+
+/// The command line, for completions and man pages.
+pub fn command() -> Command {
+    Command::new("bench")
+        .about("Measures training")
+        .after_help(HELP.to_string() + &published_names())
+        .subcommand(doctor::Args::command().name("doctor"))
+        .subcommand(run::Args::command().name("run"))
+        .subcommand(compare::Args::command().name("compare"))
+        .subcommand(sweep::Args::command().name("sweep"))
+}
+
+fn published_names() -> String {
+    BUILT_IN.map(|(name, _)| name).join(", ")
 }
 
 /// The checked config of a measurement; starts the worker threads.

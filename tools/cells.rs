@@ -11,9 +11,10 @@ use gsscale::cells::plan::{CellCount, CityPlan};
 use gsscale::cells::prior::{PriorRequest, prior};
 use gsscale::cells::seam::seam;
 use gsscale::cells::work::{COPY_EVERY, WorkRequest, code_of, status, work};
-use gsscale::config::file::{TrainOverrides, parse_command_line};
+use gsscale::config::file::{TrainOverrides, parse_arguments};
 use gsscale::config::values::ByteSize;
 use gsscale::train::error::TrainError;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -32,7 +33,7 @@ says that it is done. Exit codes of `run`: 0 done, 75 again (here or elsewhere),
 /// Trains a city in cells, on several machines or one after the other.
 #[derive(Parser)]
 #[command(name = "gsscale-cells", version, after_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     #[command(subcommand)]
     command: Command,
 }
@@ -153,9 +154,14 @@ struct RunArgs {
 }
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    match start(parse_command_line::<Args>().command) {
+    match start(parse_arguments::<Args>(&arguments).command) {
         Ok(code) => ExitCode::from(code as u8),
         Err(error) => {
             gsscale::tell!("error: {error}");

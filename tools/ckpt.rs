@@ -19,6 +19,7 @@ use gsscale::train::stores::{
     inspect_page, list, prune, rollback, salvage, verify,
 };
 use serde::Serialize;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -37,7 +38,7 @@ write to it. `gsscale-ckpt COMMAND --help` shows examples.";
 /// Lists, verifies, exports, imports, copies and repairs checkpoints.
 #[derive(Parser)]
 #[command(name = "gsscale-ckpt", version, after_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     #[command(subcommand)]
     command: Command,
 }
@@ -65,7 +66,12 @@ enum Command {
 }
 
 fn main() -> ExitCode {
-    let done = match Args::parse().command {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
+    let done = match Args::parse_from(arguments).command {
         Command::Ls(args) => run_ls(&args),
         Command::Inspect(args) => run_inspect(&args),
         Command::Verify(args) => run_verify(&args),

@@ -7,7 +7,7 @@ use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::InputError;
 use gsscale::base::say::exit_code;
 use gsscale::base::whole_file::{folder_of, write_whole};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::exchange::sog::is_tree;
 use gsscale::photos::exposure::FILE as APPEARANCE_FILE;
 use gsscale::render::lpips::InputRange;
@@ -16,6 +16,7 @@ use gsscale::report::html::{Cell, Page};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
 use gsscale::train::run::model_of_run::ModelOfRun;
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -30,7 +31,7 @@ Examples:
 /// Evaluates Gaussians on the held-out photos of a scene.
 #[derive(Parser)]
 #[command(name = "gsscale-eval", version, after_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     /// A run's output folder (its config.toml is used), a PLY, or the lod-meta.json of a folder of SOGs (each level is measured)
     model: PathBuf,
     /// The scene with the photos [default: that of the run]
@@ -58,9 +59,14 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    exit_code(start(parse_command_line()))
+    exit_code(start(parse_arguments(&arguments)))
 }
 
 fn start(args: Args) -> Result<(), TrainError> {

@@ -13,6 +13,7 @@ use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;
 use indicatif::{ProgressBar, ProgressStyle};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -44,7 +45,7 @@ const SH_DEGREE: u8 = 3;
 /// Measure how fast a drive moves pages, and print lines for a config
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-iotune", version, after_help = EXAMPLES)]
-struct Flags {
+pub struct Flags {
     /// A folder on the drive
     dir: PathBuf,
     /// Size of the test file
@@ -59,7 +60,12 @@ struct Flags {
 }
 
 fn main() -> ExitCode {
-    exit_code(run(&Flags::parse()))
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
+    exit_code(run(&Flags::parse_from(arguments)))
 }
 
 fn run(flags: &Flags) -> InputResult<()> {

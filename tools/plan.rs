@@ -12,7 +12,7 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::host_bytes_peak;
 use gsscale::base::text::read_text;
 use gsscale::base::units::format_bytes;
-use gsscale::config::file::parse_command_line;
+use gsscale::config::file::parse_arguments;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;
@@ -39,6 +39,7 @@ use gsscale::train::run::begin::forecast;
 use gsscale::train::step::device_slots::slots_of_budget;
 use output::{json_of, json_of_forecast, report};
 use serde_json::json;
+use std::ffi::OsString;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -70,7 +71,7 @@ const STEP_ASSUMED: f64 = 0.3;
 /// and view order.
 #[derive(Parser)]
 #[command(name = "gsscale-plan", version, after_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     /// Scene: a COLMAP folder, or a folder with transforms.json; or a run's output folder (its config.toml is used)
     scene: PathBuf,
     /// Config file; flags override it
@@ -167,9 +168,14 @@ struct Row {
 }
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
-    match start(&parse_command_line()) {
+    match start(&parse_arguments(&arguments)) {
         Ok(text) => {
             gsscale::say!("{text}");
             ExitCode::SUCCESS

@@ -5,6 +5,7 @@ use gsscale::base::error::InputResult;
 use gsscale::base::say::exit_code;
 use gsscale::poses::program::{FeatureOptions, ProgramPaths};
 use gsscale::poses::{PoseSearch, PosesRequest};
+use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -21,7 +22,7 @@ Next: gsscale-train scans/village";
 /// Find the camera poses of photos, for gsscale-train
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-poses", version, after_help = EXAMPLES)]
-struct Flags {
+pub struct Flags {
     /// Folder of photos, or of a scene whose photos are in images/
     photos: PathBuf,
     /// Folder of the scene, which gets sparse/0/, and images/ with links to the photos [default: the folder of the photos]
@@ -48,7 +49,12 @@ struct Flags {
 }
 
 fn main() -> ExitCode {
-    exit_code(start(&Flags::parse()))
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
+    exit_code(start(&Flags::parse_from(arguments)))
 }
 
 fn start(flags: &Flags) -> InputResult<()> {

@@ -6,6 +6,7 @@ use gsscale::base::say::exit_code;
 use gsscale::base::units::format_bytes;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -24,7 +25,7 @@ Next: gsscale-train city --out runs/city";
 /// Generate a city, fly over it, and write the photos as a COLMAP scene
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-synth", version, after_help = EXAMPLES)]
-struct Flags {
+pub struct Flags {
     /// Folder to write: images/ and sparse/0/
     dir: PathBuf,
     /// Number of photos; the city grows with it
@@ -88,7 +89,12 @@ fn parse_offset(text: &str) -> Result<[f64; 3], String> {
 }
 
 fn main() -> ExitCode {
-    let flags = Flags::parse();
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
+    let flags = Flags::parse_from(arguments);
     exit_code(run(&flags))
 }
 

@@ -7,7 +7,7 @@ use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::config::new_run;
 use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
@@ -19,6 +19,7 @@ use gsscale::train::run::begin::run;
 use gsscale::train::run::out_folder::{check_usable_out, default_out, is_trace, remedy_of_existing};
 use gsscale::train::run::request::{Existing, RunOutcome, RunRequest};
 use gsscale::train::run::resume::{ResumeRequest, describe_resume, go_on, resume};
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -51,7 +52,7 @@ report.html (open it in a browser), summary.json, metrics.jsonl, pages.json, con
 #[derive(Parser)]
 #[command(name = "gsscale-train", version, help_template = HELP, arg_required_else_help = true)]
 #[command(before_help = FIRST_EXAMPLES, before_long_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), or one of the other layouts that --help names
     ///
     /// These are one with transforms.json, an OpenDroneMap project, RealityScan's CSV, and Mega-NeRF's layout
@@ -113,9 +114,14 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    let mut args: Args = parse_command_line();
+    let mut args: Args = parse_arguments(&arguments);
     args.scene = args.scene.or(args.data.take());
     if args.list_devices {
         list_devices();

@@ -4,12 +4,13 @@ use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::say::exit_code;
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_command_line};
+use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::METRICS_FILE;
 use gsscale::train::error::TrainError;
 use gsscale::train::run::model_of_run::ModelOfRun;
 use gsscale::train::run::viewer::{ShowRequest, config_to_show, show};
+use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -24,7 +25,7 @@ Examples:
 /// Shows Gaussians beside the photos of their scene, on a page with a camera that you move.
 #[derive(Parser)]
 #[command(name = "gsscale-view", version, after_help = EXAMPLES)]
-struct Args {
+pub struct Args {
     /// A run's output folder, a PLY, the lod-meta.json of a folder of SOGs (its finest level), or a store
     model: PathBuf,
     /// The scene with the photos [default: that of the run]
@@ -41,9 +42,14 @@ struct Args {
 }
 
 fn main() -> ExitCode {
+    run_with(std::env::args_os().collect())
+}
+
+/// The program, with the words of its command line; the first is its name.
+pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     return_freed_blocks();
     quiet_wayland();
-    exit_code(start(parse_command_line()))
+    exit_code(start(parse_arguments(&arguments)))
 }
 
 fn start(args: Args) -> Result<(), TrainError> {

@@ -573,12 +573,8 @@ impl Class {
     }
 }
 
-/// Parses the command line of a program with [`super::file::TrainOverrides`]; prints help and usage errors and exits.
-pub fn parse_command_line<T: clap::CommandFactory + clap::FromArgMatches>() -> T {
-    parse_arguments(&std::env::args_os().collect::<Vec<_>>())
-}
-
-/// As [`parse_command_line`], for given arguments, starting with the program's name.
+/// Parses the command line of a program with [`super::file::TrainOverrides`], its name first; prints help and usage errors and
+/// exits.
 pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
     let arguments = &with_our_spelling(arguments)[..];
     if let Some((flag, advice)) = advice_for(arguments) {
@@ -591,8 +587,8 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
 }
 
 /// Gives each key its help with its default, and its place in help: the first ones alone stand in `-h`, in one group and in few
-/// words. Flags have no clap defaults, because an absent flag must keep the config file's value.
-fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Command {
+/// words (`is_short`). Flags have no clap defaults, because an absent flag must keep the config file's value.
+pub fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Command {
     let commands: Vec<String> = command.get_subcommands().map(|command| command.get_name().to_string()).collect();
     if !commands.is_empty() {
         let with_help = |command| with_help_of_keys(command, is_short);

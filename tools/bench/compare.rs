@@ -16,7 +16,7 @@ gsscale-eval --json writes the file, and a sweep does so for runs on smaller pho
 
 /// Compares finished runs: figures, curves over steps and seconds, renders of the same view under a slider.
 #[derive(Parser)]
-#[command(name = "gsscale-bench compare", bin_name = "gsscale-bench compare", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench compare", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Output folders of gsscale-train
     #[arg(required = true, num_args = 2..)]

@@ -44,7 +44,7 @@ doctor.json and doctor.html in --out hold all figures: please attach doctor.json
 
 /// Checks a GPU: same pictures and gradients as the CPU, same bytes twice, rates, times of steps, a short training.
 #[derive(Parser)]
-#[command(name = "gsscale-bench doctor", bin_name = "gsscale-bench doctor", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench doctor", version, after_help = EXAMPLES)]
 pub struct Args {
     /// The GPU: a part of its name; default: the best one, software drivers last
     #[arg(long, value_name = "NAME")]

@@ -47,7 +47,7 @@ const DEFAULTS_FOLDER: &str = "defaults";
 
 /// Trains a published run and prints our figures beside the published ones.
 #[derive(Parser)]
-#[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Name of a published run, or a config file with a table `published`
     run: PathBuf,

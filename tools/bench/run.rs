@@ -30,7 +30,7 @@ evaluation. host_bytes_peak excludes the copy that writing a PLY needs.";
 
 /// Trains a scene and prints one line of JSON: steps, seconds, CPU seconds, peak memory, PSNR, SSIM, machine.
 #[derive(Parser)]
-#[command(name = "gsscale-bench run", bin_name = "gsscale-bench run", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench run", version, after_help = EXAMPLES)]
 pub struct Args {
     /// Scene: a COLMAP folder (images/, sparse/), one with transforms.json, or Mega-NeRF's layout
     scene: PathBuf,

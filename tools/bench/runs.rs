@@ -19,6 +19,7 @@ use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE,
 use gsscale::train::log::report::Summary;
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -56,7 +57,7 @@ pub struct Surroundings {
 impl Surroundings {
     /// Reads scene, drive, program and machine. Errors: `gsscale-train` is missing.
     pub fn of(place: &Place) -> InputResult<Surroundings> {
-        let program = digest(&beside("gsscale-train")?)?;
+        let program = digest(&beside("gsscale-train")?.0)?;
         // The default folder in --out is not part of the key: an output folder may move with its results.
         let drive = place.spill.as_ref().map_or_else(String::new, |path| resolved(path).display().to_string());
         let (threads, cpu) = (rayon::current_num_threads(), cpu_model());
@@ -301,17 +302,23 @@ impl Sweep {
         remove(&ply)
     }
 
-    /// Runs a program from the folder of this program to its end. The program's standard input is the lock file, so the
+    /// Runs a program that is part of this program, or lies in its folder, to its end. The program's standard input is the lock file, so the
     /// lock stays held while the program lives.
     fn spawn(&self, program: &str, arguments: &[&Path], environment: &BTreeMap<String, String>) -> InputResult<Output> {
-        let path = beside(program)?;
+        let (path, command) = beside(program)?;
         let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
-        let mut command = Command::new(&path);
-        command.args(arguments).envs(environment).stdin(Stdio::from(held)).stdout(Stdio::null()).stderr(Stdio::piped());
+        let mut started = Command::new(&path);
+        started
+            .args(command)
+            .args(arguments)
+            .envs(environment)
+            .stdin(Stdio::from(held))
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped());
         if program == "gsscale-train" {
-            command.arg("--quiet");
+            started.arg("--quiet");
         }
-        command.output().map_err(|e| InputError::io(&path, "starting the program", &e))
+        started.output().map_err(|e| InputError::io(&path, "starting the program", &e))
     }
 }
 
@@ -342,12 +349,17 @@ fn resolved(path: &Path) -> PathBuf {
     path.ancestors().find_map(of).unwrap_or_else(|| path.clone())
 }
 
-/// Path of a program in the folder of this program.
-fn beside(program: &str) -> InputResult<PathBuf> {
+/// Path of a program and its first argument: this program with a command if it is `gsscale`, else one in the same folder.
+fn beside<'a>(program: &'a str) -> InputResult<(PathBuf, Option<&'a str>)> {
     let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
+    if let (Some("gsscale"), Some(command)) =
+        (own.file_stem().and_then(OsStr::to_str), program.strip_prefix("gsscale-"))
+    {
+        return Ok((own, Some(command)));
+    }
     let path = own.with_file_name(format!("{program}{}", std::env::consts::EXE_SUFFIX));
     match path.is_file() {
-        true => Ok(path),
+        true => Ok((path, None)),
         false => Err(InputError::new(&path, "is missing", "build all programs: cargo build --release")),
     }
 }

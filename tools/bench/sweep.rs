@@ -36,7 +36,7 @@ a table. A sweep that stopped continues when started again.";
 
 /// Trains the runs of a list on each scene.
 #[derive(Parser)]
-#[command(name = "gsscale-bench sweep", bin_name = "gsscale-bench sweep", version, after_help = EXAMPLES)]
+#[command(name = "gsscale-bench sweep", version, after_help = EXAMPLES)]
 pub struct Args {
     /// pareto, ladder, ladder-gpu, stability, or a TOML file
     list: PathBuf,
