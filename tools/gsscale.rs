@@ -85,7 +85,9 @@ fn own_command(arguments: &[OsString]) -> InputResult<()> {
         Some(("man", given)) => {
             let folder = given.get_one::<PathBuf>("DIR").map_or(Path::new("."), PathBuf::as_path);
             let io = |e| InputError::io(folder, "writing man pages", &e);
-            std::fs::create_dir_all(folder).and_then(|()| clap_mangen::generate_to(commands, folder)).map_err(io)?;
+            std::fs::create_dir_all(folder)
+                .and_then(|()| clap_mangen::generate_to(with_all_help(commands), folder))
+                .map_err(io)?;
         }
         _ => gsscale::say!("{FIRST_STEPS}"),
     }
@@ -104,6 +106,11 @@ fn all_commands() -> Command {
         .subcommand(Command::new("completions").about("Prints completions for a shell").arg(shell))
         .subcommand(Command::new("man").about("Writes a man page of each command").arg(folder));
     with_help_of_keys(all, false)
+}
+
+/// The command line with the text of flags that only `--help` shows: a man page has no short form.
+fn with_all_help(command: Command) -> Command {
+    command.mut_args(|arg| arg.hide_short_help(false)).mut_subcommands(with_all_help)
 }
 
 /// The command line without flags that help does not show: completions would offer them.

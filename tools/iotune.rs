@@ -42,7 +42,7 @@ const AS_GOOD: f64 = 0.9;
 /// SH degree of the measured pages.
 const SH_DEGREE: u8 = 3;
 
-/// Measure how fast a drive moves pages, and print lines for a config
+/// Measures how fast a drive moves pages, and prints lines for a config
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-iotune", version, after_help = EXAMPLES)]
 pub struct Flags {

@@ -19,7 +19,7 @@ It runs COLMAP (3.8 or newer) or pycolmap, whichever is installed, with or witho
 in the photos choose the pairs that are compared, and give the model metres, north and up. A stopped search goes on when it is started again.
 Next: gsscale-train scans/village";
 
-/// Find the camera poses of photos, for gsscale-train
+/// Finds the camera poses of photos, for gsscale-train
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-poses", version, after_help = EXAMPLES)]
 pub struct Flags {

@@ -22,7 +22,7 @@ Examples:
 The same flags give the same bytes for any number of threads.
 Next: gsscale-train city --out runs/city";
 
-/// Generate a city, fly over it, and write the photos as a COLMAP scene
+/// Generates a city, flies over it, and writes the photos as a COLMAP scene
 #[derive(Debug, Parser)]
 #[command(name = "gsscale-synth", version, after_help = EXAMPLES)]
 pub struct Flags {

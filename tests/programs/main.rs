@@ -39,6 +39,7 @@ mod matrix;
 mod mcmc;
 mod memory;
 mod near_names;
+mod one_command;
 mod optimizers;
 mod outgrown;
 mod outliers;
