@@ -59,6 +59,7 @@
 //! ```
 //!
 //! The programs are in `tools/`, one file each, with a folder where a program has several commands: they parse, call, print.
+//! `tools/gsscale.rs` holds all of them as commands.
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a
 //! *view* a photo with its pose, a *target* its pixels, a *tile* 16x16 pixels, a *stage* one kernel of the pipeline,

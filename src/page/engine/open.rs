@@ -17,6 +17,7 @@ pub const DEPTH: usize = 16;
 /// only when it is polled, which a step does four times. With 16 entries the drive idled in between, and steps with a
 /// tenth of the pages in memory waited 5 % of the time. With 64 they waited 1.8 %, the cost of a drive that never
 /// idles; 256 gained nothing more (pages of 512 rows, steps of 50 ms, one NVMe drive).
+#[cfg(target_os = "linux")]
 const RING_DEPTH: usize = 64;
 
 /// The I/O engine that moves pages: the values of `--io`.

@@ -233,6 +233,7 @@ pub(in crate::page) fn of_another_run(folder: &Path) -> InputError {
 /// Creates the folder, private, if the name is free. Returns whether it did.
 fn make_folder(folder: &Path) -> InputResult<bool> {
     check_above(folder, folder_of(folder))?;
+    #[cfg_attr(not(unix), expect(unused_mut))]
     let mut builder = std::fs::DirBuilder::new();
     #[cfg(unix)]
     {

@@ -38,6 +38,7 @@ impl StopFlag {
 
     fn install() -> std::io::Result<StopFlag> {
         let flag = StopFlag::default();
+        #[cfg_attr(not(unix), expect(unused_mut))]
         let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];
         #[cfg(unix)]
         if !is_ignored(signal_hook::consts::SIGHUP) {
