@@ -6,7 +6,6 @@ use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
 use gsscale::config::habits::ADVICE;
 use gsscale::config::values::choices;
-use std::path::Path;
 use std::process::{Command, Output};
 
 /// Asserts that the run trains to the end; returns stderr.
@@ -363,7 +362,7 @@ fn a_reader_that_has_gone_is_no_error() {
 #[cfg(target_os = "linux")]
 #[test]
 fn a_full_standard_output_is_an_error() {
-    let full = std::fs::File::options().write(true).open(Path::new("/dev/full")).unwrap();
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
     let output = piped(Workdir::new().command(BENCH, "help").stdout(full));
     let errors = stderr(&output);
     assert!(!output.status.success() && errors.contains("standard output") && errors.contains("remedy"), "{errors}");

@@ -1,6 +1,7 @@
 //! A dry run refuses what the run refuses, and changes nothing; that of `--resume` says what the resume would do.
 
 use crate::support::scenes::{stderr, told};
+#[cfg(unix)]
 use crate::support::small_drive::Small;
 use crate::support::workdir::{TRAIN, Workdir};
 
@@ -43,6 +44,7 @@ fn a_dry_run_refuses_what_the_run_refuses() {
 }
 
 /// The PLY of 500 Gaussians takes 124,000 bytes.
+#[cfg(unix)]
 #[test]
 fn a_drive_without_room_for_the_result_is_refused_before_the_first_step() {
     let work = small();

@@ -109,11 +109,17 @@ impl StorageBackend for DriveFile {
         std::os::unix::fs::FileExt::read_exact_at(&self.0, out, offset)
     }
 
-    #[cfg(not(unix))]
-    fn read(&self, offset: u64, out: &mut [u8]) -> io::Result<()> {
-        use std::io::{Read, Seek};
-        (&self.0).seek(io::SeekFrom::Start(offset))?;
-        (&self.0).read_exact(out)
+    // Several threads may read: the place is part of each call.
+    #[cfg(windows)]
+    fn read(&self, mut offset: u64, mut out: &mut [u8]) -> io::Result<()> {
+        while !out.is_empty() {
+            let bytes = std::os::windows::fs::FileExt::seek_read(&self.0, out, offset)?;
+            if bytes == 0 {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+            (offset, out) = (offset + bytes as u64, &mut out[bytes..]);
+        }
+        Ok(())
     }
 
     fn set_len(&self, len: u64) -> io::Result<()> {
@@ -136,11 +142,16 @@ impl StorageBackend for DriveFile {
         std::os::unix::fs::FileExt::write_all_at(&self.0, data, offset)
     }
 
-    #[cfg(not(unix))]
-    fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {
-        use std::io::{Seek, Write};
-        (&self.0).seek(io::SeekFrom::Start(offset))?;
-        (&self.0).write_all(data)
+    #[cfg(windows)]
+    fn write(&self, mut offset: u64, mut data: &[u8]) -> io::Result<()> {
+        while !data.is_empty() {
+            let bytes = std::os::windows::fs::FileExt::seek_write(&self.0, data, offset)?;
+            if bytes == 0 {
+                return Err(io::ErrorKind::WriteZero.into());
+            }
+            (offset, data) = (offset + bytes as u64, &data[bytes..]);
+        }
+        Ok(())
     }
 }
 

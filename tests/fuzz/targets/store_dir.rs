@@ -189,7 +189,7 @@ fn run(input: &[u8]) {
     }
 }
 
-fn make_private(folder: &Path) {
-    use std::os::unix::fs::PermissionsExt;
-    std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o700)).unwrap();
+fn make_private(_folder: &Path) {
+    #[cfg(unix)]
+    std::fs::set_permissions(_folder, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
 }
