@@ -1,7 +1,7 @@
 //! Command lines and scenes that are wrong or unusual, through the real binaries. A bad scene ends with a message that
 //! names the file, the place and the remedy, with a non-zero exit code, and without an output folder.
 
-use crate::support::scenes::{TextModel, stderr};
+use crate::support::scenes::{TextModel, stderr, stdout};
 use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
 use gsscale::config::habits::ADVICE;
@@ -24,10 +24,6 @@ fn refuses(work: &Workdir, more: &str, words: &[&str]) {
 fn refuses_scene(work: &Workdir, scene: &str, more: &str, words: &[&str]) {
     work.refuses(&format!("{scene} --out refused --steps 12 {more}"), words);
     assert!(!work.exists("refused"), "{more}: something was left behind");
-}
-
-fn stdout(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 /// Each trains, and says some words.

@@ -3,7 +3,6 @@
 use crate::support::scenes::{classic, stderr, stdout};
 use crate::support::workdir::{Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
-use std::path::Path;
 use std::process::Command;
 
 const GSSCALE: &str = env!("CARGO_BIN_EXE_gsscale");
@@ -33,7 +32,7 @@ fn commands_are_the_programs() {
 fn other_names_of_the_program_are_its_commands() {
     use std::os::unix::fs::symlink;
     let work = Workdir::new();
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
     let manifest = std::fs::read_to_string(root.join("Cargo.toml")).unwrap();
     let names = manifest.split("\nname = \"gsscale-").skip(1).map(|rest| rest.split('"').next().unwrap());
     assert_eq!(names.clone().count(), 10);
@@ -71,7 +70,7 @@ fn completions_offer_what_help_shows() {
         assert!(!script.contains(hidden.trim_start_matches('-')), "{shell} offers {hidden}");
         std::fs::write(work.path(shell), script).unwrap();
     }
-    let typed = "source bash; COMP_WORDS=(gsscale train --max-ga); COMP_CWORD=2; _gsscale gsscale --max-ga train; echo ${COMPREPLY[@]}";
+    let typed = "source ./bash; COMP_WORDS=(gsscale train --max-ga); COMP_CWORD=2; _gsscale gsscale --max-ga train; echo ${COMPREPLY[@]}";
     match Command::new("bash").args(["-c", typed]).current_dir(work.path("")).output() {
         Ok(output) => assert_eq!(stdout(&output).trim(), "--max-gaussians", "{}", stderr(&output)),
         Err(_) => eprintln!("skipped: bash is not installed"),

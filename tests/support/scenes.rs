@@ -210,7 +210,11 @@ pub fn classic(args: &[&str]) -> Vec<&'static str> {
 
 /// Standard output, then standard error.
 pub fn told(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned() + &stderr(output)
+    stdout(output) + &stderr(output)
+}
+
+pub fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
 }
 
 pub fn stderr(output: &Output) -> String {
