@@ -350,7 +350,7 @@ fn resolved(path: &Path) -> PathBuf {
 }
 
 /// Path of a program and its first argument: this program with a command if it is `gsscale`, else one in the same folder.
-fn beside<'a>(program: &'a str) -> InputResult<(PathBuf, Option<&'a str>)> {
+fn beside(program: &str) -> InputResult<(PathBuf, Option<&str>)> {
     let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
     if let (Some("gsscale"), Some(command)) =
         (own.file_stem().and_then(OsStr::to_str), program.strip_prefix("gsscale-"))
