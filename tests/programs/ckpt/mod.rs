@@ -117,7 +117,7 @@ fn a_run_and_an_export_write_the_same_files_in_memory_or_spilled_or_resumed() {
     };
     let (ply, early) = (bench.ply("out").len(), files("out", "point_cloud_sog"));
     assert!(early.0[0].len() < ply / 4, "{} of {ply} bytes", early.0[0].len());
-    let export = bench.summary("out")["export"].clone();
+    let export = bench.summary("out")["more_exports"][0].clone();
     assert_eq!(export["file"], "point_cloud_sog/lod-meta.json");
     let finest = export["levels"][0].as_u64().unwrap();
     assert_eq!(finest + number(&export, "always_shown"), number(&export, "gaussians"), "{export}");
