@@ -18,7 +18,7 @@
 //! | equal points, one point | a size from the scene; trains | unusual_scenes_train, degenerate_clouds_get_sane_scales |
 //! | flat photos, photos below a window, masks of everything | SSIM as defined, a loss; a run of such masks stops | flat_bright_patches_and_equal_pictures, small_and_empty_pictures_have_a_loss, a_run_whose_masks_are_all_black_stops |
 //! | second moments at the size of epsilon, far apart in time | the values of dense Adam in f64 | adam_deferred_equals_torch_at_every_snapshot, bounds_hold_for_every_allowed_eps |
-//! | 2,000 missed steps under a rate that decays | the values of dense Adam in f64 | adam_deferred_equals_torch_at_every_snapshot, far_gaps_reach_the_limit |
+//! | 2,000 missed steps under a rate that decays | the values of dense Adam in f64 | adam_deferred_equals_torch_at_every_snapshot, values_follow_dense_adam_in_f64 |
 //! | a row from a later step | it does not move | rows_do_not_move_into_the_past_nor_without_end |
 //! | step numbers of 2^32 - 1, counts that are full | limits, no wrap | rows_do_not_move_into_the_past_nor_without_end, rows_that_were_never_counted_are_noticed_and_no_counter_wraps, a_decay_over_any_gap_errs_by_a_rounding_or_two |
 //! | moments below the smallest float after long gaps | flushed to zero, on every path | tiny_results_are_flushed_to_zero_and_none_is_negative |
