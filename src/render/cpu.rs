@@ -90,7 +90,7 @@ impl StageClock {
     fn time<T>(&mut self, stage: &str, work: impl FnOnce() -> T) -> T {
         let start = Instant::now();
         let out = work();
-        if let Some(at) = STAGES.iter().position(|s| s.name == stage) {
+        if let Some(at) = STAGES.iter().position(|s| *s == stage) {
             self.seconds[at] += start.elapsed().as_secs_f64();
         }
         out
@@ -98,7 +98,7 @@ impl StageClock {
 
     /// Sets the times of `stages` to zero, before the stages run again.
     fn reset(&mut self, stages: &[&str]) {
-        let stages = STAGES.iter().zip(&mut self.seconds).filter(|(s, _)| stages.contains(&s.name));
+        let stages = STAGES.iter().zip(&mut self.seconds).filter(|(s, _)| stages.contains(s));
         stages.for_each(|(_, seconds)| *seconds = 0.0);
     }
 }
@@ -248,7 +248,7 @@ impl CpuRenderer {
 
     /// Seconds of each stage in the last view, in the order of [`STAGES`]; 0 for a stage that did not run.
     pub fn stage_seconds(&self) -> impl Iterator<Item = (&'static str, f64)> + '_ {
-        STAGES.iter().zip(self.clock.seconds).map(|(stage, seconds)| (stage.name, seconds))
+        STAGES.into_iter().zip(self.clock.seconds)
     }
 
     /// Counters of the last view.
