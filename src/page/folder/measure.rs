@@ -19,7 +19,7 @@ use crate::page::engine::page_engine::{Completion, Direction, PageEngine, Place,
 use crate::page::folder::file_system::free_bytes;
 use crate::page::format::codec::Codec;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Target number of rounds.
@@ -136,11 +136,23 @@ fn median(values: &mut [f64]) -> Option<f64> {
 /// Unlinked segments, one per engine.
 struct ScratchSegments {
     engines: Vec<MeasuredEngine>,
+    /// Where open files keep their names. After `engines`, which close the files first.
+    _folder: Option<FolderToRemove>,
     segment_bytes: u64,
     buffers: Vec<PageBuffer>,
     draws: Stream,
     pub notes: Vec<String>,
     pub written_bytes: u64,
+}
+
+/// A folder of this process that goes with the value.
+struct FolderToRemove(PathBuf);
+
+impl Drop for FolderToRemove {
+    fn drop(&mut self) {
+        // What is left is in the user's sight.
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
 }
 
 /// An open engine with its segment.
@@ -166,6 +178,10 @@ impl ScratchSegments {
         let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
         std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
         let opened = ScratchSegments::open_all(&own, engines, file_bytes, depth);
+        if cfg!(not(unix)) {
+            let folder = FolderToRemove(own);
+            return opened.map(|scratch| ScratchSegments { _folder: Some(folder), ..scratch });
+        }
         // Unlinks the segments: the system frees their space when this process ends, at the latest.
         std::fs::remove_dir_all(&own).map_err(failed("removing the folder of the measurement"))?;
         opened
@@ -174,6 +190,7 @@ impl ScratchSegments {
     fn open_all(own: &Path, engines: &[IoEngine], file_bytes: u64, depth: usize) -> InputResult<ScratchSegments> {
         let mut scratch = ScratchSegments {
             engines: Vec::new(),
+            _folder: None,
             segment_bytes: file_bytes / engines.len().max(1) as u64 / FILL_BYTES as u64 * FILL_BYTES as u64,
             buffers: Vec::new(),
             draws: Stream::new(1, Purpose::Test, 0, 0),
