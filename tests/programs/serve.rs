@@ -149,7 +149,10 @@ fn a_finished_run_is_shown_beside_its_photos() {
         assert!(served.get("/metrics?from=0").1 == work.bytes("out/metrics.jsonl"), "the curves of the run");
         let same = first.get_or_insert_with(|| scene.clone());
         // SOGs round colours and positions to bytes and words: two steps of a byte a value.
-        let rounding = if flags.ends_with("json") { 2 * 64 * 48 * 3 } else { 0 };
+        // Rows lie in another order in a file than in a store, so those of equal depth blend in another order: a step of a byte in
+        // one value of a hundred.
+        let values = 64 * 48 * 3;
+        let rounding = if flags.ends_with("json") { 2 * values } else { values / 100 };
         assert!(difference(same, &scene) <= rounding, "{flags}: {}", difference(same, &scene));
 
         let photo = served.picture("view=2&turn=40&show=photo");
