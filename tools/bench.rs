@@ -4,7 +4,7 @@
 #[path = "bench/compare.rs"]
 mod compare;
 #[path = "bench/doctor.rs"]
-mod doctor;
+pub mod doctor;
 #[path = "bench/facts.rs"]
 mod facts;
 #[path = "bench/front.rs"]

@@ -58,11 +58,14 @@ gsscale doctor checks the GPU. gsscale --help lists all commands, gsscale help t
 fn main() -> ExitCode {
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
     let own_name = arguments.first().and_then(|own| Path::new(own).file_stem()?.to_str()?.strip_prefix("gsscale-"));
-    if let Some((name, ..)) = own_name.and_then(|own| COMMANDS.iter().find(|(name, ..)| own == *name)) {
+    if let Some((name, ..)) = own_name.and_then(|own| COMMANDS.iter().find(|(name, ..)| own.eq_ignore_ascii_case(name)))
+    {
         arguments.splice(..1, ["gsscale", name].map(OsString::from));
     }
-    if arguments.get(1).is_some_and(|name| name == "doctor") {
-        arguments.insert(1, "bench".into());
+    // `doctor` is short for `bench doctor`, also after `help`.
+    let at = 1 + usize::from(arguments.get(1).is_some_and(|name| name == "help"));
+    if arguments.get(at).is_some_and(|name| name == "doctor") {
+        arguments.insert(at, "bench".into());
     }
     let Some((name, _, run_with)) = arguments.get(1).and_then(|given| COMMANDS.iter().find(|(name, ..)| given == name))
     else {
@@ -103,6 +106,7 @@ fn all_commands() -> Command {
         .about("Trains 3D Gaussian Splatting scenes bigger than memory")
         .after_help(FIRST_STEPS)
         .subcommands(COMMANDS.map(|(name, command, _)| command().name(name)))
+        .subcommand(bench::doctor::Args::command().name("doctor"))
         .subcommand(Command::new("completions").about("Prints completions for a shell").arg(shell))
         .subcommand(Command::new("man").about("Writes a man page of each command").arg(folder));
     with_help_of_keys(all, false)

@@ -36,6 +36,7 @@ use std::fmt;
 use std::fs::{File, Metadata, TryLockError};
 use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
+use std::time::UNIX_EPOCH;
 
 /// The folder in the scene in which the program works.
 pub const WORK_FOLDER: &str = "poses";
@@ -285,7 +286,7 @@ impl PoseSearch {
         let images = self.scene.join("images");
         let entries = || std::fs::read_dir(work).into_iter().flatten().flatten();
         // A search that was killed before its first word leaves its lock.
-        let is_only_lock = entries().any(|_| true) && entries().all(|entry| entry.file_name() == "lock");
+        let is_only_lock = work.is_dir() && entries().all(|entry| entry.file_name() == "lock");
         if !work.exists() || is_only_lock {
             if self.links_photos && images.exists() {
                 let remedy = "name a new folder: gsscale-poses PHOTOS --out FOLDER";
@@ -310,6 +311,7 @@ impl PoseSearch {
             return Ok((old, lock));
         }
         let (was, is) = match (old.program == new.program, old.options == new.options) {
+            _ if old.program.is_empty() => ("of an older gsscale-poses", "of this one"),
             (false, _) => (old.program.as_str(), new.program.as_str()),
             (_, false) => (old.options.as_str(), new.options.as_str()),
             _ => ("of other photos", "of these"),
@@ -334,7 +336,7 @@ impl PoseSearch {
             }
             match std::fs::symlink_metadata(&target) {
                 // A copy, or what somebody has made of it.
-                Ok(now) if !is_ours && now.len() == photo.bytes => continue,
+                Ok(now) if !is_ours && now.len() == photo.bytes && is_as_young(&now, photo.modified) => continue,
                 Ok(_) if !is_ours => {
                     let remedy = "move it away, or name a new folder: gsscale-poses PHOTOS --out FOLDER";
                     return Err(InputError::new(target, "another file has the name of a photo", remedy));
@@ -629,6 +631,12 @@ fn plain_name(i: usize, name: &str) -> String {
     format!("{i:06}.{}", ending.unwrap_or_default())
 }
 
+/// Whether a file was changed at that time or later, nanoseconds since 1970: an older one is not a copy of the photo as it is now.
+fn is_as_young(file: &Metadata, modified: u64) -> bool {
+    let at = file.modified().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
+    at.is_none_or(|at| at.as_nanos() as u64 >= modified)
+}
+
 /// Whether two names are of one file, as far as the system tells.
 fn are_one_file(a: &Path, b: &Path) -> bool {
     let facts = |path: &Path| std::fs::metadata(path);
@@ -768,6 +776,21 @@ mod tests {
         let refused = second.link_photos(&work).unwrap_err();
         assert!(refused.problem.contains("another file") && refused.remedy.contains("--out"), "{refused}");
         assert_eq!([read("a.jpg"), read("b.jpg")], ["the second", "edited"]);
+        // A photo that changed at its length begins the search again; what is finished stays otherwise.
+        let mut third = search([("a.jpg", "the second"), ("b.jpg", "b"), ("c.jpg", "c")]);
+        drop(lock);
+        let (mut state, lock) = third.begin(&work).unwrap();
+        state.finish("features", &work).unwrap();
+        drop(lock);
+        let (state, lock) = third.begin(&work).unwrap();
+        assert_eq!(state.done, ["features"]);
+        drop(lock);
+        third.photos[0].modified += 1;
+        let (state, lock) = third.begin(&work).unwrap();
+        assert!(state.done.is_empty());
+        drop(lock);
+        third.photos[0].modified -= 1;
+        let (_, lock) = third.begin(&work).unwrap();
         // Of the same length it stays as well.
         std::fs::write(image("b.jpg"), "e").unwrap();
         second.link_photos(&work).unwrap();

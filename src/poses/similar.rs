@@ -71,7 +71,12 @@ pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &mut dyn FnMut(usi
         Ok((gray, size)) => corners(&gray, size, &pattern),
         Err(_) => Vec::new(),
     };
-    let corners: Vec<Vec<Corner>> = photos.par_iter().map(describe).collect();
+    // Some half of the work.
+    let mut corners: Vec<Vec<Corner>> = Vec::with_capacity(photos.len());
+    for some in photos.chunks(PHOTOS_AT_ONCE) {
+        watch(corners.len() / 2);
+        corners.par_extend(some.par_iter().map(describe));
+    }
     let (n, stride) = (corners.len(), stride(photos.len()));
     let of_row = |a: usize| {
         let is_compared = |b: &usize| a.is_multiple_of(stride) || b.is_multiple_of(stride);
@@ -80,7 +85,7 @@ pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &mut dyn FnMut(usi
     };
     let mut found: Vec<Vec<(u16, usize)>> = vec![Vec::new(); n];
     for begin in (0..n).step_by(PHOTOS_AT_ONCE) {
-        watch(begin);
+        watch(n / 2 + begin / 2);
         let rows: Vec<_> = (begin..n.min(begin + PHOTOS_AT_ONCE)).into_par_iter().map(of_row).collect();
         for (a, row) in (begin..).zip(rows) {
             for (score, b) in row {
@@ -89,6 +94,7 @@ pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &mut dyn FnMut(usi
             }
         }
     }
+    watch(n);
     let best = |mut others: Vec<(u16, usize)>| {
         others.sort_by_key(|&(score, b)| (u16::MAX - score, b));
         others.into_iter().take(most).map(|(_, b)| b as u32).collect()
@@ -306,7 +312,7 @@ mod tests {
         assert_eq!(alike, [vec![1, 2], vec![0, 2], vec![0, 1], vec![4], vec![3]]);
         let mut done = Vec::new();
         assert_eq!(look_alikes(&photos, 1, &mut |n| done.push(n))[3], [4]);
-        assert_eq!(done, [0]);
+        assert_eq!(done, [0, 2, 5]);
     }
 
     #[test]

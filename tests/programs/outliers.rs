@@ -78,6 +78,8 @@ fn masking_what_stands_on_one_photo_only_wins_decibels() {
     let steps = format!("{STEPS} --steps 900");
     boxes.run("c", &steps);
     boxes.run("d", &format!("{steps} --robust-pixels"));
+    disturbed(&work, "clean", &Disturbance::Nothing).run("b", &format!("{steps} --robust-pixels"));
+    assert!(masked(&work, "b") < 0.5 * masked(&work, "d"), "{} of a clean scene", masked(&work, "b"));
     let [with, masking] = ["c", "d"].map(|out| work.psnr(out));
     println!("boxes {with:.2} dB, masking {masking:.2} dB, {:.1} %", 100.0 * masked(&work, "d"));
     assert!(masking > with + 0.3, "{masking} {with}");

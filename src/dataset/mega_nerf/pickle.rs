@@ -309,3 +309,23 @@ fn count(value: &Value) -> Option<usize> {
     let Value::Int(n) = value else { return None };
     usize::try_from(*n).ok()
 }
+
+#[cfg(test)]
+mod tests {
+    /// `tests/fuzz` mutates these; here each is refused for its own reason.
+    #[test]
+    fn attacks_are_refused() {
+        for (text, word) in [
+            (&b"cos\nsystem\n."[..], "os system"),
+            (b"cbuiltins\neval\n(X\x01\x00\x00\x001tR.", "builtins eval"),
+            (b"X\xff\xff\xff\xffabc.", "ends in the middle"),
+            (b"Nr\xff\xff\xff\x7f.", "beyond"),
+            (b"h\x05.", "never made"),
+            (b"]q\x00h\x00.", "twice"),
+            (b"I1\n.", "instruction"),
+        ] {
+            let said = super::read(text).err().unwrap_or_default();
+            assert!(said.contains(word), "{said} for {text:?}");
+        }
+    }
+}

@@ -67,38 +67,34 @@ fn draw_orbit(
             DIFFERENCE_FACTOR * (value.clamp(0.0, 1.0) - f32::from(byte) / 255.0).abs()
         });
         if orbit.show == PictureKind::Error {
-            return Ok(heat(&image));
+            heat(&mut image);
         }
     }
     Ok(image)
 }
 
-/// The mean of the values in a square of [`HEAT_RADIUS`] around each pixel, as a colour of [`HEAT`]. The root of the mean
-/// is shown: errors of good pictures are small.
-fn heat(image: &Image) -> Image {
+/// Replaces each pixel by a colour of [`HEAT`], for the root of the mean of the values in a square of [`HEAT_RADIUS`] around it: errors
+/// of good pictures are small.
+fn heat(image: &mut Image) {
     let (width, height) = (image.width as usize, image.height as usize);
-    let mut sums = vec![0.0f64; (width + 1) * (height + 1)];
-    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
-        let of_pixel: f32 = (0..3).map(|plane| image.rgb[(plane * height + y) * width + x].min(1.0)).sum();
-        let at = (y + 1) * (width + 1) + x + 1;
-        sums[at] = f64::from(of_pixel) / 3.0 + sums[at - 1] + sums[at - width - 1] - sums[at - width - 2];
-    }
-    let mut drawn = Image::new(image.width, image.height);
-    for (y, x) in (0..height).flat_map(|y| (0..width).map(move |x| (y, x))) {
-        let span = |at: usize, size: usize| (at.saturating_sub(HEAT_RADIUS), (at + HEAT_RADIUS + 1).min(size));
-        let ((left, right), (top, bottom)) = (span(x, width), span(y, height));
-        let sum = |y: usize, x: usize| sums[y * (width + 1) + x];
-        let inside = sum(bottom, right) - sum(bottom, left) - sum(top, right) + sum(top, left);
-        let mean = inside / ((right - left) * (bottom - top)) as f64;
-        let place = mean.max(0.0).sqrt() * (HEAT.len() - 1) as f64;
-        let below = (place as usize).min(HEAT.len() - 2);
-        let share = (place - below as f64).clamp(0.0, 1.0) as f32;
-        for plane in 0..3 {
-            let [from, to] = [HEAT[below][plane], HEAT[below + 1][plane]];
-            drawn.rgb[(plane * height + y) * width + x] = from + share * (to - from);
+    let span = |at: usize, size: usize| at.saturating_sub(HEAT_RADIUS)..(at + HEAT_RADIUS + 1).min(size);
+    let of_pixel = |at: usize| (0..3).map(|plane| image.rgb[plane * width * height + at].min(1.0)).sum::<f32>() / 3.0;
+    let values: Vec<f32> = (0..width * height).map(of_pixel).collect();
+    for y in 0..height {
+        let rows = span(y, height);
+        let sums: Vec<f32> = (0..width).map(|x| rows.clone().map(|row| values[row * width + x]).sum::<f32>()).collect();
+        for x in 0..width {
+            let columns = span(x, width);
+            let count = (columns.len() * rows.len()) as f32;
+            let place = (sums[columns].iter().sum::<f32>() / count).max(0.0).sqrt() * (HEAT.len() - 1) as f32;
+            let below = (place as usize).min(HEAT.len() - 2);
+            let share = (place - below as f32).clamp(0.0, 1.0);
+            for plane in 0..3 {
+                let [from, to] = [HEAT[below][plane], HEAT[below + 1][plane]];
+                image.rgb[(plane * height + y) * width + x] = from + share * (to - from);
+            }
         }
     }
-    drawn
 }
 
 /// Replaces each value of an image by one that follows from it and from the value of a photo of the same size.
