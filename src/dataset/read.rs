@@ -14,7 +14,13 @@ use std::path::{Path, PathBuf};
 /// file. If a folder matches several, the first of these applies.
 /// Errors: any problem with the files; if nothing matches, the error lists what was searched for.
 pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let facts = std::fs::metadata(path).map_err(|e| InputError::io(path, "opening the scene", &e))?;
+    let facts = std::fs::metadata(path).map_err(|e| match e.kind() {
+        std::io::ErrorKind::NotFound => InputError {
+            kind: Some(e.kind()),
+            ..InputError::new(path, "there is no such scene", "check the name, and the folder that you are in")
+        },
+        _ => InputError::io(path, "opening the scene", &e),
+    })?;
     let root = if facts.is_file() { path.parent().unwrap_or(Path::new("")) } else { path };
     let mut scene = read_kind(path, facts.is_file(), options)?;
     make_readable(path, &mut scene)?;

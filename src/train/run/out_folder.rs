@@ -108,6 +108,12 @@ pub fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError
     }
 }
 
+/// Refuses the folder of the photos as that of the results, also for `--overwrite`.
+pub fn check_apart(out: &Path, scene: &Path) -> InputResult<()> {
+    let is_one = out.canonicalize().is_ok_and(|out| scene.canonicalize().is_ok_and(|scene| out == scene));
+    if is_one { Err(InputError::new(out, "is the scene itself", "name another folder with --out")) } else { Ok(()) }
+}
+
 /// Identity of the run whose config lies in `out`.
 fn run_in(out: &Path) -> RunId {
     read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
