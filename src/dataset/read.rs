@@ -17,7 +17,7 @@ pub fn read_scene(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     let facts = std::fs::metadata(path).map_err(|e| match e.kind() {
         std::io::ErrorKind::NotFound => InputError {
             kind: Some(e.kind()),
-            ..InputError::new(path, "there is no such scene", "check the name, and the folder that you are in")
+            ..InputError::new(path, "there is no such scene", "check the path, and the folder that you are in")
         },
         _ => InputError::io(path, "opening the scene", &e),
     })?;
