@@ -29,14 +29,13 @@ use crate::dataset::read::read_scene;
 use geo::{Similarity, metres_from, robust_similarity};
 use glam::DVec3;
 use pairs::{ChosenBy, choose_pairs, count_of, way_of};
-use photos::{FoundPhoto, camera_groups, list_photos};
+use photos::{FoundPhoto, camera_groups, list_photos, modified_at};
 use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs::{File, Metadata, TryLockError};
 use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
-use std::time::UNIX_EPOCH;
 
 /// The folder in the scene in which the program works.
 pub const WORK_FOLDER: &str = "poses";
@@ -118,10 +117,20 @@ struct SearchState {
     made_by: String,
     program: String,
     options: String,
-    /// Names with bytes, times of the last change, and camera groups.
-    photos: Vec<(String, u64, u64, usize)>,
+    photos: Vec<SearchedPhoto>,
     /// Finished phases.
     done: Vec<String>,
+}
+
+/// What tells a photo from another of its name.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct SearchedPhoto {
+    name: String,
+    bytes: u64,
+    /// As [`FoundPhoto::modified`].
+    modified: u64,
+    /// Number of its camera group.
+    group: usize,
 }
 
 impl PoseSearch {
@@ -274,8 +283,12 @@ impl PoseSearch {
         for (g, group) in self.groups.iter().enumerate() {
             group.iter().for_each(|&i| group_of[i] = g);
         }
-        let of_photo =
-            |(i, photo): (usize, &FoundPhoto)| (photo.name.clone(), photo.bytes, photo.modified, group_of[i]);
+        let of_photo = |(i, photo): (usize, &FoundPhoto)| SearchedPhoto {
+            name: photo.name.clone(),
+            bytes: photo.bytes,
+            modified: photo.modified,
+            group: group_of[i],
+        };
         let new = SearchState {
             made_by: MADE_BY.to_string(),
             program: self.program.name.clone(),
@@ -335,8 +348,8 @@ impl PoseSearch {
                 continue;
             }
             match std::fs::symlink_metadata(&target) {
-                // A copy, or what somebody has made of it.
-                Ok(now) if !is_ours && now.len() == photo.bytes && is_as_young(&now, photo.modified) => continue,
+                // A copy, or what somebody has made of it. An older file is not a copy of the photo as it is now.
+                Ok(now) if !is_ours && now.len() == photo.bytes && modified_at(&now) >= photo.modified => continue,
                 Ok(_) if !is_ours => {
                     let remedy = "move it away, or name a new folder: gsscale-poses PHOTOS --out FOLDER";
                     return Err(InputError::new(target, "another file has the name of a photo", remedy));
@@ -352,7 +365,7 @@ impl PoseSearch {
 
     /// Removes our links in `images` to earlier photos of names that are other photos now.
     fn unlink_changed(&self, old: &SearchState, work: &Path) -> InputResult<()> {
-        for (i, (name, ..)) in old.photos.iter().enumerate() {
+        for (i, SearchedPhoto { name, .. }) in old.photos.iter().enumerate() {
             let (plain, target) = (work.join(PHOTOS).join(plain_name(i, name)), self.scene.join("images").join(name));
             let changed = |photo: &FoundPhoto| photo.name == *name && !are_one_file(&photo.path, &target);
             if self.links_photos && are_one_file(&plain, &target) && self.photos.iter().any(changed) {
@@ -629,12 +642,6 @@ fn make_folder(folder: &Path) -> InputResult<()> {
 fn plain_name(i: usize, name: &str) -> String {
     let ending = Path::new(name).extension().map(|ending| ending.to_string_lossy().to_lowercase());
     format!("{i:06}.{}", ending.unwrap_or_default())
-}
-
-/// Whether a file was changed at that time or later, nanoseconds since 1970: an older one is not a copy of the photo as it is now.
-fn is_as_young(file: &Metadata, modified: u64) -> bool {
-    let at = file.modified().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
-    at.is_none_or(|at| at.as_nanos() as u64 >= modified)
 }
 
 /// Whether two names are of one file, as far as the system tells.

@@ -9,6 +9,7 @@ use crate::dataset::masks::FOLDERS as MASK_FOLDERS;
 use crate::dataset::photo_header::{PhotoHeader, read_header};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs::Metadata;
 use std::path::{Path, PathBuf};
 use std::time::UNIX_EPOCH;
 
@@ -47,8 +48,7 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
         let header = read_header(&path).map_err(|e| format!("{name} is left out: {}", e.problem))?;
         let facts = std::fs::metadata(&path).ok();
         let bytes = facts.as_ref().map_or(0, |facts| facts.len());
-        let modified = facts.and_then(|facts| facts.modified().ok()?.duration_since(UNIX_EPOCH).ok());
-        let modified = modified.map_or(0, |since| since.as_nanos() as u64);
+        let modified = facts.as_ref().map_or(0, modified_at);
         // Without readable EXIF data, a photo is as one of an unknown camera at an unknown place.
         let facts = header.exif.and_then(|exif| camera_and_place(&path, exif).ok());
         let (camera, place) = facts.unwrap_or_default();
@@ -75,6 +75,12 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
         return Err(InputError::new(folder, problem, "name a folder with at least three photos that overlap"));
     }
     Ok((photos, said))
+}
+
+/// When a file was changed, nanoseconds since 1970; 0 where the drive does not say.
+pub(super) fn modified_at(file: &Metadata) -> u64 {
+    let since = file.modified().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
+    since.map_or(0, |since| since.as_nanos() as u64)
 }
 
 /// Adds the names of photos in `folder`; counts pictures that are not used. `scene` is left out.

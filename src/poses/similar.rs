@@ -51,19 +51,23 @@ const COMPARISONS_MOST: usize = 3_000_000;
 /// Photos between two words about progress.
 const PHOTOS_AT_ONCE: usize = 64;
 
-/// Every how many photos one is compared with all others.
+/// About how many pairs of photos are compared if one photo in `stride` is compared with all others.
+fn pairs_at(stride: usize, photos: usize) -> usize {
+    photos * photos / 2 * (2 * stride - 1) / (stride * stride)
+}
+
+/// One photo in so many is compared with all others; the rest with these alone.
 fn stride(photos: usize) -> usize {
-    let of_pairs = |stride: usize| photos * photos / 2 * (2 * stride - 1) / (stride * stride);
-    (1..).find(|&stride| of_pairs(stride) <= COMPARISONS_MOST).unwrap_or(1)
+    (1..).find(|&stride| pairs_at(stride, photos) <= COMPARISONS_MOST).unwrap_or(1)
 }
 
 /// About how many comparisons of two photos [`look_alikes`] makes.
 pub fn comparisons(photos: usize) -> usize {
-    let stride = stride(photos);
-    photos * photos / 2 * (2 * stride - 1) / (stride * stride)
+    pairs_at(stride(photos), photos)
 }
 
-/// For each photo up to `most` others that look alike, best first. `watch` gets how many photos are done.
+/// For each photo up to `most` others that look alike, best first. `watch` gets how much of the work is done, in photos:
+/// half of each photo is its description, half its comparisons.
 /// A photo that cannot be decoded looks like none: the program that computes poses leaves it out as well.
 pub fn look_alikes(photos: &[FoundPhoto], most: usize, watch: &mut dyn FnMut(usize)) -> Vec<Vec<u32>> {
     let pattern = pattern();

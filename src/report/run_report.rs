@@ -38,6 +38,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     if let Some(text) = unfinished_text(folder, &summary) {
         page.paragraph(&text);
     }
+    add_views(&mut page, folder, progress)?;
     page.heading("Training");
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
@@ -63,7 +64,6 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
         (kind.finding)(&file, &summary).into_iter().for_each(|finding| add_finding(&mut page, finding));
     }
     add_page_map(&mut page, &folder.join(PAGES_FILE));
-    add_views(&mut page, folder, progress)?;
     page.heading("Config");
     if let Some(text) = read_text(&folder.join(CONFIG_FILE)) {
         page.folded("config.toml, every key as it was used", &text);

@@ -75,7 +75,8 @@ fn the_dry_run_of_a_resume_says_what_it_would_do() {
         ("plain --steps 50", &["after 20 of 50 steps, from 500 Gaussians of point_cloud.ply"]),
         // What the resume refuses is refused.
         ("kept --steps 50 --seed 7", &["seed", "remedy"]),
-        ("none", &["neither a config.toml", "remedy"]),
+        ("none", &["there is no such folder", "remedy"]),
+        ("scene", &["neither a config.toml", "remedy"]),
     ] {
         let output = work.output(TRAIN, &format!("--resume {flags} --dry-run"));
         let said = told(&output);

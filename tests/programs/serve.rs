@@ -186,6 +186,7 @@ fn a_finished_run_is_shown_beside_its_photos() {
     }
     assert!(work.files("out") == before && work.json_of(EVAL, "out") == held_out, "a viewer changes nothing of a run");
     work.refuses_with(VIEW, "out/point_cloud.spz", &["point_cloud.spz", "does not exist"]);
+    work.refuses_with(VIEW, "scene", &["this folder holds no run", "gsscale-view runs/NAME"]);
     work.write("bare.ply", work.bytes("out/point_cloud.ply"));
     work.refuses_with(VIEW, "bare.ply", &["bare.ply", "name the scene: gsscale-view FILE SCENE"]);
 }

@@ -43,6 +43,12 @@ fn scene_of(program: &str, file: &Path) -> InputResult<(PathBuf, PathBuf)> {
     let whole = std::path::absolute(file).map_err(|e| InputError::io(file, "finding its folder", &e))?;
     let folder = if is_tree(&whole) { folder_of(folder_of(&whole)) } else { folder_of(&whole) };
     let config = folder.join(CONFIG_FILE);
+    if !config.is_file() && file.is_dir() {
+        let remedy = format!(
+            "name the output folder of a run ({program} runs/NAME), or Gaussians and their scene ({program} FILE SCENE)"
+        );
+        return Err(InputError::new(file, "this folder holds no run", remedy));
+    }
     if !config.is_file() {
         let problem = "a file outside of a run's folder does not say its scene";
         return Err(InputError::new(file, problem, format!("name the scene: {program} FILE SCENE")));

@@ -140,6 +140,10 @@ impl Earlier {
         }
         let named = request.keys.spill_dir.as_deref().filter(|folder| !folder.is_empty());
         let folder = named.map_or_else(|| checkpoint_folder(&request.out), PathBuf::from);
+        if named.is_none() && !request.out.exists() {
+            let remedy = "name the output folder of a run, such as runs/village";
+            return Err(InputError::new(&request.out, "there is no such folder", remedy).into());
+        }
         let nothing = || {
             let problem = format!("there is neither a config.toml nor a checkpoint in {}", folder.display());
             let remedy = "name the output folder of a run; if its pages lie in a spill directory, name it too: --spill-dir; a run \
