@@ -106,7 +106,7 @@ fn models_that_cannot_be_are_refused() {
     whole.write(&work.scene());
     work.write("start.ply", "not a ply at all");
     refuses(&work, "--init-ply start.ply", &["start.ply"]);
-    work.refuses("scene --out scene --overwrite", &["is the scene itself", "--out"]);
+    work.refuses("scene --out scene --overwrite --steps 2", &["is the scene itself", "--out"]);
     work.refuses("scne --out elsewhere", &["scne", "there is no such scene"]);
     let [w, h] = whole.size;
     work.write("scene/sparse/0/cameras.txt", format!("1 FOV {w} {h} 80 80 48 32 0.9\n"));

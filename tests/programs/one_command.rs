@@ -20,6 +20,8 @@ fn commands_are_the_programs() {
     says(&stdout(&work.output(GSSCALE, "help plan")), &["Usage: gsscale plan [OPTIONS] <SCENE>"]);
     says(&stdout(&work.output(GSSCALE, "cells cut --help")), &["Usage: gsscale cells cut "]);
     says(&stdout(&work.output(GSSCALE, "doctor --help")), &["Usage: gsscale bench doctor "]);
+    says(&stdout(&work.output(GSSCALE, "help doctor")), &["Usage: gsscale bench doctor "]);
+    says(&stdout(&work.output(GSSCALE, "--help")), &["\n  doctor "]);
     says(&stdout(&work.output(GSSCALE, "--version")), &[&format!("gsscale {}", env!("CARGO_PKG_VERSION"))]);
     let wrong = work.output(GSSCALE, "trian scene");
     assert_eq!(wrong.status.code(), Some(2));
@@ -44,10 +46,13 @@ fn other_names_of_the_program_are_its_commands() {
         let (link, script) = (work.path(&program), scripts.join(&program));
         symlink(GSSCALE, &link).unwrap();
         std::fs::copy(root.join("tools/names/scripts").join(&program), &script).unwrap();
+        // Somebody's link to the script, under a name without a dash.
+        let linked = work.path(name);
+        symlink(&script, &linked).unwrap();
         let help = |program: &str| stdout(&work.output(program, "--help"));
         let expected = stdout(&work.output(GSSCALE, &format!("{name} --help")));
         says(&expected, &["gsscale", "--help"]);
-        assert!([&link, &script].iter().all(|program| help(program.to_str().unwrap()) == expected), "{name}");
+        assert!([&link, &script, &linked].iter().all(|program| help(program.to_str().unwrap()) == expected), "{name}");
     }
 }
 

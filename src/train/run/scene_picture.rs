@@ -193,6 +193,25 @@ mod tests {
     }
 
     #[test]
+    fn heat_is_the_root_of_the_mean_around_a_pixel() {
+        let side = 4 * HEAT_RADIUS + 1;
+        let (pixels, middle) = (side * side, side * side / 2);
+        let mut image = Image::new(side as u32, side as u32);
+        (0..3).for_each(|plane| image.rgb[plane * pixels + middle] = 1.0);
+        heat(&mut image);
+        // One of 81 values is 1: a ninth of four colours lies between the first two.
+        let share = 4.0 / (2 * HEAT_RADIUS + 1) as f32;
+        for (y, x) in (0..side).flat_map(|y| (0..side).map(move |x| (y, x))) {
+            let is_near = [y, x].iter().all(|at| at.abs_diff(2 * HEAT_RADIUS) <= HEAT_RADIUS);
+            for plane in 0..3 {
+                let want = if is_near { share * HEAT[1][plane] } else { 0.0 };
+                // Rounding of a root and two products.
+                assert!((image.rgb[(plane * side + y) * side + x] - want).abs() < 1e-6, "{y} {x}");
+            }
+        }
+    }
+
+    #[test]
     fn an_orbit_at_rest_is_the_view_and_the_pivot_stays_before_every_other() {
         let still = Orbit { width: 120, ..Orbit::default() };
         let at_rest = orbit_camera(&base(), 4.0, None, still);
