@@ -100,10 +100,13 @@ pub(super) fn image_folders(
         Some(_) => folders.iter().find(same).cloned(),
         None => folders.iter().find(same).cloned().or_else(|| photo_folder(scene)),
     };
-    let flat = || (options.images.is_none() && photos_in(scene) > 0).then(|| scene.to_path_buf());
-    if let Some(found) = other.or_else(flat) {
+    if let Some(found) = other {
         warnings.push(format!("{} does not exist: the photos are read from {}", stated.display(), found.display()));
         return Ok(vec![found]);
+    }
+    // As `gsscale-poses` leaves a flat folder of photos.
+    if options.images.is_none() && photos_in(scene) > 0 {
+        return Ok(vec![scene.to_path_buf()]);
     }
     let found = folders.iter().map(|path| name(path)).collect::<Vec<_>>().join(", ");
     let problem = match folders.is_empty() {
