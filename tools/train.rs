@@ -169,7 +169,17 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
         (file, _) => new_run::of_new_run(file.as_deref(), &args.keys)?,
     };
     config.check()?;
-    let out = args.out.unwrap_or_else(|| default_out(args.scene.as_deref()));
+    let out = args.out.unwrap_or_else(|| {
+        let (out, first) = default_out(args.scene.as_deref());
+        if out != first && !args.quiet {
+            let first = first.display();
+            gsscale::tell!(
+                "{first} is taken: results go to {}; to resume the run there: gsscale-train --resume {first}",
+                out.display()
+            );
+        }
+        out
+    });
     if args.demo {
         check_demo_out(&out, args.overwrite)?;
     }

@@ -49,6 +49,8 @@ fn a_run_needs_no_folder_and_says_where_everything_is() {
     assert!(stderr(&again).is_empty() && work.exists("scene/runs/scene/point_cloud.ply"), "{}", stderr(&again));
     work.train(&format!("{} {quiet}", text(&work.scene())));
     assert!(work.exists("runs/scene-2/point_cloud.ply"));
+    let said = stderr(&work.output(TRAIN, "scene --dry-run"));
+    assert!(said.contains("runs/scene is taken: results go to runs/scene-3; "), "{said}");
 }
 
 /// In a quiet environment, as of a container.

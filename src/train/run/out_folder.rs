@@ -75,12 +75,12 @@ pub fn is_trace(name: &OsStr) -> bool {
 }
 
 /// The output folder where none is named: `runs/NAME` in the working folder, NAME that of the scene's folder, or `demo`
-/// without a scene; with `-2`, `-3` and so on where that is taken.
-pub fn default_out(scene: Option<&Path>) -> PathBuf {
+/// without a scene; with `-2`, `-3` and so on where that is taken. And the one without a number.
+pub fn default_out(scene: Option<&Path>) -> (PathBuf, PathBuf) {
     let name = scene.map_or_else(|| "demo".to_string(), scene_name);
     let numbered = |n: u32| Path::new("runs").join(if n == 1 { name.clone() } else { format!("{name}-{n}") });
     let is_free = |out: &PathBuf| !out.exists() || is_empty(out);
-    (1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1))
+    ((1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1)), numbered(1))
 }
 
 /// The name of a scene: that of its folder.
