@@ -75,9 +75,17 @@ fn main() -> ExitCode {
     run_with(arguments)
 }
 
-/// What `gsscale` does itself. Errors: a man page cannot be written.
+/// What `gsscale` does itself. Errors: a man page cannot be written, or a scene or a flag stands where a command belongs.
 fn own_command(arguments: &[OsString]) -> InputResult<()> {
     let commands = all_commands();
+    let is_own = |given: &&OsString| {
+        *given == "help" || *given == "--help" || *given == "--version" || commands.find_subcommand(given).is_some()
+    };
+    let is_for_train = |given: &&OsString| Path::new(given).exists() || given.to_string_lossy().starts_with("--");
+    if let Some(given) = arguments.get(1).filter(|given| !is_own(given) && is_for_train(given)) {
+        let remedy = format!("to train: gsscale train {}", given.display());
+        return Err(InputError::new(given, "stands where a command belongs", remedy));
+    }
     match commands.clone().get_matches_from(arguments).subcommand() {
         Some(("completions", given)) => {
             let mut script = Vec::new();

@@ -23,6 +23,8 @@ fn commands_are_the_programs() {
     says(&stdout(&work.output(GSSCALE, "help doctor")), &["Usage: gsscale bench doctor "]);
     says(&stdout(&work.output(GSSCALE, "--help")), &["\n  doctor "]);
     says(&stdout(&work.output(GSSCALE, "--version")), &[&format!("gsscale {}", env!("CARGO_PKG_VERSION"))]);
+    work.refuses_with(GSSCALE, "scene --steps 7", &["to train: gsscale train scene"]);
+    work.refuses_with(GSSCALE, "--demo", &["to train: gsscale train --demo"]);
     let wrong = work.output(GSSCALE, "trian scene");
     assert_eq!(wrong.status.code(), Some(2));
     says(&stderr(&wrong), &["'trian'", "'train'"]);
@@ -68,6 +70,8 @@ fn hidden_and_shown() -> (String, String) {
 #[test]
 fn completions_offer_what_help_shows() {
     let work = Workdir::new();
+    // A folder of the name of a command changes nothing.
+    std::fs::create_dir(work.path("completions")).unwrap();
     let (hidden, shown) = hidden_and_shown();
     for shell in ["bash", "zsh", "fish", "powershell"] {
         let script = stdout(&work.output(GSSCALE, &format!("completions {shell}")));
