@@ -84,7 +84,7 @@ fn own_command(arguments: &[OsString]) -> InputResult<()> {
     let is_for_train = |given: &&OsString| Path::new(given).exists() || given.to_string_lossy().starts_with("--");
     if let Some(given) = arguments.get(1).filter(|given| !is_own(given) && is_for_train(given)) {
         let remedy = format!("to train: gsscale train {}", given.display());
-        return Err(InputError::new(given, "stands where a command belongs", remedy));
+        return Err(InputError::new(given, "is not a command of gsscale", remedy));
     }
     match commands.clone().get_matches_from(arguments).subcommand() {
         Some(("completions", given)) => {

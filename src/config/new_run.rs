@@ -203,7 +203,7 @@ pub fn adapt_schedule(config: &mut TrainConfig, photos: usize) -> Option<u32> {
 pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
     let is_on_host = config.optimizer_on != Chosen(Some(OptimizerPlace::Device));
     let grows_by_score = config.strategy == StrategyName::LongAxis && is_on_host;
-    // A count that the run decides itself makes up for poor points better than these keys do.
+    // Without a cap, a run grows to the count that its photos need, and these keys cost decibels.
     let is_capped = config.max_gaussians > 0;
     if config.poor_points.0.is_none() && asked.poor_points && grows_by_score && is_capped {
         // As if no key was given.

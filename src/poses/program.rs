@@ -304,8 +304,8 @@ fn option_of(help: &str, name: &str) -> Option<String> {
     words.into_iter().find(|word| word.ends_with(&format!(".{name}"))).map(String::from)
 }
 
-/// Lets the system end the program when the thread that starts it has ended, also by SIGKILL. Elsewhere than on Linux the program works
-/// on, and its lock keeps others out of the folder.
+/// Asks the system to send the program SIGTERM when the thread that started it ends, also after a SIGKILL. On other systems than Linux
+/// the program works on, and its lock keeps others out of the folder.
 #[cfg(target_os = "linux")]
 #[allow(unsafe_code)]
 fn end_with_this_process(command: &mut Command) {

@@ -138,7 +138,7 @@ fn fly_pass(options: &CityOptions, pass: u32, views: u32, side: f64, tilt: f64, 
     }
     let strips = ((f64::from(views) * ratio).sqrt() + 0.5).clamp(1.0, f64::from(views)) as u32;
     let back = ALTITUDE * libm::tan(tilt);
-    // Cameras that look higher stand where the others do, and see what lies behind their aims.
+    // The user's tilt turns cameras up or down at their places: they look past the places that they aimed at.
     let tilt = options.tilt.map_or(tilt, f64::to_radians);
     for strip in 0..strips {
         let (from, to) = (views * strip / strips, views * (strip + 1) / strips);
