@@ -197,6 +197,7 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     if has_pycolmap() {
         let program = format!("--python {}", python());
         std::fs::create_dir(work.path("scene/poses")).unwrap();
+        work.write("scene/poses/notes.txt", "mine");
         refused(&format!("scene {program}"), &["scene/poses", "not a work folder of gsscale-poses"]);
         std::fs::create_dir_all(work.path("new/images")).unwrap();
         refused(&format!("scene --out new {program}"), &["new/images", "exists already"]);
