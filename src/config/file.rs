@@ -215,9 +215,11 @@ config_keys! {
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers hidden;
-        /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo) or full (also eight
+        /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo), if-needed (exposure, which
+        /// the run drops after four passes over the photos if they differ by less than .2 stops) or full (also eight
         /// numbers for its colours, and the vignetting of each camera). auto is exposure where the exposures of photos differ by
-        /// .2 stops or more, measured at the first points, full where their colours do, else off. Exposures
+        /// .2 stops or more, measured at the first points, full where their colours do, if-needed where the points say nothing,
+        /// else off. Exposures
         /// start from the EXIF data of the photos if more than half of them state time, f-number and ISO. On the CPU, exposure
         /// costs about a tenth of a step and full two fifths; on a GPU the picture and its gradient also cross the bus twice.
         /// gsscale-eval fits these values to the left halves of held-out photos
@@ -225,7 +227,7 @@ config_keys! {
         /// With --appearance, start from the values of another run's photos, and hold their mean: its appearance.json. Empty = none
         first_appearance: String = String::new() => Derived hidden;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
-        /// auto is on where the first points contradict a photo before training. The log and the report name such views with and
+        /// auto is on where the first points contradict a photo before training, or say nothing. The log and the report name such views with and
         /// without this key
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_views: Chosen<bool> = Chosen(None) => Numbers;
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The

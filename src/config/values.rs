@@ -360,7 +360,7 @@ open_choices! {
     "spill-codec": Codec, "auto" in CODECS, parsed, |codec: Codec| codec.to_string();
     "simd": SimdPath, "auto" in ["auto", "avx512", "avx2", "baseline"], SimdPath::from_name, |path: SimdPath| path.name().to_string();
     "optimizer-on": OptimizerPlace, "auto" in ["auto", "device", "host"], OptimizerPlace::from_name, |place: OptimizerPlace| place.name().to_string();
-    "appearance": AppearanceMode, "auto" in ["auto", "off", "exposure", "full"], AppearanceMode::from_name, |mode: AppearanceMode| mode.name().to_string();
+    "appearance": AppearanceMode, "auto" in ["auto", "off", "exposure", "if-needed", "full"], AppearanceMode::from_name, |mode: AppearanceMode| mode.name().to_string();
     "color-correct": ColorCorrect, "off" in ["off", "affine", "quadratic"], ColorCorrect::from_name, |fit: ColorCorrect| fit.name().to_string();
 }
 

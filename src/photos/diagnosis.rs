@@ -8,7 +8,8 @@
 //! - *agreement*: the correlation of brightness over the points. A photo of another place has next to none;
 //! - *shift*: where the agreement is best, when all pixels move together by some pixels. Poses that are off have shifts.
 //!
-//! From these follow the remedies that a run switches on by itself ([`Diagnosis::remedies`]).
+//! From these follow the remedies that a run switches on by itself ([`Diagnosis::remedies`]). Where the points say nothing, the run
+//! finds out in training whether exposures differ and photos contradict the scene ([`Remedies::of_unknown`]).
 //!
 //! Not here: what training finds ([`super::outlier`]).
 //!
@@ -106,13 +107,13 @@ pub struct Diagnosis {
 /// Photos that a line names.
 const NAMED: usize = 3;
 /// Fewest photos for a remedy.
-const PHOTOS_FOR_REMEDIES: usize = 8;
+pub(super) const PHOTOS_FOR_REMEDIES: usize = 8;
 /// Below this agreement, points and photos have nothing to do with each other. Measured: 0 to .04 with random points; .6 to .84 on clean
 /// scenes, and .7 with the faults of `gsscale-bench sweep stability`.
 const AGREEMENT_LEAST: f64 = 0.25;
 /// Stops of [`Diagnosis::exposure_spread`] and [`Diagnosis::color_spread`] from which on appearance is trained. Measured: .01 to .13 and 0 to
 /// .06 on clean scenes; .37 with exposures within half a stop, .44 with white balance within .3 stops.
-const EXPOSURE_SPREAD: f64 = 0.2;
+pub(super) const EXPOSURE_SPREAD: f64 = 0.2;
 const COLOR_SPREAD: f64 = 0.2;
 /// A photo shows something else if its agreement is less than this share of the median, and this multiple of the usual share of points,
 /// and at least this share, is off. Uniform photos have a low agreement, but hardly a point that is off.
@@ -135,6 +136,13 @@ pub struct Remedies {
     pub robust_views: bool,
     pub refine_poses: bool,
     pub poor_points: bool,
+}
+
+impl Remedies {
+    /// Where nothing is known before training: what finds out for itself, and costs right photos next to nothing.
+    pub fn of_unknown() -> Remedies {
+        Remedies { appearance: AppearanceMode::IfNeeded, robust_views: true, ..Remedies::default() }
+    }
 }
 
 #[derive(Serialize)]
@@ -210,10 +218,10 @@ impl Diagnosis {
     /// What a run without flags switches on.
     pub fn remedies(&self) -> Remedies {
         if self.photos.len() < PHOTOS_FOR_REMEDIES {
-            return Remedies::default();
+            return Remedies::of_unknown();
         }
         if !self.points_fit() {
-            return Remedies { poor_points: self.photos_per_point >= PHOTOS_PER_POINT, ..Remedies::default() };
+            return Remedies { poor_points: self.photos_per_point >= PHOTOS_PER_POINT, ..Remedies::of_unknown() };
         }
         let appearance = match (self.color_spread >= COLOR_SPREAD, self.exposure_spread >= EXPOSURE_SPREAD) {
             (true, _) => AppearanceMode::Full,
@@ -232,7 +240,9 @@ impl Diagnosis {
     pub fn text(&self) -> Vec<String> {
         let examined = self.photos.len();
         if examined < PHOTOS_FOR_REMEDIES {
-            return vec![format!("only {examined} show enough first points to be examined: no remedy is chosen")];
+            return vec![format!(
+                "only {examined} show enough first points to be examined: no remedy is chosen by them"
+            )];
         }
         let digits = usize::from(self.photos_per_point < 10.0);
         let points = format!(
@@ -405,7 +415,7 @@ fn median(mut values: Vec<f64>) -> f64 {
 }
 
 /// Robust standard deviation; 0 of nothing.
-fn spread(mut values: Vec<f64>) -> f64 {
+pub(super) fn spread(mut values: Vec<f64>) -> f64 {
     median_and_deviation(&mut values).map_or(0.0, |(_, deviation)| deviation / MAD_OF_NORMAL)
 }
 
@@ -448,11 +458,12 @@ mod tests {
         let none = Remedies::default();
         let exposure = |photos, agreement| Diagnosis { exposure_spread: 0.7, ..of(photos, agreement) }.remedies();
         assert_eq!(exposure(100, 0.7), Remedies { appearance: AppearanceMode::Exposure, ..none });
-        assert_eq!((exposure(7, 0.7), of(100, 0.7).remedies()), (none, none));
+        let unknown = Remedies::of_unknown();
+        assert_eq!((exposure(7, 0.7), of(100, 0.7).remedies()), (unknown, none));
         // Points that do not fit say nothing about exposures, and are poor where photos overlap much.
-        assert_eq!(exposure(100, 0.1), Remedies { poor_points: true, ..none });
+        assert_eq!(exposure(100, 0.1), Remedies { poor_points: true, ..unknown });
         let sparse = Diagnosis { photos_per_point: 7.0, ..of(100, 0.1) };
-        assert_eq!(sparse.remedies(), none);
+        assert_eq!(sparse.remedies(), unknown);
         assert!(sparse.text()[0].contains("have not the colours"));
         // Shifts count in units of each photo, and where they explain something.
         let shifted = |shift_units, by| Diagnosis { shift_units, agreement_by_shift: by, ..of(100, 0.7) }.remedies();

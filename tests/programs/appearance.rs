@@ -2,6 +2,7 @@
 
 use crate::support::a_device;
 use crate::support::exif::{Settings, add_exif};
+use crate::support::scenes::TextModel;
 use crate::support::workdir::Workdir;
 
 /// Stops by which a training photo is changed: 1.2 up or down, and back.
@@ -55,6 +56,34 @@ fn errors(work: &Workdir, out: &str, changed: &[(String, f64)]) -> Vec<f64> {
 
 fn mean(values: &[f64]) -> f64 {
     values.iter().sum::<f64>() / values.len() as f64
+}
+
+/// Nothing is known of photos before training where the scene has no points.
+#[test]
+fn without_points_the_run_finds_out_whether_exposures_differ() {
+    let (work, changed) = flickering_city();
+    let without_points = |work: &Workdir| {
+        let mut model = TextModel::of(&work.scene());
+        (model.points, model.colors) = (Vec::new(), Vec::new());
+        model.write(&work.scene());
+    };
+    without_points(&work);
+    // Four passes of 21 photos.
+    let flags = "--steps 90 --init-points 1500";
+    let told = said(&work, "flickering", flags);
+    assert!(
+        told.contains("no points to examine them by") && told.contains("has --appearance if-needed --robust-views;"),
+        "{told}"
+    );
+    assert!(told.contains("stops between photos: they stay corrected"), "{told}");
+    let errors = errors(&work, "flickering", &changed);
+    // A pass over random points finds less than one over the points of the scene.
+    assert!(mean(&errors) < 0.3, "{errors:?}");
+    let clean = Workdir::city(24, 112, 80, 1500);
+    without_points(&clean);
+    let told = said(&clean, "clean", flags);
+    assert!(told.contains("stops between photos: they are no longer corrected"), "{told}");
+    assert!(!clean.exists("clean/appearance.json") && clean.summary("clean")["test"]["predicted_psnr"].is_null());
 }
 
 #[test]

@@ -47,8 +47,8 @@ fn each_fault_of_a_capture_switches_its_remedy_on_and_a_clean_one_none() {
         ("poses", Disturbance::PoseNoise { share: 0.005 }, &["--refine-poses"]),
         ("jpeg", Disturbance::Jpeg { quality: 20 }, &[]),
         ("few", Disturbance::FewPhotos { one_in: 3 }, &[]),
-        // Photos of this scene do not overlap enough for a remedy.
-        ("random", Disturbance::RandomPoints, &[]),
+        // Nothing is known of the photos, and they do not overlap enough for a remedy of points.
+        ("random", Disturbance::RandomPoints, &["--appearance", "if-needed", "--robust-views"]),
     ] {
         let (flags, said, wrong) = switched_on(&work, name, &disturbance, "");
         assert_eq!(flags, want, "{name}: {said}");

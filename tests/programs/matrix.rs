@@ -64,11 +64,15 @@ features! {
         without ["--view-order groups:4"],
         shows |_| ();
 
-    // Almost every view sees almost every page, and the views outgrow any budget.
+    // Almost every view sees almost every page, and the views outgrow any budget. Exposures are dropped after four passes, 56 steps.
     compact: || Workdir::city_of(16, [64, 48], 3000, 2),
-        "--grow-grad2d 0.0005 --refine-start 10 --refine-every 10 --reset-every 45 --sh-every 30 --prune-opa 0.05 --steps 60",
-        without [],
-        shows |work| assert!(2 * work.count("alone", "pages_pinned_max") > work.count("alone", "pages"));
+        "--grow-grad2d 0.0005 --refine-start 10 --refine-every 10 --reset-every 45 --sh-every 30 --prune-opa 0.05 --steps 70 \
+         --appearance if-needed",
+        without ["--appearance off", "--appearance exposure"],
+        shows |work| {
+            assert!(2 * work.count("alone", "pages_pinned_max") > work.count("alone", "pages"));
+            assert!(!work.exists("alone/appearance.json"));
+        };
 
     // Rounds follow each other closely, so that most growing pages are unseen between two of them. Nothing is pruned, which would make
     // room again. A histogram bin that does not fit as a whole is left out.

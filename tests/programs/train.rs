@@ -47,7 +47,7 @@ fn every_global_change_is_an_event_in_order() {
         strategy: StrategyName::Default,
         ..TrainConfig::default()
     };
-    let Prepared { dataset, columns, sh_degree_start } = prepare(&scene.scene(), &config).unwrap();
+    let Prepared { dataset, columns, sh_degree_start, .. } = prepare(&scene.scene(), &config).unwrap();
     let options = RunOptions { sh_degree_start, ..RunOptions::new(&config, dataset.scene_scale) };
     let targets = TargetCache::new(&dataset.views, 1 << 24, 1).unwrap();
     let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options).unwrap();

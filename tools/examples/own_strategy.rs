@@ -46,7 +46,7 @@ fn main() -> Result<(), TrainError> {
 /// Rounds, and the PSNR of the held-out photos, dB.
 pub fn train(scene: &Path) -> Result<(usize, f64), TrainError> {
     let config = TrainConfig { steps: 200, max_resolution: 400, ..TrainConfig::default() };
-    let Prepared { dataset, columns, sh_degree_start } = prepare(scene, &config)?;
+    let Prepared { dataset, columns, sh_degree_start, .. } = prepare(scene, &config)?;
     let strategy = Arc::new(RemoveFaint(RoundSteps { start: 50, stop: 200, every: 20 }));
     let options = RunOptions { sh_degree_start, strategy, ..RunOptions::new(&config, dataset.scene_scale) };
     let photos = TargetCache::new(&dataset.views, 1 << 30, 2)?;

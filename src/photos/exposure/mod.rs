@@ -21,6 +21,7 @@ pub mod predict;
 pub mod state;
 
 use super::PhotoOptions;
+use super::diagnosis::{EXPOSURE_SPREAD, PHOTOS_FOR_REMEDIES, spread};
 use super::parameter::{
     Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
 };
@@ -46,11 +47,13 @@ use std::sync::Arc;
 
 /// Which corrections are trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "kebab-case")]
 pub enum AppearanceMode {
     #[default]
     Off,
     Exposure,
+    /// As `Exposure`. After four passes over the photos the run drops the exposures if they hardly differ, and is one without appearance from then on.
+    IfNeeded,
     /// Exposure and colour homography per photo, vignetting per camera.
     Full,
 }
@@ -62,7 +65,7 @@ impl AppearanceMode {
     }
 
     pub fn from_name(name: &str) -> Option<AppearanceMode> {
-        [AppearanceMode::Off, AppearanceMode::Exposure, AppearanceMode::Full]
+        [AppearanceMode::Off, AppearanceMode::Exposure, AppearanceMode::IfNeeded, AppearanceMode::Full]
             .into_iter()
             .find(|mode| mode.name() == name)
     }
@@ -72,6 +75,7 @@ impl AppearanceMode {
         match self {
             AppearanceMode::Off => "off",
             AppearanceMode::Exposure => "exposure",
+            AppearanceMode::IfNeeded => "if-needed",
             AppearanceMode::Full => "full",
         }
     }
@@ -80,7 +84,7 @@ impl AppearanceMode {
     pub fn image_values(self) -> usize {
         match self {
             AppearanceMode::Off => 0,
-            AppearanceMode::Exposure => 1,
+            AppearanceMode::Exposure | AppearanceMode::IfNeeded => 1,
             AppearanceMode::Full => IMAGE_VALUES,
         }
     }
@@ -95,9 +99,13 @@ pub(super) const KIND: Kind = Kind { name: "appearance", file: Some(FILE), first
 
 /// Photos that a warning names.
 const NAMED: usize = 3;
+/// Passes over the training photos after which exposures that are corrected [`AppearanceMode::IfNeeded`] are judged.
+const PASSES: usize = 4;
 
 struct Appearance {
     mode: AppearanceMode,
+    /// The step after which exposures are judged, if they are.
+    judged_after: Option<u32>,
     /// For each view, the number of its group of equal cameras.
     camera_groups: Vec<usize>,
     state: AppearanceState,
@@ -114,9 +122,12 @@ struct Appearance {
 
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
     let camera_groups = camera_groups(dataset.views.iter().map(|view| &view.camera));
+    let passes = PASSES * dataset.train_views().len();
+    let is_judged = options.appearance == AppearanceMode::IfNeeded;
     options.appearance.is_on().then(|| -> Box<dyn PhotoParameter> {
         Box::new(Appearance {
             mode: options.appearance,
+            judged_after: is_judged.then_some(u32::try_from(passes).unwrap_or(u32::MAX)),
             state: AppearanceState::new(&camera_groups),
             camera_groups,
             first_exposures: 0,
@@ -160,7 +171,7 @@ impl PhotoParameter for Appearance {
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
         let (state, first_exposures) = decoded(saved)?;
-        if state.has_same_counts(&self.state) {
+        if state.has_same_counts(&self.state) || (self.judged_after.is_some() && state.images.is_empty()) {
             (self.state, self.first_exposures) = (state, first_exposures);
         }
         Ok(())
@@ -206,10 +217,13 @@ impl PhotoParameter for Appearance {
     }
 
     fn corrects(&self) -> bool {
-        true
+        !self.is_dropped()
     }
 
     fn predict(&self, dataset: &Dataset, views: &[usize]) -> Option<Vec<Correction>> {
+        if self.is_dropped() {
+            return None;
+        }
         let camera = |view: usize| &dataset.views[view].camera;
         let is_known = |view: &usize| self.state.images.get(*view).is_some_and(|image| image.sightings > 0);
         let of_known = |view: usize| (camera(view), self.state.acting(view, self.mode.image_values()));
@@ -237,6 +251,9 @@ impl PhotoParameter for Appearance {
     }
 
     fn picture_back(&mut self, photo: &Target, gradient: &mut PictureGradient) {
+        if self.is_dropped() {
+            return;
+        }
         self.look.back(&self.drawn, photo, &mut gradient.v_rgb);
     }
 
@@ -249,7 +266,8 @@ impl PhotoParameter for Appearance {
                 false => self.state.learn(self.mode, (outcome.view, group), &found),
             }
         }
-        Vec::new()
+        let is_due = self.judged_after == Some(outcome.step.saturating_add(1)) && !self.is_dropped();
+        is_due.then(|| self.judge(outcome.dataset)).into_iter().collect()
     }
 
     fn buffer_bytes(&self) -> u64 {
@@ -261,6 +279,14 @@ impl PhotoParameter for Appearance {
     }
 
     fn write_file(&self, folder: &Path, dataset: &Dataset) -> InputResult<()> {
+        let path = folder.join(FILE);
+        if self.is_dropped() {
+            // An earlier part of the run may have ended before the exposures were judged.
+            return match std::fs::remove_file(&path) {
+                Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(InputError::io(&path, "removing", &e)),
+                _ => Ok(()),
+            };
+        }
         let of_image = |view: usize| {
             let [exposure, h @ ..] = self.state.acting(view, self.mode.image_values());
             ImageValues {
@@ -281,7 +307,28 @@ impl PhotoParameter for Appearance {
             images: views_by_name(dataset).into_iter().map(of_image).collect(),
             cameras: trained.map(|(group, camera)| (group, camera.falloff)).filter_map(of_camera).collect(),
         };
-        write_values(&folder.join(FILE), &file)
+        write_values(&path, &file)
+    }
+}
+
+impl Appearance {
+    /// Whether the exposures have been judged and hardly differ. A commit holds the values of no photo then.
+    fn is_dropped(&self) -> bool {
+        self.state.images.is_empty()
+    }
+
+    /// Drops the exposures if they differ by less than what [`diagnosis`] takes for a difference. Returns what the user is told.
+    fn judge(&mut self, dataset: &Dataset) -> String {
+        let views = dataset.train_views();
+        let seen = views.into_iter().filter(|&view| self.state.images[view].sightings > 1);
+        let exposures: Vec<f64> = seen.map(|view| self.state.acting(view, 1)[0]).collect();
+        let is_enough = exposures.len() >= PHOTOS_FOR_REMEDIES;
+        let spread = spread(exposures);
+        if is_enough && spread >= EXPOSURE_SPREAD {
+            return format!("exposures differ by {spread:.2} stops between photos: they stay corrected");
+        }
+        (self.state, self.drawn) = (AppearanceState::default(), Vec::new());
+        format!("exposures differ by {spread:.2} stops between photos: they are no longer corrected")
     }
 }
 
@@ -306,7 +353,7 @@ pub fn read_values(file: &Path) -> InputResult<GivenValues> {
 
 #[derive(Debug, Serialize, Deserialize)]
 struct AppearanceFile {
-    /// `exposure` or `full`.
+    /// `exposure`, `if-needed` or `full`.
     model: Cow<'static, str>,
     /// Training photos whose exposure started from EXIF data.
     exposures_from_exif: u32,

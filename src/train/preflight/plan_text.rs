@@ -52,8 +52,9 @@ fn growth(forecast: &Forecast) -> String {
 }
 
 /// What the photos say, and what the run switches on because of it: where the config left it open `before`.
-pub fn describe_photos(diagnosis: &Diagnosis, before: &TrainConfig, now: &TrainConfig) -> String {
-    let mut text = format!("photos  {}", diagnosis.text().join("\n        "));
+pub fn describe_photos(diagnosis: Option<&Diagnosis>, before: &TrainConfig, now: &TrainConfig) -> String {
+    let said = diagnosis.map(|diagnosis| diagnosis.text().join("\n        "));
+    let mut text = format!("photos  {}", said.as_deref().unwrap_or("the scene has no points to examine them by"));
     let appearance = format!("--appearance {}", now.appearance.word());
     let switched_on = [
         (before.appearance.0.is_none() && now.appearance != Chosen(Some(AppearanceMode::Off)), appearance.as_str()),

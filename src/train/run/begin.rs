@@ -90,7 +90,11 @@ fn adapt_to_photos(
 ) -> Result<(RunRequest, Start, Option<Diagnosis>), TrainError> {
     let diagnosis = start.diagnose()?;
     let before = request.config.clone();
-    let asked = diagnosis.as_ref().map_or_else(Remedies::default, Diagnosis::remedies);
+    let asked = match &diagnosis {
+        Some(diagnosis) => diagnosis.remedies(),
+        None if start.is_of_random_points() => Remedies::of_unknown(),
+        None => Remedies::default(),
+    };
     new_run::adapt_to_photos(&mut request.config, &asked);
     let start = match request.config.init_scale == before.init_scale {
         true => start,
@@ -100,8 +104,9 @@ fn adapt_to_photos(
             Start::read(&request.scene, &request.config, host_mem)?
         }
     };
-    if let Some(diagnosis) = diagnosis.as_ref().filter(|_| !request.quiet) {
-        tell_plan(&request, &plan_text::describe_photos(diagnosis, &before, &request.config));
+    let is_told = diagnosis.is_some() || asked != Remedies::default();
+    if is_told && !request.quiet {
+        tell_plan(&request, &plan_text::describe_photos(diagnosis.as_ref(), &before, &request.config));
     }
     Ok((request, start, diagnosis))
 }

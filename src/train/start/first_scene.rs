@@ -114,8 +114,16 @@ pub struct Start {
 }
 
 enum FirstRows {
-    Columns(Columns),
-    Points { cloud: Cloud, extent: Extent, init: InitOptions },
+    /// `is_random`: at random places, since the scene has neither points nor Gaussians.
+    Columns {
+        columns: Columns,
+        is_random: bool,
+    },
+    Points {
+        cloud: Cloud,
+        extent: Extent,
+        init: InitOptions,
+    },
     Gaussians(GaussianFile),
     Store(Box<StoredStart>),
 }
@@ -158,7 +166,7 @@ impl Start {
 
     fn in_memory(scene: &Path, options: &FirstOptions, host_mem: Option<u64>) -> InputResult<Start> {
         check_gaussians_fit(options, host_mem)?;
-        let Prepared { dataset, columns, sh_degree_start } = prepare_with(scene, options)?;
+        let Prepared { dataset, columns, sh_degree_start, is_random } = prepare_with(scene, options)?;
         let points = match dataset.points.as_slice() {
             [] => {
                 let mut print = GaussiansPrint::default();
@@ -167,7 +175,8 @@ impl Start {
             }
             points => points_print(&(points, dataset.colors.as_slice()))?.0,
         };
-        Ok(Start { dataset, sh_degree_start, rows: columns.rows() as u64, points, from: FirstRows::Columns(columns) })
+        let rows = columns.rows() as u64;
+        Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Columns { columns, is_random } })
     }
 
     /// From the Gaussians of a store.
@@ -269,6 +278,11 @@ impl Start {
         Ok((points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)))
     }
 
+    /// Whether the scene has neither Gaussians nor points.
+    pub(crate) fn is_of_random_points(&self) -> bool {
+        matches!(self.from, FirstRows::Columns { is_random: true, .. })
+    }
+
     /// The dataset alone, for a run that has its Gaussians already. Drops their source: columns, a spool, or a store
     /// with its lock.
     pub(crate) fn into_dataset(self) -> Dataset {
@@ -330,7 +344,7 @@ impl Start {
             take(id, state).map_err(|error| not_stored(failed.insert(error)))
         };
         let done = match &mut self.from {
-            FirstRows::Columns(columns) => first_pages(columns, fill, sh_degree, &mut take_state),
+            FirstRows::Columns { columns, .. } => first_pages(columns, fill, sh_degree, &mut take_state),
             FirstRows::Points { cloud, extent, init } => {
                 let import = ImportOptions { init, fill, budget };
                 let source = LocalCloud { cloud, extent: *extent, frame };
@@ -372,6 +386,8 @@ pub struct Prepared {
     pub columns: Columns,
     /// SH degree of the first step: that of the given Gaussians or of the config, whichever is higher.
     pub sh_degree_start: u8,
+    /// Whether the Gaussians are at random places, since the scene has neither points nor Gaussians.
+    pub is_random: bool,
 }
 
 /// Reads the scene and creates the first Gaussians.
@@ -406,6 +422,7 @@ fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
     let mut dataset = load_dataset(raw, &options.load)?;
     check_train_views(scene, &dataset)?;
     let mut from = scene.to_path_buf();
+    let is_random = gaussians.is_none() && dataset.points.is_empty();
     let (columns, sh_degree_start) = match gaussians {
         Some((mut columns, meta, ply)) => {
             from.clone_from(&ply);
@@ -419,7 +436,7 @@ fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
         None => (first_gaussians(scene, &mut dataset, options)?, options.init.sh_degree),
     };
     options.check_rows(&from, columns.rows() as u64)?;
-    Ok(Prepared { dataset, columns, sh_degree_start })
+    Ok(Prepared { dataset, columns, sh_degree_start, is_random })
 }
 
 /// Refuses a dataset without training views.
