@@ -2,6 +2,7 @@
 
 use crate::support::scenes::told;
 use crate::support::workdir::{TRAIN, Workdir};
+use gsscale::base::units::format_grouped;
 use serde_json::Value;
 
 const DECIDES: &str = "scene --out out --overwrite --strategy long-axis --device cpu --steps 60 --log-every 5 --refine-start 10 \
@@ -25,7 +26,7 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     for check in checks {
         let line = format!("step {}: Gaussians ", check["step"]);
         let line = said.lines().find(|l| l.starts_with(&line)).unwrap_or_else(|| panic!("no {line} in {said}"));
-        assert!(line.len() <= 100 && line.contains(&check["allowed"].to_string()), "{line}");
+        assert!(line.len() <= 100 && line.contains(&format_grouped(of(check, "allowed"))), "{line}");
         assert_eq!(line.contains("up to"), check["decision"] == "doubles", "{line}");
     }
     // The check that changes the count says what the run takes from then on.

@@ -77,6 +77,10 @@ const PHOTOS_PER_PAGE_LEAST: f64 = 37.0;
 /// Brighton's 10 are .67 of its photos.
 const SHARE_OF_PHOTOS: f64 = 0.8;
 
+/// Seconds from which a plan names shorter runs, and their steps.
+const LONG_SECONDS: f64 = 1200.0;
+const SHORTER_STEPS: [u32; 2] = [7000, 2000];
+
 /// How the number of Gaussians at the end is known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Reach {
@@ -114,7 +118,7 @@ impl TrainingPhotos {
 /// The number of Gaussians that a run with `rows` Gaussians after `steps_done` steps will reach, and how that is known. A guess is at most one
 /// Gaussian for each of the `pixels` of the training photos: a Gaussian without a pixel of its own soon has no gradient that splits it.
 /// A run that decides its count rarely changes it after the first of its `checks`. Before that, it is expected to stay as it is where few
-/// photos see each place.
+/// photos see each place and the run is long enough to find that out, and otherwise to double at every check.
 pub fn reach(
     config: &TrainConfig,
     rows: u64,
@@ -126,18 +130,20 @@ pub fn reach(
     let first = config.refine_start.max(steps_done);
     // Rounds come at the multiples of `every` strictly between `first` and `last`.
     let every = config.refine_every.max(1);
-    let rounds = (last.saturating_sub(1) / every).saturating_sub(first / every);
-    if !config.strategy.grows() || rounds == 0 {
+    let rounds = first / every + 1..=last.saturating_sub(1) / every;
+    if !config.strategy.grows() || rounds.is_empty() {
         return (rows, Reach::Constant);
     }
     if config.max_gaussians > 0 {
         return (rows_at_most(config, rows), Reach::Cap);
     }
-    let guess = guess(rows, rounds, every).min(photos.pixels[0].max(rows));
+    let pixels = photos.pixels;
     match (limits::growth_rule(config), checks.last()) {
-        (None, _) => (guess, Reach::Guess),
-        (Some(rule), None) if photos.overlap_little() => (rule.first(rows, photos.pixels[1]), Reach::Sparse),
-        (Some(rule), None) => (guess.min(rule.most(photos.pixels[1]).max(rows)), Reach::Decided),
+        (None, _) => (guess(rows, rounds.count() as u32, every).min(pixels[0].max(rows)), Reach::Guess),
+        (Some(rule), None) if photos.overlap_little() && rule.is_of_measured_length() => {
+            (rule.first(rows, pixels[1]), Reach::Sparse)
+        }
+        (Some(rule), None) => (rule.reachable(rows, pixels[1], rounds.map(|round| round * every)), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
     }
 }
@@ -183,6 +189,8 @@ pub struct Forecast {
     pub commit_bytes_most: f64,
     /// Seconds of all steps.
     pub seconds: f64,
+    /// Steps and seconds of shorter runs of the same scene, where this one is long.
+    pub shorter: Vec<(u32, f64)>,
     /// Seconds among them in which steps wait for the drive.
     pub drive_seconds: f64,
 }
@@ -261,7 +269,14 @@ pub(crate) fn plan_run(
         drive,
         frames_at_end,
     };
-    let forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
+    let mut forecast = Forecast::new(config, memory, plan.clone(), &measured, host_mem);
+    if forecast.seconds > LONG_SECONDS && steps_done == 0 {
+        let of_steps = |steps| {
+            let config = TrainConfig { steps, ..config.clone() };
+            (steps, Forecast::new(&config, memory, plan.clone(), &measured, host_mem).seconds)
+        };
+        forecast.shorter = SHORTER_STEPS.into_iter().filter(|steps| 2 * steps <= config.steps).map(of_steps).collect();
+    }
     if !(matches!(known, Reach::Decided | Reach::Sparse) && last > rows && trainer.growth().is_empty()) {
         return Ok(forecast);
     }
@@ -328,6 +343,7 @@ impl Forecast {
             bytes_written: 0.0,
             commit_bytes_most,
             seconds,
+            shorter: Vec::new(),
             drive_seconds,
         };
         if !is_in_memory {
@@ -728,6 +744,9 @@ mod tests {
         );
         let hardly_seen = TrainingPhotos { pixels: [9_600_000; 2], count: 100, per_page: PHOTOS_PER_PAGE_LEAST - 1.0 };
         assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (41_321, Reach::Sparse));
+        // The checks of a short run hold no scene back.
+        let short = TrainConfig { steps: 500, refine_start: 83, refine_every: 16, refine_stop: 400, ..decides.clone() };
+        assert_eq!(reach(&short, 41_321, hardly_seen, 0, &[]), (300_000, Reach::Decided));
         let check = GrowthCheck {
             step: 1001,
             gaussians: 41_000,

@@ -102,10 +102,10 @@ pub fn describe(
         scene.display(),
         dataset.train_views().len(),
         dataset.test_views().len(),
-        trainer.scene.rows(),
+        format_grouped(trainer.scene.rows()),
         config.sh_degree,
         growth(forecast),
-        config.steps,
+        format_grouped(config.steps.into()),
         rayon::current_num_threads(),
         limits::simd_path(config).name(),
         trainer.renderer.device(),
@@ -170,6 +170,15 @@ fn describe_tiers(forecast: &Forecast, tiers: &Tiers) -> String {
         forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_seconds(kept.seconds))),
         waits(forecast)
     ));
+    if !forecast.shorter.is_empty() {
+        let of_run =
+            |(steps, seconds): &(u32, f64)| format!("--steps {steps} takes about {}", format_seconds(*seconds));
+        let runs: Vec<String> = forecast.shorter.iter().map(of_run).collect();
+        text.push_str(&format!(
+            "        shorter: {}; smaller photos (--max-resolution) are faster, too\n",
+            runs.join(", ")
+        ));
+    }
     text
 }
 

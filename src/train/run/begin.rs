@@ -10,6 +10,7 @@ use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, train_into};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
+use crate::base::units::format_grouped;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::config::new_run;
@@ -75,8 +76,9 @@ fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     let mut request = request.clone();
     let photos = start.dataset.train_views().len();
     if let Some(steps) = new_run::adapt_schedule(&mut request.config, photos).filter(|_| !request.quiet) {
-        let text = format!("photos  {photos} to train on: the rates fall until step {steps}, and stay low");
-        tell_plan(&request, &(text + " (see --schedule-steps)"));
+        let steps = format_grouped(steps.into());
+        let text = format!("photos  {photos} to train on, few for so many steps: those after {steps} change little");
+        tell_plan(&request, &text);
     }
     request
 }
