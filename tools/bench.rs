@@ -28,10 +28,10 @@ mod sweep;
 #[path = "bench/sweep_page.rs"]
 mod sweep_page;
 
-use clap::{Command, CommandFactory, Parser};
+use clap::{Command, CommandFactory};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::say::exit_code;
-use gsscale::config::file::parse_arguments;
+use gsscale::config::command_line::{parse_arguments, parse_plain};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
 use gsscale::config::new_run;
@@ -83,9 +83,9 @@ pub fn run_with(mut arguments: Vec<OsString>) -> ExitCode {
     } else if named("sweep") {
         sweep::start(&parse_arguments(&arguments), &mut print)
     } else if named("doctor") {
-        doctor::start(&doctor::Args::parse_from(&arguments), &mut print)
+        doctor::start(&parse_plain(&arguments), &mut print)
     } else if named("compare") {
-        compare::start(&compare::Args::parse_from(&arguments))
+        compare::start(&parse_plain(&arguments))
     } else if named("run") && published::is_published_run(&arguments) {
         match published::start(&parse_arguments(&arguments), &mut print) {
             Ok(code) => return code,

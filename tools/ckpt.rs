@@ -5,6 +5,7 @@ use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
 use gsscale::base::units::format_bytes;
+use gsscale::config::command_line::parse_plain;
 use gsscale::config::values::ByteSize;
 use gsscale::exchange::format::ExportFormat;
 use gsscale::exchange::sink::LevelCounts;
@@ -71,7 +72,7 @@ fn main() -> ExitCode {
 
 /// The program, with the words of its command line; the first is its name.
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
-    let done = match Args::parse_from(arguments).command {
+    let done = match parse_plain::<Args>(&arguments).command {
         Command::Ls(args) => run_ls(&args),
         Command::Inspect(args) => run_inspect(&args),
         Command::Verify(args) => run_verify(&args),

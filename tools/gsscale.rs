@@ -19,8 +19,8 @@ use clap::builder::Resettable::Reset;
 use clap::{Arg, Command, CommandFactory, value_parser};
 use clap_complete::Shell;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::say::exit_code;
-use gsscale::config::file::with_help_of_keys;
+use gsscale::base::say::{exit_code, set_commands};
+use gsscale::config::command_line::{in_words_of_caller, with_help_of_keys};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -56,6 +56,7 @@ Your own photos, in scans/village:
 gsscale doctor checks the GPU. gsscale --help lists all commands, gsscale help train explains one.";
 
 fn main() -> ExitCode {
+    set_commands(COMMANDS.iter().map(|(name, ..)| *name).collect());
     let mut arguments: Vec<OsString> = std::env::args_os().collect();
     let own_name = arguments.first().and_then(|own| Path::new(own).file_stem()?.to_str()?.strip_prefix("gsscale-"));
     if let Some((name, ..)) = own_name.and_then(|own| COMMANDS.iter().find(|(name, ..)| own.eq_ignore_ascii_case(name)))
@@ -117,7 +118,7 @@ fn all_commands() -> Command {
         .subcommand(bench::doctor::Args::command().name("doctor"))
         .subcommand(Command::new("completions").about("Prints completions for a shell").arg(shell))
         .subcommand(Command::new("man").about("Writes a man page of each command").arg(folder));
-    with_help_of_keys(all, false)
+    in_words_of_caller(with_help_of_keys(all, false))
 }
 
 /// The command line with the text of flags that only `--help` shows: a man page has no short form.

@@ -5,6 +5,7 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::say::exit_code;
 use gsscale::base::units::{format_bytes, parse_bytes};
+use gsscale::config::command_line::parse_plain;
 use gsscale::page::engine::open::IoEngine;
 use gsscale::page::folder::file_system::FileSystem;
 use gsscale::page::folder::measure::codec_for;
@@ -65,7 +66,7 @@ fn main() -> ExitCode {
 
 /// The program, with the words of its command line; the first is its name.
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
-    exit_code(run(&Flags::parse_from(arguments)))
+    exit_code(run(&parse_plain::<Flags>(&arguments)))
 }
 
 fn run(flags: &Flags) -> InputResult<()> {

@@ -12,7 +12,7 @@ use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::host_bytes_peak;
 use gsscale::base::text::read_text;
 use gsscale::base::units::format_bytes;
-use gsscale::config::file::parse_arguments;
+use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
 use gsscale::config::values::ByteSize;

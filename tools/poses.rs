@@ -3,6 +3,7 @@
 use clap::Parser;
 use gsscale::base::error::InputResult;
 use gsscale::base::say::exit_code;
+use gsscale::config::command_line::parse_plain;
 use gsscale::poses::program::{FeatureOptions, ProgramPaths};
 use gsscale::poses::{PoseSearch, PosesRequest};
 use std::ffi::OsString;
@@ -54,7 +55,7 @@ fn main() -> ExitCode {
 
 /// The program, with the words of its command line; the first is its name.
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
-    exit_code(start(&Flags::parse_from(arguments)))
+    exit_code(start(&parse_plain::<Flags>(&arguments)))
 }
 
 fn start(flags: &Flags) -> InputResult<()> {

@@ -4,6 +4,7 @@ use clap::Parser;
 use gsscale::base::error::InputResult;
 use gsscale::base::say::exit_code;
 use gsscale::base::units::format_bytes;
+use gsscale::config::command_line::parse_plain;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use indicatif::{ProgressBar, ProgressStyle};
 use std::ffi::OsString;
@@ -94,7 +95,7 @@ fn main() -> ExitCode {
 
 /// The program, with the words of its command line; the first is its name.
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
-    let flags = Flags::parse_from(arguments);
+    let flags = parse_plain::<Flags>(&arguments);
     exit_code(run(&flags))
 }
 

@@ -7,11 +7,13 @@ use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::trace;
 use gsscale::base::units::{format_grouped, format_seconds};
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
+use gsscale::config::command_line::parse_arguments;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
+use gsscale::dataset::read::MORE_OVERLAP;
 use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::poses::{MORE_OVERLAP, PoseSearch, PosesRequest};
+use gsscale::poses::{PoseSearch, PosesRequest};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE, SETTINGS_FILE};
 use gsscale::train::error::TrainError;
@@ -59,7 +61,7 @@ pub struct Args {
     #[arg(required_unless_present_any = ["demo", "list_devices", "resume", "data"])]
     scene: Option<PathBuf>,
     /// The scene as a flag, as other trainers name it
-    #[arg(long, short = 's', aliases = ["data-dir", "source-path", "source"], hide = true, conflicts_with_all = ["scene", "demo"])]
+    #[arg(long, short = 's', aliases = ["data-dir", "data-path", "source-path", "source", "input"], hide = true, conflicts_with_all = ["scene", "demo"])]
     data: Option<PathBuf>,
     /// Photos without poses: `auto` finds the poses first, as gsscale-poses does
     #[arg(long, value_name = "HOW", value_parser = ["auto"], hide_short_help = true)]
@@ -67,7 +69,7 @@ pub struct Args {
     /// Output folder [default: runs/NAME, with the name of the scene]
     ///
     /// If that is taken, runs/NAME-2 and so on
-    #[arg(long, short, aliases = ["result-dir", "model-path", "output-dir"], short_alias = 'm')]
+    #[arg(long, short, aliases = ["result-dir", "model-path", "output-dir", "output-path", "output", "export-path"], short_alias = 'm')]
     out: Option<PathBuf>,
     /// Config file; flags override it
     #[arg(long, hide_short_help = true)]
@@ -313,7 +315,7 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
             if !outcome.keeps_checkpoint {
                 gsscale::tell!(
-                    "              (from the PLY, without Adam's moments; runs with --keep-checkpoint go on exactly)"
+                    "              (a little worse than in one go; a run with --keep-checkpoint goes on exactly)"
                 );
             }
         }

@@ -4,7 +4,8 @@ use clap::Parser;
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::say::exit_code;
-use gsscale::config::file::{TrainConfig, TrainOverrides, parse_arguments};
+use gsscale::config::command_line::parse_arguments;
+use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::METRICS_FILE;
 use gsscale::train::error::TrainError;
@@ -54,7 +55,8 @@ pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
 
 fn start(args: Args) -> Result<(), TrainError> {
     let ModelOfRun { file, scene, config } = ModelOfRun::find("gsscale-view", &args.model, args.scene)?;
-    let metrics = config.as_deref().map(|config| config.with_file_name(METRICS_FILE)).filter(|file| file.is_file());
+    let of_run = config.as_deref().map(|config| config.with_file_name(""));
+    let saved = of_run.filter(|folder| folder.join(METRICS_FILE).is_file());
     let config = args.config.or(config).map_or_else(|| Ok(TrainConfig::default()), |file| TrainConfig::read(&file))?;
     let (mut config, spill_dir) = (config, args.keys.spill_dir.clone());
     args.keys.apply(&mut config);
@@ -63,5 +65,5 @@ fn start(args: Args) -> Result<(), TrainError> {
     let on_port = |port| Live::begin(SocketAddr::from(([127, 0, 0, 1], port)));
     let live = args.serve.map_or_else(|| on_port(8080).or_else(|_| on_port(0)), Live::begin)?;
     gsscale::tell!("live page: http://{}/", live.address());
-    show(&ShowRequest { gaussians: file, scene, config, metrics, live })
+    show(&ShowRequest { gaussians: file, scene, config, saved, live })
 }

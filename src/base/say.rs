@@ -3,11 +3,16 @@
 //!
 //! Invariants: 1. a terminal that is gone, a closed pipe or a full drive behind standard error ends no program: such lines
 //! are lost; 2. nothing that a file's name holds can move the cursor or turn the direction of a line: control characters
-//! and direction marks are printed as escapes (`\u202e`, as in JSON).
+//! and direction marks are printed as escapes (`\u202e`, as in JSON); 3. a line names the programs as the user called this one:
+//! texts say `gsscale-train`, and after `gsscale ...` the lines say `gsscale train` ([`as_called`]).
 
 use std::borrow::Cow;
 use std::fmt::{Arguments, Write as _};
 use std::io::{ErrorKind, Write};
+use std::sync::OnceLock;
+
+/// The commands of `gsscale`, once a user has called it by that name.
+static COMMANDS: OnceLock<Vec<&'static str>> = OnceLock::new();
 
 /// As `println!`, except that a closed pipe (`| head`) is ignored and the program continues.
 #[macro_export]
@@ -42,7 +47,38 @@ pub fn tell_line(text: Arguments<'_>) {
 /// One call of `write`, so that lines of several threads or processes do not mix.
 fn write_line(stream: &mut dyn Write, text: Arguments<'_>) -> std::io::Result<()> {
     let line = format!("{text}\n");
-    stream.write_all(visible(&line).as_bytes())
+    stream.write_all(visible(&as_called(&line)).as_bytes())
+}
+
+/// Says that this process is `gsscale` with these commands, each of which is also a program (`gsscale-train`).
+pub fn set_commands(commands: Vec<&'static str>) {
+    // The first word counts: a process is called once.
+    let _ = COMMANDS.set(commands);
+}
+
+/// The text with the programs named as the user called this one.
+pub fn as_called(text: &str) -> Cow<'_, str> {
+    COMMANDS.get().map_or(Cow::Borrowed(text), |commands| with_commands(text, commands))
+}
+
+/// The text with `gsscale train` for the word `gsscale-train`, for each of `commands`. A part of a path is no word.
+fn with_commands<'a>(text: &'a str, commands: &[&str]) -> Cow<'a, str> {
+    const START: &str = "gsscale-";
+    let is_of_word = |char: char| char.is_alphanumeric() || matches!(char, '-' | '_' | '/' | '\\' | '.');
+    let mut named = String::new();
+    let mut rest = text;
+    while let Some(at) = rest.find(START) {
+        let (before, from) = rest.split_at(at);
+        let after = &from[START.len()..];
+        let end = after.find(|char: char| !char.is_ascii_lowercase()).unwrap_or(after.len());
+        // A point ends a sentence, unless a name goes on behind it.
+        let next = after[end..].strip_prefix('.').unwrap_or(&after[end..]);
+        let is_word = !before.ends_with(is_of_word) && !next.starts_with(is_of_word);
+        named.push_str(before);
+        named.push_str(if is_word && commands.contains(&&after[..end]) { "gsscale " } else { START });
+        rest = after;
+    }
+    if named.is_empty() { Cow::Borrowed(text) } else { Cow::Owned(named + rest) }
 }
 
 /// The text with its control characters (but for line breaks and tabs) and direction marks as escapes.
@@ -82,6 +118,19 @@ pub fn exit_code(done: Result<(), impl std::fmt::Display>) -> std::process::Exit
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn programs_are_named_as_commands_where_they_are_words() {
+        let named = |text: &str| with_commands(text, &["train", "poses"]).into_owned();
+        assert_eq!(named("`gsscale-train --resume a`, gsscale-poses."), "`gsscale train --resume a`, gsscale poses.");
+        for other in
+            ["/bin/gsscale-train a", "gsscale-trainer", "my-gsscale-train", "gsscale-poses.json", "gsscale-new"]
+        {
+            assert_eq!(named(other), other);
+        }
+        assert_eq!(named("gsscale-train"), "gsscale train");
+        assert_eq!(as_called("gsscale-train"), "gsscale-train", "tests are not called gsscale");
+    }
 
     #[test]
     fn a_name_cannot_turn_the_line() {

@@ -1,4 +1,4 @@
-//! The keys of a run: one list defines the TOML file, the command line with its help and configs/default.toml, the defaults and the class of
+//! The keys of a run: one list defines the TOML file, the flags with their help and configs/default.toml, the defaults and the class of
 //! each key (the effect of a change). Reading them, their ranges, and the relations between them. The config.toml of a run holds every
 //! setting, and facts resolved at its start (`[resolved]`), which resume and evaluation read.
 //!
@@ -15,7 +15,6 @@ use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
-use crate::config::habits::{ALIASES, advice_for, with_our_spelling};
 use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, RgbColor, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -573,59 +572,6 @@ impl Class {
     pub fn makes_another_run(self) -> bool {
         !matches!(self, Class::Free | Class::Lasting | Class::Place | Class::Instructions)
     }
-}
-
-/// Parses the command line of a program with [`super::file::TrainOverrides`], its name first; prints help and usage errors and
-/// exits.
-pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
-    let arguments = &with_our_spelling(arguments)[..];
-    if let Some((flag, advice)) = advice_for(arguments) {
-        crate::tell!("error: {flag} is no flag of gsscale\n  remedy: {advice}");
-        std::process::exit(2);
-    }
-    let is_short = arguments.iter().any(|argument| argument == "-h");
-    let matches = with_help_of_keys(T::command(), is_short).get_matches_from(arguments);
-    T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
-}
-
-/// Gives each key its help with its default, and its place in help: the first ones alone stand in `-h`, in one group and in few
-/// words (`is_short`). Flags have no clap defaults, because an absent flag must keep the config file's value.
-pub fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Command {
-    let commands: Vec<String> = command.get_subcommands().map(|command| command.get_name().to_string()).collect();
-    if !commands.is_empty() {
-        let with_help = |command| with_help_of_keys(command, is_short);
-        return commands.iter().fold(command, |command, name| command.mut_subcommand(name, with_help));
-    }
-    if !command.get_arguments().any(|argument| argument.get_id() == KEYS[0].field) {
-        return command;
-    }
-    let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
-    for key in KEYS {
-        let value =
-            defaults.get(&key.name()).map(|value| value.as_str().map_or_else(|| value.to_string(), str::to_string));
-        let default =
-            value.filter(|value| !value.is_empty()).map_or(String::new(), |value| format!(" [default: {value}]"));
-        command = command.mut_arg(key.field, |arg| {
-            let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
-            let end = [". ", "; "].iter().filter_map(|mark| help.find(mark)).min().unwrap_or(help.len());
-            let arg = arg.help(format!("{}{default}", &help[..end])).long_help(format!("{help}{default}"));
-            let arg = arg.hide(key.shown == Shown::Nowhere).hide_short_help(key.shown != Shown::First);
-            let in_short =
-                |arg: clap::Arg| arg.help_heading(None::<&str>).value_name("VALUE").hide_possible_values(true);
-            if is_short { in_short(arg) } else { arg }
-        });
-    }
-    for (name, key) in ALIASES {
-        command = command.mut_arg(key.replace('-', "_"), |arg| arg.alias(name));
-    }
-    // Of fewer columns, clap would make each flag two lines.
-    if is_short {
-        command = command.term_width(100);
-    }
-    let hidden = KEYS.iter().filter(|key| key.shown == Shown::Nowhere).count();
-    let more = format!("{hidden} more keys, for work on the program and for comparisons, are in configs/README.md.");
-    let last = command.get_after_help().map_or(more.clone(), |text| format!("{text}\n\n{more}"));
-    command.after_long_help(last)
 }
 
 /// The text of configs/default.toml: every key with its meaning and default.

@@ -148,14 +148,47 @@ pub fn lacks_poses(path: &Path) -> bool {
         && without_poses(path).is_some()
 }
 
+/// The folder inside a scene in which [`crate::poses`] searches for poses, and the file there that says how far the search is.
+pub const SEARCH_FOLDER: &str = "poses";
+pub const SEARCH_STATE: &str = "state.json";
+/// The last phase of a search.
+pub const SEARCH_END: &str = "model";
+/// What to do if photos have no pose.
+pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
+    blurred photos; if all is sharp and overlaps, try gsscale-poses with --max-resolution 2400";
+/// Fewest photos for which poses can be found.
+pub const PHOTOS_LEAST: usize = 3;
+
+/// Whether a search for the poses of a scene has come to its end.
+fn is_searched(scene: &Path) -> bool {
+    let state = std::fs::read(scene.join(SEARCH_FOLDER).join(SEARCH_STATE)).unwrap_or_default();
+    let state: serde_json::Value = serde_json::from_slice(&state).unwrap_or_default();
+    state["done"].as_array().is_some_and(|done| done.iter().any(|phase| phase == SEARCH_END))
+}
+
 /// Photos of a drone's card lie in folders of folders.
 const FOLDERS_DEEP: usize = 3;
 
 /// The error, which says how to get poses, for a folder of photos without a model that a reader knows.
 fn without_poses(folder: &Path) -> Option<InputError> {
     let images = folder.join("images");
-    let count = [images.as_path(), folder].into_iter().map(|at| photos_below(at, FOLDERS_DEEP)).find(|n| *n > 0)?;
+    let search = folder.join(SEARCH_FOLDER);
+    let of_search = if search.join(SEARCH_STATE).is_file() { photos_below(&search, FOLDERS_DEEP - 1) } else { 0 };
+    let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
+    let count = counts.into_iter().find(|n| *n > 0)?;
     let place = folder.display();
+    // What would only send the user back.
+    if is_searched(folder) {
+        let problem = format!("gsscale-poses has found no poses: the {count} photos show too little in common");
+        let remedy = format!("{MORE_OVERLAP}; then gsscale-poses {place} again");
+        return Some(InputError::new(folder, problem, remedy));
+    }
+    if count < PHOTOS_LEAST {
+        let problem = format!("{count} photo(s), but no camera poses");
+        let remedy =
+            "take some dozens of photos from places around, of which neighbours share two thirds of their content";
+        return Some(InputError::new(folder, problem, remedy));
+    }
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(
         "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}\n  \

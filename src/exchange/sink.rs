@@ -102,7 +102,7 @@ impl<F: Format> GaussianSink for FormatSink<F> {
         if rows == 0 {
             return Err(format.holds_none(given).unwrap_or_else(|| {
                 let problem = format!("none of the {given} Gaussians is finite, so there is no row to write");
-                InputError::new(path, problem, "the training diverged or lost all Gaussians: lower the rates")
+                InputError::new(path, problem, "the training diverged or lost all Gaussians: leave out flags of rates")
             }));
         }
         let (bytes, levels) = format.complete(rows)?;

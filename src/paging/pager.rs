@@ -460,6 +460,11 @@ impl Pager {
         self.tier.counters.commit_seconds
     }
 
+    /// Pages that have a frame.
+    pub fn pages_in_memory(&self) -> usize {
+        (0..self.index().len()).filter(|&page| self.is_in_memory(PageNo(page as u32))).count()
+    }
+
     /// Whether a page has a frame.
     pub fn is_in_memory(&self, page: PageNo) -> bool {
         self.tier.frames.state(page).is_some()

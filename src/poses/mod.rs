@@ -23,9 +23,10 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::units::{format_grouped, format_seconds};
 use crate::base::whole_file::write_whole;
 use crate::base::whole_folder::remove_ours;
+use crate::dataset::colmap::looks_like_colmap;
 use crate::dataset::exif::GpsPlace;
 use crate::dataset::model::{RawScene, ReadOptions};
-use crate::dataset::read::read_scene;
+use crate::dataset::read::{MORE_OVERLAP, SEARCH_END, SEARCH_FOLDER, SEARCH_STATE, read_scene};
 use geo::{Similarity, metres_from, robust_similarity};
 use glam::DVec3;
 use pairs::{ChosenBy, choose_pairs, count_of, way_of};
@@ -38,10 +39,10 @@ use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
 
 /// The folder in the scene in which the program works.
-pub const WORK_FOLDER: &str = "poses";
+pub const WORK_FOLDER: &str = SEARCH_FOLDER;
 /// Where the origin of a model in metres lies, as OpenSfM names it.
 pub const ORIGIN_FILE: &str = "reference_lla.json";
-const STATE_FILE: &str = "state.json";
+const STATE_FILE: &str = SEARCH_STATE;
 const PAIRS_FILE: &str = "pairs.json";
 /// What marks a work folder as ours.
 const MADE_BY: &str = "gsscale-poses 1";
@@ -265,13 +266,13 @@ impl PoseSearch {
             }
             state.finish("matches", &work)?;
         }
-        if !state.is_done("model") {
+        if !state.is_done(SEARCH_END) {
             remove_ours(&work.join(SPARSE), is_of_model)?;
             make_folder(&work.join(SPARSE))?;
             let total = self.photos.len() as u32;
             let mut show = |line: &str| registered_in(line).into_iter().for_each(|n| watch("photos placed", n, total));
             self.program.run(&Phase::Model, &self.features, place, &mut show)?;
-            state.finish("model", &work)?;
+            state.finish(SEARCH_END, &work)?;
         }
         self.write_scene(&work)
     }
@@ -437,12 +438,11 @@ impl PoseSearch {
     /// Writes the largest model into the scene, in metres if GPS allows.
     fn write_scene(&self, work: &Path) -> InputResult<FoundPoses> {
         let options = ReadOptions { images: Some(PHOTOS.to_string()), points_later: true, ..ReadOptions::default() };
-        let no_model = |error: InputError| InputError {
-            problem: format!("no model was found: {}", error.problem),
-            remedy: MORE_OVERLAP.to_string(),
-            ..error
-        };
-        let raw = read_scene(work, &options).map_err(no_model)?;
+        if !looks_like_colmap(work) {
+            let problem = format!("no poses were found: its {} photos show too little in common", self.photos.len());
+            return Err(InputError::new(&self.scene, problem, MORE_OVERLAP));
+        }
+        let raw = read_scene(work, &options)?;
         let index = |name: &str| name.split('.').next()?.parse::<usize>().ok().filter(|&i| i < self.photos.len());
         let mut is_placed = vec![false; self.photos.len()];
         raw.views.iter().filter_map(|view| index(&view.name)).for_each(|i| is_placed[i] = true);
@@ -516,10 +516,6 @@ impl PoseSearch {
         }
     }
 }
-
-/// What to do if photos have no pose.
-pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
-    blurred photos; if all is sharp and overlaps, try gsscale-poses with --max-resolution 2400";
 
 impl fmt::Display for FoundPoses {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -8,6 +8,8 @@ use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
+use serde_json::json;
+use std::cell::Cell;
 
 /// Width and height of a chart, SVG units.
 const SIZE: (u32, u32) = (560, 320);
@@ -134,7 +136,22 @@ impl Chart {
     }
 
     pub fn svg(&self) -> String {
-        draw_svg(self.size(), |root| self.draw(root))
+        let plot = Cell::default();
+        let svg = draw_svg(self.size(), |root| self.draw(root, &plot));
+        svg.replacen("<svg ", &format!("<svg data-plot=\"{}\" ", escape(&self.values(plot.get()).to_string())), 1)
+    }
+
+    /// What the script of a page needs to show the values under the pointer: the edges of the plot in pixels, the ranges of its axes, and
+    /// the points of each series.
+    fn values(&self, [left, top, right, bottom]: [i32; 4]) -> serde_json::Value {
+        let (x, y) = self.ranges();
+        let of_series = |series: &Series| {
+            let name = if series.mark == Mark::Faint { "one view" } else { &series.name };
+            let finite = series.points.iter().filter(|(x, y)| x.is_finite() && y.is_finite());
+            json!({ "name": name, "points": finite.collect::<Vec<_>>() })
+        };
+        let series: Vec<serde_json::Value> = self.series.iter().map(of_series).collect();
+        json!({ "plot": [left, top, right, bottom], "x": x, "y": y, "of": self.x, "series": series })
     }
 
     fn size(&self) -> (u32, u32) {
@@ -160,23 +177,26 @@ impl Chart {
         Ok(())
     }
 
-    fn draw(&self, root: &Canvas<'_>) -> Result<(), String> {
+    /// `edges` becomes those of the plot: left, top, right and lower, pixels.
+    fn draw(&self, root: &Canvas<'_>, edges: &Cell<[i32; 4]>) -> Result<(), String> {
         root.fill(&WHITE).map_err(text)?;
         if !self.is_wide {
-            return self.draw_plot(root);
+            return self.draw_plot(root, edges);
         }
         let (plot, legend) = root.split_horizontally(WIDE.0 - LEGEND_WIDTH);
         self.draw_legend(&legend)?;
         let (plot, _) = plot.split_vertically(WIDE.1);
-        self.draw_plot(&plot)
+        self.draw_plot(&plot, edges)
     }
 
-    fn draw_plot(&self, root: &Canvas<'_>) -> Result<(), String> {
+    fn draw_plot(&self, root: &Canvas<'_>, edges: &Cell<[i32; 4]>) -> Result<(), String> {
         let ([x0, x1], [y0, y1]) = self.ranges();
         let mut builder = ChartBuilder::on(root);
         builder.margin(8).margin_right(18).x_label_area_size(48).y_label_area_size(72);
         builder.caption(&self.title, ("sans-serif", TITLE_SIZE));
         let mut chart = builder.build_cartesian_2d(x0..x1, y0..y1).map_err(text)?;
+        let ((left, bottom), (right, top)) = (chart.backend_coord(&(x0, y0)), chart.backend_coord(&(x1, y1)));
+        edges.set([left, top, right, bottom]);
         let mut mesh = chart.configure_mesh();
         mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(TRANSPARENT).bold_line_style(GRID);
         mesh.label_style(("sans-serif", TEXT_SIZE)).x_labels(6).y_labels(6);
@@ -579,6 +599,16 @@ mod tests {
             .with("dots", vec![(1.0, 15.0)], Mark::Dots)
             .svg();
         assert!(svg.starts_with("<svg") && svg.contains("polyline") && svg.contains("circle"));
+        let values = svg.split('"').nth(1).unwrap_or_default().replace("&quot;", "\"").replace("&amp;", "&");
+        let values: serde_json::Value = serde_json::from_str(&values).unwrap_or_default();
+        assert_eq!(
+            values["series"][0],
+            json!({ "name": "train & test", "points": [[0.0, 10.0], [2.0, 20.0]] }),
+            "{values}"
+        );
+        // The first point lies at the left edge of the plot, less the margin of the axis.
+        let [left, right] = [0, 2].map(|edge| values["plot"][edge].as_i64().unwrap_or(-1));
+        assert!(0 < left && left < right && right < i64::from(SIZE.0) && values["of"] == "step", "{values}");
         assert!(svg.contains("train &amp; test") && !svg.contains("<b>"));
         assert!(Chart::new("a", "b", "c").svg().contains("no data"));
         let flat = Chart::new("a", "b", "c").with("", vec![(5.0, 1.0), (5.0, 1.0)], Mark::Line).zero_based().svg();

@@ -37,6 +37,9 @@ pre{background:var(--paper);border:1px solid var(--line);border-radius:8px;paddi
 div.table{overflow-x:auto}
 th{vertical-align:bottom}
 .views{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(440px,100%),1fr));gap:14px}
+figure{position:relative}
+figure .pointed{position:absolute;pointer-events:none;background:var(--paper);border:1px solid var(--line);border-radius:6px;padding:3px 8px;font-size:13px;white-space:pre;font-variant-numeric:tabular-nums;box-shadow:0 1px 4px #0004}
+figure svg.chart{touch-action:pan-y;cursor:crosshair}
 .slider{position:relative;overflow:hidden;line-height:0;touch-action:pan-y;cursor:ew-resize}
 .slider img{width:100%;display:block}
 .slider .over{position:absolute;inset:0;width:50%;overflow:hidden;border-right:2px solid #fff}
@@ -47,7 +50,7 @@ th{vertical-align:bottom}
 details summary{cursor:pointer;color:var(--accent)}
 ";
 
-/// Moves the edge between the two pictures of a slider with the pointer or the arrow keys.
+/// Moves the edge between the two pictures of a slider with the pointer or the arrow keys; shows the values of a chart under the pointer.
 const SCRIPT: &str = "\
 document.querySelectorAll('.slider').forEach(function(s){var o=s.querySelector('.over');
 function fit(){o.querySelector('img').style.width=s.clientWidth+'px';}
@@ -56,6 +59,22 @@ s.addEventListener('pointermove',function(e){var r=s.getBoundingClientRect();to(
 s.addEventListener('keydown',function(e){var f=+s.getAttribute('aria-valuenow')/100;
 if(e.key==='ArrowLeft')to(f-.05);if(e.key==='ArrowRight')to(f+.05);});
 window.addEventListener('resize',fit);fit();to(.5);});
+document.querySelectorAll('svg[data-plot]').forEach(function(s){var d=JSON.parse(s.dataset.plot),figure=s.closest('figure');
+var all=d.series.filter(function(a){return a.points.length});if(!all.length||!figure)return;
+var tip=document.createElement('div');tip.className='pointed';tip.hidden=true;figure.append(tip);
+s.insertAdjacentHTML('beforeend','<line stroke=\"currentColor\" visibility=\"hidden\" opacity=\".5\" y1=\"'+d.plot[1]+'\" y2=\"'+d.plot[3]+'\"/>');
+var line=s.lastElementChild;
+function text(v){return v.toLocaleString('en',{maximumFractionDigits:Math.abs(v)<10?4:Math.abs(v)<1000?2:0});}
+function show(e){var r=s.getBoundingClientRect(),scale=s.viewBox.baseVal.width/r.width,wide=(d.plot[2]-d.plot[0])/(d.x[1]-d.x[0]);
+var at=d.x[0]+((e.clientX-r.left)*scale-d.plot[0])/wide;
+function nearest(points){return points.reduce(function(a,b){return Math.abs(b[0]-at)<Math.abs(a[0]-at)?b:a});}
+var found=all.map(function(a){return[a.name,nearest(a.points)]}),x=nearest(found.map(function(f){return f[1]}))[0];
+tip.textContent=d.of+' '+text(x)+found.map(function(f){return'\\n'+(f[0]?f[0]+': ':'')+text(f[1][1])+(f[1][0]===x?'':' ('+d.of+' '+text(f[1][0])+')')}).join('');
+var px=d.plot[0]+(x-d.x[0])*wide;line.setAttribute('x1',px);line.setAttribute('x2',px);line.setAttribute('visibility','visible');tip.hidden=false;
+var left=s.offsetLeft||r.left-figure.getBoundingClientRect().left,place=left+px/scale,half=place>figure.clientWidth/2;
+tip.style.top='34px';tip.style.left=half?'auto':place+8+'px';tip.style.right=half?figure.clientWidth-place+8+'px':'auto';}
+s.addEventListener('pointermove',show);s.addEventListener('pointerdown',show);
+s.addEventListener('pointerleave',function(){tip.hidden=true;line.setAttribute('visibility','hidden');});});
 ";
 
 pub struct Page {

@@ -7,6 +7,8 @@ use std::fmt::Write as _;
 
 /// Longest side of the map, SVG units.
 const SIDE: f64 = 720.0;
+/// Fewest pages of a map: a large page among a few covers it, or leaves it empty.
+const TILES_LEAST: usize = 12;
 /// Most rectangles: browsers show larger files slowly.
 const RECTANGLES_MAX: usize = 20_000;
 
@@ -65,10 +67,14 @@ pub struct PageTile {
     pub resident: bool,
 }
 
-/// The map as SVG: the fill shows the number of views, the outline shows residency. Empty without pages.
+/// The map as SVG: the fill shows the number of views, the outline shows residency. Empty for fewer pages than a map needs to show anything
+/// ([`TILES_LEAST`]).
 pub fn page_map_svg(tiles: &[PageTile]) -> String {
+    if tiles.len() < TILES_LEAST {
+        return String::new();
+    }
     let corners = || tiles.iter().flat_map(|t| [t.lo, t.hi]).filter(|c| c.iter().all(|x| x.is_finite()));
-    // A few distant pages (sky, giants) would shrink the rest to a dot, so the map spans 98 % of the corners.
+    // A few distant pages (sky, giants) would shrink the rest to a dot, so the map spans nine tenths of the corners.
     let Some((lo, hi)) = span(corners().map(|c| c[0])).zip(span(corners().map(|c| c[1]))) else {
         return String::new();
     };
@@ -110,7 +116,7 @@ fn area(tile: &PageTile) -> f32 {
     (tile.hi[0] - tile.lo[0]) * (tile.hi[1] - tile.lo[1])
 }
 
-/// The 1st and 99th percentiles.
+/// The 5th and 95th percentiles.
 fn span(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
     let mut values: Vec<f32> = values.collect();
     if values.is_empty() {
@@ -118,7 +124,7 @@ fn span(values: impl Iterator<Item = f32>) -> Option<(f32, f32)> {
     }
     values.sort_unstable_by(f32::total_cmp);
     let last = values.len() - 1;
-    Some((values[last / 100], values[last - last / 100]))
+    Some((values[last / 20], values[last - last / 20]))
 }
 
 #[cfg(test)]
@@ -135,7 +141,7 @@ mod tests {
         let svg = page_map_svg(&tiles);
         assert_eq!(svg.matches("<rect x=").count(), 202);
         assert!(!svg.contains("NaN") && !svg.contains("inf"), "{svg}");
-        assert_eq!(page_map_svg(&[]), "");
+        assert_eq!([page_map_svg(&[]), page_map_svg(&tiles[..TILES_LEAST - 1])], ["", ""]);
         // The legend has the colours of the map: those of no views and of the most.
         let legend = page_map_legend(&tiles);
         assert!(legend.contains(&color(0.0)) && legend.contains(&color(1.0)) && legend.contains("199 views"));

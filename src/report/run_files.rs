@@ -86,10 +86,10 @@ pub fn saved_ply_name(step: u32) -> String {
     format!("point_cloud_{step:06}.ply")
 }
 
-/// Whether [`saved_ply_name`] makes this name.
-pub fn is_saved_ply(name: &str) -> bool {
-    let step = name.strip_prefix("point_cloud_").and_then(|rest| rest.strip_suffix(".ply"));
-    step.is_some_and(|step| step.len() >= 6 && step.bytes().all(|b| b.is_ascii_digit()))
+/// The step for which [`saved_ply_name`] makes this name; `None` for every other name.
+pub fn saved_step(name: &str) -> Option<u32> {
+    let step = name.strip_prefix("point_cloud_")?.strip_suffix(".ply")?;
+    step.parse().ok().filter(|&step| saved_ply_name(step) == name)
 }
 
 #[cfg(test)]
@@ -99,10 +99,10 @@ mod tests {
     #[test]
     fn names_of_saved_gaussians_are_recognised() {
         for step in [0, 7, 1_234_567] {
-            assert!(is_saved_ply(&saved_ply_name(step)));
+            assert_eq!(saved_step(&saved_ply_name(step)), Some(step));
         }
         for other in [PLY_FILE, "point_cloud_1.ply", "point_cloud_00000a.ply", "point_cloud_000001.txt"] {
-            assert!(!is_saved_ply(other));
+            assert_eq!(saved_step(other), None);
         }
     }
 }

@@ -11,6 +11,7 @@ use super::run_files::{
     CONFIG_FILE, DIAGNOSIS_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
 };
 use crate::base::error::{InputError, InputResult};
+use crate::base::say::as_called;
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
 use crate::photos::KINDS;
@@ -85,7 +86,8 @@ fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     let done = summary["steps"].as_u64()?;
     let [done, planned] = [done, planned].map(format_grouped);
     let folder = folder.display();
-    Some(format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}"))
+    let text = format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}");
+    Some(as_called(&text).into_owned())
 }
 
 fn add_finding(page: &mut Page, Finding { title, text, table, curve }: Finding) {
@@ -134,7 +136,9 @@ pub(super) fn read_metrics(folder: &Path) -> InputResult<Vec<Value>> {
 
 /// Points (x, y) of the lines that have both values, evenly thinned to at most about [`POINTS_MAX`].
 pub(super) fn curve(metrics: &[Value], x: &str, y: impl Fn(&Value) -> Option<f64>) -> Vec<(f64, f64)> {
-    let all: Vec<(f64, f64)> = metrics.iter().filter_map(|m| Some((m[x].as_f64()?, y(m)?))).collect();
+    let mut all: Vec<(f64, f64)> = metrics.iter().filter_map(|m| Some((m[x].as_f64()?, y(m)?))).collect();
+    // A step may have a second line, with an evaluation.
+    all.dedup_by_key(|point| point.0);
     let stride = all.len().div_ceil(POINTS_MAX).max(1);
     let last = all.len().saturating_sub(1);
     all.into_iter().enumerate().filter(|(i, _)| i % stride == 0 || *i == last).map(|(_, p)| p).collect()

@@ -203,7 +203,10 @@ fn what_cannot_work_is_refused_with_a_remedy() {
         refused(&format!("scene --out new {program}"), &["new/images", "exists already"]);
         assert!(!work.exists("new/poses"));
         // Photos of a size that shows nothing: pycolmap finds no model.
-        let told = refused(&format!("scene --out small {program}"), &["no model was found", "remedy"]);
+        let told = refused(&format!("scene --out small {program}"), &["no poses were found", "remedy"]);
+        // Training does not send the user back, and counts each photo once.
+        let photos = format!("the {} photos show too little", work.photos().len());
+        work.refuses_with(TRAIN, "small", &[&photos, "take more photos between the gaps", "gsscale-poses small again"]);
         assert!(!work.exists("small/sparse"), "{told}");
         let lock = std::fs::File::open(work.path("small/poses/lock")).unwrap();
         lock.try_lock().unwrap();

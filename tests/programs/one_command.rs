@@ -18,6 +18,19 @@ fn commands_are_the_programs() {
     assert!(trained.status.success(), "{}", stderr(&trained));
     assert!(work.ply("out") == work.run("expected", "--steps 7"));
     says(&stdout(&work.output(GSSCALE, "help plan")), &["Usage: gsscale plan [OPTIONS] <SCENE>"]);
+    // Remedies and examples name the command as the user called it.
+    let of_command = stderr(&work.output(GSSCALE, "train scene/images/none.ply"));
+    let missing = stderr(&work.output(GSSCALE, "view scene"));
+    says(&missing, &["gsscale view runs/NAME"]);
+    for told in [
+        of_command,
+        missing,
+        stdout(&work.output(GSSCALE, "train --help")),
+        stdout(&work.output(GSSCALE, "help view")),
+        stdout(&work.output(GSSCALE, "poses --help")),
+    ] {
+        assert!(!told.contains("gsscale-"), "{told}");
+    }
     says(&stdout(&work.output(GSSCALE, "cells cut --help")), &["Usage: gsscale cells cut "]);
     says(&stdout(&work.output(GSSCALE, "doctor --help")), &["Usage: gsscale bench doctor "]);
     says(&stdout(&work.output(GSSCALE, "help doctor")), &["Usage: gsscale bench doctor "]);

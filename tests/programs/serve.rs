@@ -132,7 +132,10 @@ fn a_picture_of_more_gaussians_than_the_budget_allows_is_refused_and_the_run_goe
 #[test]
 fn a_finished_run_is_shown_beside_its_photos() {
     let work = Workdir::wide_city(3000);
-    work.run("out", "--steps 120 --max-gaussians 3000 --device cpu --export sog --keep-checkpoint --log-every 40");
+    work.run(
+        "out",
+        "--steps 120 --max-gaussians 3000 --device cpu --export sog --keep-checkpoint --log-every 40 --save-every 40",
+    );
     let held_out = work.json_of(EVAL, "out");
     let before = work.files("out");
     let mut first: Option<image::RgbImage> = None;
@@ -147,7 +150,19 @@ fn a_finished_run_is_shown_beside_its_photos() {
         let view = &status["overview"];
         assert!(view.as_u64().unwrap() < status["views"].as_u64().unwrap(), "{status}");
         assert!(served.get("/metrics?from=0").1 == work.bytes("out/metrics.jsonl"), "the curves of the run");
+        let count = |name: &str| status[name].as_u64().unwrap();
+        assert_eq!(count("views") + count("held_out"), work.photos().len() as u64, "{status}");
+        assert!(0 < count("pages_in_memory") && count("pages_in_memory") <= count("pages"), "{status}");
         let same = first.get_or_insert_with(|| scene.clone());
+        // The Gaussians that the run has saved on its way, and the result again.
+        assert_eq!(status["saved"], serde_json::json!([40, 80]), "{status}");
+        let early = served.picture("view=2&width=64&step=40");
+        assert!(difference(&early, &scene) > 64 * 48, "{flags}");
+        assert_eq!(served.json("/status")["step"], 40);
+        assert!(served.picture("view=2&width=64") == scene, "{flags}");
+        let (head, body) = served.get("/picture?view=2&step=41");
+        let said = String::from_utf8_lossy(&body);
+        assert!(head.starts_with("HTTP/1.1 503") && said.contains("no Gaussians of step 41 are saved"), "{said}");
         // SOGs round colours and positions to bytes and words: two steps of a byte a value.
         // Rows lie in another order in a file than in a store, so those of equal depth blend in another order: a step of a byte in
         // one value of a hundred.

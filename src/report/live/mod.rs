@@ -1,5 +1,5 @@
 //! A page that shows a run while it trains (`--serve`) or a scene after training (`gsscale-view`): its curves, and a picture from a
-//! camera that the person watching moves.
+//! camera that the person watching moves. After training, also of the Gaussians that the run has saved on its way (`--save-every`).
 //!
 //! The run and the server share a [`Live`]. The server stores the requests for pictures. The run draws the oldest one between two
 //! steps and stores its PNG. The server reads curves from the run's `metrics.jsonl`, so they cost the run nothing.
@@ -57,6 +57,8 @@ pub struct Orbit {
     /// Width of the picture, pixels.
     pub width: u32,
     pub show: PictureKind,
+    /// A step of [`Status::saved`]; 0 for the scene as it is now.
+    pub step: u32,
 }
 
 impl Default for Orbit {
@@ -70,6 +72,7 @@ impl Default for Orbit {
             ahead: 0.0,
             width: 640,
             show: PictureKind::Scene,
+            step: 0,
         }
     }
 }
@@ -102,10 +105,17 @@ pub struct Status {
     pub step: u32,
     pub steps: u32,
     pub gaussians: u64,
+    /// Pages of the scene, and those of them that are in memory.
+    pub pages: u64,
+    pub pages_in_memory: u64,
     /// PSNR of the last step's view, dB.
     pub psnr: f64,
     /// Training views, for [`Orbit::view`].
     pub views: u32,
+    /// Photos that are held out.
+    pub held_out: u32,
+    /// The steps of which Gaussians are saved, ascending; the page asks for a picture of one by [`Orbit::step`].
+    pub saved: Vec<u32>,
     /// Percent of the time that pictures may take.
     pub picture_percent: u32,
 }

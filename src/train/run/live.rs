@@ -64,10 +64,9 @@ impl LivePage {
                 is_training: true,
                 step: trainer.steps_done(),
                 steps: trainer.options.steps,
-                gaussians: trainer.scene.rows(),
                 psnr,
-                views: dataset.train_views().len() as u32,
                 picture_percent: PICTURE_PERCENT,
+                ..counts(trainer, dataset)
             });
         }
         // A step in flight is finished first; the page waits.
@@ -76,6 +75,19 @@ impl LivePage {
         let _span = trace::span("live picture");
         self.live.show((ticket, orbit), picture(trainer, dataset, targets, orbit));
         self.spent += started.elapsed();
+    }
+}
+
+/// The numbers of a scene, for a page.
+pub(super) fn counts(trainer: &Trainer, dataset: &Dataset) -> Status {
+    let pager = &trainer.scene.pager;
+    Status {
+        gaussians: trainer.scene.rows(),
+        pages: pager.index().len() as u64,
+        pages_in_memory: pager.pages_in_memory() as u64,
+        views: dataset.train_views().len() as u32,
+        held_out: dataset.test_views().len() as u32,
+        ..Status::default()
     }
 }
 

@@ -21,7 +21,7 @@ use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::photos;
 use crate::report::run_files::{
-    BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, is_saved_ply,
+    BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, saved_step,
 };
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
@@ -277,7 +277,8 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
 /// The PLY files that `--save-every` wrote.
 pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(failed(out, "listing the folder"))?;
-    let is_saved = |path: &PathBuf| path.file_name().and_then(|name| name.to_str()).is_some_and(is_saved_ply);
+    let is_saved =
+        |path: &PathBuf| path.file_name().and_then(|name| name.to_str()).is_some_and(|name| saved_step(name).is_some());
     Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
 

@@ -7,6 +7,7 @@
 //! error of the page alone.
 
 use super::begin::{PagedStart, page_start};
+use super::live::counts;
 use super::out_folder::scene_name;
 use super::scene_picture::{overview, picture};
 use crate::base::error::InputError;
@@ -14,6 +15,7 @@ use crate::base::units::format_grouped;
 use crate::checkpoint::interval::CommitEvery;
 use crate::config::file::TrainConfig;
 use crate::config::values::Chosen;
+use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::densify::strategy::StrategyName;
 use crate::optim::method::OptimizerPlace;
@@ -21,12 +23,15 @@ use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::check_usable;
 use crate::photos::exposure::AppearanceMode;
 use crate::report::live::{Live, Status};
+use crate::report::run_files::{METRICS_FILE, saved_ply_name, saved_step};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::host_budget;
 use crate::train::preflight::forecast::plan_run;
 use crate::train::start::first_scene::Start;
+use crate::train::start::tiers::Tiers;
+use crate::train::state::trainer::Trainer;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -42,8 +47,8 @@ pub struct ShowRequest {
     pub scene: PathBuf,
     /// That of the run, or the defaults; checked.
     pub config: TrainConfig,
-    /// The metrics of the run, if there are any.
-    pub metrics: Option<PathBuf>,
+    /// The folder of the run, if it has metrics; its saved Gaussians can be shown, too.
+    pub saved: Option<PathBuf>,
     pub live: Live,
 }
 
@@ -71,38 +76,107 @@ pub fn config_to_show(config: TrainConfig, gaussians: &Path, spill_dir: Option<S
     }
 }
 
-/// Shows the Gaussians until a stop is asked for (Ctrl-C).
+/// Gaussians that are shown. The pages may lie in the tiers, so drop them after the trainer.
+struct Shown {
+    /// A step of [`Status::saved`], or 0.
+    step: u32,
+    dataset: Dataset,
+    targets: TargetCache,
+    trainer: Trainer,
+    tiers: Tiers,
+}
+
+impl Shown {
+    /// Reads Gaussians with the photos of their scene.
+    /// Errors: the Gaussians or the scene cannot be used, or memory does not suffice.
+    fn open(request: &ShowRequest, step: u32, quiet: bool) -> Result<Shown, TrainError> {
+        let mut config = request.config.clone();
+        if step > 0 {
+            let folder = request.saved.as_deref().unwrap_or(Path::new(""));
+            config.init_ply = folder.join(saved_ply_name(step)).to_string_lossy().into_owned();
+        }
+        let host_mem = host_budget(config.host_mem.0);
+        let start = Start::read(&request.scene, &config, host_mem)?;
+        let PagedStart { dataset, mut trainer, mut tiers, driver } =
+            page_start(&config, quiet, false, start, host_mem)?;
+        tiers.is_done = true;
+        plan_run(&config, &dataset, &tiers, &mut trainer, host_mem, driver, DriveRate::COMMON)?;
+        let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+        Ok(Shown { step, dataset, targets, trainer, tiers })
+    }
+
+    /// Frees memory and the spill directory.
+    fn close(mut self) {
+        drop(self.trainer);
+        self.tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
+    }
+}
+
+/// The steps of the files of `--save-every` in a folder, ascending.
+fn saved_steps(folder: &Path) -> Vec<u32> {
+    let names = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.file_name());
+    let mut steps: Vec<u32> = names.filter_map(|name| saved_step(name.to_str()?)).collect();
+    steps.sort_unstable();
+    steps
+}
+
+/// Shows the Gaussians until a stop is asked for (Ctrl-C). Those of another step are read when the page asks for them, in place of the
+/// ones before.
 /// Errors: the Gaussians or the scene cannot be used, or memory does not suffice.
 pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     let ShowRequest { scene, config, live, .. } = request;
     machine::set_up(config)?;
     config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
-    let host_mem = host_budget(config.host_mem.0);
-    let start = Start::read(scene, config, host_mem)?;
-    let PagedStart { dataset, mut trainer, mut tiers, driver } = page_start(config, false, false, start, host_mem)?;
-    tiers.is_done = true;
-    plan_run(config, &dataset, &tiers, &mut trainer, host_mem, driver, DriveRate::COMMON)?;
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    let rows = trainer.scene.rows();
-    request.metrics.iter().for_each(|metrics| live.set_metrics(metrics.clone()));
-    live.set_status(Status {
+    let first = Shown::open(request, 0, false)?;
+    request.saved.iter().for_each(|folder| live.set_metrics(folder.join(METRICS_FILE)));
+    let status = Status {
         name: scene_name(scene),
-        overview: overview(&trainer.scene, &dataset),
-        gaussians: rows,
-        views: dataset.train_views().len() as u32,
+        overview: overview(&first.trainer.scene, &first.dataset),
         picture_percent: 100,
+        saved: request.saved.as_deref().map_or_else(Vec::new, saved_steps),
         ..Status::default()
-    });
+    };
+    let saved = status.saved.clone();
+    let tell = |shown: &Shown| {
+        let counts = counts(&shown.trainer, &shown.dataset);
+        let Status { gaussians, pages, pages_in_memory, views, held_out, .. } = counts;
+        let step = shown.step;
+        live.set_status(Status { step, gaussians, pages, pages_in_memory, views, held_out, ..status.clone() });
+    };
+    tell(&first);
     // Until here, Ctrl-C ends the program at once; the pages go at the next start.
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    crate::tell!("{} Gaussians are shown until Ctrl-C", format_grouped(rows));
+    crate::tell!("{} Gaussians are shown until Ctrl-C", format_grouped(first.trainer.scene.rows()));
+    let mut shown = Some(first);
     while stop.exit_code().is_none() {
-        match live.wanted() {
-            Some((ticket, orbit)) => live.show((ticket, orbit), picture(&mut trainer, &dataset, &targets, orbit)),
-            None => std::thread::sleep(LOOK_EVERY),
+        let Some((ticket, orbit)) = live.wanted() else {
+            std::thread::sleep(LOOK_EVERY);
+            continue;
+        };
+        if orbit.step > 0 && !saved.contains(&orbit.step) {
+            live.show((ticket, orbit), Err(format!("no Gaussians of step {} are saved", orbit.step)));
+            continue;
+        }
+        if shown.as_ref().is_none_or(|shown| shown.step != orbit.step) {
+            // Not both in memory.
+            if let Some(before) = shown.take() {
+                before.close();
+            }
+            match Shown::open(request, orbit.step, true) {
+                Ok(opened) => shown = Some(opened),
+                Err(error) => {
+                    live.show((ticket, orbit), Err(format!("step {} cannot be shown: {error}", orbit.step)));
+                    continue;
+                }
+            }
+        }
+        if let Some(shown) = &mut shown {
+            live.show((ticket, orbit), picture(&mut shown.trainer, &shown.dataset, &shown.targets, orbit));
+            tell(shown);
         }
     }
-    drop(trainer);
-    tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
+    if let Some(last) = shown {
+        last.close();
+    }
     Ok(())
 }

@@ -42,7 +42,7 @@ pub(crate) fn no_view_sees(dataset: &Dataset, gaussians: u64) -> InputError {
 
 fn no_gaussian_left(dataset: &Dataset) -> InputError {
     let problem = "no Gaussian is left: resets and pruning have removed all of them";
-    let remedy = "lower --prune-opa, raise --reset-every or --prune-scale3d, or lower the learning rates";
+    let remedy = "leave out flags of rates and of pruning (--prune-opa, --prune-scale3d, --reset-every); without any, check the poses";
     InputError::new(&dataset.image_folder, problem, remedy)
 }
 
@@ -81,10 +81,11 @@ pub(crate) fn note_soundness(
         return Ok(());
     }
     let remedy = match init_ply {
-        "" => "lower the learning rates; with the default rates, report this as a bug and attach the scene".to_string(),
+        "" => "leave out flags of rates (see config.toml); without any, report this as a bug and attach the scene"
+            .to_string(),
         ply => format!(
             "check {ply}, from which the run started: colours (f_dc, f_rest), positions and scales of a sound file are \
-             below 1e6; if it is sound, lower the learning rates"
+             below 1e6; if it is sound, leave out flags of rates"
         ),
     };
     let (problem, count) = (problem_of(outcome), state.steps_skipped_in_a_row);
@@ -141,7 +142,7 @@ impl Idle {
         if self.with_drawn == 0 {
             let problem =
                 format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
-            let remedy = "raise --init-opacity, raise --reset-every, or lower --opacities-lr";
+            let remedy = "leave out flags of rates, of opacity and of resets; without any, check the poses";
             return fail(problem, remedy);
         }
         if !std::mem::replace(&mut self.is_told, true) {

@@ -36,5 +36,7 @@ fn in_a_browser(page: &Path, scratch: &Path) -> Option<usize> {
     let sliders = dom.matches("class=\"slider\"").count();
     assert!(dom.contains("</main>"), "the page is whole");
     assert_eq!(dom.matches("style=\"width: 50%;\"").count(), sliders, "the sliders were not set up");
+    let charts = dom.matches("data-plot=").count();
+    assert!(charts == 0 || dom.contains("class=\"pointed\""), "no chart shows its values");
     Some(sliders)
 }
