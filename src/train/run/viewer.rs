@@ -77,7 +77,7 @@ pub fn config_to_show(config: TrainConfig, gaussians: &Path, spill_dir: Option<S
 }
 
 /// Gaussians that are shown. The pages may lie in the tiers, so drop them after the trainer.
-struct Shown {
+struct ShownScene {
     /// A step of [`Status::saved`], or 0.
     step: u32,
     dataset: Dataset,
@@ -86,10 +86,10 @@ struct Shown {
     tiers: Tiers,
 }
 
-impl Shown {
+impl ShownScene {
     /// Reads Gaussians with the photos of their scene.
     /// Errors: the Gaussians or the scene cannot be used, or memory does not suffice.
-    fn open(request: &ShowRequest, step: u32, quiet: bool) -> Result<Shown, TrainError> {
+    fn open(request: &ShowRequest, step: u32, quiet: bool) -> Result<ShownScene, TrainError> {
         let mut config = request.config.clone();
         if step > 0 {
             let folder = request.saved.as_deref().unwrap_or(Path::new(""));
@@ -102,7 +102,7 @@ impl Shown {
         tiers.is_done = true;
         plan_run(&config, &dataset, &tiers, &mut trainer, host_mem, driver, DriveRate::COMMON)?;
         let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-        Ok(Shown { step, dataset, targets, trainer, tiers })
+        Ok(ShownScene { step, dataset, targets, trainer, tiers })
     }
 
     /// Frees memory and the spill directory.
@@ -127,7 +127,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     let ShowRequest { scene, config, live, .. } = request;
     machine::set_up(config)?;
     config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
-    let first = Shown::open(request, 0, false)?;
+    let first = ShownScene::open(request, 0, false)?;
     request.saved.iter().for_each(|folder| live.set_metrics(folder.join(METRICS_FILE)));
     let status = Status {
         name: scene_name(scene),
@@ -137,7 +137,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
         ..Status::default()
     };
     let saved = status.saved.clone();
-    let tell = |shown: &Shown| {
+    let tell = |shown: &ShownScene| {
         let counts = counts(&shown.trainer, &shown.dataset);
         let Status { gaussians, pages, pages_in_memory, views, held_out, .. } = counts;
         let step = shown.step;
@@ -162,7 +162,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
             if let Some(before) = shown.take() {
                 before.close();
             }
-            match Shown::open(request, orbit.step, true) {
+            match ShownScene::open(request, orbit.step, true) {
                 Ok(opened) => shown = Some(opened),
                 Err(error) => {
                     live.show((ticket, orbit), Err(format!("step {} cannot be shown: {error}", orbit.step)));
