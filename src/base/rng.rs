@@ -30,6 +30,8 @@ pub enum Purpose {
     MeanNoise = 10,
     /// Places that descriptions of corners compare; keys: 0, 0.
     CornerPattern = 11,
+    /// Patches of photos whose depth is looked for; keys: view, patch.
+    SweptPatch = 12,
 }
 
 /// Mixes one 64-bit word (the finaliser of SplitMix64: Steele, Lea, Flood 2014, "Fast splittable pseudorandom number

@@ -211,7 +211,11 @@ config_keys! {
         /// --schedule, where they are not given. Photos that overlap little lose by it. auto is on where the first points have
         /// not the colours that photos show there, photos overlap much, and --max-gaussians is given: a count that the run decides
         /// itself does better without. A resumed run keeps its values
-        [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free;
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free hidden;
+        /// Begin from points that the photos agree on, found by moving patches of photos through depths (a plane sweep; seconds for 150
+        /// photos), instead of the points of the scene. auto is on where the scene has no points, or points whose colours photos do not
+        /// show there, and the sweep finds enough. A resumed run keeps its Gaussians
+        [num_args = 0..=1, default_missing_value = "on", require_equals = true] sweep_points: Chosen<bool> = Chosen(None) => Free;
         /// Upper clamp of alpha (0.999 reproduces gsplat before 2026)
         max_alpha: f64 = 0.99 => Numbers hidden;
         /// Correct the pictures by values trained for each photo: off, exposure (one number for each photo), if-needed (exposure, which
@@ -442,6 +446,10 @@ impl TrainConfig {
         if self.strategy == StrategyName::Mcmc && self.max_gaussians == 0 {
             let problem = "it grows up to a cap, and there is none";
             return Err(InputError::new("--strategy mcmc", problem, "give --max-gaussians N, such as 1000000"));
+        }
+        if self.sweep_points.is_on() && !self.init_ply.is_empty() {
+            let problem = "it looks for first points, and --init-ply gives them";
+            return Err(InputError::new("--sweep-points", problem, "leave out one of the two"));
         }
         self.check_place()?;
         if (EPS_MIN..=1.0).contains(&self.adam_eps) {

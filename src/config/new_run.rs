@@ -219,6 +219,7 @@ pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
         config.poor_points = Chosen::ON;
     }
     config.poor_points.0.get_or_insert(false);
+    config.sweep_points.0.get_or_insert(asked.sweep_points);
     config.appearance.0.get_or_insert(asked.appearance);
     config.robust_views.0.get_or_insert(asked.robust_views);
     config.robust_pixels.0.get_or_insert(false);

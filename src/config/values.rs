@@ -215,7 +215,8 @@ impl Chosen<bool> {
 }
 
 /// The keys of what a run may switch on by itself.
-const REMEDIES: [&str; 5] = ["poor-points", "robust-views", "robust-pixels", "refine-poses", "export-clean"];
+const REMEDIES: [&str; 6] =
+    ["poor-points", "sweep-points", "robust-views", "robust-pixels", "refine-poses", "export-clean"];
 
 /// Every key whose value is a word, with the words that a user may write.
 pub fn choices() -> impl Iterator<Item = (&'static str, &'static [&'static str])> {

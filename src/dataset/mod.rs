@@ -23,6 +23,7 @@ pub mod paths;
 pub mod photo;
 mod photo_files;
 pub mod photo_header;
+pub mod plane_sweep;
 pub mod read;
 pub mod reality_capture;
 pub mod resize;

@@ -16,8 +16,8 @@
 //! Invariants: 1. the result is a function of photos, poses and points; 2. one photo is decoded at a time, and beyond `PHOTOS_LEAST`
 //! photos no more than `PIXELS_MOST` pixels are decoded and `DRAWN_MOST` points drawn in all.
 
-use super::exposure::AppearanceMode;
-use super::outlier::{MAD_OF_NORMAL, is_used, median_and_deviation};
+use super::exposure::{AppearanceMode, EXPOSURE_SPREAD, PHOTOS_FOR_REMEDIES};
+use super::outlier::{is_used, median_and_deviation, spread};
 use super::parameter::{Curve, Finding, write_values};
 use crate::base::error::InputResult;
 use crate::base::units::format_grouped;
@@ -100,20 +100,19 @@ pub struct Diagnosis {
     /// Pixels, and in units of each photo.
     pub shift: f64,
     pub shift_units: f64,
+    /// Whether the points differ in colour.
+    pub are_colored: bool,
     /// Numbers in `photos` of those that show something else.
     pub wrong: Vec<usize>,
 }
 
 /// Photos that a line names.
 const NAMED: usize = 3;
-/// Fewest photos for a remedy.
-pub(super) const PHOTOS_FOR_REMEDIES: usize = 8;
 /// Below this agreement, points and photos have nothing to do with each other. Measured: 0 to .04 with random points; .6 to .84 on clean
 /// scenes, and .7 with the faults of `gsscale-bench sweep stability`.
 const AGREEMENT_LEAST: f64 = 0.25;
-/// Stops of [`Diagnosis::exposure_spread`] and [`Diagnosis::color_spread`] from which on appearance is trained. Measured: .01 to .13 and 0 to
-/// .06 on clean scenes; .37 with exposures within half a stop, .44 with white balance within .3 stops.
-pub(super) const EXPOSURE_SPREAD: f64 = 0.2;
+/// Stops of [`Diagnosis::color_spread`] from which on colours are trained, too. Measured: 0 to .06 on clean scenes; .44 with white balance
+/// within .3 stops.
 const COLOR_SPREAD: f64 = 0.2;
 /// A photo shows something else if its agreement is less than this share of the median, and this multiple of the usual share of points,
 /// and at least this share, is off. Uniform photos have a low agreement, but hardly a point that is off.
@@ -136,6 +135,8 @@ pub struct Remedies {
     pub robust_views: bool,
     pub refine_poses: bool,
     pub poor_points: bool,
+    /// The run begins from points that the photos agree on.
+    pub sweep_points: bool,
 }
 
 impl Remedies {
@@ -199,6 +200,7 @@ pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagn
         agreement_by_shift: median(of(&|photo| photo.agreement - photo.agreement_in_place)),
         shift: median(of(&PhotoFinding::shift_pixels)),
         shift_units: median(of(&|photo| photo.shift_pixels() / f64::from(photo.unit))),
+        are_colored: points.iter().any(|(_, color)| *color != points[0].1),
         wrong: (0..photos.len()).filter(|&number| is_wrong(&photos[number])).collect(),
         photos,
     }
@@ -211,8 +213,13 @@ impl Diagnosis {
     }
 
     /// Whether points and photos agree, so that a photo can be judged by the points.
-    fn points_fit(&self) -> bool {
+    pub fn points_fit(&self) -> bool {
         self.agreement >= AGREEMENT_LEAST
+    }
+
+    /// Whether the colours of the points say that the points are elsewhere than what the photos show.
+    pub fn points_contradict(&self) -> bool {
+        self.photos.len() >= PHOTOS_FOR_REMEDIES && self.are_colored && !self.points_fit()
     }
 
     /// What a run without flags switches on.
@@ -233,6 +240,7 @@ impl Diagnosis {
             robust_views: !self.wrong.is_empty(),
             refine_poses: self.shift_units >= SHIFT_UNITS && self.agreement_by_shift >= AGREEMENT_BY_SHIFT,
             poor_points: false,
+            sweep_points: false,
         }
     }
 
@@ -414,11 +422,6 @@ fn median(mut values: Vec<f64>) -> f64 {
     median_and_deviation(&mut values).map_or(0.0, |(median, _)| median)
 }
 
-/// Robust standard deviation; 0 of nothing.
-pub(super) fn spread(mut values: Vec<f64>) -> f64 {
-    median_and_deviation(&mut values).map_or(0.0, |(_, deviation)| deviation / MAD_OF_NORMAL)
-}
-
 #[cfg(test)]
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
@@ -449,6 +452,7 @@ mod tests {
             agreement_by_shift: 0.0,
             shift: 0.0,
             shift_units: 0.0,
+            are_colored: true,
             wrong: Vec::new(),
         }
     }

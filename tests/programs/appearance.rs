@@ -69,7 +69,7 @@ fn without_points_the_run_finds_out_whether_exposures_differ() {
     };
     without_points(&work);
     // Four passes of 21 photos.
-    let flags = "--steps 90 --init-points 1500";
+    let flags = "--steps 90 --init-points 1500 --sweep-points=off";
     let told = said(&work, "flickering", flags);
     assert!(
         told.contains("no points to examine them by") && told.contains("has --appearance if-needed --robust-views;"),

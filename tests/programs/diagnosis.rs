@@ -1,9 +1,10 @@
 //! What a run finds out about its photos before training, and what it switches on because of it, through the real program.
 
-use crate::support::scenes::told;
+use crate::support::scenes::{TextModel, told};
 use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
+use gsscale::dataset::plane_sweep::sweep;
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::train::start::first_scene::prepare;
 
@@ -47,21 +48,61 @@ fn each_fault_of_a_capture_switches_its_remedy_on_and_a_clean_one_none() {
         ("poses", Disturbance::PoseNoise { share: 0.005 }, &["--refine-poses"]),
         ("jpeg", Disturbance::Jpeg { quality: 20 }, &[]),
         ("few", Disturbance::FewPhotos { one_in: 3 }, &[]),
-        // Nothing is known of the photos, and they do not overlap enough for a remedy of points.
-        ("random", Disturbance::RandomPoints, &["--appearance", "if-needed", "--robust-views"]),
+        // Points that the photos agree on take their place, and say what the points of the scene cannot.
+        ("random", Disturbance::RandomPoints, &[]),
     ] {
         let (flags, said, wrong) = switched_on(&work, name, &disturbance, "");
         assert_eq!(flags, want, "{name}: {said}");
-        assert_eq!(said.contains("have not the colours that"), name == "random", "{said}");
+        assert_eq!(said.contains("Gaussians begin at such points"), name == "random", "{said}");
         if name == "swapped" {
             assert!(said.contains(&format!("{} do not show what", wrong.len())), "{said}");
         }
     }
+    // Without such points nothing is known of the photos.
+    let (flags, said, _) = switched_on(&work, "random", &Disturbance::RandomPoints, "--sweep-points=off");
+    assert_eq!(flags, ["--appearance", "if-needed", "--robust-views"]);
+    assert!(said.contains("have not the colours that"), "{said}");
     // A flag decides otherwise.
     let (flags, ..) = switched_on(&work, "swapped", &swapped, "--robust-views=off");
     assert!(flags.is_empty(), "{flags:?}");
     let (flags, ..) = switched_on(&work, "exposure", &Disturbance::Exposure { stops: 0.5 }, "--appearance full");
     assert!(flags.is_empty(), "{flags:?}");
+}
+
+/// The photos have other exposures, of which a correlation sees nothing.
+#[test]
+fn points_that_photos_agree_on_are_on_surfaces_and_are_worth_decibels() {
+    let work = Workdir::new();
+    let size = CityOptions { seed: 5, views: 24, width: 160, height: 112, points: 20_000, ..CityOptions::default() };
+    write_city(&work.scene(), &CityOptions { exposure: 0.3, ..size }, &|_, _| {}).unwrap();
+    let dataset = prepare(&work.scene(), &TrainConfig::default()).unwrap().dataset;
+    let (points, colors) = sweep(&dataset, SEED);
+    assert!(points.len() > 2000 && points.len() == colors.len(), "{}", points.len());
+    let to_surface = |point: &[f32; 3]| {
+        let distance2 = |own: &[f32; 3]| own.iter().zip(point).map(|(a, b)| (a - b) * (a - b)).sum::<f32>();
+        dataset.points.iter().map(distance2).fold(f32::INFINITY, f32::min).sqrt()
+    };
+    let mut distances: Vec<f32> = points.iter().step_by(20).map(to_surface).collect();
+    distances.sort_by(f32::total_cmp);
+    // The next of 20,000 points of the city is some .01 scales away; the depths that are tried first are .04 of themselves apart.
+    let [median, most] =
+        [2, 10].map(|part| distances[distances.len() - 1 - distances.len() / part] / dataset.scene_scale);
+    println!("{} points, {median:.4} scales from a point of the city (median), {most:.4} (nine tenths)", points.len());
+    assert!(median < 0.02 && most < 0.06, "{median} {most}");
+    // The same for any number of threads.
+    let alone = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    assert!(alone.install(|| sweep(&dataset, SEED)) == (points, colors));
+
+    let mut model = TextModel::of(&work.scene());
+    (model.points, model.colors) = (Vec::new(), Vec::new());
+    model.write(&work.scene());
+    let flags = "--steps 200 --max-gaussians 6000 --seed 1 --appearance off";
+    work.run("swept", flags);
+    work.run("random", &format!("{flags} --sweep-points=off"));
+    let [swept, random] = ["swept", "random"].map(|out| work.psnr(out));
+    println!("{swept:.2} dB from such points, {random:.2} from random ones");
+    // Well below what was seen.
+    assert!(swept > random + 1.0, "{swept} {random}");
 }
 
 /// A photo of a large city shows a small part of its points.

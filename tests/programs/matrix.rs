@@ -148,10 +148,17 @@ features! {
         without ["--optimizer deferred"],
         shows |work| assert!(work.count("alone", "gaussians") > 4050);
 
-    sparse: || Workdir::wide_city(6000),
+    // A scene without points.
+    sparse: || {
+            let work = Workdir::city_of(24, [96, 64], 3000, 3);
+            let mut model = TextModel::of(&work.scene());
+            (model.points, model.colors) = (Vec::new(), Vec::new());
+            model.write(&work.scene());
+            work
+        },
         "--optimizer sparse --refine-start 10 --refine-every 10 --grow-grad2d 0.001 --steps 60",
-        without ["--optimizer deferred"],
-        shows |_| ();
+        without ["--optimizer deferred", "--sweep-points=off"],
+        shows |work| assert!(work.count("alone", "gaussians") < 50_000, "it began at random points");
 
     // Photos with EXIF data that state other exposures, which are where the values start.
     appearance: || {

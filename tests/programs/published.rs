@@ -81,9 +81,17 @@ fn the_files_hold_the_tables() {
         };
         // And no remedy.
         let off = Chosen(Some(false));
-        let (poor_points, robust_views, robust_pixels, refine_poses) = (off, off, off, off);
+        let (poor_points, sweep_points, robust_views, robust_pixels, refine_poses) = (off, off, off, off, off);
         let appearance = Chosen(Some(AppearanceMode::Off));
-        let expected = TrainConfig { appearance, poor_points, robust_views, robust_pixels, refine_poses, ..expected };
+        let expected = TrainConfig {
+            appearance,
+            poor_points,
+            sweep_points,
+            robust_views,
+            robust_pixels,
+            refine_poses,
+            ..expected
+        };
         assert_eq!(run.config, expected, "{name}");
         assert_eq!((run.facts.size, run.tier_of(&run.config)), (size, Some("S1")), "{name}");
         assert_eq!(run.tiers.len(), 6);

@@ -23,6 +23,11 @@ pub(super) fn median_and_deviation(values: &mut [f64]) -> Option<(f64, f64)> {
     Some((median, *values.select_nth_unstable_by(middle, f64::total_cmp).1))
 }
 
+/// Robust standard deviation; 0 of nothing.
+pub(super) fn spread(mut values: Vec<f64>) -> f64 {
+    median_and_deviation(&mut values).map_or(0.0, |(_, deviation)| deviation / MAD_OF_NORMAL)
+}
+
 /// Whether a pixel (y * width + x) of a photo is not masked.
 pub(super) fn is_used(photo: &Target, pixel: usize) -> bool {
     photo.mask.as_ref().is_none_or(|mask| mask[pixel] != 0)

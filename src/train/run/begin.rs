@@ -30,7 +30,7 @@ use crate::train::memory::host_budget;
 use crate::train::preflight::forecast::{Forecast, check_drive_of_results, check_first_drive, first_pages, plan_run};
 use crate::train::preflight::plan::rows_at_most;
 use crate::train::preflight::plan_text;
-use crate::train::start::first_scene::{Start, dataset_print};
+use crate::train::start::first_scene::{Start, dataset_print, random_points_warning};
 use crate::train::start::tiers::{self, Tiers};
 use crate::train::state::trainer::Trainer;
 use crate::train::state::turns::{keeps_first_count, too_few_to_decide};
@@ -90,15 +90,15 @@ fn adapt_to_photos(
     start: Start,
     host_mem: Option<u64>,
 ) -> Result<(RunRequest, Start, Option<Diagnosis>), TrainError> {
-    let diagnosis = start.diagnose()?;
     let before = request.config.clone();
+    let (start, diagnosis, sweep_points) = with_useful_points(&request, start, host_mem)?;
     let asked = match &diagnosis {
         Some(diagnosis) => diagnosis.remedies(),
         None if start.is_of_random_points() => Remedies::of_unknown(),
         None => Remedies::default(),
     };
-    new_run::adapt_to_photos(&mut request.config, &asked);
-    let start = match request.config.init_scale == before.init_scale {
+    new_run::adapt_to_photos(&mut request.config, &Remedies { sweep_points, ..asked });
+    let start = match sweep_points || request.config.init_scale == before.init_scale {
         true => start,
         false => {
             // Not both in memory.
@@ -111,6 +111,41 @@ fn adapt_to_photos(
         tell_plan(&request, &plan_text::describe_photos(diagnosis.as_ref(), &before, &request.config));
     }
     Ok((request, start, diagnosis))
+}
+
+/// The start, what the photos say, and whether the start is from points that the photos agree on, since the scene has none that are of use.
+/// Errors: the scene cannot be read.
+fn with_useful_points(
+    request: &RunRequest,
+    start: Start,
+    host_mem: Option<u64>,
+) -> Result<(Start, Option<Diagnosis>, bool), TrainError> {
+    let diagnosis = start.diagnose()?;
+    let contradict = diagnosis.as_ref().is_some_and(Diagnosis::points_contradict);
+    let reason = match request.config.sweep_points.0 {
+        Some(true) => "as --sweep-points asks",
+        None if start.is_of_random_points() => "since the scene has none",
+        None if contradict => "since those of the scene have not the colours that photos show there",
+        _ => return Ok((start, diagnosis, false)),
+    };
+    if !request.quiet {
+        tell_plan(request, &format!("points  first points are sought where photos agree, {reason}"));
+    }
+    let (swept, is_swept) = start.from_swept_points(&request.scene, &request.config)?;
+    let said = swept.diagnose()?;
+    // Points at which photos agree have the colours of the photos. Others are no better than those of the scene.
+    if is_swept && said.as_ref().is_some_and(Diagnosis::points_fit) {
+        if !request.quiet {
+            let count = format_grouped(swept.rows);
+            tell_plan(request, &format!("        {count} Gaussians begin at such points (see --sweep-points)"));
+        }
+        return Ok((swept, said, true));
+    }
+    if !request.quiet {
+        tell_plan(request, "        too few are found");
+    }
+    let start = if is_swept { Start::read(&request.scene, &request.config, host_mem)? } else { swept };
+    Ok((start, diagnosis, false))
 }
 
 /// A trainer before its first step, with all that belongs to it. Its pages may lie in the tiers, so drop them after it.
@@ -185,6 +220,9 @@ pub(crate) fn begin(
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     if !config.first_appearance.is_empty() {
         options.photos.first_appearance = Some(read_values(Path::new(&config.first_appearance))?);
+    }
+    if start.is_of_random_points() {
+        crate::tell!("warning: {}", random_points_warning(config));
     }
     let views = start.dataset.train_views().len();
     if keeps_first_count(&options.strategy, views) {

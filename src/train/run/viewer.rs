@@ -68,6 +68,7 @@ pub fn config_to_show(config: TrainConfig, gaussians: &Path, spill_dir: Option<S
         strategy: StrategyName::None,
         optimizer_on: Chosen(Some(OptimizerPlace::Host)),
         poor_points: Chosen(Some(false)),
+        sweep_points: Chosen(Some(false)),
         appearance: Chosen(Some(AppearanceMode::Off)),
         robust_views: Chosen(Some(false)),
         robust_pixels: Chosen(Some(false)),

@@ -18,6 +18,7 @@ use crate::dataset::frame::Extent;
 use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, PointSource, import_points};
 use crate::dataset::loader::{Dataset, LoadOptions, load_dataset, load_dataset_with_cloud};
 use crate::dataset::model::{PointCloud, RawScene, TakePoint};
+use crate::dataset::plane_sweep;
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::up::estimate_up;
 use crate::exchange::frames::to_local;
@@ -60,7 +61,6 @@ struct FirstOptions {
     init_ply: Option<PathBuf>,
     pages_file: Option<PathBuf>,
     init_points: u32,
-    poor_points: bool,
     /// Whether Gaussians may exceed memory.
     spills: bool,
 }
@@ -76,7 +76,6 @@ impl FirstOptions {
             init_ply: (!config.init_ply.is_empty()).then(|| PathBuf::from(&config.init_ply)),
             pages_file: (!config.pages_file.is_empty()).then(|| PathBuf::from(&config.pages_file)),
             init_points: config.init_points,
-            poor_points: config.poor_points.is_on(),
             spills: config.residence().spill_dir().is_some(),
         }
     }
@@ -100,6 +99,9 @@ impl FirstOptions {
     }
 }
 
+/// Fewest points of a plane sweep that a run begins from.
+const SWEPT_LEAST: usize = 200;
+
 /// A dataset and the source of its first Gaussians.
 pub struct Start {
     /// Views and frame.
@@ -108,7 +110,8 @@ pub struct Start {
     pub sh_degree_start: u8,
     /// Number of first Gaussians; an upper bound for point clouds.
     pub rows: u64,
-    /// Digest of their source; the same for streamed and whole input.
+    /// That of the scene's own first Gaussians, as its print has it, and the digest of their source; the same for streamed and whole input.
+    pub own_rows: u64,
     pub points: u64,
     from: FirstRows,
 }
@@ -176,7 +179,8 @@ impl Start {
             points => points_print(&(points, dataset.colors.as_slice()))?.0,
         };
         let rows = columns.rows() as u64;
-        Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Columns { columns, is_random } })
+        let from = FirstRows::Columns { columns, is_random };
+        Ok(Start { dataset, sh_degree_start, rows, own_rows: rows, points, from })
     }
 
     /// From the Gaussians of a store.
@@ -197,7 +201,8 @@ impl Start {
         options.check_rows(folder, rows)?;
         let sh_degree_start = store.sh_degree().max(options.init.sh_degree);
         let points = store.digest()?;
-        Ok(Start { dataset, sh_degree_start, rows, points, from: FirstRows::Store(Box::new(store)) })
+        let from = FirstRows::Store(Box::new(store));
+        Ok(Start { dataset, sh_degree_start, rows, own_rows: rows, points, from })
     }
 
     /// From the Gaussians of a file, which are read once here to know that all of them can be.
@@ -218,7 +223,8 @@ impl Start {
         dataset.warnings.extend(giants_warning(file, giants));
         options.check_rows(file, rows)?;
         let sh_degree_start = gaussians.sh_degree.max(options.init.sh_degree);
-        Ok(Start { dataset, sh_degree_start, rows, points: print.digest(), from: FirstRows::Gaussians(gaussians) })
+        let from = FirstRows::Gaussians(gaussians);
+        Ok(Start { dataset, sh_degree_start, rows, own_rows: rows, points: print.digest(), from })
     }
 
     /// `None` where neither points nor Gaussians are in a file.
@@ -244,7 +250,7 @@ impl Start {
         let init = InitOptions { scene_scale: dataset.scene_scale, ..options.init };
         let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
         let from = FirstRows::Points { cloud, extent, init };
-        Ok(Some(Start { dataset, sh_degree_start: options.init.sh_degree, rows, points, from }))
+        Ok(Some(Start { dataset, sh_degree_start: options.init.sh_degree, rows, own_rows: rows, points, from }))
     }
 
     /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
@@ -276,6 +282,24 @@ impl Start {
         let mut points = EvenSample::new(POINTS_MOST);
         self.for_each_point(&mut |position, color| points.add((position, color)))?;
         Ok((points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)))
+    }
+
+    /// The start from points that photos agree on ([`plane_sweep`]) and true, or this one if they agree on too few. The print stays that of the
+    /// scene's own points, so that a resumed run does not search again.
+    /// Errors: as [`prepare`].
+    pub(crate) fn from_swept_points(mut self, scene: &Path, config: &TrainConfig) -> InputResult<(Start, bool)> {
+        let options = FirstOptions::new(config);
+        let (points, colors) = plane_sweep::sweep(&self.dataset, options.init.seed);
+        if points.len() < SWEPT_LEAST {
+            return Ok((self, false));
+        }
+        // Not both in memory.
+        self.from = FirstRows::Columns { columns: Columns::default(), is_random: false };
+        (self.dataset.points, self.dataset.colors) = (points, colors);
+        let columns = first_gaussians(scene, &mut self.dataset, &options)?;
+        options.check_rows(scene, columns.rows() as u64)?;
+        let rows = columns.rows() as u64;
+        Ok((Start { rows, from: FirstRows::Columns { columns, is_random: false }, ..self }, true))
     }
 
     /// Whether the scene has neither Gaussians nor points.
@@ -393,7 +417,18 @@ pub struct Prepared {
 /// Reads the scene and creates the first Gaussians.
 /// Errors: the scene or the PLY is invalid.
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
-    prepare_with(scene, &FirstOptions::new(config))
+    let mut prepared = prepare_with(scene, &FirstOptions::new(config))?;
+    prepared.dataset.warnings.extend(prepared.is_random.then(|| random_points_warning(config)));
+    Ok(prepared)
+}
+
+/// What a user is told of a start from random points.
+pub(crate) fn random_points_warning(config: &TrainConfig) -> String {
+    let remedy = if config.poor_points.is_on() { "" } else { "; --poor-points --init-scale 1 suits them" };
+    format!(
+        "the dataset has no points: starting from {} random points in the views' frusta{remedy}",
+        config.init_points
+    )
 }
 
 fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
@@ -460,11 +495,6 @@ fn first_gaussians(scene: &Path, dataset: &mut Dataset, options: &FirstOptions) 
             "give points with --init-ply, or let --init-points N draw them in the views' frusta",
         ));
     }
-    dataset.warnings.push(format!(
-        "the dataset has no points: starting from {} random points in the views' frusta{}",
-        options.init_points,
-        if options.poor_points { "" } else { "; --poor-points --init-scale 1 suits them" }
-    ));
     let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
     let count = options.init_points as usize;
     // In aerial and object captures the subject lies within a few camera spreads of the cameras.
@@ -519,7 +549,7 @@ pub fn dataset_print(start: &Start) -> InputResult<DatasetPrint> {
     let views: InputResult<Vec<ViewPrint>> = dataset.views.par_iter().map(view_print).collect();
     Ok(DatasetPrint {
         views: views?,
-        first_rows: start.rows,
+        first_rows: start.own_rows,
         points: start.points,
         scene_scale: dataset.scene_scale,
         origin: dataset.frame.origin.to_array(),
