@@ -230,7 +230,7 @@ impl GrowthRule {
         allowed.saturating_mul(if is_small { 4 } else { 2 }).min(self.most(pixels))
     }
 
-    /// Whether runs are long enough for the measurements of which scenes grow ([`UNIT_MEASURED`]).
+    /// Whether runs are long enough for the measurements of which scenes grow (`UNIT_MEASURED`).
     pub fn is_of_measured_length(&self) -> bool {
         self.unit >= UNIT_MEASURED
     }

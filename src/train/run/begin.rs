@@ -131,7 +131,7 @@ fn with_useful_points(
     if !request.quiet {
         tell_plan(request, &format!("points  first points are sought where photos agree, {reason}"));
     }
-    let (swept, is_swept) = start.from_swept_points(&request.scene, &request.config)?;
+    let (swept, is_swept) = start.with_swept_points(&request.scene, &request.config)?;
     let said = swept.diagnose()?;
     // Points at which photos agree have the colours of the photos. Others are no better than those of the scene.
     if is_swept && said.as_ref().is_some_and(Diagnosis::points_fit) {

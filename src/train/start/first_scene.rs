@@ -287,7 +287,7 @@ impl Start {
     /// The start from points that photos agree on ([`plane_sweep`]) and true, or this one if they agree on too few. The print stays that of the
     /// scene's own points, so that a resumed run does not search again.
     /// Errors: as [`prepare`].
-    pub(crate) fn from_swept_points(mut self, scene: &Path, config: &TrainConfig) -> InputResult<(Start, bool)> {
+    pub(crate) fn with_swept_points(mut self, scene: &Path, config: &TrainConfig) -> InputResult<(Start, bool)> {
         let options = FirstOptions::new(config);
         let (points, colors) = plane_sweep::sweep(&self.dataset, options.init.seed);
         if points.len() < SWEPT_LEAST {
