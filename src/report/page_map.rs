@@ -68,7 +68,7 @@ pub struct PageTile {
 }
 
 /// The map as SVG: the fill shows the number of views, the outline shows residency. Empty for fewer pages than a map needs to show anything
-/// ([`TILES_LEAST`]).
+/// (`TILES_LEAST`).
 pub fn page_map_svg(tiles: &[PageTile]) -> String {
     if tiles.len() < TILES_LEAST {
         return String::new();
