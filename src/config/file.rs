@@ -230,7 +230,7 @@ config_keys! {
         /// With --appearance, start from the values of another run's photos, and hold their mean: its appearance.json. Empty = none
         first_appearance: String = String::new() => Derived hidden;
         /// Leave out views whose photo contradicts the scene (a wrong pose, a photo of another place) for as long as it does.
-        /// auto is on where the first points contradict a photo before training, or say nothing. The log and the report name such views with and
+        /// auto is on where the first points contradict a photo before training. The log and the report name such views with and
         /// without this key
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_views: Chosen<bool> = Chosen(None) => Numbers;
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The

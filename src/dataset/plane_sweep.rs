@@ -18,10 +18,11 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Longer side of the photos that are compared, pixels.
 const SIDE: u32 = 240;
-/// Patches that are tried in all, and at least in a photo.
+/// Patches that are tried in all.
 const PATCHES: usize = 24_000;
+/// Fewest patches of a photo that gives patches.
 const PATCHES_OF_PHOTO: usize = 64;
-/// From this number of photos on not every one gives patches, and from eight times as many on each eighth does.
+/// Of n photos, one in n / `PHOTOS` gives patches, and at least one in `EVERY_MOST`.
 const PHOTOS: usize = 128;
 const EVERY_MOST: usize = 8;
 /// Photos that give patches and are worked on together.
@@ -30,23 +31,32 @@ const BATCH: usize = 16;
 const NEIGHBOURS: [usize; 8] = [0, 1, 2, 3, 5, 8, 12, 17];
 /// Smallest cosine between the axes of photos that are compared.
 const COSINE_LEAST: f32 = 0.5;
-/// Depths, in scales of the scene, each this many steps of equal ratio; the best of them is refined by so many parts of a step.
+/// Least distance between the cameras of photos that are compared, in scales of the scene: nearer ones see no depth.
+const BASELINE_LEAST: f32 = 1e-3;
+/// Nearest and farthest depth, in scales of the scene.
 const DEPTH_RANGE: [f64; 2] = [0.1, 10.0];
+/// Depths of the search, in steps of equal ratio.
 const DEPTHS: usize = 128;
+/// Depths between two of the search, among which the best is refined.
 const PARTS: usize = 8;
 /// Pixels of a patch on each side of its centre.
 const RADIUS: usize = 2;
 const TAPS: usize = (2 * RADIUS + 1) * (2 * RADIUS + 1);
 /// Least standard deviation of a patch, of values in 0..255.
 const TEXTURE_LEAST: f32 = 2.5;
-/// Photos that must show a patch at a depth, and the share of them that must agree.
+/// Least root of the sum of squares of the pixels that a patch is compared with, less their mean. Flatter pixels agree with nothing.
+const SPREAD_LEAST: f32 = 1.0;
+/// Photos that must show a patch at a depth.
 const SHOWN_LEAST: usize = 3;
-const SHARE: f64 = 0.6;
-/// Least mean correlation of a surface, and by how much it is above that of the median depth.
+/// Share of the photos that show a patch which must agree: in the others something may hide it.
+const SHARE_AGREEING: f64 = 0.6;
+/// Least mean correlation at the depth of a surface.
 const CORRELATION_LEAST: f32 = 0.75;
+/// Least difference between that correlation and the correlation at the median depth: a patch that agrees everywhere tells no depth.
 const PEAK_LEAST: f32 = 0.3;
 
-/// Points on surfaces, local frame, with their sRGB colours. Photos that cannot be read give none: training names them.
+/// Points on surfaces, local frame, and as many sRGB colours: those of the photos that the points were found in. At most as many as patches
+/// are tried. Photos that cannot be read give none: training names them.
 pub fn sweep(dataset: &Dataset, seed: u64) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
     let views = dataset.train_views();
     let every = (views.len() / PHOTOS).clamp(1, EVERY_MOST);
@@ -81,7 +91,7 @@ pub fn sweep(dataset: &Dataset, seed: u64) -> (Vec<[f32; 3]>, Vec<[u8; 3]>) {
 fn neighbours(dataset: &Dataset, views: &[usize], view: usize) -> Vec<usize> {
     let camera = |view: usize| &dataset.views[view].camera;
     let (centre, [_, _, axis]) = (camera(view).centre(), camera(view).viewmat);
-    let least = 1e-3 * dataset.scene_scale;
+    let least = BASELINE_LEAST * dataset.scene_scale;
     let mut near: Vec<(f32, usize)> = Vec::new();
     for &other in views {
         let [_, _, along] = camera(other).viewmat;
@@ -96,17 +106,18 @@ fn neighbours(dataset: &Dataset, views: &[usize], view: usize) -> Vec<usize> {
 }
 
 struct Depths {
+    /// Of the search, ascending, local units.
     coarse: Vec<f64>,
-    /// Of two depths of which one is a part of a step beyond the other.
-    part: f64,
+    /// Ratio of neighbouring depths of the refinement.
+    fine_ratio: f64,
 }
 
 impl Depths {
     fn new(scale: f64) -> Depths {
         let [near, far] = DEPTH_RANGE;
-        let part = libm::pow(far / near, 1.0 / ((DEPTHS - 1) * PARTS) as f64);
-        let coarse = (0..DEPTHS).map(|k| scale * near * libm::pow(part, (k * PARTS) as f64)).collect();
-        Depths { coarse, part }
+        let fine_ratio = libm::pow(far / near, 1.0 / ((DEPTHS - 1) * PARTS) as f64);
+        let coarse = (0..DEPTHS).map(|k| scale * near * libm::pow(fine_ratio, (k * PARTS) as f64)).collect();
+        Depths { coarse, fine_ratio }
     }
 }
 
@@ -191,9 +202,9 @@ impl<'a> PhotoPatch<'a> {
         if best.0 < CORRELATION_LEAST - PEAK_LEAST {
             return None;
         }
-        let first = best.1 / libm::pow(depths.part, PARTS as f64);
+        let first = best.1 / libm::pow(depths.fine_ratio, PARTS as f64);
         for part in 1..2 * PARTS {
-            let depth = first * libm::pow(depths.part, part as f64);
+            let depth = first * libm::pow(depths.fine_ratio, part as f64);
             if let Some(agreement) = agreement(&seen, self, depth).filter(|agreement| *agreement > best.0) {
                 best = (agreement, depth);
             }
@@ -222,7 +233,7 @@ fn agreement(seen: &[SeenPatch<'_>], patch: &PhotoPatch<'_>, depth: f64) -> Opti
         return None;
     }
     correlations.sort_by(|a, b| b.total_cmp(a));
-    let best = ((SHARE * correlations.len() as f64).ceil() as usize).max(SHOWN_LEAST);
+    let best = ((SHARE_AGREEING * correlations.len() as f64).ceil() as usize).max(SHOWN_LEAST);
     Some(correlations[..best].iter().sum::<f32>() / best as f32)
 }
 
@@ -277,6 +288,6 @@ impl<'a> SeenPatch<'a> {
             product += value * there;
         }
         let spread = (squares - sum * sum / TAPS as f32).max(0.0).sqrt();
-        Some(if spread > 1.0 { product / (spread * patch.norm) } else { 0.0 })
+        Some(if spread > SPREAD_LEAST { product / (spread * patch.norm) } else { 0.0 })
     }
 }

@@ -71,10 +71,7 @@ fn without_points_the_run_finds_out_whether_exposures_differ() {
     // Four passes of 21 photos.
     let flags = "--steps 90 --init-points 1500 --sweep-points=off";
     let told = said(&work, "flickering", flags);
-    assert!(
-        told.contains("no points to examine them by") && told.contains("has --appearance if-needed --robust-views;"),
-        "{told}"
-    );
+    assert!(told.contains("no points to examine them by") && told.contains("has --appearance if-needed;"), "{told}");
     assert!(told.contains("stops between photos: they stay corrected"), "{told}");
     let errors = errors(&work, "flickering", &changed);
     // A pass over random points finds less than one over the points of the scene.

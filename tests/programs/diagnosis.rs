@@ -60,7 +60,7 @@ fn each_fault_of_a_capture_switches_its_remedy_on_and_a_clean_one_none() {
     }
     // Without such points nothing is known of the photos.
     let (flags, said, _) = switched_on(&work, "random", &Disturbance::RandomPoints, "--sweep-points=off");
-    assert_eq!(flags, ["--appearance", "if-needed", "--robust-views"]);
+    assert_eq!(flags, ["--appearance", "if-needed"]);
     assert!(said.contains("have not the colours that"), "{said}");
     // A flag decides otherwise.
     let (flags, ..) = switched_on(&work, "swapped", &swapped, "--robust-views=off");

@@ -110,7 +110,7 @@ features! {
 
     // Rounds after every fourth step, and a check with every other of them from the seventh on.
     decides: || Workdir::wide_city(800),
-        "--strategy long-axis --refine-start 20 --refine-every 4 --quality archive --test-every 24 --appearance off --robust-views=off",
+        "--strategy long-axis --refine-start 20 --refine-every 4 --quality archive --test-every 24 --appearance off",
         without ["--quality draft", "--max-gaussians 4000"],
         shows |work| {
             let checks = growth(work);

@@ -122,6 +122,11 @@ fn with_useful_points(
 ) -> Result<(Start, Option<Diagnosis>, bool), TrainError> {
     let diagnosis = start.diagnose()?;
     let contradict = diagnosis.as_ref().is_some_and(Diagnosis::points_contradict);
+    if request.config.sweep_points.is_on() && diagnosis.is_none() && !start.is_of_random_points() {
+        let problem = "the run begins from Gaussians, which points would replace";
+        let remedy = "leave out --sweep-points, or the file of Gaussians";
+        return Err(InputError::new(&request.scene, problem, remedy).into());
+    }
     let reason = match request.config.sweep_points.0 {
         Some(true) => "as --sweep-points asks",
         None if start.is_of_random_points() => "since the scene has none",

@@ -110,8 +110,9 @@ pub struct Start {
     pub sh_degree_start: u8,
     /// Number of first Gaussians; an upper bound for point clouds.
     pub rows: u64,
-    /// That of the scene's own first Gaussians, as its print has it, and the digest of their source; the same for streamed and whole input.
+    /// As `rows`, of the scene's own points, also where the run begins from others. The print of the dataset has it.
     pub own_rows: u64,
+    /// Digest of the scene's own points or Gaussians; the same for streamed and whole input.
     pub points: u64,
     from: FirstRows,
 }
