@@ -142,7 +142,7 @@ impl Idle {
         if self.with_drawn == 0 {
             let problem =
                 format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
-            let remedy = "leave out flags of rates, of opacity and of resets; without any, check the poses";
+            let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
             return fail(problem, remedy);
         }
         if !std::mem::replace(&mut self.is_told, true) {
