@@ -52,8 +52,8 @@ Measures training.
   gsscale-bench doctor                 checks your GPU against the CPU, and says which flags to use
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
   gsscale-bench sweep LIST SCENE... --out DIR
-                                       trains the runs of a list and compares them: pareto, ladder, ladder-gpu, stability,
-                                       or a file
+                                       trains the runs of a list and compares them: pareto, ladder, ladder-gpu, speed,
+                                       stability, or a file
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
 Published scenes: ";

@@ -5,6 +5,7 @@
 
 use super::html::escape;
 use plotters::coord::Shift;
+use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -97,6 +98,8 @@ pub struct Chart {
     pub is_wide: bool,
     /// Whether the y axis starts at zero.
     pub from_zero: bool,
+    /// Whether the x axis is logarithmic: what is not above zero is dropped. Such a chart has no values under the pointer.
+    pub is_log: bool,
 }
 
 impl Chart {
@@ -131,14 +134,38 @@ impl Chart {
         self
     }
 
+    #[must_use]
+    pub fn logarithmic(mut self) -> Chart {
+        self.is_log = true;
+        self
+    }
+
     pub fn is_empty(&self) -> bool {
         self.series.iter().all(|s| s.points.is_empty())
     }
 
     pub fn svg(&self) -> String {
         let plot = Cell::default();
+        if self.is_log {
+            let in_decades = self.in_decades();
+            return draw_svg(self.size(), |root| in_decades.draw(root, &plot));
+        }
         let svg = draw_svg(self.size(), |root| self.draw(root, &plot));
         svg.replacen("<svg ", &format!("<svg data-plot=\"{}\" ", escape(&self.values(plot.get()).to_string())), 1)
+    }
+
+    /// The chart with the decimal logarithm of x in place of x.
+    fn in_decades(&self) -> Chart {
+        let mut chart = self.clone();
+        for series in &mut chart.series {
+            series.points.retain(|point| point.0 > 0.0);
+            series.points.iter_mut().for_each(|point| point.0 = point.0.log10());
+        }
+        chart.labels.retain(|label| label.0 > 0.0);
+        chart.labels.iter_mut().for_each(|label| label.0 = label.0.log10());
+        chart.ranges.retain(|range| range.0 > 0.0);
+        chart.ranges.iter_mut().for_each(|range| range.0 = range.0.log10());
+        chart
     }
 
     /// What the script of a page needs to show the values under the pointer: the edges of the plot in pixels, the ranges of its axes, and
@@ -194,13 +221,15 @@ impl Chart {
         let mut builder = ChartBuilder::on(root);
         builder.margin(8).margin_right(18).x_label_area_size(48).y_label_area_size(72);
         builder.caption(&self.title, ("sans-serif", TITLE_SIZE));
-        let mut chart = builder.build_cartesian_2d(x0..x1, y0..y1).map_err(text)?;
+        let x_axis = XAxis { range: (x0..x1).into(), is_log: self.is_log };
+        let mut chart = builder.build_cartesian_2d(x_axis, y0..y1).map_err(text)?;
         let ((left, bottom), (right, top)) = (chart.backend_coord(&(x0, y0)), chart.backend_coord(&(x1, y1)));
         edges.set([left, top, right, bottom]);
         let mut mesh = chart.configure_mesh();
         mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(TRANSPARENT).bold_line_style(GRID);
         mesh.label_style(("sans-serif", TEXT_SIZE)).x_labels(6).y_labels(6);
-        let (of_x, of_y) = (|v: &f64| tick(*v, x1 - x0), |v: &f64| tick(*v, y1 - y0));
+        let of_x = |v: &f64| if self.is_log { short(10f64.powf(*v)) } else { tick(*v, x1 - x0) };
+        let of_y = |v: &f64| tick(*v, y1 - y0);
         mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
         chart.draw_series(self.bars().map(|ends| PathElement::new(ends, AXIS.mix(0.6)))).map_err(text)?;
@@ -281,7 +310,37 @@ impl Chart {
     }
 }
 
-type PlotArea<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
+/// The x axis, of decimal logarithms if `is_log`.
+struct XAxis {
+    range: RangedCoordf64,
+    is_log: bool,
+}
+
+impl Ranged for XAxis {
+    type FormatOption = DefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        self.range.map(value, limit)
+    }
+
+    /// The ticks of logarithms are one, two and five times the powers of ten.
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        if !self.is_log {
+            return self.range.key_points(hint);
+        }
+        let range = self.range();
+        let of_decade = |decade: i32| [1.0f64, 2.0, 5.0].map(|factor| f64::from(decade) + factor.log10());
+        let all = (range.start.floor() as i32..=range.end.floor() as i32).flat_map(of_decade);
+        all.filter(|tick| range.contains(tick)).collect()
+    }
+
+    fn range(&self) -> std::ops::Range<f64> {
+        self.range.range()
+    }
+}
+
+type PlotArea<'a, 'b> = ChartContext<'a, SVGBackend<'b>, Cartesian2d<XAxis, RangedCoordf64>>;
 type Canvas<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 
 /// The SVG of a drawing, or a paragraph with the error.
@@ -513,6 +572,20 @@ fn tick(value: f64, span: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_logarithmic_axis_has_equal_steps_for_equal_factors() {
+        let points = [0.0, 4.0, 8.0, 500.0, 1000.0].map(|x| (x, 1.0)).to_vec();
+        let svg = Chart::new("", "s", "dB").with("", points, Mark::Dots).logarithmic().svg();
+        let at = |part: &str| part.split_once('"').and_then(|(value, _)| value.parse::<i32>().ok());
+        let dots: Vec<i32> = svg.split("<circle cx=\"").skip(1).filter_map(at).collect();
+        assert_eq!(dots.len(), 4, "what is not above zero has no place: {svg}");
+        // Pixels are whole.
+        assert!((dots[1] - dots[0] - (dots[3] - dots[2])).abs() <= 1, "{dots:?}");
+        for tick in ["5", "10", "20", "500", "1000"] {
+            assert!(svg.contains(&format!("\n{tick}\n")), "{tick} is no tick: {svg}");
+        }
+    }
 
     #[test]
     fn smoothing_keeps_lines_and_evens_out_noise() {

@@ -7,6 +7,7 @@
 //! fewer frames than pages is left out, with a warning, if a view needs all pages, unless it is the reference.
 
 use super::facts::Facts;
+use super::record::RunRecord;
 use super::runs::{MadeScene, Place, Planned, Surroundings, use_drive};
 use super::sweep_page::View;
 use gsscale::base::error::{InputError, InputResult};
@@ -24,10 +25,11 @@ use std::path::Path;
 use toml::{Table, Value};
 
 /// The lists of this project, by name.
-pub const BUILT_IN: [(&str, &str); 4] = [
+pub const BUILT_IN: [(&str, &str); 5] = [
     ("pareto", include_str!("../../configs/sweeps/pareto.toml")),
     ("ladder", include_str!("../../configs/sweeps/ladder.toml")),
     ("ladder-gpu", include_str!("../../configs/sweeps/ladder-gpu.toml")),
+    ("speed", include_str!("../../configs/sweeps/speed.toml")),
     ("stability", include_str!("../../configs/sweeps/stability.toml")),
 ];
 /// First letters of the environment variables that a list may set.
@@ -52,6 +54,23 @@ pub struct List {
     each: Vec<Entry>,
     #[serde(rename = "group")]
     groups: Vec<Group>,
+    /// Results of other programs.
+    #[serde(default)]
+    known: Vec<Known>,
+}
+
+/// The result of another program, measured elsewhere.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+struct Known {
+    /// Group and name, as those of runs.
+    name: String,
+    /// Folder of the scene that it was measured on.
+    scene: String,
+    psnr: f64,
+    ssim: f64,
+    cpu_seconds: f64,
+    gaussians: u64,
 }
 
 /// Runs that belong together.
@@ -97,7 +116,7 @@ impl List {
     pub fn read(path: &Path) -> InputResult<List> {
         let text = match BUILT_IN.iter().find(|(name, _)| path.as_os_str() == *name) {
             Some((_, text)) => (*text).to_string(),
-            None => read_text(path, FILE_BYTES_MAX, "give a file, or pareto, ladder, ladder-gpu or stability")?,
+            None => read_text(path, FILE_BYTES_MAX, "give a file, or pareto, ladder, ladder-gpu, speed or stability")?,
         };
         let refused = |problem: String| InputError::new(path, problem, "see \"Sweeps\" in configs/README.md");
         let list: List = toml::from_str(&text).map_err(|e| refused(e.to_string()))?;
@@ -176,6 +195,21 @@ impl List {
         let reference = planned.first().map(|run| run.config.clone());
         let reference = reference.ok_or_else(|| InputError::new("--seeds", "no seed is given", "use --seeds 1,2,3"))?;
         Ok(Plan { reference, runs: planned, dataset: planner.dataset })
+    }
+
+    /// What other programs reached on the scene in this folder.
+    pub fn known(&self, scene: &Path) -> Vec<RunRecord> {
+        let is_of_scene = |known: &&Known| scene.file_name().is_some_and(|name| name == known.scene.as_str());
+        let record = |known: &Known| RunRecord {
+            name: known.name.clone(),
+            psnr: Some(known.psnr),
+            ssim: Some(known.ssim),
+            seconds: f64::NAN,
+            cpu_seconds: Some(known.cpu_seconds),
+            gaussians: known.gaussians,
+            ..RunRecord::default()
+        };
+        self.known.iter().filter(is_of_scene).map(record).collect()
     }
 
     /// Runs in the order of the list, with the seeds of a run together.
@@ -292,6 +326,16 @@ mod tests {
                 assert!(entry.times.iter().all(|(key, factor)| times(&base[key], *factor).is_some()), "{name} {run}");
             }
         }
+    }
+
+    #[test]
+    fn other_programs_stand_beside_runs_of_their_scene_alone() {
+        let list = List::read(Path::new("speed")).unwrap();
+        let known = list.known(Path::new("data/sheffield_cross_395"));
+        assert!(
+            known.len() == 3 && known.iter().all(|record| record.seconds.is_nan() && record.cpu_seconds > Some(600.0))
+        );
+        assert!(list.known(Path::new("data/sheffield_cross")).is_empty());
     }
 
     #[test]

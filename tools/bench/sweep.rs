@@ -28,6 +28,7 @@ Lists:
   pareto      one change of a setting at a time, and a few together: cost in accuracy, savings in time, bytes, Gaussians
   ladder      the ideas of out-of-core training, added one by one
   ladder-gpu  the same on a GPU; needs --device gpu --device-mem SIZE
+  speed       what few and many steps and Gaussians reach, beside other programs
   stability   faults of photos, poses and points, and remedies
 \"Sweeps\" in configs/README.md says how to write another one.
 
@@ -38,7 +39,7 @@ a table. A sweep that stopped continues when started again.";
 #[derive(Parser)]
 #[command(name = "gsscale-bench sweep", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// pareto, ladder, ladder-gpu, stability, or a TOML file
+    /// pareto, ladder, ladder-gpu, speed, stability, or a TOML file
     list: PathBuf,
     /// Scenes: COLMAP folders (images/, sparse/), with transforms.json, or in Mega-NeRF's layout
     #[arg(required = true)]
@@ -136,9 +137,10 @@ fn sweep_scene(
     gsscale::tell!("{}: {} of {all} runs are done; {count} to do now", place.scene.display(), all - open.len());
     let page = place.out.join("sweep.html");
     let write_page = |sweep: &Sweep| -> InputResult<String> {
-        let (records, times) = sweep.records_of(in_order);
+        let (mut records, times) = sweep.records_of(in_order);
         let machine = records.first().map_or(String::new(), |r| format!("; {} threads of {}", r.threads, r.cpu));
         let facts = format!("reference: {}{machine}; {times}", in_words(&plan.reference));
+        records.extend(list.known(&place.scene));
         let html = sweep_page(&list.view, &place.scene.display().to_string(), &facts, &records);
         write_whole(&page, html.as_bytes())?;
         Ok(format!("{}\n{times}", sweep_table(&list.view, &records)))

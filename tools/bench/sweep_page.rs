@@ -32,6 +32,9 @@ pub struct ChartOf {
     /// Show how much lower the figure is than that of the reference with the same seed.
     #[serde(default)]
     pub lost: bool,
+    /// Show the other figure on a logarithmic axis.
+    #[serde(default)]
+    pub log: bool,
 }
 
 pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) -> String {
@@ -41,7 +44,10 @@ pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) 
     page.paragraph(&equal_bits(records));
     for chart in &view.charts {
         let svg = match &chart.against {
-            Some(cost) => points(&settings, &chart.figure, cost).map(|chart| chart.svg()),
+            Some(cost) => points(&settings, &chart.figure, cost).map(|points| match chart.log {
+                true => points.logarithmic().svg(),
+                false => points.svg(),
+            }),
             None => Some(bars(view, &settings, chart).svg()),
         };
         svg.iter().for_each(|svg| page.wide_chart(svg, ""));
