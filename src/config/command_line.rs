@@ -7,13 +7,15 @@ use super::habits::{ALIASES, advice_for, with_our_spelling};
 use crate::base::say::as_called;
 use clap::builder::StyledStr;
 use clap::error::{ContextKind, ContextValue};
+use std::ffi::OsString;
 
 /// Parses the command line of a program with [`TrainOverrides`](super::file::TrainOverrides), its name first; prints help and usage errors and
 /// exits.
-pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
-    let arguments = &with_our_spelling(arguments)[..];
+pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[OsString]) -> T {
+    let arguments = with_our_spelling(arguments);
     let is_short = arguments.iter().any(|argument| argument == "-h");
     let command = with_help_of_keys(T::command(), is_short);
+    let arguments = &with_joined_switches(&command, &arguments)[..];
     if let Some((flag, advice)) = advice_for(arguments).filter(|(flag, _)| !has_flag(&command, flag)) {
         crate::tell!("error: {flag} is no flag of gsscale\n  remedy: {advice}");
         std::process::exit(2);
@@ -21,12 +23,36 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
     parse(command, arguments)
 }
 
+/// The arguments with the value of a switch joined to it: clap takes `--robust-views=off` alone, since a switch needs no value.
+fn with_joined_switches(command: &clap::Command, arguments: &[OsString]) -> Vec<OsString> {
+    let is_switch = |argument: &OsString| argument.to_str().is_some_and(|flag| has_switch(command, flag));
+    let mut joined: Vec<OsString> = Vec::with_capacity(arguments.len());
+    for argument in arguments {
+        let is_value = ["on", "off", "auto", "true", "false"].iter().any(|value| argument == value);
+        match joined.last_mut() {
+            Some(before) if is_value && is_switch(before) => {
+                before.push("=");
+                before.push(argument);
+            }
+            _ => joined.push(argument.clone()),
+        }
+    }
+    joined
+}
+
+/// Whether a command, or one of its commands, has a switch of this name, with its dashes.
+fn has_switch(command: &clap::Command, flag: &str) -> bool {
+    let Some(long) = flag.strip_prefix("--") else { return false };
+    command.get_arguments().any(|arg| arg.get_long() == Some(long) && arg.is_require_equals_set())
+        || command.get_subcommands().any(|command| has_switch(command, flag))
+}
+
 /// As [`parse_arguments`], for a program without keys: names that other trainers give to flags mean nothing to it.
-pub fn parse_plain<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[std::ffi::OsString]) -> T {
+pub fn parse_plain<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[OsString]) -> T {
     parse(T::command(), arguments)
 }
 
-fn parse<T: clap::FromArgMatches>(command: clap::Command, arguments: &[std::ffi::OsString]) -> T {
+fn parse<T: clap::FromArgMatches>(command: clap::Command, arguments: &[OsString]) -> T {
     let matches = in_words_of_caller(command.clone()).try_get_matches_from(arguments);
     let matches = matches.unwrap_or_else(|error| without_odd_tips(error, &command).exit());
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())

@@ -170,6 +170,12 @@ fn flags_and_keys_are_read_in_any_order_and_unknown_ones_refused() {
     refuses(&work, "--config bad.toml", &["bad.toml", "stepz"]);
     // Switches may stand before the scene.
     work.train("--allow-missing scene --masks=false --out switches --steps 3 -q");
+    // A switch takes its value with or without `=`.
+    work.train("scene --masks false --robust-views on --sweep-points off --out spaced --steps 3 -q");
+    let config = work.text("spaced/config.toml");
+    for line in ["masks = false", "robust-views = \"on\"", "sweep-points = \"off\""] {
+        assert!(config.contains(line), "{line} is not in {config}");
+    }
     let config = work.text("switches/config.toml");
     assert!(config.contains("allow-missing = true") && config.contains("masks = false"), "{config}");
     // A hidden key works as a flag and in a file.
