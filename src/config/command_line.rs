@@ -16,7 +16,7 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
     let is_short = arguments.iter().any(|argument| argument == "-h");
     let command = with_help_of_keys(T::command(), is_short);
     let arguments = &with_joined_switches(&command, &arguments)[..];
-    if let Some((flag, advice)) = advice_for(arguments).filter(|(flag, _)| !has_flag(&command, flag)) {
+    if let Some((flag, advice)) = advice_for(arguments).filter(|(flag, _)| find_flag(&command, flag).is_none()) {
         crate::tell!("error: {flag} is no flag of gsscale\n  remedy: {advice}");
         std::process::exit(2);
     }
@@ -25,7 +25,9 @@ pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments
 
 /// The arguments with the value of a switch joined to it: clap takes `--robust-views=off` alone, since a switch needs no value.
 fn with_joined_switches(command: &clap::Command, arguments: &[OsString]) -> Vec<OsString> {
-    let is_switch = |argument: &OsString| argument.to_str().is_some_and(|flag| has_switch(command, flag));
+    let is_switch = |argument: &OsString| {
+        argument.to_str().and_then(|flag| find_flag(command, flag)).is_some_and(clap::Arg::is_require_equals_set)
+    };
     let mut joined: Vec<OsString> = Vec::with_capacity(arguments.len());
     for argument in arguments {
         let is_value = ["on", "off", "auto", "true", "false"].iter().any(|value| argument == value);
@@ -40,13 +42,6 @@ fn with_joined_switches(command: &clap::Command, arguments: &[OsString]) -> Vec<
     joined
 }
 
-/// Whether a command, or one of its commands, has a switch of this name, with its dashes.
-fn has_switch(command: &clap::Command, flag: &str) -> bool {
-    let Some(long) = flag.strip_prefix("--") else { return false };
-    command.get_arguments().any(|arg| arg.get_long() == Some(long) && arg.is_require_equals_set())
-        || command.get_subcommands().any(|command| has_switch(command, flag))
-}
-
 /// As [`parse_arguments`], for a program without keys: names that other trainers give to flags mean nothing to it.
 pub fn parse_plain<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[OsString]) -> T {
     parse(T::command(), arguments)
@@ -58,13 +53,14 @@ fn parse<T: clap::FromArgMatches>(command: clap::Command, arguments: &[OsString]
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
 }
 
-/// Whether a command, or one of its commands, has a flag of this name, with its dashes.
-fn has_flag(command: &clap::Command, flag: &str) -> bool {
+/// The flag of this name, with its dashes, of a command or of one of its commands.
+fn find_flag<'a>(command: &'a clap::Command, flag: &str) -> Option<&'a clap::Arg> {
     let is = |arg: &clap::Arg| match flag.strip_prefix("--") {
         Some(long) => arg.get_long() == Some(long),
         None => arg.get_short().is_some_and(|short| flag == format!("-{short}")),
     };
-    command.get_arguments().any(is) || command.get_subcommands().any(|command| has_flag(command, flag))
+    let own = command.get_arguments().find(|arg| is(arg));
+    own.or_else(|| command.get_subcommands().find_map(|command| find_flag(command, flag)))
 }
 
 /// Help that names programs as the user called this one.

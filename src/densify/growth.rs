@@ -33,8 +33,8 @@ pub enum Quality {
 
 /// What a doubling must have brought for another one.
 struct DoublingDemand {
-    /// Decibels that the held-out views gain since the last check, and since the last doubling, which may first have cost them some.
-    /// Training alone brings some tenths.
+    /// Decibels that the held-out views must gain since the last check, and also since the check that decided the last doubling: a
+    /// doubling first costs them some. Training alone brings some tenths.
     gain: f64,
     /// Their share of the decibels that the trained views gain. Measured: .4 to 1.1 where doublings pay, less than .1 where they fit
     /// noise.
@@ -60,9 +60,9 @@ const LAG_LEAST: f64 = 0.3;
 /// Decibels by which trained views may be better than held-out ones for a doubling. Measured at doublings that pay: -.3 to 1.5; on seneca
 /// at 395 pixels, where doublings fit noise: 2.3 to 2.6.
 const GAP_MOST: f64 = 2.2;
-/// The same for the first doubling, before which no gain says that more Gaussians pay. Measured where it pays: -.3 to 1.1; where it does
-/// not: 1.6 (brighton) and 1.6 to 1.9 (seneca at 1000 pixels). A scene that doubles and then loses the Gaussians again has .8 dB less than
-/// one that never doubled.
+/// Decibels by which trained views may be better than held-out ones for the first doubling. This limit is lower, because no gain has been
+/// measured yet. Measured where the doubling pays: -.3 to 1.1; where it does not: 1.6 (brighton), 1.6 to 1.9 (seneca at 1000 pixels). There
+/// a doubling that was undone cost .5 dB.
 const GAP_OF_FIRST: f64 = 1.3;
 /// Decibels by which trained views must be better than held-out ones for a lag to count: a check soon after a doubling may find either
 /// better by some tenths. Measured: -.3 to 1.5 where more Gaussians pay, 2.3 and more where they do not.

@@ -98,7 +98,7 @@ pub struct Chart {
     pub is_wide: bool,
     /// Whether the y axis starts at zero.
     pub from_zero: bool,
-    /// Whether the x axis is logarithmic: what is not above zero is dropped. Such a chart has no values under the pointer.
+    /// Whether the x axis is logarithmic, for values above zero. Such a chart has no values under the pointer.
     pub is_log: bool,
 }
 
@@ -134,9 +134,13 @@ impl Chart {
         self
     }
 
+    /// Makes the x axis logarithmic and drops what is not above zero.
     #[must_use]
     pub fn logarithmic(mut self) -> Chart {
         self.is_log = true;
+        self.series.iter_mut().for_each(|series| series.points.retain(|point| point.0 > 0.0));
+        self.labels.retain(|label| label.0 > 0.0);
+        self.ranges.retain(|range| range.0 > 0.0);
         self
     }
 
@@ -146,26 +150,11 @@ impl Chart {
 
     pub fn svg(&self) -> String {
         let plot = Cell::default();
-        if self.is_log {
-            let in_decades = self.in_decades();
-            return draw_svg(self.size(), |root| in_decades.draw(root, &plot));
-        }
         let svg = draw_svg(self.size(), |root| self.draw(root, &plot));
-        svg.replacen("<svg ", &format!("<svg data-plot=\"{}\" ", escape(&self.values(plot.get()).to_string())), 1)
-    }
-
-    /// The chart with the decimal logarithm of x in place of x.
-    fn in_decades(&self) -> Chart {
-        let mut chart = self.clone();
-        for series in &mut chart.series {
-            series.points.retain(|point| point.0 > 0.0);
-            series.points.iter_mut().for_each(|point| point.0 = point.0.log10());
+        if self.is_log {
+            return svg;
         }
-        chart.labels.retain(|label| label.0 > 0.0);
-        chart.labels.iter_mut().for_each(|label| label.0 = label.0.log10());
-        chart.ranges.retain(|range| range.0 > 0.0);
-        chart.ranges.iter_mut().for_each(|range| range.0 = range.0.log10());
-        chart
+        svg.replacen("<svg ", &format!("<svg data-plot=\"{}\" ", escape(&self.values(plot.get()).to_string())), 1)
     }
 
     /// What the script of a page needs to show the values under the pointer: the edges of the plot in pixels, the ranges of its axes, and
@@ -221,14 +210,17 @@ impl Chart {
         let mut builder = ChartBuilder::on(root);
         builder.margin(8).margin_right(18).x_label_area_size(48).y_label_area_size(72);
         builder.caption(&self.title, ("sans-serif", TITLE_SIZE));
-        let x_axis = XAxis { range: (x0..x1).into(), is_log: self.is_log };
+        let x_axis = match self.is_log {
+            true => XAxis::Decades((x0.log10()..x1.log10()).into()),
+            false => XAxis::Linear((x0..x1).into()),
+        };
         let mut chart = builder.build_cartesian_2d(x_axis, y0..y1).map_err(text)?;
         let ((left, bottom), (right, top)) = (chart.backend_coord(&(x0, y0)), chart.backend_coord(&(x1, y1)));
         edges.set([left, top, right, bottom]);
         let mut mesh = chart.configure_mesh();
         mesh.x_desc(&self.x).y_desc(&self.y).axis_style(AXIS).light_line_style(TRANSPARENT).bold_line_style(GRID);
         mesh.label_style(("sans-serif", TEXT_SIZE)).x_labels(6).y_labels(6);
-        let of_x = |v: &f64| if self.is_log { short(10f64.powf(*v)) } else { tick(*v, x1 - x0) };
+        let of_x = |v: &f64| if self.is_log { short(*v) } else { tick(*v, x1 - x0) };
         let of_y = |v: &f64| tick(*v, y1 - y0);
         mesh.x_label_formatter(&of_x).y_label_formatter(&of_y);
         mesh.draw().map_err(text)?;
@@ -306,14 +298,19 @@ impl Chart {
             let span = if high > low { high - low } else { high.abs().max(1.0) };
             [if below { low - 0.04 * span } else { low }, high + 0.06 * span]
         };
-        (widen(x, x[0] > 0.0 && self.series.iter().any(|s| !s.mark.is_line())), widen(y, !self.from_zero))
+        let x = match self.is_log {
+            true if x[0] > 0.0 => widen(x.map(f64::log10), true).map(|decade| 10f64.powf(decade)),
+            true => [1.0, 10.0],
+            false => widen(x, x[0] > 0.0 && self.series.iter().any(|s| !s.mark.is_line())),
+        };
+        (x, widen(y, !self.from_zero))
     }
 }
 
-/// The x axis, of decimal logarithms if `is_log`.
-struct XAxis {
-    range: RangedCoordf64,
-    is_log: bool,
+enum XAxis {
+    Linear(RangedCoordf64),
+    /// Of decimal logarithms.
+    Decades(RangedCoordf64),
 }
 
 impl Ranged for XAxis {
@@ -321,22 +318,28 @@ impl Ranged for XAxis {
     type ValueType = f64;
 
     fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
-        self.range.map(value, limit)
+        match self {
+            XAxis::Linear(range) => range.map(value, limit),
+            XAxis::Decades(range) => range.map(&value.log10(), limit),
+        }
     }
 
-    /// The ticks of logarithms are one, two and five times the powers of ten.
+    /// In decades: one, two and five times the powers of ten.
     fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
-        if !self.is_log {
-            return self.range.key_points(hint);
-        }
-        let range = self.range();
-        let of_decade = |decade: i32| [1.0f64, 2.0, 5.0].map(|factor| f64::from(decade) + factor.log10());
-        let all = (range.start.floor() as i32..=range.end.floor() as i32).flat_map(of_decade);
-        all.filter(|tick| range.contains(tick)).collect()
+        let decades = match self {
+            XAxis::Linear(range) => return range.key_points(hint),
+            XAxis::Decades(range) => range.range(),
+        };
+        let of_decade = |decade: i32| [1.0, 2.0, 5.0].map(|factor| factor * 10f64.powi(decade));
+        let all = (decades.start.floor() as i32..=decades.end.floor() as i32).flat_map(of_decade);
+        all.filter(|tick| decades.contains(&tick.log10())).collect()
     }
 
     fn range(&self) -> std::ops::Range<f64> {
-        self.range.range()
+        match self {
+            XAxis::Linear(range) => range.range(),
+            XAxis::Decades(range) => 10f64.powf(range.range().start)..10f64.powf(range.range().end),
+        }
     }
 }
 
@@ -576,6 +579,7 @@ mod tests {
     #[test]
     fn a_logarithmic_axis_has_equal_steps_for_equal_factors() {
         let points = [0.0, 4.0, 8.0, 500.0, 1000.0].map(|x| (x, 1.0)).to_vec();
+        assert!(Chart::new("", "s", "dB").logarithmic().svg().contains("no data"));
         let svg = Chart::new("", "s", "dB").with("", points, Mark::Dots).logarithmic().svg();
         let at = |part: &str| part.split_once('"').and_then(|(value, _)| value.parse::<i32>().ok());
         let dots: Vec<i32> = svg.split("<circle cx=\"").skip(1).filter_map(at).collect();

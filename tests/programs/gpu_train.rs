@@ -91,7 +91,7 @@ fn assert_ends_with_last_good_step(work: &Workdir, fault: &str, address_space: O
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{fault}: {said}");
     let line = said.lines().rev().find(|l| l.starts_with("error: ")).unwrap_or_else(|| panic!("{fault}: {said}"));
-    // The stage whose results the run waited for, or the submitted part of the step (a picture alone where the run looks at photos).
+    // The stage whose results the run waited for, or the submitted part of the step. Where the run judges a photo, that part is a picture.
     let stage = line.split(": ").nth(2).unwrap_or_default();
     let is_stage = STAGES.contains(&stage) || ["forward", "backward", "picture"].contains(&stage);
     assert!(is_stage, "{fault}: {line}");

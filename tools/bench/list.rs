@@ -130,6 +130,9 @@ impl List {
                 return Err(refused(format!("the list has two runs {name}")));
             }
         }
+        if let Some(known) = list.known.iter().find(|known| names.contains(&known.name)) {
+            return Err(refused(format!("a run and a known result have the name {}", known.name)));
+        }
         match names.contains(&list.view.reference) {
             true => Ok(list),
             false => Err(refused(format!("the reference {} is no run of the list", list.view.reference))),
@@ -197,8 +200,11 @@ impl List {
         Ok(Plan { reference, runs: planned, dataset: planner.dataset })
     }
 
-    /// What other programs reached on the scene in this folder.
-    pub fn known(&self, scene: &Path) -> Vec<RunRecord> {
+    /// What other programs reached on the scene in this folder, if runs like `reference` see its photos as they are and hold every eighth out.
+    pub fn known(&self, scene: &Path, reference: &TrainConfig) -> Vec<RunRecord> {
+        if load_options(reference) != load_options(&TrainConfig::default()) {
+            return Vec::new();
+        }
         let is_of_scene = |known: &&Known| scene.file_name().is_some_and(|name| name == known.scene.as_str());
         let record = |known: &Known| RunRecord {
             name: known.name.clone(),
@@ -329,13 +335,15 @@ mod tests {
     }
 
     #[test]
-    fn other_programs_stand_beside_runs_of_their_scene_alone() {
+    fn known_results_are_shown_for_their_scene_and_size_alone() {
         let list = List::read(Path::new("speed")).unwrap();
-        let known = list.known(Path::new("data/sheffield_cross_395"));
+        let (scene, config) = (Path::new("data/sheffield_cross_395"), TrainConfig::default());
+        let known = list.known(scene, &config);
         assert!(
             known.len() == 3 && known.iter().all(|record| record.seconds.is_nan() && record.cpu_seconds > Some(600.0))
         );
-        assert!(list.known(Path::new("data/sheffield_cross")).is_empty());
+        assert!(list.known(Path::new("data/sheffield_cross"), &config).is_empty());
+        assert!(list.known(scene, &TrainConfig { max_resolution: 200, ..config }).is_empty(), "photos of another size");
     }
 
     #[test]

@@ -140,7 +140,7 @@ fn sweep_scene(
         let (mut records, times) = sweep.records_of(in_order);
         let machine = records.first().map_or(String::new(), |r| format!("; {} threads of {}", r.threads, r.cpu));
         let facts = format!("reference: {}{machine}; {times}", in_words(&plan.reference));
-        records.extend(list.known(&place.scene));
+        records.extend(list.known(&place.scene, &plan.reference));
         let html = sweep_page(&list.view, &place.scene.display().to_string(), &facts, &records);
         write_whole(&page, html.as_bytes())?;
         Ok(format!("{}\n{times}", sweep_table(&list.view, &records)))

@@ -95,13 +95,13 @@ fn explanation(view: &View, settings: &[Setting]) -> String {
              minus the spread of the reference (highest minus lowest) over {n} seeds."
         ),
     };
-    let is_of_others = |setting: &Setting| setting.runs.iter().any(|run| run.seconds.is_nan());
-    let of_others = match settings.iter().any(is_of_others) {
+    let is_other_program = |setting: &Setting| setting.runs.iter().any(|run| run.seconds.is_nan());
+    let other_programs = match settings.iter().any(is_other_program) {
         true => " Other programs were measured elsewhere, on the same photos.",
         false => "",
     };
     format!(
-        "Every run was a process of its own.{of_others} Values are means over seeds; the reference is {}. Times are those of the \
+        "Every run was a process of its own.{other_programs} Values are means over seeds; the reference is {}. Times are those of the \
          training steps, without loading and evaluation. Bytes written include the commit after the last step. A grey \
          line joins the settings that no other setting beats. {rule}",
         view.reference
