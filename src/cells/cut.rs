@@ -15,11 +15,14 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::new_run;
+use crate::photos::outlier::blocks::MASKED_SHARE;
 use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use crate::scene::state::row_bytes;
 use crate::train::error::TrainError;
 use crate::train::log::report::Summary;
 use crate::train::stores::ListedPage;
+use serde::de::DeserializeOwned;
+use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -134,12 +137,19 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
     Ok((plan, phases))
 }
 
-/// The remedies that the prior has decided on: its diagnosis saw all photos, and every cell shall have the same.
+/// The remedies that the prior has decided on: its diagnosis saw all photos, and every cell shall have the same. `robust-pixels = "auto"` is what
+/// the prior came to, since cells begin from Gaussians.
 pub(crate) fn remedies_of_prior(city: &City) -> InputResult<toml::Table> {
     let file = city.prior_run().join(CONFIG_FILE);
     let config = toml::Table::try_from(TrainConfig::read(&file)?);
-    let config = config.map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
-    Ok(config.into_iter().filter(|(key, _)| REMEDIES.contains(&key.as_str())).collect())
+    let mut config = config.map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+    config.retain(|key, _| REMEDIES.contains(&key));
+    let masks = config.entry("robust-pixels").or_insert("off".into());
+    if masks.as_str() == Some("auto") {
+        let has_masked = summary_of_prior::<serde_json::Map<String, Value>>(city)?.contains_key(MASKED_SHARE);
+        *masks = (if has_masked { "on" } else { "off" }).into();
+    }
+    Ok(config)
 }
 
 /// Cells of the number asked for or, if that is a number of Gaussians, the fewest whose trained rows stay below it.
@@ -283,12 +293,15 @@ fn neighbour(
     others.min_by(|&a, &b| apart(a).total_cmp(&apart(b))).map_or(usize::from(cell == 0), |page| owner[page])
 }
 
-/// Seconds of a step of the prior, from its summary.
-fn past_of(city: &City) -> InputResult<f64> {
+fn summary_of_prior<T: DeserializeOwned>(city: &City) -> InputResult<T> {
     let file = city.prior_run().join(SUMMARY_FILE);
     let text = std::fs::read_to_string(&file).map_err(|e| InputError::io(&file, "reading", &e))?;
-    let summary: Summary =
-        serde_json::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), "train the prior again"))?;
+    serde_json::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), "train the prior again"))
+}
+
+/// Seconds of a step of the prior.
+fn past_of(city: &City) -> InputResult<f64> {
+    let summary: Summary = summary_of_prior(city)?;
     Ok(summary.train_seconds / f64::from(summary.steps.max(1)))
 }
 

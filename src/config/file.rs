@@ -236,7 +236,9 @@ config_keys! {
         /// Mask the parts of photos that contradict the scene (cars, people, shadows that moved) for as long as they do. The
         /// side of a masked block is a 64th of the photo's longer side. Pixels beside a masked block that have its colour are
         /// masked too. At most a quarter of the blocks of a photo is masked, from a tenth of the run on (step 500 at the
-        /// latest). Masks of your own work better: see --masks. auto is off
+        /// latest). Masks of your own work better: see --masks. auto begins without masks, and goes on with them if photos contradict
+        /// each other after six passes (600 steps at least, half the run at most): at 3 % of the first points that they show. Runs that begin
+        /// from Gaussians or random points, and runs of fewer than 1,200 steps, have none
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_pixels: Chosen<bool> = Chosen(None) => Numbers;
         /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
         /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. auto is on where photos

@@ -17,6 +17,7 @@ use crate::optim::method::{Method, OptimizerPlace};
 use crate::optim::moments::Moments;
 use crate::optim::rates::Rates;
 use crate::photos::PhotoOptions;
+use crate::photos::outlier::blocks::BlockMasks;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
 use crate::render::{LossOptions, RenderOptions};
@@ -102,7 +103,13 @@ impl RunOptions {
                 // Read when a run begins.
                 first_appearance: None,
                 robust_views: config.robust_views.is_on(),
-                robust_pixels: config.robust_pixels.is_on(),
+                robust_pixels: match config.robust_pixels.0 {
+                    Some(true) => BlockMasks::On,
+                    Some(false) => BlockMasks::Off,
+                    None => BlockMasks::IfNeeded,
+                },
+                // Drawn when a run begins.
+                landmarks: Vec::new(),
                 refine_poses: config.refine_poses.is_on(),
                 steps: config.steps,
                 scene_scale,

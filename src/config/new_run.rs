@@ -222,7 +222,9 @@ pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
     config.sweep_points.0.get_or_insert(asked.sweep_points);
     config.appearance.0.get_or_insert(asked.appearance);
     config.robust_views.0.get_or_insert(asked.robust_views);
-    config.robust_pixels.0.get_or_insert(false);
+    if !asked.judge_pixels {
+        config.robust_pixels.0.get_or_insert(false);
+    }
     config.refine_poses.0.get_or_insert(asked.refine_poses && is_on_host);
 }
 

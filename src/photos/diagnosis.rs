@@ -19,6 +19,7 @@
 use super::exposure::{AppearanceMode, EXPOSURE_SPREAD, PHOTOS_FOR_REMEDIES};
 use super::outlier::{is_used, median_and_deviation, spread};
 use super::parameter::{Curve, Finding, write_values};
+use super::visible::{points_in, visible_points};
 use crate::base::error::InputResult;
 use crate::base::units::format_grouped;
 use crate::dataset::loader::Dataset;
@@ -48,9 +49,6 @@ const UNITS: u32 = 400;
 const SHIFTS: i32 = 9;
 /// Points by which shifts are compared.
 const POINTS_FOR_SHIFTS: usize = 1024;
-/// Cells of the longer side of a photo, for what hides what: a point beyond this multiple of the nearest depth in its cell is hidden.
-const CELLS: f64 = 48.0;
-const DEPTH_MOST: f64 = 1.15;
 /// Pixel values beyond these are clipped or dark noise: they say nothing about gains.
 const VALUES: std::ops::Range<u8> = 10..246;
 
@@ -133,6 +131,8 @@ const PHOTOS_PER_POINT: f64 = 16.0;
 pub struct Remedies {
     pub appearance: AppearanceMode,
     pub robust_views: bool,
+    /// Training judges whether photos show moving things.
+    pub judge_pixels: bool,
     pub refine_poses: bool,
     pub poor_points: bool,
     /// The run begins from points that the photos agree on.
@@ -170,7 +170,7 @@ pub fn finding(file: &Value) -> Option<Finding> {
 pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagnosis {
     let views = dataset.train_views();
     let first = thinned(points, points.len().div_ceil(POINTS_FIRST));
-    let in_view = |&view: &usize| points_in(&first, &dataset.views[view].camera).len() as f64;
+    let in_view = |&view: &usize| points_in(&first, |point| point.0, &dataset.views[view].camera).len() as f64;
     let in_views: Vec<f64> = views.par_iter().map(in_view).collect();
     let share = median(in_views.clone()) / first.len().max(1) as f64;
     let every = (points.len() as f64 * share / POINTS_WANTED) as usize;
@@ -238,6 +238,7 @@ impl Diagnosis {
         Remedies {
             appearance,
             robust_views: !self.wrong.is_empty(),
+            judge_pixels: true,
             refine_poses: self.shift_units >= SHIFT_UNITS && self.agreement_by_shift >= AGREEMENT_BY_SHIFT,
             poor_points: false,
             sweep_points: false,
@@ -284,24 +285,6 @@ impl Diagnosis {
     }
 }
 
-/// A point in a photo: its pixel, its depth, and its number.
-#[derive(Clone, Copy)]
-struct Drawn {
-    at: [f64; 2],
-    depth: f64,
-    point: usize,
-}
-
-/// The points inside the frame of a camera.
-fn points_in(points: &[ColoredPoint], camera: &Camera) -> Vec<Drawn> {
-    let size = [camera.width, camera.height].map(f64::from);
-    let project = |(point, (position, _)): (usize, &ColoredPoint)| {
-        let (at, depth) = camera.project(position.map(f64::from))?;
-        (0..2).all(|axis| (0.0..size[axis]).contains(&at[axis])).then_some(Drawn { at, depth, point })
-    };
-    points.par_iter().enumerate().filter_map(project).collect()
-}
-
 /// One point in `every`.
 fn thinned(points: &[ColoredPoint], every: usize) -> Vec<ColoredPoint> {
     points.iter().step_by(every.max(1)).copied().collect()
@@ -322,22 +305,12 @@ impl<'a> PhotoLook<'a> {
         let unit = unit_of(longer) as i32;
         let margin = unit * SHIFTS;
         let inside = |at: i32, size: u32| (margin..size as i32 - margin).contains(&at);
-        // Points behind others in a cell of the photo are probably hidden.
-        let cell = f64::from(longer) / CELLS;
-        let cell_of = |at: [f64; 2]| at.map(|x| (x / cell) as usize);
-        let mut nearest = vec![f64::INFINITY; (CELLS as usize + 1).pow(2)];
-        let drawn = points_in(points, camera);
-        let place = |[x, y]: [usize; 2]| (CELLS as usize + 1) * y + x;
-        for point in &drawn {
-            let nearest = &mut nearest[place(cell_of(point.at))];
-            *nearest = nearest.min(point.depth);
-        }
-        let is_seen = |point: &&Drawn| point.depth <= DEPTH_MOST * nearest[place(cell_of(point.at))];
         let counts = |[x, y]: [i32; 2]| {
             let pixel = y as usize * photo.width as usize + x as usize;
             inside(x, photo.width) && inside(y, photo.height) && is_used(photo, pixel)
         };
-        let seen = drawn.iter().filter(is_seen).map(|point| (point.at.map(|x| x as i32), points[point.point].1));
+        let seen = visible_points(points, |point| point.0, camera).into_iter();
+        let seen = seen.map(|point| (point.at.map(|x| x as i32), points[point.point].1));
         PhotoLook { photo, unit, points: seen.filter(|(at, _)| counts(*at)).collect() }
     }
 
@@ -459,7 +432,7 @@ mod tests {
 
     #[test]
     fn a_remedy_takes_photos_that_can_be_judged() {
-        let none = Remedies::default();
+        let none = Remedies { judge_pixels: true, ..Remedies::default() };
         let exposure = |photos, agreement| Diagnosis { exposure_spread: 0.7, ..of(photos, agreement) }.remedies();
         assert_eq!(exposure(100, 0.7), Remedies { appearance: AppearanceMode::Exposure, ..none });
         let unknown = Remedies::of_unknown();

@@ -19,11 +19,13 @@ pub mod exposure;
 pub mod outlier;
 pub mod parameter;
 pub mod pose;
+mod visible;
 
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::camera::Camera;
 use exposure::{AppearanceMode, GivenValues};
+use outlier::blocks::BlockMasks;
 use parameter::{Kind, PhotoParameter, SavedValues, ValuesError};
 
 /// What the user asked for, and what the kinds need of the other options of a run.
@@ -36,7 +38,9 @@ pub struct PhotoOptions {
     /// Whether views that contradict the scene are left out.
     pub robust_views: bool,
     /// Whether blocks of photos that contradict the scene are masked.
-    pub robust_pixels: bool,
+    pub robust_pixels: BlockMasks,
+    /// Some of the first points, local frame, by which a run finds out whether masks are needed; none where they do not fit the photos.
+    pub landmarks: Vec<[f32; 3]>,
     pub refine_poses: bool,
     pub steps: u32,
     /// Scene scale, local units.

@@ -168,8 +168,8 @@ pub trait PhotoParameter {
         false
     }
 
-    /// Whether the host acts between picture and gradient, so that a device cannot be given steps ahead.
-    fn needs_host(&self) -> bool {
+    /// Whether the host acts between picture and gradient at 0-based `step`, so that a device cannot be given this step ahead.
+    fn needs_host(&self, _step: u32) -> bool {
         self.corrects() || self.adds_loss()
     }
 

@@ -35,7 +35,7 @@ use crate::scene::image::{PictureGradient, Target};
 use fit::{FittedPair, bounded};
 use model::{CHANNEL_VALUES, IMAGE_VALUES};
 use picture::Look;
-use predict::predict;
+use predict::{PhotoPlace, predict};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -153,6 +153,12 @@ fn check(saved: &Encoded) -> Result<(), ValuesError> {
     decoded(saved).map(drop)
 }
 
+/// The exposure of a photo by its EXIF data, stops; `None` if they lack it. Errors: the reason why the data cannot be read.
+fn stated_exposure(dataset: &Dataset, view: usize) -> Result<Option<f64>, String> {
+    let photo = &dataset.views[view].photo;
+    photo.header.exif.map_or(Ok(None), |place| exif::brightness(&photo.image_path, place))
+}
+
 /// The warning that the EXIF data of photos cannot be read: each a view and the reason.
 fn damaged_exif(dataset: &Dataset, damaged: &[(usize, &str)]) -> Option<String> {
     let (&(first, why), rest) = damaged.split_first()?;
@@ -194,10 +200,7 @@ impl PhotoParameter for Appearance {
             return Vec::new();
         }
         let views = dataset.train_views();
-        let read = |&view: &usize| {
-            let photo = &dataset.views[view].photo;
-            photo.header.exif.map_or(Ok(None), |place| exif::brightness(&photo.image_path, place))
-        };
+        let read = |&view: &usize| stated_exposure(dataset, view);
         let read: Vec<Result<Option<f64>, String>> = views.par_iter().map(read).collect();
         let damaged = views.iter().zip(&read);
         let damaged = damaged.filter_map(|(&view, read)| Some((view, read.as_ref().err()?.as_str())));
@@ -230,10 +233,17 @@ impl PhotoParameter for Appearance {
             return None;
         }
         let camera = |view: usize| &dataset.views[view].camera;
-        let is_known = |view: &usize| self.state.images.get(*view).is_some_and(|image| image.sightings > 0);
-        let of_known = |view: usize| (camera(view), self.state.acting(view, self.mode.image_values()));
-        let known: Vec<_> = dataset.train_views().into_iter().filter(is_known).map(of_known).collect();
-        let said = predict(&known, &views.iter().map(|&view| camera(view)).collect::<Vec<_>>());
+        let place = |&view: &usize| PhotoPlace {
+            camera: camera(view),
+            stated: stated_exposure(dataset, view).unwrap_or_default(),
+        };
+        let mut known = dataset.train_views();
+        known.retain(|&view| self.state.images.get(view).is_some_and(|image| image.sightings > 0));
+        let of_known = |view: &usize| (place(view), self.state.acting(*view, self.mode.image_values()));
+        let said = predict(
+            &known.par_iter().map(of_known).collect::<Vec<_>>(),
+            &views.par_iter().map(place).collect::<Vec<_>>(),
+        );
         let look = |(&view, image): (&usize, _)| -> Correction {
             let group = self.camera_groups.get(view).copied().unwrap_or_default();
             let look = Look { image, ..self.state.look(self.mode, (view, group), camera(view)) };

@@ -205,7 +205,7 @@ impl AppearanceState {
 
 /// Stops of exposure per stop of light. An exposure multiplies pixel values, and pixel values are stored with a gamma of about
 /// 2.2, so a stop of light changes them by 1/2.2 stops.
-const PER_STOP: f64 = 1.0 / 2.2;
+pub const PER_STOP: f64 = 1.0 / 2.2;
 
 /// First exposures (stops) of photos with these brightnesses (stops of light; `None` where unknown): the difference to the
 /// median brightness, within the bounds of the model. `None` unless more than half of the photos have a brightness.

@@ -52,6 +52,11 @@ impl BlockGrid {
         self.columns() * self.height.div_ceil(self.side)
     }
 
+    /// The block of a place in the photo, pixels.
+    pub fn block_at(&self, [x, y]: [f64; 2]) -> usize {
+        y as usize / self.side * self.columns() + x as usize / self.side
+    }
+
     /// Columns and rows of the pixels of a block.
     pub fn pixels(&self, block: usize) -> (Range<usize>, Range<usize>) {
         let (x, y) = (block % self.columns() * self.side, block / self.columns() * self.side);

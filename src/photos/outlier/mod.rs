@@ -1,6 +1,7 @@
 //! Outliers: photos, and parts of photos, that contradict the rest of the scene.
 //!
 //! [`blocks`]: parts of photos that show what other photos do not (cars, people), by their residuals on a grid (`grid`).
+//! [`landmarks`]: whether photos show such parts at all.
 //! [`views`]: whole views whose photo does not match their pose (a wrong pose, another place, a broken photo).
 //!
 //! Invariant: every value is a function of photos, pictures and steps alone, so runs give the same bits for any number
@@ -8,6 +9,7 @@
 
 pub mod blocks;
 mod grid;
+pub mod landmarks;
 pub mod views;
 
 use crate::scene::image::Target;

@@ -283,7 +283,7 @@ impl PhotoParameter for OutlierViews {
         self.leaves_out(view) && !(epoch as usize + view).is_multiple_of(MEASURED_EVERY)
     }
 
-    fn needs_host(&self) -> bool {
+    fn needs_host(&self, _: u32) -> bool {
         self.are_left_out
     }
 

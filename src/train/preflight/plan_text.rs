@@ -59,7 +59,6 @@ pub fn describe_photos(diagnosis: Option<&Diagnosis>, before: &TrainConfig, now:
     let switched_on = [
         (before.appearance.0.is_none() && now.appearance != Chosen(Some(AppearanceMode::Off)), appearance.as_str()),
         (before.robust_views.0.is_none() && now.robust_views.is_on(), "--robust-views"),
-        (before.robust_pixels.0.is_none() && now.robust_pixels.is_on(), "--robust-pixels"),
         (before.refine_poses.0.is_none() && now.refine_poses.is_on(), "--refine-poses"),
         (before.poor_points.0.is_none() && now.poor_points.is_on(), "--poor-points"),
     ];

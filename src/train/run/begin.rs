@@ -226,6 +226,9 @@ pub(crate) fn begin(
     if !config.first_appearance.is_empty() {
         options.photos.first_appearance = Some(read_values(Path::new(&config.first_appearance))?);
     }
+    if config.robust_pixels.0.is_none() {
+        options.photos.landmarks = start.landmarks()?;
+    }
     if start.is_of_random_points() {
         crate::tell!("warning: {}", random_points_warning(config));
     }

@@ -26,6 +26,7 @@ use crate::exchange::ply::{self, PlyContent, read_ply};
 use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::Pager;
 use crate::photos::diagnosis::{Diagnosis, POINTS_MOST, diagnose};
+use crate::photos::outlier::landmarks::LANDMARKS_MOST;
 use crate::scene::columns::{Columns, row_width};
 use crate::scene::init::{InitOptions, gaussians_from_points, random_points_in_frusta};
 use crate::scene::log_scales::LogScaleRange;
@@ -283,6 +284,14 @@ impl Start {
         let mut points = EvenSample::new(POINTS_MOST);
         self.for_each_point(&mut |position, color| points.add((position, color)))?;
         Ok((points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)))
+    }
+
+    /// Some of the first points; none where the run starts from Gaussians or random points.
+    /// Errors: the points cannot be read.
+    pub(crate) fn landmarks(&self) -> InputResult<Vec<[f32; 3]>> {
+        let mut landmarks = EvenSample::new(LANDMARKS_MOST);
+        self.for_each_point(&mut |position, _| landmarks.add(position))?;
+        Ok(landmarks.kept)
     }
 
     /// The start from points that photos agree on ([`plane_sweep`]) and true, or this one if they agree on too few. The print stays that of the

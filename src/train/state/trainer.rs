@@ -367,7 +367,7 @@ impl Trainer {
             return Err(error);
         }
         // Without corrections and masks no step needs its picture on the host.
-        if !self.is_ahead() && !self.photos.iter().any(|parameter| parameter.needs_host()) {
+        if !self.is_ahead() && !self.needs_host(step) {
             self.record(dataset, 0, target)?;
         }
         if self.is_ahead() {
@@ -416,7 +416,8 @@ impl Trainer {
     /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
     fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let may_record = self.device.as_ref().is_some_and(|tier| tier.flights.may_record());
-        if !may_record || !self.ahead.is_allowed || !self.has_no_event_or_end_after(self.state.step) {
+        let is_followed_up = self.needs_host(self.state.step + 1) || !self.has_no_event_or_end_after(self.state.step);
+        if !may_record || !self.ahead.is_allowed || is_followed_up {
             return Ok(());
         }
         let Some(&view) = self.turns.coming(self.state.step, 2, &self.photos).get(1) else { return Ok(()) };
@@ -428,6 +429,10 @@ impl Trainer {
             other => drop(other?),
         }
         Ok(())
+    }
+
+    fn needs_host(&self, step: u32) -> bool {
+        self.photos.iter().any(|parameter| parameter.needs_host(step))
     }
 
     /// Whether no event follows 0-based `step`, and no outcome of the step can end the run.

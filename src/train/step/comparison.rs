@@ -173,7 +173,7 @@ mod tests {
         let probes = [Probe::default(), Probe::default()];
         let [first, second] = [&probes[0], &probes[1]].map(|probe| probe.v_rgb.clone());
         let mut photos = probes.map(|probe| Box::new(probe) as Box<dyn PhotoParameter>);
-        assert!(photos[0].needs_host(), "steps that a device records ahead would lack the term");
+        assert!(photos[0].needs_host(0), "steps that a device records ahead would lack the term");
         let (photo, mut renderer) = (photo(51), drawn(0.25));
         let mut comparison = Comparison { photos: &mut photos, ..Comparison::new(&photo, LossOptions::default()) };
         comparison.loss_and_back(&mut renderer).unwrap();

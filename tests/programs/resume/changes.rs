@@ -27,8 +27,8 @@ fn what_changed_is_said_and_left_as_it_was() {
             "appearance was \"off\" and is \"exposure\"",
         ],
     );
-    for key in ["refine-poses", "robust-views", "robust-pixels"] {
-        assert!(said.contains(&format!("{key} was \"off\" and is \"on\"")), "{said}");
+    for (key, was) in [("refine-poses", "off"), ("robust-views", "off"), ("robust-pixels", "auto")] {
+        assert!(said.contains(&format!("{key} was \"{was}\" and is \"on\"")), "{said}");
     }
     assert!(!said.contains("threads"), "{said}");
     // The layout of stored pages cannot change, and steps cannot be fewer than were done.
