@@ -232,8 +232,13 @@ impl Blocks {
         check_views(&self.views)
     }
 
+    /// Reads what a commit holds. Earlier versions wrote the blocks of the views alone.
     fn decoded(saved: &Encoded) -> Result<Blocks, ValuesError> {
-        saved.decoded(Blocks::check)
+        let of_views = |views| Blocks { views, ..Blocks::default() };
+        saved.decoded(Blocks::check).or_else(|error| {
+            let views: Result<Vec<_>, _> = saved.decoded(|views: &Vec<_>| check_views(views));
+            views.map(of_views).map_err(|_| error)
+        })
     }
 }
 
@@ -287,7 +292,11 @@ impl PhotoParameter for MaskedBlocks {
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.blocks, Blocks::check, |a, b| a.views.len() == b.views.len())
+        let saved = Blocks::decoded(saved)?;
+        if saved.views.len() == self.blocks.views.len() {
+            self.blocks = saved;
+        }
+        Ok(())
     }
 
     fn needs_host(&self, step: u32) -> bool {
@@ -510,6 +519,18 @@ mod tests {
         assert_eq!(masked.mask.unwrap(), of_user);
         photo.mask = Some(vec![0; photo.pixels()]);
         assert_eq!(look(&[], &picture, &photo), None);
+    }
+
+    #[test]
+    fn blocks_of_earlier_versions_are_read() {
+        let views = vec![vec![BlockState::new(9, true), BlockState::new(5, false)].repeat(2), Vec::new()];
+        let read = Blocks::decoded(&Encoded::of(&views).unwrap()).unwrap();
+        assert_eq!((read.views, read.contradicted, read.landmarks.len()), (views.clone(), None, 0));
+        let now = Blocks { views, contradicted: Some(0.04), landmarks: vec![[1.0; 3]] };
+        let read = Blocks::decoded(&Encoded::of(&now).unwrap()).unwrap();
+        assert_eq!((read.views, read.contradicted, read.landmarks), (now.views, Some(0.04), vec![[1.0; 3]]));
+        let masked = vec![vec![BlockState::new(9, true); 2]];
+        assert!(Blocks::decoded(&Encoded::of(&masked).unwrap()).is_err(), "more than a quarter is masked");
     }
 
     #[test]
