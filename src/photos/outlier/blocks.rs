@@ -523,7 +523,10 @@ mod tests {
 
     #[test]
     fn blocks_of_earlier_versions_are_read() {
-        let views = vec![[BlockState::new(9, true), BlockState::new(5, false)].repeat(2), Vec::new()];
+        let views = vec![
+            [(9, true), (5, false), (5, false), (5, false)].map(|(mean, is)| BlockState::new(mean, is)).repeat(2),
+            Vec::new(),
+        ];
         let read = Blocks::decoded(&Encoded::of(&views).unwrap()).unwrap();
         assert_eq!((read.views, read.contradicted, read.landmarks.len()), (views.clone(), None, 0));
         let now = Blocks { views, contradicted: Some(0.04), landmarks: vec![[1.0; 3]] };
