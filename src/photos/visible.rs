@@ -9,15 +9,18 @@ use rayon::prelude::*;
 const CELLS: f64 = 48.0;
 const DEPTH_MOST: f64 = 1.15;
 
-/// A point in a photo: its pixel, its depth, and its number.
+/// A point in a photo.
 #[derive(Clone, Copy)]
 pub struct Drawn {
+    /// Its place in the photo, pixels from the upper left corner.
     pub at: [f64; 2],
+    /// Along the view, local units.
     pub depth: f64,
+    /// Its number among the points.
     pub point: usize,
 }
 
-/// Positions, local frame, that lie in the frame of a camera.
+/// The points in the frame of a camera, in their order. `position`: of a point, local frame.
 pub fn points_in<P: Sync>(points: &[P], position: fn(&P) -> [f32; 3], camera: &Camera) -> Vec<Drawn> {
     let size = [camera.width, camera.height].map(f64::from);
     let project = |(point, of): (usize, &P)| {

@@ -155,7 +155,7 @@ fn tiles(summary: &Value, metrics: &[Value]) -> Vec<(String, &'static str)> {
     let tiles = [
         (decibels(&test["psnr"]), "PSNR, held-out views"),
         (test["ssim"].as_f64().map(|ssim| format!("{ssim:.3}")), "SSIM, held-out views"),
-        (decibels(&test["predicted"]["predicted_psnr"]), "PSNR, exposures predicted from neighbours"),
+        (decibels(&test["predicted"]["predicted_psnr"]), "PSNR, exposures predicted without the photo"),
         (
             decibels(&corrected["cc_psnr"]),
             match corrected["method"].as_str() {

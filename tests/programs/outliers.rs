@@ -79,7 +79,7 @@ fn masking_what_stands_on_one_photo_only_wins_decibels() {
     boxes.run("c", &format!("{steps} --robust-pixels=off"));
     boxes.run("d", &format!("{steps} --robust-pixels"));
     let said = boxes.run("e", &steps);
-    assert!(said.contains("are masked from here on"), "{said}");
+    assert!(said.contains("masked from here on"), "{said}");
     let said = disturbed(&work, "clean", &Disturbance::Nothing).run("b", &steps);
     assert!(!said.contains("masked"), "{said}");
     let contradicted = ["b", "e"].map(|out| work.summary(out)["contradicted_share"].as_f64().unwrap());

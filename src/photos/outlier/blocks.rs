@@ -417,8 +417,8 @@ impl MaskedBlocks {
         if self.is_masking() {
             let percent = 100.0 * share.unwrap_or_default();
             return Some(format!(
-                "{percent:.1} % of what photos show contradicts the other photos, as things that moved do: such parts are masked from \
-                 here on (--robust-pixels)"
+                "{percent:.1} % of the first points in photos look wrong on one photo alone, as things that moved do: such parts of photos are \
+                 masked from here on (--robust-pixels off keeps them)"
             ));
         }
         self.blocks.views.iter_mut().for_each(Vec::clear);

@@ -22,16 +22,17 @@ const TIMES_OTHERS: f64 = 4.0;
 const OTHERS_LEAST: f64 = 0.01;
 /// Fewest other photos that show a landmark.
 const OTHERS: usize = 2;
-/// Fewest landmarks in photos for a judgement.
+/// Fewest sightings, of all landmarks in all photos, for a result.
 const SIGHTINGS_LEAST: usize = 256;
 
-/// Residuals of the blocks of a photo, `None` for those without used pixels.
+/// A photo that was measured.
 pub struct ViewResiduals<'a> {
     pub camera: &'a Camera,
+    /// The residual of each block of its grid, of values in 0..1; `None` for a block without used pixels.
     pub of_block: Vec<Option<f64>>,
 }
 
-/// Which share of the landmarks in photos is contradicted there; `None` if photos show too few.
+/// The share of the sightings of landmarks (local frame) that are contradictions, 0..1; `None` if there are too few sightings.
 pub fn contradicted_share(landmarks: &[[f32; 3]], views: &[ViewResiduals<'_>]) -> Option<f64> {
     let seen_in = |view: &ViewResiduals<'_>| {
         let grid = BlockGrid::of(view.camera.width, view.camera.height);

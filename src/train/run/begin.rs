@@ -203,7 +203,11 @@ pub(super) fn page_start(
         crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     check_first_drive(config, start.rows)?;
-    let (renderer, options, driver) = begin(quiet, config, &start)?;
+    let (renderer, mut options, driver) = begin(quiet, config, &start)?;
+    // A resumed run has them in its commit.
+    if config.robust_pixels.0.is_none() {
+        options.photos.landmarks = start.landmarks()?;
+    }
     let [pages, _] = first_pages(config, rows_at_most(config, start.rows));
     let (pager, tiers) = tiers::open(config, pages as usize, host_mem.unwrap_or(u64::MAX), dry_run)?;
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
@@ -225,9 +229,6 @@ pub(crate) fn begin(
         RunOptions { sh_degree_start: start.sh_degree_start, ..RunOptions::new(config, start.dataset.scene_scale) };
     if !config.first_appearance.is_empty() {
         options.photos.first_appearance = Some(read_values(Path::new(&config.first_appearance))?);
-    }
-    if config.robust_pixels.0.is_none() {
-        options.photos.landmarks = start.landmarks()?;
     }
     if start.is_of_random_points() {
         crate::tell!("warning: {}", random_points_warning(config));

@@ -416,8 +416,8 @@ impl Trainer {
     /// Records the step behind the one in flight, if it may be recorded. An error of reading its pages is reported when the step is due.
     fn record_next(&mut self, dataset: &Dataset, targets: &TargetCache) -> Result<(), TrainError> {
         let may_record = self.device.as_ref().is_some_and(|tier| tier.flights.may_record());
-        let is_followed_up = self.needs_host(self.state.step + 1) || !self.has_no_event_or_end_after(self.state.step);
-        if !may_record || !self.ahead.is_allowed || is_followed_up {
+        let step = self.state.step;
+        if !may_record || !self.ahead.is_allowed || self.needs_host(step + 1) || !self.has_no_event_or_end_after(step) {
             return Ok(());
         }
         let Some(&view) = self.turns.coming(self.state.step, 2, &self.photos).get(1) else { return Ok(()) };
