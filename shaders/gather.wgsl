@@ -1,11 +1,11 @@
 // Stage "gather": the rows of pages that lie on the device, as they are now. `cull` lists the rows of each page that the
-// camera may draw, `list` packs the lists in the order of the pages, `gather_geometry` and `gather_colors` evaluate the columns of the
-// listed rows, and `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score, the lowest opacity
+// camera may draw, `gather_geometry` and `gather_colors` evaluate the columns of the listed rows, page after page,
+// and `bounds` finds the bounds of a page after its update. `survey` computes the largest mean score, the lowest opacity
 // and the least mean weight of a page, from which the host decides whether a round edits rows. Where the host does not wait for the
-// numbers of rows, `place` finds where the list of each page begins, and `list` also fills the room behind the last row. The twin of
-// tests/numerics/twins/gather.rs.
+// numbers of rows, `place` finds where the rows of each page begin, and the room behind the last row is filled with entries that no
+// stage draws. The twin of tests/numerics/twins/gather.rs.
 //
-// A payload lies in one slab, and a dispatch works on the pages of one slab. Everything that evaluates a row is in this
+// A payload lies in one slab, and a dispatch works on the pages of one slab; a workgroup works on one page. Everything that evaluates a row is in this
 // file, so that one compiled formula decides what is seen, drawn, updated and bounded.
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
@@ -30,7 +30,7 @@ struct GatherUniforms {
     /// The slab that is bound.
     slab: u32,
     page_count: u32,
-    /// Listed rows of this dispatch; in `list` the room of a list that is to be filled, else 0.
+    /// Rows of the columns that are bound.
     row_count: u32,
     /// Floats per row of the higher SH bands of the output.
     sh_n_width: u32,
@@ -40,6 +40,12 @@ struct GatherUniforms {
     grow_grad2d: f32,
     split_scale: f32,
     split_reach: f32,
+    /// Number, in the batch, of the first row that is bound.
+    first_bound: u32,
+    /// The pages of this dispatch, and the chunks of each.
+    first_page: u32,
+    end_page: u32,
+    chunks: u32,
     pad: u32,
 }
 
@@ -53,19 +59,17 @@ struct GatherUniforms {
 @group(0) @binding(5) var<storage, read_write> counts: array<u32>;
 /// At `first_row` of a page on: the rows that the camera may draw, ascending.
 @group(0) @binding(6) var<storage, read_write> found: array<u32>;
-/// Listed rows of the batch: number of the page, or UNLISTED, and number of the row in it.
-@group(0) @binding(7) var<storage, read_write> rows: array<vec2<u32>>;
 /// Columns of the listed rows.
-@group(0) @binding(8) var<storage, read_write> means: array<f32>;
-@group(0) @binding(9) var<storage, read_write> quats: array<f32>;
-@group(0) @binding(10) var<storage, read_write> scales: array<f32>;
-@group(0) @binding(11) var<storage, read_write> opacities: array<f32>;
-@group(0) @binding(12) var<storage, read_write> sh0: array<f32>;
-@group(0) @binding(13) var<storage, read_write> sh_n: array<f32>;
-@group(0) @binding(14) var<storage, read_write> results: array<PageResult>;
+@group(0) @binding(7) var<storage, read_write> means: array<f32>;
+@group(0) @binding(8) var<storage, read_write> quats: array<f32>;
+@group(0) @binding(9) var<storage, read_write> scales: array<f32>;
+@group(0) @binding(10) var<storage, read_write> opacities: array<f32>;
+@group(0) @binding(11) var<storage, read_write> sh0: array<f32>;
+@group(0) @binding(12) var<storage, read_write> sh_n: array<f32>;
+@group(0) @binding(13) var<storage, read_write> results: array<PageResult>;
 /// The pages, for `place`.
-@group(0) @binding(15) var<storage, read_write> placed: array<DevicePage>;
-@group(0) @binding(16) var<storage, read_write> surveys: array<PageSurvey>;
+@group(0) @binding(14) var<storage, read_write> placed: array<DevicePage>;
+@group(0) @binding(15) var<storage, read_write> surveys: array<PageSurvey>;
 
 /// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
 /// is twice the CPU's, for devices that divide and take roots less exactly.
@@ -78,6 +82,10 @@ const REACH_SLACK: f32 = 1.0001;
 const EPSILON: f32 = 1.1920929e-7;
 /// Quotients of smaller sums are not exact: a mean score above 0 counts as at least this one.
 const SMALLEST_MEAN: f32 = 1e-30;
+/// Rows of a chunk.
+const CHUNK_ROWS: u32 = 64u;
+/// Number of the page of entries without a row.
+const NO_PAGE: u32 = 0xffffffffu;
 /// Opacity, before activation, of entries without a row.
 const HIDDEN_LOGIT: f32 = -100.0;
 
@@ -206,6 +214,7 @@ fn place(workgroup: Group, place: SubgroupPlace) {
         let scanned = workgroup_scan(count, place);
         if p < u.page_count {
             placed[p].first_listed = before + scanned.before;
+            placed[p].listed = count;
         }
         before += scanned.total;
         workgroupBarrier();
@@ -215,75 +224,63 @@ fn place(workgroup: Group, place: SubgroupPlace) {
     }
 }
 
-/// One workgroup for each page, of any slab; behind them one for each 256 rows of a list that is to be filled.
-@compute @workgroup_size(256)
-fn list(workgroup: Group, place: Place) {
-    let p = linear_group(workgroup);
-    if p >= u.page_count {
-        let i = 256u * (p - u.page_count) + place.lane;
-        if i < u.row_count && i >= counts[u.page_count] {
-            rows[i] = vec2<u32>(UNLISTED, 0u);
+/// The rows of a workgroup; behind the pages a workgroup fills entries without a row, as far as there are some.
+fn chunk(workgroup: Group) -> Chunk {
+    let n = linear_group(workgroup);
+    let p = u.first_page + n / u.chunks;
+    if p < u.end_page {
+        if pages[p].slab != u.slab {
+            return Chunk(p, 0u, 0u, 0u);
         }
-        return;
+        return chunk_of(pages[p], p, n % u.chunks, CHUNK_ROWS, u.first_bound, u.row_count);
     }
-    // The list may have less room than rows; the gate of the step is closed then.
-    let room = arrayLength(&rows) - min(pages[p].first_listed, arrayLength(&rows));
-    for (var i = place.lane; i < min(counts[p], room); i += 256u) {
-        rows[pages[p].first_listed + i] = vec2<u32>(p, found[pages[p].first_row + i]);
-    }
+    let last = pages[u.page_count - 1u];
+    let first = CHUNK_ROWS * (n - (u.end_page - u.first_page) * u.chunks);
+    let begin = max(first, max(last.first_listed + last.listed, u.first_bound) - u.first_bound);
+    let end = min(first + CHUNK_ROWS, u.row_count);
+    return Chunk(NO_PAGE, 0u, begin, max(end, begin) - begin);
 }
 
-struct Gathered {
-    value: f32,
-    /// Whether the row lies in this slab, or nowhere.
-    is_here: bool,
-}
-
-fn gathered(f: Float) -> Gathered {
-    if !f.exists {
-        return Gathered(0.0, false);
+/// A float of a row of a chunk.
+fn gathered(c: Chunk, f: Float) -> f32 {
+    if c.page == NO_PAGE {
+        return select(0.0, HIDDEN_LOGIT, f.column == OPACITIES);
     }
+    let page = pages[c.page];
     let row = f.at / f.width;
-    let listed = rows[row];
-    if listed.x == UNLISTED {
-        // Transparent, so no stage draws it.
-        return Gathered(select(0.0, HIDDEN_LOGIT, f.column == OPACITIES), true);
-    }
-    let page = pages[listed.x];
-    if page.slab != u.slab {
-        return Gathered(0.0, false);
-    }
-    return Gathered(element(page, f.column, listed.y, f.at - row * f.width, u.now), true);
+    return element(page, f.column, found[page.first_row + c.first + row], f.at - row * f.width, u.now);
 }
 
-/// One invocation for each float of means, quats, scales and opacities.
+/// One workgroup for each chunk: its floats of means, quats, scales and opacities.
 @compute @workgroup_size(256)
 fn gather_geometry(workgroup: Group, place: Place) {
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, MEANS, vec4<u32>(3u, 4u, 3u, 1u));
-    let g = gathered(f);
-    if !g.is_here {
-        return;
-    }
-    switch f.column {
-        case MEANS: { means[f.at] = g.value; }
-        case QUATS: { quats[f.at] = g.value; }
-        case SCALES: { scales[f.at] = g.value; }
-        default: { opacities[f.at] = g.value; }
+    let c = chunk(workgroup);
+    for (var k = place.lane; k < 11u * c.rows; k += 256u) {
+        let f = float_of(k, c.rows, MEANS, vec4<u32>(3u, 4u, 3u, 1u));
+        let value = gathered(c, f);
+        let at = f.width * c.at + f.at;
+        switch f.column {
+            case MEANS: { means[at] = value; }
+            case QUATS: { quats[at] = value; }
+            case SCALES: { scales[at] = value; }
+            default: { opacities[at] = value; }
+        }
     }
 }
 
-/// One invocation for each float of the colours.
+/// One workgroup for each chunk: its floats of the colours.
 @compute @workgroup_size(256)
 fn gather_colors(workgroup: Group, place: Place) {
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, SH0, vec4<u32>(3u, u.sh_n_width, 0u, 0u));
-    let g = gathered(f);
-    if !g.is_here {
-        return;
-    }
-    if f.column == SH0 {
-        sh0[f.at] = g.value;
-    } else {
-        sh_n[f.at] = g.value;
+    let c = chunk(workgroup);
+    for (var k = place.lane; k < (3u + u.sh_n_width) * c.rows; k += 256u) {
+        let f = float_of(k, c.rows, SH0, vec4<u32>(3u, u.sh_n_width, 0u, 0u));
+        let value = gathered(c, f);
+        let at = f.width * c.at + f.at;
+        if f.column == SH0 {
+            sh0[at] = value;
+        } else {
+            sh_n[at] = value;
+        }
     }
 }
 

@@ -4,8 +4,8 @@
 //
 // `clear_statistics` takes the place of a round that edits no row.
 //
-// Values come from the stage "gather" at the same step. A row is rewritten as a whole or not at all. Nothing is written behind a
-// closed gate (gate.wgsl).
+// Values come from the stage "gather" at the same step. A workgroup works on one page. A row is rewritten as a whole or not at all.
+// Nothing is written behind a closed gate (gate.wgsl).
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
 #import "shared/deferred.wgsl"
@@ -18,7 +18,7 @@
 struct UpdateUniforms {
     /// The slab that is bound.
     slab: u32,
-    /// Listed rows of this dispatch; pages, in `clear_statistics`.
+    /// Rows of the columns that are bound; pages, in `clear_statistics`.
     row_count: u32,
     /// In `step_geometry` the first of the two columns.
     column: u32,
@@ -36,14 +36,20 @@ struct UpdateUniforms {
     weighs: u32,
     /// Rates of the columns over the bias of the first moment.
     step_sizes: array<vec4<f32>, 2>,
+    /// Number, in the batch, of the first row that is bound.
+    first_bound: u32,
+    /// The pages of this dispatch, and the chunks of each.
+    first_page: u32,
+    end_page: u32,
+    chunks: u32,
 }
 
 @group(0) @binding(0) var<uniform> u: UpdateUniforms;
 @group(0) @binding(1) var<storage, read> pages: array<DevicePage>;
 @group(0) @binding(2) var<storage, read_write> slab: array<u32>;
 @group(0) @binding(3) var<storage, read> tables: array<u32>;
-/// Number of the page, or UNLISTED, and number of the row in it.
-@group(0) @binding(4) var<storage, read> rows: array<vec2<u32>>;
+/// At `first_row` of a page on: its listed rows.
+@group(0) @binding(4) var<storage, read> found: array<u32>;
 /// `[listed row]`: words of the records of shared/splat.wgsl. The last word of a record is the largest magnitude of a gradient.
 @group(0) @binding(5) var<storage, read> v_splats: array<u32>;
 /// One word: 0 while the gate is open.
@@ -133,38 +139,47 @@ fn step_float(column: u32, at: u32, words: u32, d: Decays, value: f32, g: f32) {
     slab[v_at] = bitcast<u32>(v);
 }
 
-/// One invocation for each float of two columns of the geometry.
-@compute @workgroup_size(256)
-fn step_geometry(workgroup: Group, place: Place) {
-    let widths = vec4<u32>(3u, column_width(u.column + 1u, 0u), 0u, 0u);
-    let f = float_of(linear_index(workgroup, place, 256u), u.row_count, u.column, widths);
-    if !f.exists || gate[0] != 0u {
-        return;
+/// The rows of a workgroup, in chunks of `size`.
+fn chunk(workgroup: Group, size: u32) -> Chunk {
+    let n = linear_group(workgroup);
+    let p = u.first_page + n / u.chunks;
+    if p >= u.end_page || gate[0] != 0u || pages[p].slab != u.slab {
+        return Chunk();
     }
-    let row = f.at / f.width;
-    let listed = rows[row];
-    if listed.x == UNLISTED {
-        return;
-    }
-    let page = pages[listed.x];
-    if page.slab != u.slab || !is_usable(largest(row)) {
-        return;
-    }
-    var value: f32;
-    var g: f32;
-    if f.column == u.column {
-        value = values[f.at];
-        g = grads[f.at];
-    } else {
-        value = second_values[f.at];
-        g = second_grads[f.at];
-    }
-    let at = column_at(page, f.column) + listed.y * f.width + f.at - row * f.width;
-    step_float(f.column, at, table_words(page, f.column), decays_of(page, listed.y), value, g);
+    return chunk_of(pages[p], p, n % u.chunks, size, u.first_bound, u.row_count);
 }
 
-/// Rows of a workgroup of `step_colors`.
-const COLOR_ROWS: u32 = 64u;
+/// Rows of a chunk of the columns.
+const CHUNK_ROWS: u32 = 64u;
+
+/// One workgroup for each chunk: its floats of two columns of the geometry.
+@compute @workgroup_size(256)
+fn step_geometry(workgroup: Group, place: Place) {
+    let c = chunk(workgroup, CHUNK_ROWS);
+    let page = pages[c.page];
+    let widths = vec4<u32>(3u, column_width(u.column + 1u, 0u), 0u, 0u);
+    for (var k = place.lane; k < (widths.x + widths.y) * c.rows; k += 256u) {
+        let f = float_of(k, c.rows, u.column, widths);
+        let i = f.at / f.width;
+        if !is_usable(largest(c.at + i)) {
+            continue;
+        }
+        let entry = f.width * c.at + f.at;
+        var value: f32;
+        var g: f32;
+        if f.column == u.column {
+            value = values[entry];
+            g = grads[entry];
+        } else {
+            value = second_values[entry];
+            g = second_grads[entry];
+        }
+        let row = found[page.first_row + c.first + i];
+        let at = column_at(page, f.column) + row * f.width + f.at - i * f.width;
+        step_float(f.column, at, table_words(page, f.column), decays_of(page, row), value, g);
+    }
+}
+
 /// Basis functions, and floats of a row.
 #ifdef SH_DEGREE_1
 const BASIS: u32 = 1u + SH_WIDTH / 3u;
@@ -185,31 +200,26 @@ struct ColorRow {
     v: vec3<f32>,
 }
 
-var<workgroup> color_rows: array<ColorRow, COLOR_ROWS>;
-var<workgroup> bases: array<f32, COLOR_ROWS * BASIS>;
+var<workgroup> color_rows: array<ColorRow, CHUNK_ROWS>;
+var<workgroup> bases: array<f32, CHUNK_ROWS * BASIS>;
 
-/// Finds what the floats of listed row `i` share, the row of this number in the workgroup.
-fn share_color(i: u32, own: u32) {
+/// Finds what the floats of a row of the chunk share.
+fn share_color(c: Chunk, own: u32) {
     color_rows[own].sh0_words = 0u;
-    if i >= u.row_count {
+    let i = c.at + own;
+    if own >= c.rows || !is_usable(largest(i)) {
         return;
     }
-    let listed = rows[i];
-    if listed.x == UNLISTED || !is_usable(largest(i)) {
-        return;
-    }
-    let page = pages[listed.x];
-    if page.slab != u.slab {
-        return;
-    }
+    let page = pages[c.page];
+    let row = found[page.first_row + c.first + own];
     let at = 4u * SPLAT_STRIDE * i + 8u;
     let v = vec3<f32>(bitcast<f32>(v_splats[at]), bitcast<f32>(v_splats[at + 1u]), bitcast<f32>(v_splats[at + 2u]));
     color_rows[own] = ColorRow(
-        column_at(page, SH_N) + listed.y * page.sh_n_width,
+        column_at(page, SH_N) + row * page.sh_n_width,
         table_words(page, SH_N),
-        column_at(page, SH0) + listed.y * 3u,
+        column_at(page, SH0) + row * 3u,
         table_words(page, SH0),
-        decays_of(page, listed.y),
+        decays_of(page, row),
         // A channel clamped at 0 passes no gradient.
         select(vec3<f32>(), v, splats[SPLAT_STRIDE * i + 2u].xyz > vec3<f32>()),
     );
@@ -235,21 +245,18 @@ fn share_color(i: u32, own: u32) {
 #endif
 }
 
-/// One workgroup for each 64 rows. Makes the gradients of the coefficients, as sh_bwd does where the host wants them, and takes the step
+/// One workgroup for each chunk. Makes the gradients of the coefficients, as sh_bwd does where the host wants them, and takes the step
 /// at once: the gradients, four fifths of a row's, are never stored. A compiler may order the products of a basis function otherwise
 /// than in sh_bwd, which moves the last bit of a gradient (Mesa does for one of the sixteen), never whether a row is updated: that is
 /// judged by what sh_bwd found.
 @compute @workgroup_size(256)
 fn step_colors(workgroup: Group, place: Place) {
-    let first = COLOR_ROWS * linear_group(workgroup);
-    if gate[0] != 0u {
-        return;
-    }
-    if place.lane < COLOR_ROWS {
-        share_color(first + place.lane, place.lane);
+    let c = chunk(workgroup, CHUNK_ROWS);
+    if place.lane < CHUNK_ROWS {
+        share_color(c, place.lane);
     }
     workgroupBarrier();
-    for (var k = place.lane; k < COLOR_ROWS * COLOR_FLOATS; k += 256u) {
+    for (var k = place.lane; k < c.rows * COLOR_FLOATS; k += 256u) {
         let own = k / COLOR_FLOATS;
         let e = k % COLOR_FLOATS;
         let row = color_rows[own];
@@ -259,12 +266,12 @@ fn step_colors(workgroup: Group, place: Place) {
         let g = bases[BASIS * own + e / 3u] * row.v[e % 3u];
 #ifdef SH_DEGREE_1
         if e >= 3u {
-            let value = sh_n[SH_WIDTH * (first + own) + e - 3u];
+            let value = sh_n[SH_WIDTH * (c.at + own) + e - 3u];
             step_float(SH_N, row.sh_n_at + e - 3u, row.sh_n_words, row.decays, value, g);
             continue;
         }
 #endif
-        step_float(SH0, row.sh0_at + e, row.sh0_words, row.decays, sh0[3u * (first + own) + e], g);
+        step_float(SH0, row.sh0_at + e, row.sh0_words, row.decays, sh0[3u * (c.at + own) + e], g);
     }
 }
 
@@ -319,34 +326,29 @@ fn collect(page: DevicePage, p: u32, row: u32, footprint: vec4<f32>, weight: f32
     atomicAdd(&results[RESULT_WORDS * p + COLLECTED], 1u);
 }
 
-/// One invocation for each row; after all columns.
+/// One workgroup for each chunk, an invocation for each of its rows; after all columns.
 @compute @workgroup_size(256)
 fn finish(workgroup: Group, place: Place) {
-    let i = linear_index(workgroup, place, 256u);
-    if i >= u.row_count || gate[0] != 0u {
+    let c = chunk(workgroup, 256u);
+    if place.lane >= c.rows {
         return;
     }
-    let listed = rows[i];
-    if listed.x == UNLISTED {
-        return;
-    }
-    let page = pages[listed.x];
-    if page.slab != u.slab {
-        return;
-    }
+    let page = pages[c.page];
+    let row = found[page.first_row + c.first + place.lane];
+    let i = c.at + place.lane;
     let most = largest(i);
     if is_usable(most) {
-        slab[stamps_at(page) + listed.y] = u.now + 1u;
-        atomicAdd(&results[RESULT_WORDS * listed.x + UPDATED], 1u);
+        slab[stamps_at(page) + row] = u.now + 1u;
+        atomicAdd(&results[RESULT_WORDS * c.page + UPDATED], 1u);
     } else if most != 0u {
-        atomicAdd(&results[RESULT_WORDS * listed.x + SKIPPED], 1u);
+        atomicAdd(&results[RESULT_WORDS * c.page + SKIPPED], 1u);
     }
     let of_row = select(1u, 2u, u.weighs != 0u);
     let footprint = footprints[of_row * i];
     if footprint.z > 0.0 && footprint.w > 0.0 {
-        atomicAdd(&results[RESULT_WORDS * listed.x + DRAWN], 1u);
+        atomicAdd(&results[RESULT_WORDS * c.page + DRAWN], 1u);
         if u.collects != 0u {
-            collect(page, listed.x, listed.y, footprint, footprints[of_row * i + of_row - 1u].x);
+            collect(page, c.page, row, footprint, footprints[of_row * i + of_row - 1u].x);
         }
     }
 }

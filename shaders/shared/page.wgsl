@@ -15,7 +15,29 @@ struct DevicePage {
     first_row: u32,
     /// Number, in the batch, of the page's first listed row.
     first_listed: u32,
-    pad: vec2<u32>,
+    /// Listed rows.
+    listed: u32,
+    pad: u32,
+}
+
+/// Consecutive listed rows of a page: what a workgroup gathers or updates.
+struct Chunk {
+    /// Number of the page.
+    page: u32,
+    /// First of the rows, among the listed rows of the page.
+    first: u32,
+    /// Its place in the columns that are bound.
+    at: u32,
+    /// Rows; 0 where the workgroup has nothing to do.
+    rows: u32,
+}
+
+/// Chunk number `n`, of `size` rows, of page `p`: those of its rows that the bound columns hold, which begin at `first_bound` in the
+/// batch and are `bound`.
+fn chunk_of(page: DevicePage, p: u32, n: u32, size: u32, first_bound: u32, bound: u32) -> Chunk {
+    let begin = max(page.first_listed + min(size * n, page.listed), first_bound);
+    let end = min(page.first_listed + min(size * n + size, page.listed), first_bound + bound);
+    return Chunk(p, begin - page.first_listed, begin - first_bound, max(end, begin) - begin);
 }
 
 /// What an update did to a page, and its bounds.
@@ -45,9 +67,6 @@ struct PageSurvey {
     least_weight: u32,
     pad: u32,
 }
-
-/// Number of the page of an entry without a row, behind the listed rows.
-const UNLISTED: u32 = 0xffffffffu;
 
 /// Columns in storage order, and the tables of each.
 const MEANS: u32 = 0u;
@@ -91,23 +110,23 @@ struct Float {
     width: u32,
     /// Number of the float in the column.
     at: u32,
-    exists: bool,
 }
 
-/// The i-th float of so many rows of at most four columns from `first` on, of these widths, one column behind the other.
+/// The i-th float of so many rows of at most four columns from `first` on, of these widths, one column behind the other; `i` is below
+/// their sum.
 fn float_of(i: u32, row_count: u32, first: u32, widths: vec4<u32>) -> Float {
     let two = widths.x + widths.y;
-    let ends = row_count * vec4<u32>(widths.x, two, two + widths.z, two + widths.z + widths.w);
+    let ends = row_count * vec3<u32>(widths.x, two, two + widths.z);
     if i < ends.x {
-        return Float(first, widths.x, i, true);
+        return Float(first, widths.x, i);
     }
     if i < ends.y {
-        return Float(first + 1u, widths.y, i - ends.x, true);
+        return Float(first + 1u, widths.y, i - ends.x);
     }
     if i < ends.z {
-        return Float(first + 2u, widths.z, i - ends.y, true);
+        return Float(first + 2u, widths.z, i - ends.y);
     }
-    return Float(first + 3u, max(widths.w, 1u), i - ends.z, i < ends.w);
+    return Float(first + 3u, widths.w, i - ends.z);
 }
 
 /// Words of the table of values of a column, which are those of its moments.

@@ -206,6 +206,10 @@ crate::wgsl_struct! {
         pub grow_grad2d: f32,
         pub split_scale: f32,
         pub split_reach: f32,
+        pub first_bound: u32,
+        pub first_page: u32,
+        pub end_page: u32,
+        pub chunks: u32,
         pub pad: u32,
     }
 
@@ -220,11 +224,15 @@ crate::wgsl_struct! {
         pub centre: [f32; 3],
         pub weighs: u32,
         pub step_sizes: [[f32; 4]; 2],
+        pub first_bound: u32,
+        pub first_page: u32,
+        pub end_page: u32,
+        pub chunks: u32,
     }
 }
 
 impl GatherUniforms {
-    /// Uniforms of a step on the pages of a batch; slab and rows are set for each dispatch.
+    /// Uniforms of a step on the pages of a batch; slab, rows and chunks are set for each dispatch.
     pub fn new(camera: &Camera, run: &RunNumbers, now: u32, splits: &SplitLimits, page_count: u32) -> GatherUniforms {
         let frustum = Frustum::new(camera);
         GatherUniforms {
@@ -253,7 +261,7 @@ pub fn of_columns(numbers: &[f32; Column::ALL.len()]) -> [[f32; 4]; 2] {
 }
 
 impl UpdateUniforms {
-    /// Uniforms of a step; slab, rows and column are set for each dispatch.
+    /// Uniforms of a step; slab, rows, chunks and column are set for each dispatch.
     pub fn new(camera: &Camera, step: &StepNumbers, collects: bool, weighs: bool) -> UpdateUniforms {
         UpdateUniforms {
             now: step.now,
@@ -282,7 +290,9 @@ crate::wgsl_struct! {
         pub first_row: u32,
         /// Number, in the batch, of the page's first listed row.
         pub first_listed: u32,
-        pub pad: [u32; 2],
+        /// Listed rows.
+        pub listed: u32,
+        pub pad: u32,
     }
 
     /// What an update did to a page, and its bounds: `PageResult` in `shaders/shared/page.wgsl`.
@@ -320,7 +330,7 @@ impl DevicePage {
     /// A page whose payload begins at word `base` of a slab.
     pub fn new(layout: PageLayout, slab: u32, base: u32, first_row: u32) -> DevicePage {
         let (rows, sh_n_width) = (layout.rows as u32, sh_n_width(layout.sh_degree) as u32);
-        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, pad: [0; 2] }
+        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, listed: 0, pad: 0 }
     }
 }
 

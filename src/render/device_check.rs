@@ -4,7 +4,8 @@
 //! A driver may compile a stage wrongly; then a run would train something else for hours. Views are compared as a whole, and the first
 //! wrong output names the stage in which the fault lies.
 //!
-//! Not here: the stages one by one, which the tests compare (`tests/numerics/parity`).
+//! Not here: the stages one by one, which the tests compare (`tests/numerics/parity`); steps of the optimizer on a device
+//! (`train/inputs/page_check`).
 
 use super::cpu::CpuRenderer;
 use super::{Gradients, LossOptions, LossValue, RenderError, RenderOptions, Renderer};
@@ -102,21 +103,24 @@ pub fn scene(rows: usize, width: u32, height: u32, broken: bool) -> (Columns, Ca
     (c, Camera::pinhole(viewmat, [60.0, 65.0, 0.5 * width as f32, 0.5 * height as f32], [width, height]))
 }
 
-/// Draws a view, compares it with a smooth photo that has a hole in its mask, and takes the loss back to the rows.
+/// A smooth photo with a hole in its mask.
+pub fn photo(width: u32, height: u32) -> Target {
+    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+    let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
+    let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
+    Target { mask, ..Target::new([width, height], rgb) }
+}
+
+/// Draws a view, compares it with [`photo`], and takes the loss back to the rows.
 pub fn view(
     renderer: &mut dyn Renderer,
     columns: &Columns,
     camera: &Camera,
     options: &RenderOptions,
 ) -> Result<View, RenderError> {
-    let (width, height) = (camera.width, camera.height);
-    let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-    let rgb = pixels.clone().flat_map(|(x, y)| [(3 * x % 256) as u8, ((2 * y + x) % 256) as u8, 90]).collect();
-    let mask = Some(pixels.map(|(x, y)| if x / 9 == 1 && y > 5 { 0 } else { 255 }).collect());
-    let target = Target { mask, ..Target::new([width, height], rgb) };
     let mut grads = Gradients::default();
     renderer.draw(columns, camera, options)?;
-    renderer.loss(&target, &LossOptions::default())?;
+    renderer.loss(&photo(camera.width, camera.height), &LossOptions::default())?;
     renderer.backpropagate(columns, &mut grads)?;
     let loss = renderer.loss_value()?;
     let image = renderer.image()?.clone();
@@ -166,7 +170,7 @@ fn exceeds(difference: f64, limit: f64) -> bool {
 }
 
 /// Relative L2 distance.
-fn l2(got: &[f32], want: &[f32]) -> f64 {
+pub fn l2(got: &[f32], want: &[f32]) -> f64 {
     let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
     let error = norm(&mut got.iter().zip(want).map(|(g, w)| f64::from(*g) - f64::from(*w)));
     error / norm(&mut want.iter().map(|w| f64::from(*w))).max(1e-30)

@@ -1,8 +1,8 @@
 //! Records the stages on pages on a device: gather and update. Owns the slots, the optimizer's tables and the bins of
 //! growth scores and weights.
 //!
-//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. An invocation gathers
-//! or updates a float, of as many columns as bindings allow.
+//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages, of workgroups for the
+//! pages from its first to its last in the slab. A workgroup gathers or updates a chunk of the listed rows of one page.
 //!
 //! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`), steps that are recorded without waiting (`gpu_recorded`).
 //!
@@ -29,16 +29,13 @@ use std::sync::Arc;
 pub(super) const WORKGROUP: u32 = 256;
 /// Bins of mean growth scores, and as many of mean weights: the upper halves of floats that are not negative.
 const BINS: u64 = 1 << 15;
-/// Bytes of a listed row: number of the page, number of the row.
-const LISTED_BYTES: u64 = 8;
-/// Rows of a workgroup that updates colours.
-const COLOR_ROWS: u32 = 64;
+/// Rows of a workgroup that gathers or updates columns.
+const CHUNK_ROWS: u32 = 64;
 
 #[derive(Debug)]
 pub(super) struct Stages {
     pub(super) cull: Arc<Pipeline>,
     pub(super) place: Arc<Pipeline>,
-    pub(super) list: Arc<Pipeline>,
     gather_geometry: Arc<Pipeline>,
     gather_colors: Arc<Pipeline>,
     bounds: Arc<Pipeline>,
@@ -76,15 +73,15 @@ pub struct PagesView {
 /// What an update does to the pages of a batch ([`crate::kernels::uniforms::PageResult`]s), on its way to the host; `None` for a batch without pages.
 pub(super) type PendingResults = Option<Readback>;
 
-/// The listed rows of a batch.
+/// The listed rows of a batch: those that the camera may draw, page after page.
 #[derive(Debug)]
 pub struct PageBatch {
-    /// First listed row of each page; empty where only the device knows.
-    pub first_listed: Vec<u32>,
-    /// Listed rows, or those that the list has room for.
+    /// Listed rows of each page; empty where only the device knows.
+    pub listed: Vec<u32>,
+    /// Listed rows, or those that the columns have room for.
     pub rows: u32,
-    /// `[rows]`: number of the page, number of the row in it.
-    pub listed: Buffer,
+    /// `[row of the pages]`: at the first row of a page on, the numbers of its listed rows.
+    pub found: Buffer,
 }
 
 /// Pages of a batch in their slots.
@@ -99,6 +96,36 @@ impl PageTable {
     fn slabs(&self) -> BTreeSet<u32> {
         self.pages.iter().map(|page| page.slab).collect()
     }
+
+    /// The pages of a dispatch, and the chunks of `size` rows of the largest: from the first to the last of those in the slab whose
+    /// listed rows reach into `rows`. All in the slab where only the device knows which rows are listed.
+    fn chunks(&self, slab: u32, rows: &Range<u32>, size: u32) -> PageChunks {
+        let is_known = self.pages.iter().any(|page| page.listed > 0);
+        let reaches = |page: &DevicePage| {
+            !is_known || (page.first_listed < rows.end && page.first_listed + page.listed > rows.start)
+        };
+        let mut of_dispatch = PageChunks { pages: 0..0, chunks: 1 };
+        for (p, page) in self.pages.iter().enumerate().filter(|(_, page)| page.slab == slab && reaches(page)) {
+            let first = if of_dispatch.pages.is_empty() { p as u32 } else { of_dispatch.pages.start };
+            of_dispatch.pages = first..p as u32 + 1;
+            let rows = if is_known { page.listed } else { page.rows };
+            of_dispatch.chunks = of_dispatch.chunks.max(rows.div_ceil(size));
+        }
+        of_dispatch
+    }
+}
+
+/// The chunks of rows on which a dispatch works.
+struct PageChunks {
+    pages: Range<u32>,
+    /// Chunks of each page.
+    chunks: u32,
+}
+
+impl PageChunks {
+    fn workgroups(&self) -> u32 {
+        self.pages.len() as u32 * self.chunks
+    }
 }
 
 impl DevicePages {
@@ -108,7 +135,6 @@ impl DevicePages {
         let stages = Stages {
             cull: of("gather.wgsl", "cull")?,
             place: of("gather.wgsl", "place")?,
-            list: of("gather.wgsl", "list")?,
             gather_geometry: of("gather.wgsl", "gather_geometry")?,
             gather_colors: of("gather.wgsl", "gather_colors")?,
             bounds: of("gather.wgsl", "bounds")?,
@@ -137,15 +163,17 @@ impl DevicePages {
         GatherUniforms::new(&view.camera, &self.rules.numbers, view.step.now, &self.rules.splits, pages as u32)
     }
 
-    /// Uploads the table of pages in their slots, with the first listed row of each.
-    pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], first_listed: &[u32]) -> GpuResult<PageTable> {
-        let mut first_row = 0;
+    /// Uploads the table of pages in their slots, with the number of listed rows of each, where it is known.
+    pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], listed: &[u32]) -> GpuResult<PageTable> {
+        let (mut first_row, mut first_listed) = (0, 0);
         let mut entries = Vec::with_capacity(pages.len());
         for (i, page) in pages.iter().enumerate() {
             let (slab, offset) = self.slots.place(page.slot);
+            let listed = listed.get(i).copied().unwrap_or(0);
             let entry = DevicePage::new(page.layout, slab, (offset / 4) as u32, first_row);
+            entries.push(DevicePage { first_listed, listed, ..entry });
             first_row += entry.rows;
-            entries.push(DevicePage { first_listed: first_listed.get(i).copied().unwrap_or(0), ..entry });
+            first_listed += listed;
         }
         let on_device = recorder.buffer_with("page table", &entries)?;
         Ok(PageTable { pages: entries, on_device })
@@ -178,29 +206,18 @@ impl DevicePages {
     pub fn list(&self, gpu: &Gpu, view: &PagesView, pages: &[SlotPage]) -> GpuResult<(PageBatch, PageTable)> {
         let mut recorder = gpu.begin("gather");
         let (table, [counts, found]) = self.cull(gpu, &mut recorder, view, pages)?;
-        let uniforms = self.uniforms(view, pages.len());
-        let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
         let read = recorder.read_back("gather", &counts.slice(0, 4 * pages.len() as u64))?;
         gpu.submit(recorder)?;
         drop(table);
-        let (mut first_listed, mut listed) = (Vec::with_capacity(pages.len()), 0);
-        for count in read.to_vec::<u32>()? {
-            first_listed.push(listed);
-            listed += count;
-        }
+        let listed = read.to_vec::<u32>()?;
         let mut recorder = gpu.begin("gather");
-        let table = self.table(&mut recorder, pages, &first_listed)?;
-        let batch =
-            PageBatch { first_listed, rows: listed, listed: gpu.buffer("listed", LISTED_BYTES * u64::from(listed))? };
-        let views =
-            [recorder.uniform(&uniforms)?, table.on_device.view(), counts.view(), found.view(), batch.listed.view()];
-        recorder.dispatch("gather", &self.stages.list, &views, groups)?;
+        let table = self.table(&mut recorder, pages, &listed)?;
         gpu.submit(recorder)?;
-        Ok((batch, table))
+        Ok((PageBatch { rows: listed.iter().sum(), listed, found }, table))
     }
 
-    /// Records the list of the rows that the camera may draw, with room for `rows` rows. Returns it with the counts of the pages and
-    /// their sum.
+    /// Records the list of the rows that the camera may draw, for columns with room for `rows` rows. Returns it with the counts of the
+    /// pages and their sum.
     pub(super) fn list_within(
         &self,
         gpu: &Gpu,
@@ -209,15 +226,9 @@ impl DevicePages {
         rows: u32,
     ) -> GpuResult<(PageBatch, PageTable, Buffer)> {
         let (table, [counts, found]) = self.cull(gpu, recorder, view, pages)?;
-        let listed = gpu.buffer("listed", LISTED_BYTES * u64::from(rows))?;
-        let uniforms = GatherUniforms { row_count: rows, ..self.uniforms(view, pages.len()) };
-        let uniform = recorder.uniform(&uniforms)?;
-        let views = [uniform.clone(), counts.view(), table.on_device.view()];
+        let views = [recorder.uniform(&self.uniforms(view, pages.len()))?, counts.view(), table.on_device.view()];
         recorder.dispatch("gather", &self.stages.place, &views, groups_1d(1, 1))?;
-        let views = [uniform, table.on_device.view(), counts.view(), found.view(), listed.view()];
-        let groups = groups_1d(pages.len() as u32 + rows.div_ceil(WORKGROUP), 1);
-        recorder.dispatch("gather", &self.stages.list, &views, groups)?;
-        Ok((PageBatch { first_listed: Vec::new(), rows, listed }, table, counts))
+        Ok((PageBatch { listed: Vec::new(), rows, found }, table, counts))
     }
 
     /// The listed rows of a batch as a source of columns.
@@ -239,40 +250,50 @@ impl DevicePages {
         let uniforms = UpdateUniforms::new(&view.camera, &view.step, collects, grads.weighs);
         let (stages, gate) = (&self.stages, self.gate.view());
         for window in windows(gpu, values.rows, values.widest()) {
-            let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
+            let bound = bound_rows(part, window);
             let (splats, v_splats) = (splats.window(window), v_splats.window(window));
             for slab in table.slabs() {
-                let uniforms = UpdateUniforms { slab, row_count: window.rows, ..uniforms };
-                let [pages, slab] = [table.on_device.view(), self.slots.slab(slab)?];
+                let of_dispatch = table.chunks(slab, &bound, CHUNK_ROWS);
+                if of_dispatch.pages.is_empty() {
+                    continue;
+                }
+                let uniforms = UpdateUniforms {
+                    slab,
+                    row_count: window.rows,
+                    first_bound: bound.start,
+                    first_page: of_dispatch.pages.start,
+                    end_page: of_dispatch.pages.end,
+                    chunks: of_dispatch.chunks,
+                    ..uniforms
+                };
+                let finishing = table.chunks(slab, &bound, WORKGROUP);
+                let groups = groups_1d(of_dispatch.workgroups(), 1);
+                let [pages, found, slab] = [table.on_device.view(), batch.found.view(), self.slots.slab(slab)?];
                 let of_slab =
-                    [pages.clone(), slab.clone(), self.tables.view(), rows.clone(), v_splats.clone(), gate.clone()];
+                    [pages.clone(), slab.clone(), self.tables.view(), found.clone(), v_splats.clone(), gate.clone()];
                 let (w, g) = (values.window(window), grads.columns.window(window));
                 let pairs = [
-                    (Column::Means, 7, [&w.means, &g.means, &w.quats, &g.quats]),
-                    (Column::Scales, 4, [&w.scales, &g.scales, &w.opacities, &g.opacities]),
+                    (Column::Means, [&w.means, &g.means, &w.quats, &g.quats]),
+                    (Column::Scales, [&w.scales, &g.scales, &w.opacities, &g.opacities]),
                 ];
-                for (column, width, own) in pairs {
+                for (column, own) in pairs {
                     let uniform = recorder.uniform(&UpdateUniforms { column: column as u32, ..uniforms })?;
                     let own = own.map(BufferView::clone);
                     let views: Vec<BufferView> = [uniform].into_iter().chain(of_slab.clone()).chain(own).collect();
-                    recorder.dispatch(
-                        "update",
-                        &stages.step_geometry,
-                        &views,
-                        groups_1d(window.rows * width, WORKGROUP),
-                    )?;
+                    recorder.dispatch("update", &stages.step_geometry, &views, groups)?;
                 }
                 let uniform = recorder.uniform(&uniforms)?;
-                let mut views: Vec<BufferView> = [uniform.clone()].into_iter().chain(of_slab).collect();
+                let mut views: Vec<BufferView> = [uniform].into_iter().chain(of_slab).collect();
                 views.extend([splats.clone()].into_iter().chain(w.sh0));
                 views.extend(w.sh_n.into_iter().flat_map(|sh_n| [w.means.clone(), sh_n]));
                 let step_colors = &stages.step_colors[usize::from(values.sh_degree)];
-                recorder.dispatch("update", step_colors, &views, groups_1d(window.rows, COLOR_ROWS))?;
+                recorder.dispatch("update", step_colors, &views, groups)?;
                 let footprints = window.of(&grads.footprints, footprint_bytes(grads.weighs));
-                let of_rows = [pages, slab, rows.clone(), v_splats.clone(), gate.clone()];
+                let uniform = recorder.uniform(&UpdateUniforms { chunks: finishing.chunks, ..uniforms })?;
+                let of_rows = [pages, slab, found, v_splats.clone(), gate.clone()];
                 let own = [footprints, results.view(), self.bins.view()];
                 let views: Vec<BufferView> = [uniform].into_iter().chain(of_rows).chain(own).collect();
-                recorder.dispatch("update", &stages.finish, &views, groups_1d(window.rows, WORKGROUP))?;
+                recorder.dispatch("update", &stages.finish, &views, groups_1d(finishing.workgroups(), 1))?;
             }
         }
         Ok(())
@@ -344,6 +365,12 @@ impl DevicePages {
     }
 }
 
+/// The rows of a batch that a window of its rows `part` binds.
+fn bound_rows(part: &Range<usize>, window: Window) -> Range<u32> {
+    let first = part.start as u32 + window.first as u32;
+    first..first + window.rows
+}
+
 /// Buffers of the update of a chunk of rows.
 pub struct UpdateBuffers<'a> {
     /// Values of the rows, from [`PageRows`].
@@ -384,11 +411,27 @@ impl RowSource for PageRows<'_> {
         let sh_n_width = sh_n_width(columns.sh_degree) as u32;
         let uniforms = pages.uniforms(view, table.pages.len());
         for window in windows(gpu, columns.rows, columns.widest()) {
-            let rows = Window { first: part.start as u64 + window.first, ..window }.of(&batch.listed, LISTED_BYTES);
+            let bound = bound_rows(part, window);
+            // Where only the device knows how many rows there are, the first dispatch fills the room behind them.
+            let mut filled = if batch.listed.is_empty() { window.rows.div_ceil(CHUNK_ROWS) } else { 0 };
             for slab in table.slabs() {
-                let uniforms = GatherUniforms { slab, row_count: window.rows, sh_n_width, ..uniforms };
+                let of_dispatch = table.chunks(slab, &bound, CHUNK_ROWS);
+                let uniforms = GatherUniforms {
+                    slab,
+                    row_count: window.rows,
+                    sh_n_width,
+                    first_bound: bound.start,
+                    first_page: of_dispatch.pages.start,
+                    end_page: of_dispatch.pages.end,
+                    chunks: of_dispatch.chunks,
+                    ..uniforms
+                };
+                let groups = groups_1d(of_dispatch.workgroups() + std::mem::take(&mut filled), 1);
+                if of_dispatch.pages.is_empty() {
+                    continue;
+                }
                 let [slab, tables, recent] = [pages.slots.slab(slab)?, pages.tables.view(), view.recent.view()];
-                let buffers = [table.on_device.view(), slab, tables, recent, rows.clone()];
+                let buffers = [table.on_device.view(), slab, tables, recent, batch.found.view()];
                 let w = columns.window(window);
                 // Bound in place of bands that no invocation has.
                 let no_bands = gpu.buffer("no bands", 4)?;
@@ -396,12 +439,10 @@ impl RowSource for PageRows<'_> {
                 let geometry = vec![w.means, w.quats, w.scales, w.opacities];
                 let colors = w.sh0.into_iter().chain([sh_n]).collect();
                 let stages = &pages.stages;
-                for (stage, width, out) in
-                    [(&stages.gather_geometry, 11, geometry), (&stages.gather_colors, 3 + sh_n_width, colors)]
-                {
+                for (stage, out) in [(&stages.gather_geometry, geometry), (&stages.gather_colors, colors)] {
                     let uniform = recorder.uniform(&uniforms)?;
                     let views: Vec<BufferView> = [uniform].into_iter().chain(buffers.clone()).chain(out).collect();
-                    recorder.dispatch("gather", stage, &views, groups_1d(window.rows * width, WORKGROUP))?;
+                    recorder.dispatch("gather", stage, &views, groups)?;
                 }
             }
         }

@@ -30,14 +30,14 @@ pub(super) fn update_batch(
     let Some((of_view, of_batch)) = of_view.and_then(|view| Some((view, view.batches.get(batch)?))) else {
         return Err(needs);
     };
-    if of_batch.first_listed.len() != pages.len() {
+    if of_batch.listed.len() != pages.len() {
         return Err(RenderError::BatchRows { batch, given: pages.len() });
     }
     if pages.is_empty() {
         return Ok(None);
     }
     let mut recorder = stages.gpu.begin("update");
-    let table = held.table(&mut recorder, pages, &of_batch.first_listed)?;
+    let table = held.table(&mut recorder, pages, &of_batch.listed)?;
     let results = recorder.buffer_zeroed("page results", (size_of::<PageResult>() * pages.len()) as u64)?;
     stages.gpu.submit(recorder)?;
     let source = held.source(of_view, of_batch, &table);

@@ -1,6 +1,6 @@
 //! A city in cells through the program: the bytes of a cell, its failures, the ring, and the merge.
 
-use crate::support::scenes::told;
+use crate::support::scenes::{add_boxes, told};
 use crate::support::workdir::{CKPT, Running, Workdir, says};
 use gsscale::exchange::meta::ExportFrame;
 use gsscale::scene::columns::Column;
@@ -94,9 +94,20 @@ impl Cells {
     }
 }
 
+/// A prior of enough steps finds out whether photos contradict each other. Cells, which begin from Gaussians, cannot.
+#[test]
+fn cells_mask_what_their_prior_has_masked() {
+    let cells = Cells(Workdir::city(24, 64, 48, 1500));
+    add_boxes(&cells.0.photos());
+    cells.done(&format!("prior scene --out city --steps 4800 {KEYS} --strategy none"));
+    cells.done("cut scene --out city --cells 2");
+    says(&cells.0.text("city/cells/1/cell.toml"), &["robust-pixels = \"on\""]);
+}
+
 #[test]
 fn one_cell_equals_the_plain_run_from_the_same_prior() {
     let cells = Cells::cut(120, "--cells 1");
+    says(&cells.0.text("city/cells/0/cell.toml"), &["robust-pixels = \"off\""]);
     cells.done("run city --cell 0");
     says(&cells.done("run city --cell 0"), &["cell 0 is done"]);
     let plain = "--config city/cells/0/cell.toml --schedule run-length --strategy long-axis";

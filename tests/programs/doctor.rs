@@ -25,7 +25,7 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
     assert!(sound.status.success(), "{}", stderr(&sound));
     let found = json(&work.text("doctor/doctor.json"));
     let checks = found["checks"].as_array().unwrap();
-    assert!(checks.len() == 2 && checks.iter().all(|check| check["verdict"] == "good"), "{found}");
+    assert!(checks.len() == 3 && checks.iter().all(|check| check["verdict"] == "good"), "{found}");
     assert!(work.text("doctor/doctor.html").contains("8 views agree with the CPU"));
     let has_subgroups = &found["subgroups"];
 
@@ -62,11 +62,26 @@ fn a_wrong_constant_is_found_and_its_stage_is_named() {
         let said = stderr(&wrong);
         assert!(said.contains(stage) && said.contains("--device cpu"), "{fault}: {said}");
     }
-    // A run on such a device does not begin.
-    let mut run = work.command(TRAIN, "scene --out run --device gpu --steps 1");
-    run.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", "sh_fwd.wgsl:0.28209479=0.3");
-    let run = run.output().unwrap();
-    let said = stderr(&run);
-    assert!(!run.status.success() && said.contains("sh_fwd") && said.contains("--device cpu"), "{said}");
-    assert!(!work.path("run/point_cloud.ply").exists());
+    let of_pages = "update.wgsl:g * g *=1.01 * g * g *";
+    let wrong = doctor(&work, &[], Some(of_pages));
+    let said = stderr(&wrong);
+    assert_eq!(wrong.status.code(), Some(1), "{said}");
+    assert!(said.contains("8 views agree") && said.contains("--optimizer-on host"), "{said}");
+
+    // A run on such a device does not begin, unless it needs no pages there.
+    let run = |fault: &str, flags: &str| {
+        let mut run = work.command(TRAIN, &format!("scene --overwrite --out run --device gpu --steps 1 {flags}"));
+        run.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", fault).output().unwrap()
+    };
+    for (fault, flags, stage, remedy) in [
+        ("sh_fwd.wgsl:0.28209479=0.3", "", "sh_fwd", "--device cpu"),
+        (of_pages, "--optimizer-on device", "gather and update", "--optimizer-on host"),
+    ] {
+        let refused = run(fault, flags);
+        let said = stderr(&refused);
+        assert!(!refused.status.success() && said.contains(stage) && said.contains(remedy), "{said}");
+        assert!(!work.path("run/point_cloud.ply").exists());
+    }
+    let on_host = run(of_pages, "");
+    assert!(on_host.status.success(), "{}", stderr(&on_host));
 }

@@ -1,6 +1,7 @@
 //! Photos that contradict the scene, through the real binaries.
 
 use crate::support::a_device;
+use crate::support::scenes::add_boxes;
 use crate::support::workdir::Workdir;
 use gsscale::config::file::TrainConfig;
 use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
@@ -101,13 +102,7 @@ fn masking_what_stands_on_one_photo_only_wins_decibels() {
 #[test]
 fn a_run_that_is_killed_around_its_decision_decides_and_masks_the_same() {
     let work = Workdir::city(24, 64, 48, 1500);
-    for (i, photo) in work.photos().iter().enumerate() {
-        let mut picture = image::open(photo).unwrap().to_rgb8();
-        for (x, y) in (0..16).flat_map(|x| (0..20).map(move |y| (x + 7 * i as u32, y + 5 * i as u32))) {
-            picture.put_pixel(x % 64, y % 48, image::Rgb([250, 40, 220]));
-        }
-        picture.save(photo).unwrap();
-    }
+    add_boxes(&work.photos());
     let flags = "--steps 1200 --strategy none --log-every 1";
     work.run("whole", flags);
     assert!(masked(&work, "whole") > 0.01, "nothing is masked, so the test shows nothing");

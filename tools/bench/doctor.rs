@@ -27,6 +27,7 @@ use gsscale::render::{RenderOptions, Renderer};
 use gsscale::report::html::{Cell, Page};
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::train::error::TrainError;
+use gsscale::train::inputs::page_check;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
 use serde::Serialize;
@@ -110,6 +111,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     let mut checks = vec![
         doctor.run_check("same as the CPU", Doctor::parity),
         doctor.run_check("same bytes twice", Doctor::same_bytes),
+        doctor.run_check("pages on it", Doctor::pages),
     ];
     if !args.quick {
         checks.push(doctor.run_check("rates", Doctor::rates));
@@ -138,6 +140,9 @@ fn advice(checks: &[Check], kind: DeviceKind) -> String {
     let failed = |name: &str| checks.iter().any(|c| c.name == name && c.verdict == Verdict::Failed);
     if failed("same as the CPU") || failed("same bytes twice") || failed("short training") {
         return "train with --device cpu: this GPU or its driver computes something else; an update of the driver may help".into();
+    }
+    if failed("pages on it") {
+        return "train with --optimizer-on host, the default: the optimizer computes something else on this GPU".into();
     }
     if kind == DeviceKind::Software {
         return "it computes what the CPU computes, but it is a driver in software: train with --device cpu, which is faster".into();
@@ -191,6 +196,14 @@ impl Doctor<'_> {
                 );
                 Ok((format!("{} views agree with the CPU", views.len()), figures.collect()))
             }
+        }
+    }
+
+    /// Steps of the optimizer in pages on the device.
+    fn pages(&self) -> Result<(String, Value), String> {
+        match page_check::check(&mut self.renderer(false)?).map_err(|e| e.to_string())? {
+            None => Ok(("two steps of the optimizer agree with the CPU".into(), Value::Null)),
+            Some(difference) => Err(difference),
         }
     }
 
@@ -265,6 +278,9 @@ impl Doctor<'_> {
                     found += &format!(
                         "{rows} Gaussians: {cpu} ms on the CPU, {host} on the GPU, {device} with pages on it. "
                     );
+                    if let Some(failure) = of_size["device_form_failure"].as_str() {
+                        found += &format!("Pages on it: {failure}. ");
+                    }
                     figures.push(of_size);
                 }
                 // A size that does not fit says something about the next ones, and nothing about those before.
@@ -293,11 +309,13 @@ impl Doctor<'_> {
         let scene = CityScene::new(&folder.0, &city, config)?;
         let cpu = scene.step_seconds(Box::new(CpuRenderer::new()), OptimizerPlace::Host)?;
         let host = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Host)?;
-        let device = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Device).ok();
+        let on_device = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Device);
+        let (device, failure) = (on_device.as_ref().ok(), on_device.as_ref().err());
         let mut profiled = self.renderer(true)?;
         let stages = scene.stage_seconds(&mut profiled)?;
         Ok(json!({
             "gaussians": scene.columns.rows(), "cpu_seconds": cpu, "host_form_seconds": host, "device_form_seconds": device,
+            "device_form_failure": failure,
             "stage_seconds": stages, "device_bytes_peak": profiled.traffic().device_bytes_peak,
         }))
     }

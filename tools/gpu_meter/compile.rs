@@ -1,5 +1,6 @@
 //! Compiles every shader as stages do, on the first Vulkan device, and announces each pipeline on standard error, where a driver that is
-//! asked to prints its statistics. Reads none of them: `run` and `table.py` beside this file do.
+//! asked to prints its statistics. Reads none of them: `run` and `table.py` beside this file do. With METER_UNCHECKED set, indices and
+//! loops are compiled without the checks that stages have.
 
 use std::collections::BTreeSet;
 use std::error::Error;
@@ -42,6 +43,7 @@ fn open() -> Result<wgpu::Device, Box<dyn Error>> {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let device = open()?;
+    let is_checked = std::env::var_os("METER_UNCHECKED").is_none();
     for source in SOURCES.iter().filter(|source| !source.name.starts_with("shared/")) {
         let all = variants(source)?;
         let known: BTreeSet<&str> = all.iter().flatten().map(|(name, _)| name.as_str()).collect();
@@ -57,10 +59,18 @@ fn main() -> Result<(), Box<dyn Error>> {
                 continue;
             }
             let (module, _) = validate(source.name, &text, true)?;
-            let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            let descriptor = wgpu::ShaderModuleDescriptor {
                 label: Some(source.name),
                 source: wgpu::ShaderSource::Wgsl(text.into()),
-            });
+            };
+            let shader = match is_checked {
+                true => device.create_shader_module(descriptor),
+                #[allow(unsafe_code)] // argued below
+                // SAFETY: pipelines are compiled here and never run.
+                false => unsafe {
+                    device.create_shader_module_trusted(descriptor, wgpu::ShaderRuntimeChecks::unchecked())
+                },
+            };
             for entry in &module.entry_points {
                 let [threads, ..] = entry.workgroup_size;
                 let words: Vec<&str> = [source.name, &entry.name].into_iter().chain(switches.iter().copied()).collect();

@@ -8,12 +8,14 @@ use crate::config::limits::simd_path;
 use crate::config::values::Device;
 use crate::gpu::DeviceChoice;
 use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions};
+use crate::optim::method::OptimizerPlace;
 use crate::render::RenderError;
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
 use crate::render::device_check::{self, DeviceVerdict};
 use crate::render::gpu::GpuRenderer;
 use crate::train::error::TrainError;
+use crate::train::inputs::page_check;
 use std::path::{Path, PathBuf};
 
 /// Most worker threads per core, and how many are started on any machine if asked for.
@@ -76,7 +78,7 @@ pub fn renderer(config: &TrainConfig) -> Result<OpenedDevice, TrainError> {
 
 fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
-    match difference_from_cpu(choice) {
+    match difference_from_cpu(choice, config.optimizer_on.0 == Some(OptimizerPlace::Device)) {
         Ok(Some(difference)) => return without_device(choice, &difference),
         Ok(None) => {}
         Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
@@ -102,9 +104,12 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, T
 }
 
 /// In place of a device that differs from the CPU: the CPU for `auto`, with a warning.
-/// Errors: the user asked for the device.
-fn without_device(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevice, TrainError> {
-    let problem = format!("the GPU did not pass the comparison with the CPU: {difference}");
+/// Errors: the user asked for the device, or for pages on it.
+fn without_device(choice: &DeviceChoice, difference: &Difference) -> Result<OpenedDevice, TrainError> {
+    let problem = format!("the GPU did not pass the comparison with the CPU: {}", difference.problem);
+    if difference.is_of_pages {
+        return Err(InputError::new("--optimizer-on device", problem, "use --optimizer-on host").into());
+    }
     if *choice == DeviceChoice::Auto {
         crate::tell!("warning: the CPU renders: {problem}");
         return Ok(OpenedDevice::cpu(None));
@@ -113,19 +118,30 @@ fn without_device(choice: &DeviceChoice, difference: &str) -> Result<OpenedDevic
     Err(InputError::new("--device", problem, remedy).into())
 }
 
-/// The first difference between the device and the CPU, found in about a second. The device is opened for this alone and closed
+/// What a device computes otherwise than the CPU.
+struct Difference {
+    problem: String,
+    /// Only the stages on pages differ.
+    is_of_pages: bool,
+}
+
+/// The first difference between the device and the CPU, of pages as well if the device `updates_pages`, found in about a second. The device is opened for this alone and closed
 /// before the run opens it, so that nothing of the comparison stays on it. A software driver is compared only if
 /// `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software drivers. A device that cannot be opened is not
 /// compared: opening it for the run says why.
 /// Errors: those of the device, which say nothing about its results.
-fn difference_from_cpu(choice: &DeviceChoice) -> Result<Option<String>, RenderError> {
+fn difference_from_cpu(choice: &DeviceChoice, updates_pages: bool) -> Result<Option<Difference>, RenderError> {
     let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(None) };
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
         return Ok(None);
     }
-    Ok(match device_check::check(&mut GpuRenderer::new(gpu)?)? {
+    let mut device = GpuRenderer::new(gpu)?;
+    Ok(match device_check::check(&mut device)? {
+        DeviceVerdict::Differs(problem) => Some(Difference { problem, is_of_pages: false }),
+        DeviceVerdict::Agrees(_) if updates_pages => {
+            page_check::check(&mut device)?.map(|problem| Difference { problem, is_of_pages: true })
+        }
         DeviceVerdict::Agrees(_) => None,
-        DeviceVerdict::Differs(difference) => Some(difference),
     })
 }
 
@@ -152,7 +168,7 @@ mod tests {
 
     #[test]
     fn a_gpu_that_differs_from_the_cpu_is_refused_or_with_auto_replaced() {
-        let of = |choice| without_device(&choice, "stage sh_fwd");
+        let of = |choice| without_device(&choice, &Difference { problem: "stage sh_fwd".into(), is_of_pages: false });
         assert_eq!(of(DeviceChoice::Auto).unwrap().renderer.name(), CpuRenderer::new().name());
         for asked in [DeviceChoice::Gpu, DeviceChoice::Named("card".into())] {
             let refusal = of(asked).err().unwrap().to_string();

@@ -88,14 +88,13 @@ fn cost(&Step { rows: n, room, isects, size, pages }: &Step) -> Cost {
     let (summed, v_colors) = if pages.is_some() { (room, 0) } else { (isects, colors) };
     let mut cost = Cost::default();
     if let Some([count, slab, tables, recent]) = pages {
-        let (table, counts, found, listed, results) = (32 * count, 4 * (count + 1), 4 * n, 8 * n, 48 * count);
+        let (table, counts, found, results) = (32 * count, 4 * (count + 1), 4 * n, 48 * count);
         cost.add(1, table + slab + tables + recent + counts + found); // cull
         cost.add(1, counts + table); // place
-        cost.add(1, table + counts + found + listed); // list
-        cost.add(2, table + slab + tables + recent + listed); // gather_geometry, gather_colors
-        cost.add(3, table + slab + tables + listed + splats + 4); // step_geometry twice, step_colors
+        cost.add(2, table + slab + tables + recent + found); // gather_geometry, gather_colors
+        cost.add(3, table + slab + tables + found + splats + 4); // step_geometry twice, step_colors
         cost.bytes += (geometry + colors) + 2 * geometry + (splats + 12 * n + colors);
-        cost.add(1, table + slab + listed + splats + 16 * n + results + (4 << 15) + 4); // finish
+        cost.add(1, table + slab + found + splats + 16 * n + results + (4 << 15) + 4); // finish
         cost.add(1, table + slab + tables + recent + results); // bounds
         cost.add(1, counts + offsets + 4 + 4 + 16 + 4 + 48); // gate
     }

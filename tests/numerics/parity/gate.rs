@@ -3,16 +3,20 @@
 use super::pages::read;
 use super::rows::camera;
 use crate::support::gpu::open;
-use crate::twins::{self, gather};
+use crate::twins;
+use crate::twins::gather::{self, GatherInput};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::gpu::{Buffer, GpuOptions, groups_1d};
+use gsscale::kernels::deferred::DeferredTables;
 use gsscale::kernels::gate::{self, GateUniforms, StepVerdict};
 use gsscale::kernels::uniforms::{DevicePage, GatherUniforms};
 use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
+use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::optimizer_numbers::SplitLimits;
-use gsscale::scene::page_layout::PageLayout;
+use gsscale::scene::page_layout::{capacity_bytes, write_page};
+use gsscale::scene::state::SceneState;
 
 /// A step within all limits, and its limits.
 fn sound() -> (GateUniforms, StepVerdict) {
@@ -83,13 +87,20 @@ fn a_gate_closes_for_every_reason_and_stays_closed() {
     }
 }
 
-/// Few and many pages, lists with room, without, and with none to spare.
+/// Few and many pages, columns with room, without, and with none to spare.
 #[test]
-fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
+fn rows_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
     let Some(gpu) = open(&GpuOptions::default()) else { return };
     let adam = DeferredAdam::new(Rates::new(1.0, 10), AdamConfig::default(), gsscale::base::simd::SimdPath::best());
     let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
-    let layout = PageLayout { rows: 40, sh_degree: 0 };
+    let numbers = adam.numbers(10).unwrap();
+    let (tables, step) = (DeferredTables::new(&numbers), adam.at(1).numbers());
+    // All pages have the same payload, and values that stay.
+    let mut columns = Columns::zeros(40, 0);
+    columns.means.iter_mut().chain(&mut columns.opacities).enumerate().for_each(|(i, x)| *x = 1.0 + i as f32);
+    let mut payload = vec![0u64; capacity_bytes(40, 0).div_ceil(8)];
+    let layout = write_page(&SceneState::from_columns(columns), bytemuck::cast_slice_mut(&mut payload));
+    let slab: &[u32] = bytemuck::cast_slice(&payload);
     for (count, room) in [(1u32, 64u32), (700, 16_000), (700, 9000), (256, 1)] {
         let mut draws = Stream::new(3, Purpose::Test, u64::from(count), 0);
         let mut pages: Vec<DevicePage> = (0..count).map(|p| DevicePage::new(layout, 0, 0, 40 * p)).collect();
@@ -97,22 +108,39 @@ fn lists_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
         let found: Vec<u32> = (0..40 * count).map(|_| draws.below(40) as u32).collect();
         let mut recorder = gpu.begin("gather");
         let table = recorder.buffer_with("pages", &pages).unwrap();
-        let [on_device, found_there] =
-            [[&counts[..], &[0]].concat(), found.clone()].map(|words| recorder.buffer_with("words", &words).unwrap());
-        let listed = recorder.buffer_with("listed", &vec![[7u32; 2]; room as usize]).unwrap();
-        let uniforms = GatherUniforms::new(&camera(), &adam.numbers(10).unwrap(), 1, &splits, count);
-        let uniform = recorder.uniform(&GatherUniforms { row_count: room, ..uniforms }).unwrap();
-        let [place, list] = ["place", "list"].map(|entry| gpu.pipeline("gather.wgsl", entry, &[]).unwrap());
-        let views = [uniform.clone(), on_device.view(), table.view()];
+        let words = [[&counts[..], &[0]].concat(), found.clone(), slab.to_vec(), tables.words().to_vec()];
+        let [counted, found_there, slab_there, tables_there] =
+            words.map(|words| recorder.buffer_with("words", &words).unwrap());
+        let recent = recorder.buffer_with("recent", step.recent.as_flattened()).unwrap();
+        let [means, quats, scales, opacities] =
+            [3, 4, 3, 1].map(|width| recorder.buffer_with("column", &vec![7.0f32; width * room as usize]).unwrap());
+        let uniforms = GatherUniforms {
+            row_count: room,
+            end_page: count,
+            chunks: 1,
+            ..GatherUniforms::new(&camera(), &numbers, 1, &splits, count)
+        };
+        let uniform = recorder.uniform(&uniforms).unwrap();
+        let [place, gather] =
+            ["place", "gather_geometry"].map(|entry| gpu.pipeline("gather.wgsl", entry, &[]).unwrap());
+        let views = [uniform.clone(), counted.view(), table.view()];
         recorder.dispatch("gather", &place, &views, groups_1d(1, 1)).unwrap();
-        let views = [uniform, table.view(), on_device.view(), found_there.view(), listed.view()];
-        recorder.dispatch("gather", &list, &views, groups_1d(count + room.div_ceil(256), 1)).unwrap();
+        let read_there = [&table, &slab_there, &tables_there, &recent, &found_there].map(Buffer::view);
+        let columns = [&means, &quats, &scales, &opacities].map(Buffer::view);
+        let views: Vec<_> = std::iter::once(uniform).chain(read_there).chain(columns).collect();
+        recorder.dispatch("gather", &gather, &views, groups_1d(count + room.div_ceil(64), 1)).unwrap();
         gpu.submit(recorder).unwrap();
-        let mut want = vec![[gather::UNLISTED, 0]; room as usize];
         let total = gather::place(&mut pages, &counts);
-        gather::list(&pages, &counts, &found, &mut want);
-        let got: Vec<[u32; 2]> = read(&gpu, &listed, room as usize);
-        assert!(got == want, "{count} pages, {total} rows, room for {room}");
-        assert_eq!(read::<u32>(&gpu, &on_device, count as usize + 1)[count as usize], total);
+        assert_eq!(read::<u32>(&gpu, &counted, count as usize + 1)[count as usize], total);
+        let mut list = vec![[gather::UNLISTED, 0]; room as usize];
+        gather::list(&pages, &counts, &found, &mut list);
+        let input =
+            GatherInput { uniforms: &uniforms, pages: &pages, slab, tables: (&tables).into(), recent: &step.recent };
+        for (column, width, there) in [(Column::Means, 3, &means), (Column::Opacities, 1, &opacities)] {
+            let mut want = vec![f32::NAN; width * room as usize];
+            gather::gather(&input, (column, width), &list, &mut want);
+            let got: Vec<f32> = read(&gpu, there, want.len());
+            assert!(got == want, "{column:?} of {count} pages, {total} rows, room for {room}");
+        }
     }
 }

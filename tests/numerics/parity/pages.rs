@@ -20,7 +20,7 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;
-use gsscale::render::gpu_pages::{DevicePages, UpdateBuffers};
+use gsscale::render::gpu_pages::{DevicePages, PageBatch, UpdateBuffers};
 use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::columns::{Column, Columns};
@@ -120,6 +120,19 @@ pub fn read<T: bytemuck::Pod>(gpu: &Gpu, buffer: &Buffer, count: usize) -> Vec<T
     let mut values: Vec<T> = bytes.to_vec().unwrap();
     values.truncate(count);
     values
+}
+
+/// The listed rows of a batch on a device: number of the page, number of the row in it.
+fn listed_rows(gpu: &Gpu, batch: &PageBatch, slots: &[SlotPage]) -> Vec<[u32; 2]> {
+    let rows: usize = slots.iter().map(|page| page.layout.rows).sum();
+    let found: Vec<u32> = read(gpu, &batch.found, rows);
+    let (mut listed, mut first_row) = (Vec::new(), 0);
+    for (p, (page, &count)) in slots.iter().zip(&batch.listed).enumerate() {
+        listed.extend(found[first_row..][..count as usize].iter().map(|row| [p as u32, *row]));
+        first_row += page.layout.rows;
+    }
+    assert_eq!(listed.len(), batch.rows as usize);
+    listed
 }
 
 fn gathered_by_twin(world: &World) -> (Vec<[u32; 2]>, Vec<Vec<f32>>) {
@@ -223,7 +236,7 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
         let on = OnDevice::new(&gpu, &world);
         let view = begin_view(&gpu, &on.pages, &camera(), &world.adam.at(now).numbers());
         let (batch, table) = on.pages.list(&gpu, &view, &on.slots).unwrap();
-        let listed: Vec<[u32; 2]> = read(&gpu, &batch.listed, batch.rows as usize);
+        let listed = listed_rows(&gpu, &batch, &on.slots);
         assert!(listed.is_sorted(), "lists are in the order of pages and rows");
         // A row at the edge of the cull's slack may be listed on one side alone.
         let differ = listed.iter().filter(|row| !list.contains(row)).count()
@@ -238,6 +251,31 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
             columns.columns().map(|(_, buffer, width)| read(&gpu, buffer, width * batch.rows as usize)).collect();
         assert_gathered(&world, &listed, &of_device, "device");
     }
+}
+
+/// A dispatch for each slab in which a batch has pages, of workgroups for these pages alone: in four slabs they are hardly more than in
+/// one, as a dispatch for each slab over all rows would be.
+#[test]
+fn dispatches_work_on_the_pages_of_their_slab() {
+    let world = World::new(1, 40, false);
+    let devices = [open(&GpuOptions::default()), device(&world)];
+    let [Some(one), Some(four)] = &devices else { return };
+    let workgroups = [one, four].map(|gpu| {
+        let on = OnDevice::new(gpu, &world);
+        let view = begin_view(gpu, &on.pages, &camera(), &world.adam.at(40).numbers());
+        let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
+        let columns = DeviceColumns::new(gpu, batch.rows, 1).unwrap();
+        let before = gpu.traffic().work;
+        let mut recorder = gpu.begin("parity");
+        let all = 0..batch.rows as usize;
+        on.pages.source(&view, &batch, &table).geometry(gpu, &mut recorder, &columns, &all).unwrap();
+        gpu.submit(recorder).unwrap();
+        let after = gpu.traffic().work;
+        [after.dispatches - before.dispatches, after.workgroups - before.workgroups]
+    });
+    let [[in_one, of_one], [in_four, of_four]] = workgroups;
+    assert_eq!([in_one, in_four], [2, 8], "two stages in one and in four slabs");
+    assert!(of_four < of_one + of_one / 2, "{of_four} workgroups in four slabs, {of_one} in one");
 }
 
 /// Gradients of listed rows.
@@ -364,7 +402,7 @@ fn updated_by_device(
     let results = on.pages.begin_results(gpu, &source, &results).unwrap().to_vec::<PageResult>().unwrap();
     let gathered = values.columns().map(|(_, buffer, width)| read(gpu, buffer, width * rows)).collect();
     let bins = on.pages.take_bins(gpu).unwrap();
-    ((on.payloads(), results, bins), read(gpu, &batch.listed, rows), gathered)
+    ((on.payloads(), results, bins), listed_rows(gpu, &batch, &on.slots), gathered)
 }
 
 /// Whether two floats, by their bits, agree within three units in the last place and `slack`.
@@ -422,7 +460,7 @@ fn assert_bounds_of_device(on: &OnDevice<'_>, world: &World, results: &[PageResu
     for later in [1, 3, 50, 199] {
         let view = begin_view(on.gpu, &on.pages, &camera(), &world.adam.at(world.now + later).numbers());
         let (batch, table) = on.pages.list(on.gpu, &view, &on.slots).unwrap();
-        let listed: Vec<[u32; 2]> = read(on.gpu, &batch.listed, batch.rows as usize);
+        let listed = listed_rows(on.gpu, &batch, &on.slots);
         let columns = DeviceColumns::new(on.gpu, batch.rows, world.layouts[0].sh_degree).unwrap();
         let mut recorder = on.gpu.begin("parity");
         let all = 0..batch.rows as usize;

@@ -1,10 +1,10 @@
 //! Stage "gather": the rows of pages, as they are now, from the words of their payloads. The twin of
 //! `shaders/gather.wgsl`, in which the functions are entry points.
 //!
-//! [`cull`] lists the rows of each page that the camera may draw, [`list`] packs the lists in the order of the pages,
-//! [`gather`] evaluates a column of the listed rows (a device takes several at once), and [`bounds`] finds the bounds of a page after its update. Where the
-//! host does not wait for the numbers of rows, [`place`] finds where the list of each page begins. The list then has spare
-//! room, and entries without a row ([`UNLISTED`]) are transparent.
+//! [`cull`] lists the rows of each page that the camera may draw, [`gather`] evaluates a column of the listed rows (a device takes
+//! several at once), and [`bounds`] finds the bounds of a page after its update. Where the host does not wait for the numbers of
+//! rows, [`place`] finds where the rows of each page begin. The columns then have spare room, and entries without a row
+//! ([`UNLISTED`]) are transparent. [`list`] writes down which row each entry has; a device finds its row without such a list.
 //!
 //! [`survey`] finds what decides whether a round of densification edits rows of a page, so that a page whose statistics a round only
 //! clears need not come to the host.
@@ -125,7 +125,7 @@ pub fn cull(input: &GatherInput<'_>, counts: &mut [u32], found: &mut [u32]) {
 /// Finds where the listed rows of each page begin; returns how many there are.
 pub fn place(pages: &mut [DevicePage], counts: &[u32]) -> u32 {
     pages.iter_mut().zip(counts).fold(0, |listed, (page, count)| {
-        page.first_listed = listed;
+        (page.first_listed, page.listed) = (listed, *count);
         listed + count
     })
 }
