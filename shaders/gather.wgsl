@@ -73,7 +73,11 @@ struct GatherUniforms {
 
 /// Relative slack of a movement, slack of a value and of a flushed value, as in src/optim/bounds.rs. The slack of values
 /// is twice the CPU's, for devices that divide and take roots less exactly.
+#ifdef HALF_MOMENTS
+const MOVEMENT_SLACK: f32 = 2e-2;
+#else
 const MOVEMENT_SLACK: f32 = 1e-3;
+#endif
 const VALUE_SLACK: f32 = 16.0 * 5.9604645e-8;
 const FLUSH_SLACK: f32 = 2.3509887e-38;
 const SIGMA_SLACK: f32 = 4e-6;
@@ -140,9 +144,12 @@ fn element(page: DevicePage, column: u32, row: u32, e: u32, end: u32) -> f32 {
     let at = column_at(page, column) + row * column_width(column, page.sh_n_width) + e;
     let words = table_words(page, column);
     let value = bitcast<f32>(slab[at]);
-    let m = bitcast<f32>(slab[at + words]);
-    let v = bitcast<f32>(slab[at + 2u * words]);
-    return evaluate(value, m, v, slab[stamps_at(page) + row], end, column == MEANS, u.rates[column / 4u][column % 4u]);
+#ifdef HALF_MOMENTS
+    let moments = moments_of(slab[at + words]);
+#else
+    let moments = vec2<f32>(bitcast<f32>(slab[at + words]), bitcast<f32>(slab[at + 2u * words]));
+#endif
+    return evaluate(value, moments.x, moments.y, slab[stamps_at(page) + row], end, column == MEANS, u.rates[column / 4u][column % 4u]);
 }
 
 /// Whether the camera may draw a row at `p` with this largest sigma. NaN counts as drawn.

@@ -108,35 +108,66 @@ struct Decays {
     first: f32,
     kept: f32,
     lost: f32,
+    /// Key of the draws that round moments to 16 bits.
+    key: u32,
+}
+
+/// The finaliser of MurmurHash3.
+fn mixed(x: u32) -> u32 {
+    let a = (x ^ (x >> 16u)) * 0x85ebca6bu;
+    let b = (a ^ (a >> 13u)) * 0xc2b2ae35u;
+    return b ^ (b >> 16u);
 }
 
 fn decays_of(page: DevicePage, row: u32) -> Decays {
     let missed = u.now - slab[stamps_at(page) + row];
     let second = decay_at(missed + 1u) + 1u;
+#ifdef HALF_MOMENTS
+    let uid = page.base + 2u * row;
+    let key = mixed(slab[uid] ^ mixed(slab[uid + 1u] ^ mixed(u.now + 1u)));
+#else
+    let key = 0u;
+#endif
     return Decays(
         bitcast<f32>(tables[decay_at(missed)]),
         bitcast<f32>(tables[second]),
         bitcast<f32>(tables[second + 1u]),
+        key,
     );
 }
 
-/// One step on the float at word `at`, whose moments follow after `words` and again `words` words.
-fn step_float(column: u32, at: u32, words: u32, d: Decays, value: f32, g: f32) {
+/// Number of the first float of a column in draws.
+fn drawn_first(column: u32) -> u32 {
+    return array<u32, 6>(0u, 3u, 7u, 10u, 11u, 14u)[column];
+}
+
+/// One step on float `e` of a column of a row, at word `at`; its moments follow after `words` and, with 32 bits, again `words` words.
+fn step_float(column: u32, e: u32, at: u32, words: u32, d: Decays, value: f32, g: f32) {
     let m_at = at + words;
     let v_at = m_at + words;
-    let decayed = flush(bitcast<f32>(slab[m_at]) * d.first);
+#ifdef HALF_MOMENTS
+    let old = moments_of(slab[m_at]);
+#else
+    let old = vec2<f32>(bitcast<f32>(slab[m_at]), bitcast<f32>(slab[v_at]));
+#endif
+    let decayed = flush(old.x * d.first);
     let m = flush(decayed + (g - decayed) * bitcast<f32>(tables[ONE_MINUS_BETA1]));
     let gained = g * g * bitcast<f32>(tables[ONE_MINUS_BETA2]);
-    let old_v = bitcast<f32>(slab[v_at]);
-    let v = max(flush(old_v * d.kept + (gained - old_v * d.lost)), 0.0);
+    let v = max(flush(old.y * d.kept + (gained - old.y * d.lost)), 0.0);
     let root = sqrt(v) * u.inv_root_correction + bitcast<f32>(tables[EPS]);
     var moved = flush(value - u.step_sizes[column / 4u][column % 4u] * (m / root));
     if column == SCALES {
         moved = max(min(moved, bitcast<f32>(tables[LOG_SCALE_HIGH])), bitcast<f32>(tables[LOG_SCALE_LOW]));
     }
     slab[at] = bitcast<u32>(moved);
+#ifdef HALF_MOMENTS
+    // Rounded up with the probability of what is cut, as src/optim/moments.rs explains.
+    let draw = mixed(d.key + (drawn_first(column) + e) * 0x9e3779b9u);
+    slab[m_at] = ((bitcast<u32>(m) + (draw & 0xffffu)) & 0xffff0000u) | ((bitcast<u32>(v) + (draw >> 16u)) >> 16u);
+#else
     slab[m_at] = bitcast<u32>(m);
     slab[v_at] = bitcast<u32>(v);
+#endif
 }
 
 /// The rows of a workgroup, in chunks of `size`.
@@ -175,8 +206,9 @@ fn step_geometry(workgroup: Group, place: Place) {
             g = second_grads[entry];
         }
         let row = found[page.first_row + c.first + i];
-        let at = column_at(page, f.column) + row * f.width + f.at - i * f.width;
-        step_float(f.column, at, table_words(page, f.column), decays_of(page, row), value, g);
+        let e = f.at - i * f.width;
+        let at = column_at(page, f.column) + row * f.width + e;
+        step_float(f.column, e, at, table_words(page, f.column), decays_of(page, row), value, g);
     }
 }
 
@@ -267,11 +299,11 @@ fn step_colors(workgroup: Group, place: Place) {
 #ifdef SH_DEGREE_1
         if e >= 3u {
             let value = sh_n[SH_WIDTH * (c.at + own) + e - 3u];
-            step_float(SH_N, row.sh_n_at + e - 3u, row.sh_n_words, row.decays, value, g);
+            step_float(SH_N, e - 3u, row.sh_n_at + e - 3u, row.sh_n_words, row.decays, value, g);
             continue;
         }
 #endif
-        step_float(SH0, row.sh0_at + e, row.sh0_words, row.decays, sh0[3u * (c.at + own) + e], g);
+        step_float(SH0, e, row.sh0_at + e, row.sh0_words, row.decays, sh0[3u * (c.at + own) + e], g);
     }
 }
 

@@ -1,5 +1,5 @@
-// The rows of a page in its bytes on a device, as words: the twin of src/kernels/page_words.rs. The layout is that of
-// src/scene/page_layout.rs, so a payload is copied between host and device as it is.
+// The rows of a page in its bytes on a device, as words. The layout is that of src/scene/page_layout.rs, so a payload is copied between
+// host and device as it is; with the switch HALF_MOMENTS moments have 16 bits, and the first and the second one of a value share a word.
 
 /// One page of a batch.
 struct DevicePage {
@@ -129,6 +129,18 @@ fn float_of(i: u32, row_count: u32, first: u32, widths: vec4<u32>) -> Float {
     return Float(first + 3u, widths.w, i - ends.z);
 }
 
+/// Tables of a column: values and moments.
+#ifdef HALF_MOMENTS
+const TABLES: u32 = 2u;
+
+/// The first and the second moment in a word.
+fn moments_of(both: u32) -> vec2<f32> {
+    return vec2<f32>(bitcast<f32>(both & 0xffff0000u), bitcast<f32>(both << 16u));
+}
+#else
+const TABLES: u32 = 3u;
+#endif
+
 /// Words of the table of values of a column, which are those of its moments.
 fn table_words(page: DevicePage, column: u32) -> u32 {
     return padded(page.rows * column_width(column, page.sh_n_width));
@@ -143,5 +155,5 @@ fn column_at(page: DevicePage, column: u32) -> u32 {
     before += select(0u, threes, column > SCALES);
     before += select(0u, padded(page.rows), column > OPACITIES);
     before += select(0u, threes, column > SH0);
-    return count_at(page) + padded(page.rows) + 3u * before;
+    return count_at(page) + padded(page.rows) + TABLES * before;
 }

@@ -198,10 +198,10 @@ config_keys! {
         /// every step: slow, for comparison), or sparse (only those with a gradient: not exact)
         optimizer: Method = Method::Deferred => Numbers hidden;
         /// Where the optimizer runs: host, or device (on the GPU that renders, in pages that stay there while --device-mem
-        /// has room; with --optimizer deferred, --moments f32 and --growth-score gradient). The two round differently.
+        /// has room; with --optimizer deferred). The two round differently.
         /// auto is host, until device is faster on measured GPUs. A resumed run keeps its place
         optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers;
-        /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk)
+        /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk and on a device that holds pages)
         moments: Moments = Moments::F32 => Numbers;
         /// Initial opacity
         init_opacity: f64 = 0.1 => Numbers hidden;
@@ -476,7 +476,6 @@ impl TrainConfig {
             (self.pages_file.is_empty(), "it knows no frozen pages", "leave out --pages-file"),
             (!self.refine_poses.is_on(), "it leaves the gradients of poses on the device", "leave out --refine-poses"),
             (self.strategy != StrategyName::Mcmc, "it adds no noise to means", "leave out --strategy mcmc"),
-            (self.moments == Moments::F32, "its moments have 32 bits", "use --moments f32"),
         ];
         match needs.iter().find(|(holds, ..)| !holds) {
             Some((_, problem, remedy)) => {

@@ -67,6 +67,12 @@ pub enum Disturbance {
     },
     /// As many points, at random places of their box, of random colours.
     RandomPoints,
+    /// Exposures, photos that have changed places and grey boxes at once, as above.
+    Together {
+        stops: f64,
+        share: f64,
+        boxes: u32,
+    },
     /// One photo in so many, at least 1, is blurred by a normal distribution of a hundredth of its width.
     Blurred {
         one_in: u32,
@@ -186,7 +192,9 @@ fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
 fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
     let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
     let shown = match disturbance {
-        Disturbance::Swapped { share, .. } => swapped(dataset, &views, *share, seed),
+        Disturbance::Swapped { share, .. } | Disturbance::Together { share, .. } => {
+            swapped(dataset, &views, *share, seed)
+        }
         _ => (0..views.len()).collect(),
     };
     let noise = match disturbance {
@@ -330,6 +338,11 @@ fn disturbed(mut photo: Target, disturbance: &Disturbance, seed: u64, number: us
         Disturbance::Exposure { stops } => {
             let gain = libm::exp2(draws.range(-stops, stops));
             scale(&mut photo, [gain; 3]);
+        }
+        Disturbance::Together { stops, boxes, .. } => {
+            let gain = libm::exp2(draws.range(-stops, stops));
+            scale(&mut photo, [gain; 3]);
+            (0..boxes).for_each(|_| add_box(&mut photo, false, &mut draws));
         }
         Disturbance::WhiteBalance { stops } => {
             let gain = libm::exp2(draws.range(-stops, stops));

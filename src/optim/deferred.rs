@@ -173,13 +173,13 @@ impl DeferredAdam {
         Decay::new(self.tables.config(), k)
     }
 
-    /// The numbers of a run of `steps` steps, for backends that update rows themselves; `None` for optimizers that only the CPU has:
-    /// moments of 16 bits, and rows that do not catch up. The sums of the series are those of the CPU, to the bit: they are
+    /// The numbers of a run of `steps` steps, for backends that update rows themselves; `None` for an optimizer that only the CPU has:
+    /// rows that do not catch up. The sums of the series are those of the CPU, to the bit: they are
     /// computed in f64 and rounded once. The factors of the direct sum, which the CPU multiplies in f64, are multiplied in
     /// f32 there: its relative error is some 1e-6 (`tests/numerics/device_adam.rs`).
     pub fn numbers(&self, steps: u32) -> Option<RunNumbers> {
         let tables = &self.tables;
-        if tables.is_still() || self.moments != Moments::F32 {
+        if tables.is_still() {
             return None;
         }
         let config = tables.config();
@@ -196,6 +196,7 @@ impl DeferredAdam {
             one_minus_betas: [(1.0 - config.beta1) as f32, (1.0 - config.beta2) as f32],
             base_rates: Column::ALL.map(|column| self.base_rate(column)),
             log_scales: [low, high],
+            has_halves: self.moments == Moments::Bf16,
         })
     }
 }

@@ -36,7 +36,7 @@ use crate::page::map::commit::{CommitError, Commits, Cut};
 use crate::page::map::opening::StoredPage;
 use crate::page::versions::paged_store::PagedStore;
 use crate::scene::camera::Camera;
-use crate::scene::page_layout::capacity_bytes;
+use crate::scene::page_layout::{PageLayout, capacity_bytes};
 use crate::scene::page_meta::PageMeta;
 use crate::schedule::visibility::visible_pages;
 
@@ -219,6 +219,11 @@ impl Pager {
 
     pub fn frame_bytes(&self) -> usize {
         self.tier.mover.frame_bytes
+    }
+
+    /// Layout of a full page.
+    pub fn largest_page(&self) -> PageLayout {
+        PageLayout { rows: self.config.page_rows, sh_degree: self.config.sh_degree }
     }
 
     /// The metas of all pages, by number.

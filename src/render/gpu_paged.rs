@@ -11,7 +11,7 @@ use super::gpu_pages::DevicePages;
 use super::gpu_recorded::{back_and_update, finish, rows_and_picture};
 use super::gpu_update::update_batch;
 use super::gpu_view::View;
-use super::pages::{DeviceSlot, PageRenderer, PageRules, RecordedUpdate, SlotPage, StepDone, StepJob};
+use super::pages::{PageRenderer, PageRules, RecordedUpdate, SlotPage, StepDone, StepJob};
 use super::{RenderError, Renderer, RowBatches};
 use crate::kernels::uniforms::{PageResult, PageSurvey};
 use crate::scene::optimizer_numbers::StepNumbers;
@@ -48,19 +48,19 @@ impl PageRenderer for GpuRenderer {
         Ok(held_mut(&mut self.pages)?.slots.add(&self.stages.gpu, wanted)?)
     }
 
-    fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError> {
+    fn write_slots(&mut self, payloads: &[(SlotPage, &[u8])]) -> Result<(), RenderError> {
         Ok(held(&self.pages)?.slots.write(&self.stages.gpu, payloads)?)
     }
 
-    fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError> {
+    fn read_slots(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> Result<(), RenderError> {
         Ok(held(&self.pages)?.slots.read(&self.stages.gpu, payloads)?)
     }
 
-    fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError> {
+    fn begin_reads(&mut self, slots: &[SlotPage]) -> Result<usize, RenderError> {
         Ok(held_mut(&mut self.pages)?.slots.begin_reads(&self.stages.gpu, slots)?)
     }
 
-    fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError> {
+    fn finish_reads(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> Result<(), RenderError> {
         Ok(held_mut(&mut self.pages)?.slots.finish_reads(payloads)?)
     }
 

@@ -131,7 +131,8 @@ impl PageChunks {
 impl DevicePages {
     /// Compiles the stages and uploads the tables of a run.
     pub fn new(gpu: &Gpu, rules: &PageRules) -> GpuResult<DevicePages> {
-        let of = |shader: &str, entry: &str| gpu.pipeline(shader, entry, &[]);
+        let halves: &[(&str, &str)] = if rules.numbers.has_halves { &[("HALF_MOMENTS", "")] } else { &[] };
+        let of = |shader: &str, entry: &str| gpu.pipeline(shader, entry, halves);
         let stages = Stages {
             cull: of("gather.wgsl", "cull")?,
             place: of("gather.wgsl", "place")?,
@@ -141,16 +142,17 @@ impl DevicePages {
             survey: of("gather.wgsl", "survey")?,
             clear: of("update.wgsl", "clear_statistics")?,
             step_geometry: of("update.wgsl", "step_geometry")?,
-            step_colors: of_degrees(gpu, "update.wgsl", "step_colors", &[])?,
+            step_colors: of_degrees(gpu, "update.wgsl", "step_colors", halves)?,
             finish: of("update.wgsl", "finish")?,
-            decide: of("gate.wgsl", "decide")?,
+            decide: gpu.pipeline("gate.wgsl", "decide", &[])?,
         };
         let mut recorder = gpu.begin("pages");
         let tables = recorder.buffer_with("optimizer tables", DeferredTables::new(&rules.numbers).words())?;
         let bins = recorder.buffer_zeroed("bins", 4 * BINS * if rules.weighs { 2 } else { 1 })?;
         let gate = recorder.buffer_zeroed("gate", 4)?;
         gpu.submit(recorder)?;
-        Ok(DevicePages { slots: Slots::new(rules.payload_bytes), stages, rules: rules.clone(), tables, bins, gate })
+        let slots = Slots::new(rules.largest, rules.numbers.has_halves);
+        Ok(DevicePages { slots, stages, rules: rules.clone(), tables, bins, gate })
     }
 
     /// Begins a view at a step: records the upload of its tables.

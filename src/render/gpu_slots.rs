@@ -4,8 +4,9 @@
 //!
 //! Invariant: a slab stays for as long as the pages of a run are held, so the place of a slot never changes.
 
-use super::pages::DeviceSlot;
+use super::pages::{DeviceSlot, SlotPage};
 use crate::gpu::{Buffer, BufferView, Gpu, GpuError, GpuResult, Readback};
+use crate::scene::page_layout::PageLayout;
 use std::collections::VecDeque;
 
 /// Bytes that a slot is a multiple of: the largest alignment that a device may require of a binding.
@@ -30,15 +31,23 @@ struct Slab {
 #[derive(Debug, Default)]
 pub struct Slots {
     slot_bytes: u64,
+    /// Whether moments have 16 bits, two to a word.
+    is_packed: bool,
     slabs: Vec<Slab>,
     /// Reads that have begun and not ended, with the slots that they read, in the order of their beginning.
     under_way: VecDeque<(DeviceSlot, Readback)>,
 }
 
 impl Slots {
-    /// No slots yet, for payloads of at most `payload_bytes` bytes.
-    pub fn new(payload_bytes: usize) -> Slots {
-        Slots { slot_bytes: (payload_bytes as u64).next_multiple_of(SLOT_STEP), ..Slots::default() }
+    /// No slots yet, for payloads up to this layout, whose moments are packed if they have 16 bits.
+    pub fn new(largest: PageLayout, is_packed: bool) -> Slots {
+        let none = Slots { is_packed, ..Slots::default() };
+        Slots { slot_bytes: none.bytes_of(largest).next_multiple_of(SLOT_STEP), ..none }
+    }
+
+    /// Bytes of a payload in a slot.
+    fn bytes_of(&self, layout: PageLayout) -> u64 {
+        (if self.is_packed { layout.packed_bytes() } else { layout.bytes() }) as u64
     }
 
     pub fn slot_bytes(&self) -> u64 {
@@ -85,24 +94,32 @@ impl Slots {
         self.slabs.get(slab as usize).map(|slab| slab.buffer.view()).ok_or_else(no_such_slot)
     }
 
-    fn view(&self, slot: DeviceSlot, bytes: usize) -> GpuResult<BufferView> {
+    fn view(&self, SlotPage { slot, layout }: SlotPage) -> GpuResult<BufferView> {
         let (slab, offset) = self.place(slot);
         let slab = self.slabs.get(slab as usize).filter(|slab| slot.0 < slab.first + slab.slots);
-        let bytes = (bytes as u64).next_multiple_of(4).min(self.slot_bytes);
+        let bytes = self.bytes_of(layout).min(self.slot_bytes);
         slab.map(|slab| slab.buffer.slice(offset, bytes)).ok_or_else(no_such_slot)
     }
 
     /// Copies payloads into slots. Does not wait.
-    pub fn write(&self, gpu: &Gpu, payloads: &[(DeviceSlot, &[u8])]) -> GpuResult<()> {
+    pub fn write(&self, gpu: &Gpu, payloads: &[(SlotPage, &[u8])]) -> GpuResult<()> {
         let mut recorder = gpu.begin("pages");
-        for (slot, payload) in payloads {
-            recorder.upload(&self.view(*slot, payload.len())?, payload)?;
+        let mut packed = Vec::new();
+        for (page, payload) in payloads {
+            let view = self.view(*page)?;
+            match self.is_packed {
+                true => {
+                    page.layout.pack(payload, &mut packed);
+                    recorder.upload(&view, &packed)?;
+                }
+                false => recorder.upload(&view, payload)?,
+            }
         }
         gpu.submit(recorder).map(|_| ())
     }
 
     /// Copies slots into payloads, as many at once as staging should hold. Waits.
-    pub fn read(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+    pub fn read(&self, gpu: &Gpu, payloads: &mut [(SlotPage, &mut [u8])]) -> GpuResult<()> {
         let mut at_once = (READ_BYTES / self.slot_bytes).max(1) as usize;
         let mut rest = payloads;
         while !rest.is_empty() {
@@ -116,16 +133,16 @@ impl Slots {
         Ok(())
     }
 
-    /// Begins to read slots, each with the bytes of its payload; returns how many, from the first: those that memory allows. Does not
+    /// Begins to read slots; returns how many, from the first: those that memory allows. Does not
     /// wait.
-    pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[(DeviceSlot, usize)]) -> GpuResult<usize> {
+    pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[SlotPage]) -> GpuResult<usize> {
         let reading = self.under_way.len() as u64 * self.slot_bytes;
         let most = UNDER_WAY_BYTES.saturating_sub(reading).min(gpu.room() / READ_SHARE) / self.slot_bytes;
         let before = self.under_way.len();
         let mut recorder = gpu.begin("pages");
-        for (slot, bytes) in slots.iter().take(most as usize) {
-            match recorder.read_back("pages", &self.view(*slot, *bytes)?) {
-                Ok(read) => self.under_way.push_back((*slot, read)),
+        for page in slots.iter().take(most as usize) {
+            match recorder.read_back("pages", &self.view(*page)?) {
+                Ok(read) => self.under_way.push_back((page.slot, read)),
                 Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
@@ -135,24 +152,30 @@ impl Slots {
     }
 
     /// Ends the reads that began first, into the payloads of the same slots. Waits for them alone.
-    pub fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+    pub fn finish_reads(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> GpuResult<()> {
         let count = payloads.len().min(self.under_way.len());
         let ending: Vec<(DeviceSlot, Readback)> = self.under_way.drain(..count).collect();
-        if !ending.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(slot, _)| slot)) {
+        if !ending.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(page, _)| &page.slot)) {
             return Err(wrong_slots("slots whose reads have not begun"));
         }
-        ending.into_iter().zip(payloads).try_for_each(|((_, read), (_, payload))| read.copy_to(payload))
+        ending.into_iter().zip(payloads).try_for_each(|((_, read), (page, payload))| self.fill(*page, read, payload))
     }
 
-    fn read_some(&self, gpu: &Gpu, payloads: &mut [(DeviceSlot, &mut [u8])]) -> GpuResult<()> {
+    fn read_some(&self, gpu: &Gpu, payloads: &mut [(SlotPage, &mut [u8])]) -> GpuResult<()> {
         let mut recorder = gpu.begin("pages");
         let mut readbacks = Vec::new();
-        for (slot, payload) in payloads.iter() {
-            readbacks.push(recorder.read_back("pages", &self.view(*slot, payload.len())?)?);
+        for (page, _) in payloads.iter() {
+            readbacks.push(recorder.read_back("pages", &self.view(*page)?)?);
         }
         gpu.submit(recorder)?;
-        for ((_, payload), bytes) in payloads.iter_mut().zip(readbacks) {
-            bytes.copy_to(payload)?;
+        payloads.iter_mut().zip(readbacks).try_for_each(|((page, payload), read)| self.fill(*page, read, payload))
+    }
+
+    /// Waits for a slot that was read, and copies it to the payload.
+    fn fill(&self, page: SlotPage, read: Readback, payload: &mut [u8]) -> GpuResult<()> {
+        match self.is_packed {
+            true => page.layout.unpack(&read.to_vec::<u32>()?, payload),
+            false => read.copy_to(payload)?,
         }
         Ok(())
     }

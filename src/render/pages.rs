@@ -3,7 +3,8 @@
 //!
 //! Not here: which pages lie in which slot, and when they come and go (`train`).
 //!
-//! Invariants: 1. a slot holds the payload of one page byte for byte; 2. the result of a step does not depend on slots,
+//! Invariants: 1. a slot holds the payload of one page byte for byte, with moments of 16 bits in the form of
+//! [`PageLayout::pack`]; 2. the result of a step does not depend on slots,
 //! batches or the room for them.
 
 use super::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
@@ -28,8 +29,8 @@ pub struct SlotPage {
 /// What a device needs to know of a run before it holds pages.
 #[derive(Debug, Clone)]
 pub struct PageRules {
-    /// Bytes of the largest payload.
-    pub payload_bytes: usize,
+    /// Layout of the largest payload.
+    pub largest: PageLayout,
     /// The optimizer.
     pub numbers: RunNumbers,
     /// Limits within which rows may split.
@@ -109,19 +110,19 @@ pub trait PageRenderer: Renderer {
     fn add_slots(&mut self, wanted: usize) -> Result<usize, RenderError>;
 
     /// Copies payloads into slots.
-    fn write_slots(&mut self, payloads: &[(DeviceSlot, &[u8])]) -> Result<(), RenderError>;
+    fn write_slots(&mut self, payloads: &[(SlotPage, &[u8])]) -> Result<(), RenderError>;
 
     /// Copies slots into payloads. Waits.
-    fn read_slots(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
+    fn read_slots(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> Result<(), RenderError>;
 
-    /// Begins to copy slots back, each with the bytes of its payload, as they are after the work submitted so far; returns how many, from
+    /// Begins to copy slots back, as they are after the work submitted so far; returns how many, from
     /// the first. Fewer than all, even none, where memory is short. Does not wait. The slots may be given other payloads at once: the
     /// device copies in the order of the calls.
-    fn begin_reads(&mut self, slots: &[(DeviceSlot, usize)]) -> Result<usize, RenderError>;
+    fn begin_reads(&mut self, slots: &[SlotPage]) -> Result<usize, RenderError>;
 
     /// Ends the copies that [`PageRenderer::begin_reads`] began first, into payloads in the same order. Waits for the copies, not for work
     /// submitted after them. Whatever happens, none of these copies is under way afterwards.
-    fn finish_reads(&mut self, payloads: &mut [(DeviceSlot, &mut [u8])]) -> Result<(), RenderError>;
+    fn finish_reads(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> Result<(), RenderError>;
 
     /// As [`Renderer::rows_in`], for the rows of `pages` that the view's camera may draw, evaluated at the step. Returns how many.
     /// Waits for that number.

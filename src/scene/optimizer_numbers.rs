@@ -30,6 +30,8 @@ pub struct RunNumbers {
     pub base_rates: [f32; Column::ALL.len()],
     /// Least and greatest log-scale that an update leaves.
     pub log_scales: [f32; 2],
+    /// Whether moments have 16 bits between updates.
+    pub has_halves: bool,
 }
 
 #[derive(Debug, Clone, Default, PartialEq)]

@@ -28,9 +28,61 @@ pub struct PageLayout {
 impl PageLayout {
     /// Bytes of the payload: at least [`super::state::row_bytes`] per row, plus padding.
     pub fn bytes(&self) -> usize {
-        let floats = |width: usize| padded(self.rows * width * 4);
-        let columns: usize = Column::ALL.iter().map(|c| 3 * floats(c.width(self.sh_degree))).sum();
-        padded(self.rows * 8) + 3 * floats(1) + columns
+        4 * (self.head_words() + 3 * self.column_words().sum::<usize>())
+    }
+
+    /// Bytes of the payload with moments of 16 bits, as a device holds it: the first and the second moment of a value share a word.
+    pub fn packed_bytes(&self) -> usize {
+        self.bytes() - 4 * self.column_words().sum::<usize>()
+    }
+
+    /// A payload whose moments have 16 bits, packed.
+    pub fn pack(&self, payload: &[u8], packed: &mut Vec<u32>) {
+        let payload: &[u32] = bytemuck::cast_slice(&payload[..self.bytes()]);
+        packed.resize(self.packed_bytes() / 4, 0);
+        let (head, mut columns) = payload.split_at(self.head_words());
+        let (packed_head, mut rest) = packed.split_at_mut(head.len());
+        packed_head.copy_from_slice(head);
+        for words in self.column_words() {
+            let (tables, others) = columns.split_at(3 * words);
+            let (own, others_packed) = rest.split_at_mut(2 * words);
+            let (values, moments) = own.split_at_mut(words);
+            values.copy_from_slice(&tables[..words]);
+            for ((both, m), v) in moments.iter_mut().zip(&tables[words..2 * words]).zip(&tables[2 * words..]) {
+                *both = m & 0xffff_0000 | v >> 16;
+            }
+            (columns, rest) = (others, others_packed);
+        }
+    }
+
+    /// The payload of [`PageLayout::pack`].
+    pub fn unpack(&self, packed: &[u32], payload: &mut [u8]) {
+        let payload: &mut [u32] = bytemuck::cast_slice_mut(&mut payload[..self.bytes()]);
+        let (head, mut columns) = payload.split_at_mut(self.head_words());
+        let (packed_head, mut rest) = packed[..self.packed_bytes() / 4].split_at(head.len());
+        head.copy_from_slice(packed_head);
+        for words in self.column_words() {
+            let (tables, others) = columns.split_at_mut(3 * words);
+            let (own, others_packed) = rest.split_at(2 * words);
+            let (values, moments) = tables.split_at_mut(words);
+            values.copy_from_slice(&own[..words]);
+            let (first, second) = moments.split_at_mut(words);
+            for ((both, m), v) in own[words..].iter().zip(first).zip(second) {
+                (*m, *v) = (both & 0xffff_0000, both << 16);
+            }
+            (columns, rest) = (others, others_packed);
+        }
+    }
+
+    /// Words before the columns.
+    fn head_words(&self) -> usize {
+        (padded(self.rows * 8) + 3 * padded(self.rows * 4)) / 4
+    }
+
+    /// Words of a table of each column.
+    fn column_words(&self) -> impl Iterator<Item = usize> {
+        let PageLayout { rows, sh_degree } = *self;
+        Column::ALL.into_iter().map(move |column| padded(rows * column.width(sh_degree) * 4) / 4)
     }
 
     /// The rows in `payload`, numbered from `first_row` in the table of a working set. Panics if `payload` is shorter
@@ -127,6 +179,28 @@ fn take_mut<'a, T: AnyBitPattern + NoUninit>(rest: &mut &'a mut [u8], count: usi
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn packed_payloads_come_back_and_take_a_word_less_for_each_value() {
+        for (rows, sh_degree) in [(1, 0), (33, 1), (700, 3)] {
+            let layout = PageLayout { rows, sh_degree };
+            let mut words: Vec<u32> = (0..layout.bytes() as u32 / 4).map(|i| i.wrapping_mul(0x9e37_79b9)).collect();
+            let mut at = layout.head_words();
+            for of_column in layout.column_words() {
+                words[at + of_column..at + 3 * of_column].iter_mut().for_each(|moment| *moment &= 0xffff_0000);
+                at += 3 * of_column;
+            }
+            let mut packed = Vec::new();
+            layout.pack(bytemuck::cast_slice(&words), &mut packed);
+            assert_eq!(
+                (4 * packed.len(), layout.bytes() - layout.packed_bytes()),
+                (layout.packed_bytes(), (at - layout.head_words()) / 3 * 4)
+            );
+            let mut back = vec![7u64; words.len().div_ceil(2)];
+            layout.unpack(&packed, bytemuck::cast_slice_mut(&mut back));
+            assert!(bytemuck::cast_slice::<u64, u32>(&back)[..words.len()] == words[..]);
+        }
+    }
     use crate::scene::columns::Columns;
     use crate::scene::state::row_bytes;
 

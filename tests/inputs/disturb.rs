@@ -70,6 +70,7 @@ fn held_out_photos_stay_clean_and_training_photos_change_by_seed() {
         Disturbance::Blurred { one_in: 2 },
         Disturbance::Swapped { share: 0.2, are_removed: false },
         Disturbance::Swapped { share: 0.2, are_removed: true },
+        Disturbance::Together { stops: 1.0, share: 0.2, boxes: 20 },
     ];
     let pixels = |dataset: &Dataset, split| -> Vec<Vec<u8>> {
         of(dataset, split).into_iter().map(|view| decode(&view.photo).unwrap().rgb).collect()
@@ -127,4 +128,6 @@ fn swapped_views_are_the_wrong_ones() {
     let removed = disturbed(folder.path(), &dataset, &found, 1);
     assert_eq!((names(&removed), of(&removed, Split::Train).len()), (names(&swapped), 21 - 6));
     assert!(plan(&dataset, &found, 1).unwrap().wrong.is_empty());
+    let together = Disturbance::Together { stops: 1.0, share: 0.2, boxes: 20 };
+    assert_eq!(plan(&dataset, &together, 1).unwrap().wrong, wrong);
 }

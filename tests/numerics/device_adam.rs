@@ -189,11 +189,11 @@ struct OnDevice {
 impl OnDevice {
     fn new(gpu: Gpu, dense: &Dense, words: &[u64], layout: PageLayout, steps: u32) -> OnDevice {
         let numbers = dense.adam.numbers(steps).unwrap();
-        let rules = PageRules { payload_bytes: layout.bytes(), numbers, splits: SPLITS, weighs: false };
+        let rules = PageRules { largest: layout, numbers, splits: SPLITS, weighs: false };
         let mut pages = DevicePages::new(&gpu, &rules).unwrap();
         pages.slots.add(&gpu, 1).unwrap();
         let slot = SlotPage { slot: DeviceSlot(0), layout };
-        pages.slots.write(&gpu, &[(slot.slot, &bytemuck::cast_slice(words)[..layout.bytes()])]).unwrap();
+        pages.slots.write(&gpu, &[(slot, &bytemuck::cast_slice(words)[..layout.bytes()])]).unwrap();
         let view = begin_view(&gpu, &pages, &camera(), &dense.adam.at(0).numbers());
         let listed = pages.list(&gpu, &view, &[slot]).unwrap();
         assert_eq!(listed.0.rows as usize, ROWS, "a row is out of view");
@@ -267,7 +267,7 @@ fn follows_on_a_device(eps: f64, steps: u32) {
     // The device has written the page, and nothing but the page.
     let mut payload = vec![0u64; layout.bytes().div_ceil(8)];
     let bytes = &mut bytemuck::cast_slice_mut(&mut payload)[..layout.bytes()];
-    on.pages.slots.read(&on.gpu, &mut [(on.slot.slot, bytes)]).unwrap();
+    on.pages.slots.read(&on.gpu, &mut [(on.slot, bytes)]).unwrap();
     assert!(payload != words, "no row was written");
 }
 

@@ -208,11 +208,11 @@ features! {
             assert!(slots["cleared"].as_u64() > Some(50), "rounds took all pages to the host: {slots}");
         };
 
-    // The device weighs rows, and a round judges them by that.
+    // The device weighs rows, and a round judges them by that. Moments have 16 bits.
     gpu_recycles: || Workdir::wide_city(6000),
         "--device gpu --optimizer-on device --strategy long-axis --steps 70 --refine-start 9 --refine-every 10 --max-gaussians 6300 \
-         --recycle 0.05 --view-order shuffle",
-        without ["--recycle 0"],
+         --recycle 0.05 --view-order shuffle --moments bf16",
+        without ["--recycle 0", "--moments f32"],
         shows |work| assert!(work.metrics("alone").last().unwrap()["slots"]["cleared"].as_u64() > Some(0));
 }
 

@@ -17,7 +17,7 @@ use crate::render::{LossOptions, RenderError, RenderOptions, RowBatches};
 use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::optimizer_numbers::SplitLimits;
-use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
+use crate::scene::page_layout::{PageLayout, read_page, write_page};
 use crate::scene::state::SceneState;
 
 /// Steps of the run, and those done before the first that is compared.
@@ -108,21 +108,21 @@ fn steps_on_device(
     camera: &Camera,
     options: &RenderOptions,
 ) -> Result<(SceneState, [u32; 2]), RenderError> {
-    let payload_bytes = capacity_bytes(PAGES.into_iter().max().unwrap_or(0), before.sh_degree());
+    let largest = PageLayout { rows: PAGES.into_iter().max().unwrap_or(0), sh_degree: before.sh_degree() };
     let rules = PageRules {
-        payload_bytes,
+        largest,
         numbers: adam.numbers(STEPS).unwrap_or_default(),
         splits: SplitLimits::NEVER,
         weighs: false,
     };
     device.prepare_page_storage(&rules)?;
     if device.add_slots(PAGES.len())? < PAGES.len() {
-        return Err(RenderError::NoSlots { bytes: payload_bytes as u64 });
+        return Err(RenderError::NoSlots { bytes: device.slot_bytes() });
     }
     let (mut pages, mut payloads, mut first) = (Vec::new(), Vec::new(), 0);
     for (slot, rows) in PAGES.into_iter().enumerate() {
         let of_page: Vec<u32> = (first..first + rows as u32).collect();
-        let mut words = vec![0u64; payload_bytes.div_ceil(8)];
+        let mut words = vec![0u64; largest.bytes().div_ceil(8)];
         let layout = write_page(&before.select(&of_page), bytemuck::cast_slice_mut(&mut words));
         // In another order than the pages.
         pages.push(SlotPage { slot: DeviceSlot((PAGES.len() - 1 - slot) as u32), layout });
@@ -131,8 +131,7 @@ fn steps_on_device(
     }
     let bytes = |page: &SlotPage, words: &'_ [u64]| bytemuck::cast_slice(words)[..page.layout.bytes()].to_vec();
     let written: Vec<Vec<u8>> = pages.iter().zip(&payloads).map(|(page, words)| bytes(page, words)).collect();
-    let slots: Vec<(DeviceSlot, &[u8])> =
-        pages.iter().zip(&written).map(|(page, bytes)| (page.slot, &bytes[..])).collect();
+    let slots: Vec<(SlotPage, &[u8])> = pages.iter().zip(&written).map(|(page, bytes)| (*page, &bytes[..])).collect();
     device.write_slots(&slots)?;
 
     let (target, loss) = (photo(SIZE[0], SIZE[1]), LossOptions::default());
@@ -158,10 +157,10 @@ fn steps_on_device(
         false => in_stages(device, DONE + 1)?,
     });
     let mut read: Vec<Vec<u64>> = payloads.iter().map(|words| vec![0; words.len()]).collect();
-    let mut slots: Vec<(DeviceSlot, &mut [u8])> = pages
+    let mut slots: Vec<(SlotPage, &mut [u8])> = pages
         .iter()
         .zip(&mut read)
-        .map(|(page, words)| (page.slot, &mut bytemuck::cast_slice_mut(words)[..page.layout.bytes()]))
+        .map(|(page, words)| (*page, &mut bytemuck::cast_slice_mut(words)[..page.layout.bytes()]))
         .collect();
     device.read_slots(&mut slots)?;
     let mut after = SceneState::from_columns(Columns::zeros(0, before.sh_degree()));

@@ -9,12 +9,13 @@ use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::gpu::{GpuError, budget_for_buffers, bytes_for_buffers};
 use crate::optim::method::OptimizerPlace;
+use crate::optim::moments::Moments;
 use crate::render::RenderError;
 use crate::render::device_needs::{DeviceNeeds, ViewSizes};
-use crate::scene::page_layout::capacity_bytes;
+use crate::scene::page_layout::PageLayout;
 use crate::train::error::TrainError;
 use crate::train::memory::{INDEX_BYTES, MemoryEstimate};
-use crate::train::step::device_slots::{SLOTS_SHARE, slots_in};
+use crate::train::step::device_slots::{SLOTS_SHARE, device_bytes, slots_in};
 use crate::train::step::pages::PagedScene;
 
 /// The needs of the largest view that was probed, grown to the cap on Gaussians; `None` without a device.
@@ -112,7 +113,8 @@ pub(crate) fn refusal(
 }
 
 fn slot_bytes(config: &TrainConfig) -> u64 {
-    capacity_bytes(config.page_rows as usize, config.sh_degree) as u64
+    let layout = PageLayout { rows: config.page_rows as usize, sh_degree: config.sh_degree };
+    device_bytes(layout, config.moments == Moments::Bf16)
 }
 
 /// The lines of the plan about the device; empty without one. `memory` is the estimate to describe.

@@ -96,8 +96,7 @@ struct SlotInUse {
     pub slot: DeviceSlot,
     /// Whether the slot is newer than the frame.
     pub is_newer: bool,
-    /// Bytes of the payload.
-    pub bytes: usize,
+    pub layout: PageLayout,
 }
 
 #[derive(Debug)]
@@ -117,6 +116,7 @@ pub(super) struct ComingUse<'a> {
     pub page: PageNo,
     /// The step that needs the page.
     pub next_use: u32,
+    pub layout: PageLayout,
     pub payload: &'a [u8],
 }
 
@@ -137,6 +137,8 @@ pub(crate) struct SlotCache {
     given: u32,
     /// Most slots that there may be.
     slots_most: usize,
+    /// Whether the device holds moments of 16 bits, two to a word.
+    is_packed: bool,
     /// Pages whose slot is newer than their frame, pinned in the pager, outside of the batch of a step.
     held: BTreeMap<PageNo, PinnedPage>,
     /// Pages whose slots were given to others and whose frames are still to be filled, in the order of their copies back.
@@ -171,8 +173,9 @@ pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
 }
 
-pub(super) fn payload_bytes(page: &PinnedPage) -> usize {
-    page.layout().bytes()
+/// Bytes of a payload in a slot.
+pub fn device_bytes(layout: PageLayout, is_packed: bool) -> u64 {
+    (if is_packed { layout.packed_bytes() } else { layout.bytes() }) as u64
 }
 
 /// Layout of a page's payload as its frame holds it; `None` for a page whose payload must not be copied ahead: it has no rows, no frame,
@@ -184,7 +187,7 @@ fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
 }
 
 fn payload(page: &PinnedPage) -> &[u8] {
-    &page.buffer.as_slice()[HEADER_BYTES..][..payload_bytes(page)]
+    &page.buffer.as_slice()[HEADER_BYTES..][..page.layout().bytes()]
 }
 
 /// What a device found out about a page, with what the index of pages says.
@@ -212,11 +215,12 @@ fn are_edits_due(scene: &PagedScene, page: PageNo) -> bool {
 
 impl SlotCache {
     /// A cache of at most `slots_most` slots, of which there is none yet.
-    pub fn new(slots_most: usize) -> SlotCache {
+    pub fn new(slots_most: usize, is_packed: bool) -> SlotCache {
         SlotCache {
             slots: FrameTable::new(0, EvictPolicy::FarthestNextUse),
             given: 0,
             slots_most,
+            is_packed,
             held: BTreeMap::new(),
             leaving: VecDeque::new(),
             in_use: BTreeMap::new(),
@@ -340,21 +344,21 @@ impl SlotCache {
     ) -> Result<(), TrainError> {
         let (mut moved, mut copies) = (Vec::new(), Vec::new());
         for page in pages {
-            let (slot, bytes) = (self.slots.begin_write(page.page), payload_bytes(page));
+            let (slot, layout) = (self.slots.begin_write(page.page), page.layout());
             moved.push((page.page, slot));
-            copies.push((slot, &mut page.payload_mut()[..bytes]));
+            copies.push((SlotPage { slot, layout }, &mut page.payload_mut()[..layout.bytes()]));
         }
         if copies.is_empty() {
             return Ok(());
         }
-        let bytes: usize = copies.iter().map(|(_, payload)| payload.len()).sum();
-        let _span = trace::span("drain").with("pages", moved.len() as u64).with("bytes", bytes as u64);
+        let bytes: u64 = copies.iter().map(|(page, _)| self.bytes_of(page.layout)).sum();
+        let _span = trace::span("drain").with("pages", moved.len() as u64).with("bytes", bytes);
         let copied = device_of(renderer).and_then(|device| Ok(device.read_slots(&mut copies)?));
         for (page, slot) in &moved {
             self.slots.finish_write(*page, *slot, copied.is_ok());
         }
         self.traffic.drains += moved.len() as u64;
-        self.traffic.bytes_drained += bytes as u64;
+        self.traffic.bytes_drained += bytes;
         copied
     }
 
@@ -385,7 +389,7 @@ impl SlotCache {
                 return Err(no_slot(device_of(renderer)?));
             }
             if let Some(slot) = self.use_slot(page) {
-                copies.push((slot, payload(page)));
+                copies.push((SlotPage { slot, layout: page.layout() }, payload(page)));
             }
         }
         if copies.is_empty() {
@@ -397,7 +401,7 @@ impl SlotCache {
             return Err(error);
         }
         self.traffic.loads += copies.len() as u64;
-        self.traffic.bytes_loaded += copies.iter().map(|(_, payload)| payload.len() as u64).sum::<u64>();
+        self.traffic.bytes_loaded += copies.iter().map(|(page, _)| self.bytes_of(page.layout)).sum::<u64>();
         Ok(())
     }
 
@@ -411,8 +415,10 @@ impl SlotCache {
         pinned: &[&PinnedPage],
     ) -> Result<Option<Vec<SlotPage>>, TrainError> {
         let missing = self.use_slots(pinned);
-        let coming: Vec<ComingUse<'_>> =
-            missing.iter().map(|page| ComingUse { page: page.page, next_use: step, payload: payload(page) }).collect();
+        let coming: Vec<ComingUse<'_>> = missing
+            .iter()
+            .map(|page| ComingUse { page: page.page, next_use: step, layout: page.layout(), payload: payload(page) })
+            .collect();
         let how = (step.saturating_sub(1), Leaves::Used, !is_alone);
         let kept: Vec<PageNo> = pinned.iter().map(|page| page.page).collect();
         let loaded = self.load_evicting(scene, renderer, how, &coming, &kept)?;
@@ -444,8 +450,9 @@ impl SlotCache {
         let missing = of_view.iter().copied().filter(|page| self.slots.state(*page).is_none());
         let coming: Vec<ComingUse<'_>> = missing
             .filter_map(|page| {
-                let payload = scene.pager.payload(page)?.get(..layout_ahead(scene, page)?.bytes())?;
-                Some(ComingUse { page, next_use: step, payload })
+                let layout = layout_ahead(scene, page)?;
+                let payload = scene.pager.payload(page)?.get(..layout.bytes())?;
+                Some(ComingUse { page, next_use: step, layout, payload })
             })
             .collect();
         self.load_evicting(scene, renderer, (step.saturating_sub(1), leaves, true), &coming, of_view).map(|_| ())
@@ -472,12 +479,12 @@ impl SlotCache {
         for page in coming {
             let Some(slot) = self.new_slot(page.page, page.next_use) else { break };
             pages.push(page.page);
-            copies.push((slot, page.payload));
+            copies.push((SlotPage { slot, layout: page.layout }, page.payload));
         }
         if copies.is_empty() {
             return Ok(0);
         }
-        let (loads, bytes) = (pages.len(), copies.iter().map(|(_, payload)| payload.len() as u64).sum());
+        let (loads, bytes) = (pages.len(), copies.iter().map(|(page, _)| self.bytes_of(page.layout)).sum());
         let _span = is_ahead.then(|| trace::span("load ahead").with("pages", loads as u64).with("bytes", bytes));
         let written = device_of(renderer).and_then(|device| Ok(device.write_slots(&copies)?));
         if let Err(error) = written {
@@ -527,13 +534,13 @@ impl SlotCache {
                 // Whether a step in flight changes the page is not known yet.
                 Some(in_use) => {
                     pages.push(page);
-                    reads.push((in_use.slot, in_use.bytes));
+                    reads.push(SlotPage { slot: in_use.slot, layout: in_use.layout });
                 }
                 None if self.slots.is_dirty(page) => {
                     let (slot, held) = (self.slots.memory(page), self.held.get(&page));
                     if let (Some(slot), Some(held)) = (slot, held) {
                         pages.push(page);
-                        reads.push((*slot, payload_bytes(held)));
+                        reads.push(SlotPage { slot: *slot, layout: held.layout() });
                     }
                 }
                 None => self.slots.evict(page),
@@ -543,7 +550,7 @@ impl SlotCache {
             return Ok(());
         }
         let begun = device_of(renderer)?.begin_reads(&reads)?;
-        for (page, (slot, _)) in pages.into_iter().zip(reads).take(begun) {
+        for (page, SlotPage { slot, .. }) in pages.into_iter().zip(reads).take(begun) {
             if let Some(in_use) = self.in_use.remove(&page) {
                 self.slots.unpin(page, in_use.slot, true);
             }
@@ -558,7 +565,9 @@ impl SlotCache {
     /// Adds the pages of a batch to the bound on loads.
     fn count_fewest(&mut self, pinned: &[&PinnedPage]) {
         let with_rows = pinned.iter().filter(|page| page.meta.rows > 0);
-        self.fewest.step(self.slots.frames_max(), with_rows.map(|page| (page.page, payload_bytes(page) as u64)));
+        let is_packed = self.is_packed;
+        let bytes = with_rows.map(|page| (page.page, device_bytes(page.layout(), is_packed)));
+        self.fewest.step(self.slots.frames_max(), bytes);
     }
 
     /// Takes the slots of the pages of a batch in use, and counts them as hits. Returns the pages that have none.
@@ -574,8 +583,13 @@ impl SlotCache {
     /// Takes the slot of a page in use, if the page has one.
     fn use_slot(&mut self, page: &PinnedPage) -> Option<DeviceSlot> {
         let (slot, is_newer) = self.slots.pin(page.page, true)?;
-        self.in_use.insert(page.page, SlotInUse { slot, is_newer, bytes: payload_bytes(page) });
+        self.in_use.insert(page.page, SlotInUse { slot, is_newer, layout: page.layout() });
         Some(slot)
+    }
+
+    /// Bytes of a payload in a slot.
+    fn bytes_of(&self, layout: PageLayout) -> u64 {
+        device_bytes(layout, self.is_packed)
     }
 
     /// A free slot for the payload of a page, which is to be copied there; `None` where no slot is free.
@@ -590,8 +604,8 @@ impl SlotCache {
     }
 
     /// Gives up slots that were not filled.
-    fn forget(&mut self, copies: &[(DeviceSlot, &[u8])]) {
-        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other == slot);
+    fn forget(&mut self, copies: &[(SlotPage, &[u8])]) {
+        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other.slot == *slot);
         let pages: Vec<PageNo> =
             self.in_use.iter().filter(|(_, in_use)| unfilled(&in_use.slot)).map(|(page, _)| *page).collect();
         for page in pages {
@@ -736,10 +750,10 @@ impl SlotCache {
                 let problem = "a page that left its slot has no frame";
                 InputError::new("the pages on the device", problem, "report this as a bug")
             })?;
-            let bytes = payload_bytes(pinned);
-            copies.push((leaving.slot, &mut pinned.payload_mut()[..bytes]));
+            let layout = pinned.layout();
+            copies.push((SlotPage { slot: leaving.slot, layout }, &mut pinned.payload_mut()[..layout.bytes()]));
         }
-        let bytes: u64 = copies.iter().map(|(_, payload)| payload.len() as u64).sum();
+        let bytes: u64 = copies.iter().map(|(page, _)| self.bytes_of(page.layout)).sum();
         let _span = trace::span("drain").with("pages", copies.len() as u64).with("bytes", bytes);
         device_of(renderer)?.finish_reads(&mut copies)?;
         self.traffic.drains += copies.len() as u64;

@@ -29,7 +29,6 @@ use crate::base::trace;
 use crate::densify::replay::PageFacts;
 use crate::kernels::uniforms::PageResult;
 use crate::optim::one_step::OneStep;
-use crate::page::format::slot_header::HEADER_BYTES;
 use crate::paging::pinned::PinnedPage;
 use crate::render::pages::{PageRules, SlotPage};
 use crate::render::{RenderError, Renderer, none_if_out_of_memory};
@@ -50,18 +49,17 @@ impl DeviceTier {
         let name = renderer.name();
         let numbers = scene.rules.adam.numbers(steps);
         let numbers = numbers.ok_or(TrainError::Render(RenderError::NoPages { backend: name }))?;
-        let splits = scene.rules.splits;
+        let (splits, has_halves) = (scene.rules.splits, numbers.has_halves);
         let flights = Flights::new(OneStep::new(&numbers, &scene.rules.splits));
-        let payload_bytes = scene.pager.frame_bytes() - HEADER_BYTES;
         let device = device_of(renderer)?;
         device.prepare_page_storage(&PageRules {
-            payload_bytes,
+            largest: scene.pager.largest_page(),
             numbers,
             splits,
             weighs: scene.rules.strategy.needs_weights(),
         })?;
         let slots_most = slots_in(device.room(), device.slot_bytes()).clamp(1, u64::from(u32::MAX / 2));
-        let mut tier = DeviceTier { cache: SlotCache::new(slots_most as usize), flights };
+        let mut tier = DeviceTier { cache: SlotCache::new(slots_most as usize, has_halves), flights };
         tier.cache.fit(scene, renderer)?;
         Ok(tier)
     }

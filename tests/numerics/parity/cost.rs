@@ -136,10 +136,10 @@ fn on_pages(gpu: &mut GpuRenderer, (rows, camera): &(Columns, Camera), host: Ste
     let (numbers, of_step) = (adam.numbers(100).unwrap(), adam.at(0).numbers());
     let (tables, recent) = (DeferredTables::new(&numbers).words().len(), of_step.recent.as_flattened().len());
     let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
-    gpu.prepare_page_storage(&PageRules { payload_bytes: layout.bytes(), numbers, splits, weighs: false }).unwrap();
+    gpu.prepare_page_storage(&PageRules { largest: layout, numbers, splits, weighs: false }).unwrap();
     assert_eq!(gpu.add_slots(1).unwrap(), 1);
     let page = SlotPage { slot: DeviceSlot(0), layout };
-    gpu.write_slots(&[(page.slot, &bytemuck::cast_slice(&words)[..layout.bytes()])]).unwrap();
+    gpu.write_slots(&[(page, &bytemuck::cast_slice(&words)[..layout.bytes()])]).unwrap();
     let (options, loss) = (RenderOptions::default(), LossOptions::default());
     let (pages, rows_room, isects_most) = (&[page][..], rows.rows() as u32, u32::MAX);
     let job = StepJob { pages, numbers: &of_step, camera, options: &options, rows_room, isects_most };

@@ -7,7 +7,7 @@ use super::rows::camera;
 use crate::support::begin_view;
 use crate::support::gpu::open;
 use crate::twins::gather::{self, GatherInput};
-use crate::twins::page_words::count_at;
+use crate::twins::page_words::{Table, count_at, row_at, stamp_at};
 use crate::twins::update::{self, UpdateInput};
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -24,7 +24,7 @@ use gsscale::render::gpu_pages::{DevicePages, PageBatch, UpdateBuffers};
 use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::columns::{Column, Columns};
-use gsscale::scene::optimizer_numbers::SplitLimits;
+use gsscale::scene::optimizer_numbers::{RunNumbers, SplitLimits};
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use gsscale::scene::rows::{RowsNow, mean_grad2d};
 use gsscale::scene::sightings::{mean_weight, views, with_view};
@@ -93,6 +93,20 @@ impl World {
             layout
         });
         World { now, adam: adam(), layouts: layouts.collect(), payloads, states }
+    }
+
+    /// The same with moments of 16 bits.
+    fn with_halves(mut self) -> World {
+        for (state, payload) in self.states.iter_mut().zip(&mut self.payloads) {
+            for table in [&mut state.exp_avg, &mut state.exp_avg_sq] {
+                for column in Column::ALL {
+                    let values = table.column_mut(column).iter_mut();
+                    values.for_each(|x| *x = f32::from_bits(x.to_bits() & 0xffff_0000));
+                }
+            }
+            write_page(state, bytemuck::cast_slice_mut(payload));
+        }
+        self
     }
 
     /// The payloads behind each other, as one slab, and the pages in it.
@@ -167,10 +181,14 @@ struct OnDevice<'g> {
 
 impl<'g> OnDevice<'g> {
     fn new(gpu: &'g Gpu, world: &World) -> OnDevice<'g> {
+        OnDevice::with_moments(gpu, world, false)
+    }
+
+    fn with_moments(gpu: &'g Gpu, world: &World, has_halves: bool) -> OnDevice<'g> {
         let layout = world.layouts[0];
-        let largest = capacity_bytes(PAGES.into_iter().max().unwrap(), layout.sh_degree);
-        let numbers = world.adam.numbers(STEPS).unwrap();
-        let rules = PageRules { payload_bytes: largest, numbers, splits: SPLITS, weighs: true };
+        let largest = PageLayout { rows: PAGES.into_iter().max().unwrap(), sh_degree: layout.sh_degree };
+        let numbers = RunNumbers { has_halves, ..world.adam.numbers(STEPS).unwrap() };
+        let rules = PageRules { largest, numbers, splits: SPLITS, weighs: true };
         let mut pages = DevicePages::new(gpu, &rules).unwrap();
         assert_eq!(pages.slots.add(gpu, 8).unwrap(), 8);
         // Not in order, so that slabs and batch differ in theirs.
@@ -178,8 +196,8 @@ impl<'g> OnDevice<'g> {
         let slots = numbers.map(DeviceSlot).into_iter().zip(&world.layouts);
         let slots: Vec<SlotPage> = slots.map(|(slot, layout)| SlotPage { slot, layout: *layout }).collect();
         let payloads = slots.iter().zip(&world.payloads);
-        let payloads: Vec<(DeviceSlot, &[u8])> = payloads
-            .map(|(page, words)| (page.slot, &bytemuck::cast_slice::<u64, u8>(words)[..page.layout.bytes()]))
+        let payloads: Vec<(SlotPage, &[u8])> = payloads
+            .map(|(page, words)| (*page, &bytemuck::cast_slice::<u64, u8>(words)[..page.layout.bytes()]))
             .collect();
         pages.slots.write(gpu, &payloads).unwrap();
         OnDevice { gpu, pages, slots }
@@ -187,9 +205,8 @@ impl<'g> OnDevice<'g> {
 
     fn payloads(&self) -> Vec<Vec<u32>> {
         let mut payloads: Vec<Vec<u32>> = self.slots.iter().map(|page| vec![0; page.layout.bytes() / 4]).collect();
-        let places = self.slots.iter().map(|page| page.slot);
-        let mut copies: Vec<(DeviceSlot, &mut [u8])> =
-            places.zip(payloads.iter_mut().map(|words| bytemuck::cast_slice_mut(words))).collect();
+        let mut copies: Vec<(SlotPage, &mut [u8])> =
+            self.slots.iter().copied().zip(payloads.iter_mut().map(|words| bytemuck::cast_slice_mut(words))).collect();
         self.pages.slots.read(self.gpu, &mut copies).unwrap();
         payloads
     }
@@ -453,6 +470,57 @@ fn updates_of_pages_agree_and_unusable_gradients_leave_their_rows() {
         assert_bounds(&world, &payloads, &results, &twin.1);
         assert_bounds_of_device(&on, &world, &results);
     }
+}
+
+/// Moments of 16 bits: values as with 32, and each moment of an updated row is that of the twin, rounded by the same draw.
+#[test]
+fn moments_of_16_bits_are_rounded_as_by_the_twin_and_packed_in_slots() {
+    let world = World::new(3, 700, false).with_halves();
+    let Some(gpu) = device(&world) else { return };
+    let on = OnDevice::with_moments(&gpu, &world, true);
+    let before = on.payloads();
+    assert!(
+        before
+            .iter()
+            .zip(&world.payloads)
+            .all(|(got, want)| got[..] == bytemuck::cast_slice::<u64, u32>(want)[..got.len()])
+    );
+    let ((payloads, results, _), list, values) = updated_by_device(&on, &world, (0.0, false));
+    let drawn = random_gradients(&values[0], 3, (0.0, false));
+    let twin = updated_by_twin(&world, &list, &values, &drawn);
+    let (_, pages) = world.slab();
+    let [mut exact, mut near] = [0; 2];
+    for (p, page) in pages.iter().enumerate() {
+        assert_eq!(results[p].updated, twin.1[p].updated);
+        let page = DevicePage { base: 0, ..*page };
+        let stamped = |row: usize| twin.0[p][stamp_at(&page, row)] == 701;
+        for (column, row) in Column::ALL.into_iter().flat_map(|c| (0..page.rows as usize).map(move |row| (c, row))) {
+            for e in 0..column.width(3) {
+                let at = |table| row_at(&page, column, table, row) + e;
+                let of = |words: &[u32]| [Table::Values, Table::ExpAvg, Table::ExpAvgSq].map(|table| words[at(table)]);
+                let ([value, m, v], [of_twin, m_twin, v_twin]) = (of(&payloads[p]), of(&twin.0[p]));
+                assert!(agree(value, of_twin, 2e-6), "page {p} row {row} {column:?} {e}: {value:#x} {of_twin:#x}");
+                let moments = [m_twin, v_twin].map(f32::from_bits);
+                let uid = world.states[p].uid[row];
+                let rounded = if stamped(row) { update::rounded(moments, uid, 701, (column, e)) } else { moments };
+                for (got, want) in [m, v].into_iter().zip(rounded.map(f32::to_bits)) {
+                    // A last bit of 32 moves a draw over its limit for one moment in thousands. Devices may flush terms below 2^-126 to zero.
+                    let is_near = got.abs_diff(want) <= 1 << 16
+                        || (f32::from_bits(got) - f32::from_bits(want)).abs() <= 4.0 * f32::MIN_POSITIVE;
+                    assert!(got & 0xffff == 0 && is_near, "page {p} row {row} {column:?} {e}: {got:#x} {want:#x}");
+                    if got == want { exact += 1 } else { near += 1 }
+                }
+            }
+        }
+        let Some(bounds) = results[p].bounds() else { continue };
+        let of_twin = twin.1[p].bounds().unwrap();
+        // Wider, for what roundings of later steps move.
+        assert!(
+            (0..3).all(|c| bounds.lo[c] <= of_twin.lo[c] && bounds.hi[c] >= of_twin.hi[c]),
+            "{bounds:?} {of_twin:?}"
+        );
+    }
+    assert!(near * 500 < exact, "{near} of {exact} moments are others");
 }
 
 /// The same for positions and scales as the device evaluates them, of the rows that the camera sees at later steps.

@@ -94,6 +94,20 @@ pub fn step(
     }
 }
 
+/// Moments of float `e` of a column of a row that contains `steps` steps, rounded to 16 bits: up with the probability of what is cut.
+pub fn rounded(moments: [f32; 2], uid: u64, steps: u32, (column, e): (Column, usize)) -> [f32; 2] {
+    let mixed = |x: u32| {
+        let a = (x ^ (x >> 16)).wrapping_mul(0x85eb_ca6b);
+        let b = (a ^ (a >> 13)).wrapping_mul(0xc2b2_ae35);
+        b ^ (b >> 16)
+    };
+    let number = Column::ALL.iter().take_while(|c| **c != column).map(|c| c.width(0)).sum::<usize>() + e;
+    let key = mixed(uid as u32 ^ mixed((uid >> 32) as u32 ^ mixed(steps)));
+    let draw = mixed(key.wrapping_add((number as u32).wrapping_mul(0x9e37_79b9)));
+    let cut = |x: f32, draw: u32| f32::from_bits(x.to_bits().wrapping_add(draw) & 0xffff_0000);
+    [cut(moments[0], draw & 0xffff), cut(moments[1], draw >> 16)]
+}
+
 /// Stamps the rows that [`step`] rewrote, counts, and collects statistics. `footprints` holds the gradient of the
 /// projected mean and the radii of each listed row, each followed by its weight where rows are weighed; `bins` the change of the number
 /// of rows by bin of the mean score, then by bin of the mean weight.
