@@ -80,7 +80,11 @@ struct World {
 
 impl World {
     fn new(sh_degree: u8, now: u32, are_weighed: bool) -> World {
-        let states: Vec<SceneState> = PAGES
+        World::of(&PAGES, sh_degree, now, are_weighed)
+    }
+
+    fn of(pages: &[usize], sh_degree: u8, now: u32, are_weighed: bool) -> World {
+        let states: Vec<SceneState> = pages
             .iter()
             .enumerate()
             .map(|(i, rows)| random_page(*rows, sh_degree, i as u64, (now, are_weighed)))
@@ -186,14 +190,15 @@ impl<'g> OnDevice<'g> {
 
     fn with_moments(gpu: &'g Gpu, world: &World, has_halves: bool) -> OnDevice<'g> {
         let layout = world.layouts[0];
-        let largest = PageLayout { rows: PAGES.into_iter().max().unwrap(), sh_degree: layout.sh_degree };
+        let rows = world.layouts.iter().map(|layout| layout.rows).max().unwrap();
+        let largest = PageLayout { rows, sh_degree: layout.sh_degree };
         let numbers = RunNumbers { has_halves, ..world.adam.numbers(STEPS).unwrap() };
         let rules = PageRules { largest, numbers, splits: SPLITS, weighs: true };
         let mut pages = DevicePages::new(gpu, &rules).unwrap();
-        assert_eq!(pages.slots.add(gpu, 8).unwrap(), 8);
         // Not in order, so that slabs and batch differ in theirs.
-        let numbers = [7, 2, 5, 0, 3];
-        let slots = numbers.map(DeviceSlot).into_iter().zip(&world.layouts);
+        let count = world.layouts.len().next_multiple_of(8) as u32;
+        assert_eq!(pages.slots.add(gpu, count as usize).unwrap(), count as usize);
+        let slots = (0..).map(|page| DeviceSlot((3 * page + 2) % count)).zip(&world.layouts);
         let slots: Vec<SlotPage> = slots.map(|(slot, layout)| SlotPage { slot, layout: *layout }).collect();
         let payloads = slots.iter().zip(&world.payloads);
         let payloads: Vec<(SlotPage, &[u8])> = payloads
@@ -347,6 +352,26 @@ fn random_gradients(means: &[f32], sh_degree: u8, (poison, weighs): (f64, bool))
         }
     }
     Drawn { grads, v_colors, splats, footprints }
+}
+
+/// Columns beyond a binding: several windows of rows, which begin and end within pages, in as many slabs as pages. No bit differs.
+#[test]
+fn windows_of_rows_change_no_bit_of_pages() {
+    let world = World::of(&[256; 29], 3, 700, false);
+    // One slot to a slab, and what the bins take.
+    let limit = 256 << 10;
+    assert!((capacity_bytes(256, 3) as u64..2 * capacity_bytes(256, 3) as u64).contains(&limit));
+    let cut = GpuOptions { max_binding_bytes: Some(limit), ..GpuOptions::default() };
+    let devices = [open(&GpuOptions::default()), open(&cut)];
+    let [Some(whole), Some(cut)] = &devices else { return };
+    let stepped = |gpu: &Gpu| {
+        let before = gpu.traffic().work.dispatches;
+        let ((payloads, ..), list, values) = updated_by_device(&OnDevice::new(gpu, &world), &world, (0.01, false));
+        (gpu.traffic().work.dispatches - before, list.len(), (payloads, list, values))
+    };
+    let ((one, rows, want), (many, _, got)) = (stepped(whole), stepped(cut));
+    assert!(180 * rows as u64 > 2 * limit && many > 10 * one, "{rows} rows fit a binding: {many} and {one} dispatches");
+    assert!(want == got);
 }
 
 /// What an update leaves: payloads, results of pages, change of the bins.
