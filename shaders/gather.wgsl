@@ -5,8 +5,8 @@
 // numbers of rows, `place` finds where the rows of each page begin, and the room behind the last row is filled with entries that no
 // stage draws. The twin of tests/numerics/twins/gather.rs.
 //
-// A payload lies in one slab, and a dispatch works on the pages of one slab; a workgroup works on one page. Everything that evaluates a row is in this
-// file, so that one compiled formula decides what is seen, drawn, updated and bounded.
+// A payload lies in one slab, and a dispatch works on the pages of one slab; a workgroup works on one page. Everything that evaluates a
+// row is in this file, so that one compiled formula decides what is seen, drawn, updated and bounded.
 #import "shared/dispatch.wgsl"
 #import "shared/math.wgsl"
 #import "shared/deferred.wgsl"
@@ -40,9 +40,9 @@ struct GatherUniforms {
     grow_grad2d: f32,
     split_scale: f32,
     split_reach: f32,
-    /// Number, in the batch, of the first row that is bound.
+    /// Number, in the batch, of the first listed row that is bound.
     first_bound: u32,
-    /// The pages of this dispatch, and the chunks of each.
+    /// The pages of this dispatch, in their turn, and the chunks of each.
     first_page: u32,
     end_page: u32,
     chunks: u32,
@@ -86,8 +86,6 @@ const REACH_SLACK: f32 = 1.0001;
 const EPSILON: f32 = 1.1920929e-7;
 /// Quotients of smaller sums are not exact: a mean score above 0 counts as at least this one.
 const SMALLEST_MEAN: f32 = 1e-30;
-/// Rows of a chunk.
-const CHUNK_ROWS: u32 = 64u;
 /// Number of the page of entries without a row.
 const NO_PAGE: u32 = 0xffffffffu;
 /// Opacity, before activation, of entries without a row.
@@ -234,11 +232,9 @@ fn place(workgroup: Group, place: SubgroupPlace) {
 /// The rows of a workgroup; behind the pages a workgroup fills entries without a row, as far as there are some.
 fn chunk(workgroup: Group) -> Chunk {
     let n = linear_group(workgroup);
-    let p = u.first_page + n / u.chunks;
-    if p < u.end_page {
-        if pages[p].slab != u.slab {
-            return Chunk(p, 0u, 0u, 0u);
-        }
+    let turn = u.first_page + n / u.chunks;
+    if turn < u.end_page {
+        let p = pages[turn].in_turn;
         return chunk_of(pages[p], p, n % u.chunks, CHUNK_ROWS, u.first_bound, u.row_count);
     }
     let last = pages[u.page_count - 1u];

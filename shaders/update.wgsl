@@ -36,9 +36,9 @@ struct UpdateUniforms {
     weighs: u32,
     /// Rates of the columns over the bias of the first moment.
     step_sizes: array<vec4<f32>, 2>,
-    /// Number, in the batch, of the first row that is bound.
+    /// Number, in the batch, of the first listed row that is bound.
     first_bound: u32,
-    /// The pages of this dispatch, and the chunks of each.
+    /// The pages of this dispatch, in their turn, and the chunks of each.
     first_page: u32,
     end_page: u32,
     chunks: u32,
@@ -173,15 +173,13 @@ fn step_float(column: u32, e: u32, at: u32, words: u32, d: Decays, value: f32, g
 /// The rows of a workgroup, in chunks of `size`.
 fn chunk(workgroup: Group, size: u32) -> Chunk {
     let n = linear_group(workgroup);
-    let p = u.first_page + n / u.chunks;
-    if p >= u.end_page || gate[0] != 0u || pages[p].slab != u.slab {
+    let turn = u.first_page + n / u.chunks;
+    if turn >= u.end_page || gate[0] != 0u {
         return Chunk();
     }
+    let p = pages[turn].in_turn;
     return chunk_of(pages[p], p, n % u.chunks, size, u.first_bound, u.row_count);
 }
-
-/// Rows of a chunk of the columns.
-const CHUNK_ROWS: u32 = 64u;
 
 /// One workgroup for each chunk: its floats of two columns of the geometry.
 @compute @workgroup_size(256)

@@ -19,6 +19,7 @@ use gsscale::config::values::ByteSize;
 use gsscale::config::values::Chosen;
 use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
+use gsscale::optim::moments::Moments;
 use gsscale::page::folder::measure::DriveRate;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::paging::frames::evict::EvictPolicy;
@@ -27,7 +28,7 @@ use gsscale::paging::plan::steps::Plan;
 use gsscale::paging::simulation::replay::{DriveModel, Figures, Replay, ReplayOptions, Stall, automatic_order, replay};
 use gsscale::report::run_files::CONFIG_FILE;
 use gsscale::scene::camera::Camera;
-use gsscale::scene::page_layout::capacity_bytes;
+use gsscale::scene::page_layout::{PageLayout, capacity_bytes};
 use gsscale::scene::page_meta::PageMeta;
 use gsscale::schedule::order::{Order, ViewOrder};
 use gsscale::schedule::visibility::ViewPages;
@@ -252,15 +253,19 @@ fn load(args: &Args) -> InputResult<Scene> {
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
     let frame_bytes = transfer_bytes(capacity_bytes(config.page_rows as usize, config.sh_degree));
+    // Payloads on a device, all of which packing shortens about alike.
+    let full = PageLayout { rows: config.page_rows as usize, sh_degree: config.sh_degree };
+    let on_device = full.bytes_on_device(config.moments == Moments::Bf16);
+    let share = on_device as f64 / full.bytes() as f64;
     Ok(Scene {
         views: ViewPages::new(&look.index, &cameras),
         page_bytes: look.page_bytes.iter().map(slot).collect(),
         payload_bytes: look
             .page_bytes
             .iter()
-            .map(|&bytes| grown(bytes as usize).min(u64::from(u32::MAX)) as u32)
+            .map(|&bytes| (share * grown(bytes as usize) as f64).min(f64::from(u32::MAX)) as u32)
             .collect(),
-        payload_most: grown(capacity_bytes(config.page_rows as usize, config.sh_degree)),
+        payload_most: grown(on_device as usize),
         frame_bytes: grown(frame_bytes),
         drive: DriveModel {
             read_rate: drive_rate.read,

@@ -1,5 +1,5 @@
-// The rows of a page in its bytes on a device, as words. The layout is that of src/scene/page_layout.rs, so a payload is copied between
-// host and device as it is; with the switch HALF_MOMENTS moments have 16 bits, and the first and the second one of a value share a word.
+// The rows of a page in its bytes on a device, as words. The layout is that of src/scene/page_layout.rs: with moments of 32 bits a payload
+// is copied between host and device as it is. With the switch HALF_MOMENTS the first and the second moment of a value share a word.
 
 /// One page of a batch.
 struct DevicePage {
@@ -17,8 +17,12 @@ struct DevicePage {
     first_listed: u32,
     /// Listed rows.
     listed: u32,
-    pad: u32,
+    /// At index i: number of the i-th page, slab after slab.
+    in_turn: u32,
 }
+
+/// Rows of a chunk of columns.
+const CHUNK_ROWS: u32 = 64u;
 
 /// Consecutive listed rows of a page: what a workgroup gathers or updates.
 struct Chunk {

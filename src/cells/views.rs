@@ -95,7 +95,7 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     ids.iter().enumerate().for_each(|(at, (no, _))| place[no.index()] = at);
     let sh_degree = store.sh_degree();
     let render = RenderOptions { sh_degree, ..RunOptions::new(&config, dataset.scene_scale).render };
-    let mut renderer = machine::renderer(&config)?.renderer;
+    let mut renderer = machine::renderer(&config, machine::DeviceUse::Pictures)?.renderer;
     let (mut views, mut working) = (Vec::new(), WorkingSet::default());
     let mut photo = PhotoBytes { file: 0.0, decoded: 0.0 };
     let share = 1.0 / dataset.views.len() as f64;

@@ -198,7 +198,7 @@ config_keys! {
         /// every step: slow, for comparison), or sparse (only those with a gradient: not exact)
         optimizer: Method = Method::Deferred => Numbers hidden;
         /// Where the optimizer runs: host, or device (on the GPU that renders, in pages that stay there while --device-mem
-        /// has room; with --optimizer deferred). The two round differently.
+        /// has room; with --optimizer deferred and --growth-score gradient). The two round differently.
         /// auto is host, until device is faster on measured GPUs. A resumed run keeps its place
         optimizer_on: Chosen<OptimizerPlace> = Chosen(None) => Numbers;
         /// Format of Adam's moments: f32, or bf16 (not exact; halves their size on disk and on a device that holds pages)

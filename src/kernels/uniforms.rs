@@ -1,7 +1,7 @@
 //! What the host and a device's shaders exchange: uniforms, packed photos, pages and their results as words.
 //!
 //! Not here: buffers and dispatches. The layout of a page's payload is that of [`crate::scene::page_layout`], so a payload is copied
-//! between host and device as it is; it lies in one slab, a buffer of at most one binding.
+//! between host and device as it is, or packed ([`PageLayout::pack`]); it lies in one slab, a buffer of at most one binding.
 //!
 //! Invariants: 1. each struct has the layout of its twin in `shaders/`, which documents its fields; 2. numbers that
 //! both backends need are computed once, by the same code.
@@ -292,7 +292,8 @@ crate::wgsl_struct! {
         pub first_listed: u32,
         /// Listed rows.
         pub listed: u32,
-        pub pad: u32,
+        /// At index i: number of the i-th page, slab after slab.
+        pub in_turn: u32,
     }
 
     /// What an update did to a page, and its bounds: `PageResult` in `shaders/shared/page.wgsl`.
@@ -330,7 +331,7 @@ impl DevicePage {
     /// A page whose payload begins at word `base` of a slab.
     pub fn new(layout: PageLayout, slab: u32, base: u32, first_row: u32) -> DevicePage {
         let (rows, sh_n_width) = (layout.rows as u32, sh_n_width(layout.sh_degree) as u32);
-        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, listed: 0, pad: 0 }
+        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, listed: 0, in_turn: 0 }
     }
 }
 

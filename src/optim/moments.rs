@@ -4,6 +4,8 @@
 //! of the cut fraction, so that the mean is right. Rounding to nearest would prevent any change of a second moment
 //! below 0.4 % at a time, which at beta2 = 0.999 is nearly every change.
 //!
+//! A device that updates rows itself draws in the same way from another key (`decays_of` in `shaders/update.wgsl`).
+//!
 //! Invariants: 1. the draw depends on the row's uid, the number of steps contained and the column's element, not on
 //! where the row is, when it is stored, or the order of lanes in a block; 2. zero and other exactly representable
 //! values stay unchanged; 3. the lower halves are zero, so that pages can omit them.

@@ -69,16 +69,26 @@ mod tests {
     use crate::optim::adam::AdamConfig;
     use crate::optim::bounds::page_bounds;
     use crate::optim::deferred::DeferredAdam;
+    use crate::optim::moments::Moments;
     use crate::optim::rates::Rates;
     use crate::optim::row_kernels::take_step;
     use crate::scene::columns::Columns;
     use crate::scene::state::SceneState;
 
+    const STEPS: u32 = 700;
+
     /// Gradients that turn, grow and fade over many orders, after gaps of any length, and statistics that change at once.
     #[test]
     fn an_update_moves_no_bound_beyond_the_widened_ones() {
-        const STEPS: u32 = 700;
-        let adam = DeferredAdam::new(Rates::new(3.0, STEPS), AdamConfig::default(), SimdPath::best());
+        for moments in [Moments::F32, Moments::Bf16] {
+            moves_no_bound(
+                DeferredAdam::new(Rates::new(3.0, STEPS), AdamConfig::default(), SimdPath::best())
+                    .with_moments(moments),
+            );
+        }
+    }
+
+    fn moves_no_bound(adam: DeferredAdam) {
         let splits = SplitLimits { grow_grad2d: 0.3, split_scale: 0.01, reach: 3.33 };
         let numbers = adam.numbers(STEPS).unwrap_or_default();
         let one_step = OneStep::new(&numbers, &splits);

@@ -1,13 +1,13 @@
 //! Records the stages on pages on a device: gather and update. Owns the slots, the optimizer's tables and the bins of
 //! growth scores and weights.
 //!
-//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages, of workgroups for the
-//! pages from its first to its last in the slab. A workgroup gathers or updates a chunk of the listed rows of one page.
+//! A dispatch works on the pages of one slab, so a batch takes one dispatch for each slab in which it has pages. A workgroup gathers or
+//! updates a chunk of the listed rows of one page.
 //!
 //! Not here: the stages on rows (`gpu_rows`), the order of a view (`gpu`), steps that are recorded without waiting (`gpu_recorded`).
 //!
 //! Invariants: 1. a dispatch binds windows of columns, so no binding is too large; floats are independent, so the result has the
-//! same bits for any windows; 2. an update of a chunk is submitted at once, so a chunk is updated as a whole or not at all.
+//! same bits for any windows; 2. an update of a part of a batch is submitted at once, so the part is updated as a whole or not at all.
 
 use super::gpu_rows::{
     DeviceColumns, OfDegree, RowGradients, RowSource, SplatRows, Window, footprint_bytes, of_degrees, windows,
@@ -29,7 +29,7 @@ use std::sync::Arc;
 pub(super) const WORKGROUP: u32 = 256;
 /// Bins of mean growth scores, and as many of mean weights: the upper halves of floats that are not negative.
 const BINS: u64 = 1 << 15;
-/// Rows of a workgroup that gathers or updates columns.
+/// Rows of a workgroup that gathers or updates columns, as in `shaders/shared/page.wgsl`.
 const CHUNK_ROWS: u32 = 64;
 
 #[derive(Debug)]
@@ -88,6 +88,8 @@ pub struct PageBatch {
 #[derive(Debug)]
 pub struct PageTable {
     pub(super) pages: Vec<DevicePage>,
+    /// Whether the numbers of listed rows are known.
+    is_known: bool,
     pub(super) on_device: Buffer,
 }
 
@@ -97,18 +99,18 @@ impl PageTable {
         self.pages.iter().map(|page| page.slab).collect()
     }
 
-    /// The pages of a dispatch, and the chunks of `size` rows of the largest: from the first to the last of those in the slab whose
-    /// listed rows reach into `rows`. All in the slab where only the device knows which rows are listed.
+    /// The pages of a dispatch, and the chunks of `size` rows of the largest: those in the slab whose listed rows reach into `rows`, and all
+    /// in the slab where only the device knows which rows are listed.
     fn chunks(&self, slab: u32, rows: &Range<u32>, size: u32) -> PageChunks {
-        let is_known = self.pages.iter().any(|page| page.listed > 0);
         let reaches = |page: &DevicePage| {
-            !is_known || (page.first_listed < rows.end && page.first_listed + page.listed > rows.start)
+            !self.is_known || (page.first_listed < rows.end && page.first_listed + page.listed > rows.start)
         };
         let mut of_dispatch = PageChunks { pages: 0..0, chunks: 1 };
-        for (p, page) in self.pages.iter().enumerate().filter(|(_, page)| page.slab == slab && reaches(page)) {
-            let first = if of_dispatch.pages.is_empty() { p as u32 } else { of_dispatch.pages.start };
-            of_dispatch.pages = first..p as u32 + 1;
-            let rows = if is_known { page.listed } else { page.rows };
+        let in_turn = self.pages.iter().map(|entry| &self.pages[entry.in_turn as usize]);
+        for (turn, page) in (0..).zip(in_turn).filter(|(_, page)| page.slab == slab && reaches(page)) {
+            let first = if of_dispatch.pages.is_empty() { turn } else { of_dispatch.pages.start };
+            of_dispatch.pages = first..turn + 1;
+            let rows = if self.is_known { page.listed } else { page.rows };
             of_dispatch.chunks = of_dispatch.chunks.max(rows.div_ceil(size));
         }
         of_dispatch
@@ -117,6 +119,7 @@ impl PageTable {
 
 /// The chunks of rows on which a dispatch works.
 struct PageChunks {
+    /// In the order of slabs.
     pages: Range<u32>,
     /// Chunks of each page.
     chunks: u32,
@@ -166,19 +169,22 @@ impl DevicePages {
     }
 
     /// Uploads the table of pages in their slots, with the number of listed rows of each, where it is known.
-    pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], listed: &[u32]) -> GpuResult<PageTable> {
+    pub fn table(&self, recorder: &mut Recorder<'_>, pages: &[SlotPage], listed_rows: &[u32]) -> GpuResult<PageTable> {
         let (mut first_row, mut first_listed) = (0, 0);
         let mut entries = Vec::with_capacity(pages.len());
         for (i, page) in pages.iter().enumerate() {
             let (slab, offset) = self.slots.place(page.slot);
-            let listed = listed.get(i).copied().unwrap_or(0);
+            let listed = listed_rows.get(i).copied().unwrap_or(0);
             let entry = DevicePage::new(page.layout, slab, (offset / 4) as u32, first_row);
             entries.push(DevicePage { first_listed, listed, ..entry });
             first_row += entry.rows;
             first_listed += listed;
         }
+        let mut in_turn: Vec<u32> = (0..entries.len() as u32).collect();
+        in_turn.sort_by_key(|page| entries[*page as usize].slab);
+        entries.iter_mut().zip(in_turn).for_each(|(entry, page)| entry.in_turn = page);
         let on_device = recorder.buffer_with("page table", &entries)?;
-        Ok(PageTable { pages: entries, on_device })
+        Ok(PageTable { pages: entries, is_known: !listed_rows.is_empty(), on_device })
     }
 
     /// Records the cull of the pages. Returns their table, their counts with a word for the sum, and the rows that were found.
@@ -218,7 +224,7 @@ impl DevicePages {
         Ok((PageBatch { rows: listed.iter().sum(), listed, found }, table))
     }
 
-    /// Records the list of the rows that the camera may draw, for columns with room for `rows` rows. Returns it with the counts of the
+    /// Records which rows the camera may draw, for columns with room for `rows` rows. Returns it with the counts of the
     /// pages and their sum.
     pub(super) fn list_within(
         &self,
@@ -367,13 +373,13 @@ impl DevicePages {
     }
 }
 
-/// The rows of a batch that a window of its rows `part` binds.
+/// The listed rows, numbered in the batch, that a window of its rows `part` binds.
 fn bound_rows(part: &Range<usize>, window: Window) -> Range<u32> {
     let first = part.start as u32 + window.first as u32;
     first..first + window.rows
 }
 
-/// Buffers of the update of a chunk of rows.
+/// Buffers of the update of a part of a batch.
 pub struct UpdateBuffers<'a> {
     /// Values of the rows, from [`PageRows`].
     pub values: &'a DeviceColumns,
@@ -418,6 +424,9 @@ impl RowSource for PageRows<'_> {
             let mut filled = if batch.listed.is_empty() { window.rows.div_ceil(CHUNK_ROWS) } else { 0 };
             for slab in table.slabs() {
                 let of_dispatch = table.chunks(slab, &bound, CHUNK_ROWS);
+                if of_dispatch.pages.is_empty() {
+                    continue;
+                }
                 let uniforms = GatherUniforms {
                     slab,
                     row_count: window.rows,
@@ -429,9 +438,6 @@ impl RowSource for PageRows<'_> {
                     ..uniforms
                 };
                 let groups = groups_1d(of_dispatch.workgroups() + std::mem::take(&mut filled), 1);
-                if of_dispatch.pages.is_empty() {
-                    continue;
-                }
                 let [slab, tables, recent] = [pages.slots.slab(slab)?, pages.tables.view(), view.recent.view()];
                 let buffers = [table.on_device.view(), slab, tables, recent, batch.found.view()];
                 let w = columns.window(window);

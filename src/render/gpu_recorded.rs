@@ -2,7 +2,7 @@
 //! computes.
 //!
 //! The host knows neither how many rows are listed nor how long the lists are. So a recorded step takes buffers whose sizes
-//! its caller and earlier steps predict. Entries without a row fill the rest of the list of rows. The gate (`gate.wgsl`)
+//! its caller and earlier steps predict. Entries without a row fill the rest of the columns. The gate (`gate.wgsl`)
 //! lets the update write only if every list fitted and the numbers are sound. Everything else is recorded as in other
 //! steps, and has the same bits: entries without a row are never drawn, and the empty tail of a list changes no sum.
 //!

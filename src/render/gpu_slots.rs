@@ -35,7 +35,7 @@ pub struct Slots {
     is_packed: bool,
     slabs: Vec<Slab>,
     /// Reads that have begun and not ended, with the slots that they read, in the order of their beginning.
-    under_way: VecDeque<(DeviceSlot, Readback)>,
+    under_way: VecDeque<(SlotPage, Readback)>,
 }
 
 impl Slots {
@@ -47,7 +47,7 @@ impl Slots {
 
     /// Bytes of a payload in a slot.
     fn bytes_of(&self, layout: PageLayout) -> u64 {
-        (if self.is_packed { layout.packed_bytes() } else { layout.bytes() }) as u64
+        layout.bytes_on_device(self.is_packed)
     }
 
     pub fn slot_bytes(&self) -> u64 {
@@ -142,7 +142,7 @@ impl Slots {
         let mut recorder = gpu.begin("pages");
         for page in slots.iter().take(most as usize) {
             match recorder.read_back("pages", &self.view(*page)?) {
-                Ok(read) => self.under_way.push_back((page.slot, read)),
+                Ok(read) => self.under_way.push_back((*page, read)),
                 Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
@@ -154,8 +154,8 @@ impl Slots {
     /// Ends the reads that began first, into the payloads of the same slots. Waits for them alone.
     pub fn finish_reads(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> GpuResult<()> {
         let count = payloads.len().min(self.under_way.len());
-        let ending: Vec<(DeviceSlot, Readback)> = self.under_way.drain(..count).collect();
-        if !ending.iter().map(|(slot, _)| slot).eq(payloads.iter().map(|(page, _)| &page.slot)) {
+        let ending: Vec<(SlotPage, Readback)> = self.under_way.drain(..count).collect();
+        if !ending.iter().map(|(page, _)| page).eq(payloads.iter().map(|(page, _)| page)) {
             return Err(wrong_slots("slots whose reads have not begun"));
         }
         ending.into_iter().zip(payloads).try_for_each(|((_, read), (page, payload))| self.fill(*page, read, payload))

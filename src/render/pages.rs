@@ -3,8 +3,7 @@
 //!
 //! Not here: which pages lie in which slot, and when they come and go (`train`).
 //!
-//! Invariants: 1. a slot holds the payload of one page byte for byte, with moments of 16 bits in the form of
-//! [`PageLayout::pack`]; 2. the result of a step does not depend on slots,
+//! Invariants: 1. a slot holds the payload of one page: byte for byte, or packed ([`PageLayout::pack`]) if moments have 16 bits; 2. the result of a step does not depend on slots,
 //! batches or the room for them.
 
 use super::{LossOptions, LossValue, RenderError, RenderOptions, Renderer};
@@ -48,7 +47,7 @@ pub struct StepJob<'a> {
     pub numbers: &'a StepNumbers,
     pub camera: &'a Camera,
     pub options: &'a RenderOptions,
-    /// Capacity of the list of rows: an upper bound, or the caller's prediction. A step that lists more rows is not taken.
+    /// Rows that the columns have room for: an upper bound, or the caller's prediction. A step that lists more rows is not taken.
     pub rows_room: u32,
     /// Upper limit on the capacity of the list of intersections, which the renderer predicts. Tests lower it to inject a list without room.
     pub isects_most: u32,

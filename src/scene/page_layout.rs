@@ -36,7 +36,13 @@ impl PageLayout {
         self.bytes() - 4 * self.column_words().sum::<usize>()
     }
 
-    /// A payload whose moments have 16 bits, packed.
+    /// Bytes of the payload on a device whose moments are packed, or are not.
+    pub fn bytes_on_device(&self, is_packed: bool) -> u64 {
+        (if is_packed { self.packed_bytes() } else { self.bytes() }) as u64
+    }
+
+    /// Packs a payload, without the lower halves of its moments. Panics if the payload is shorter than [`PageLayout::bytes`] or not
+    /// aligned to 4 bytes.
     pub fn pack(&self, payload: &[u8], packed: &mut Vec<u32>) {
         let payload: &[u32] = bytemuck::cast_slice(&payload[..self.bytes()]);
         packed.resize(self.packed_bytes() / 4, 0);
@@ -55,7 +61,7 @@ impl PageLayout {
         }
     }
 
-    /// The payload of [`PageLayout::pack`].
+    /// The payload of [`PageLayout::pack`], which panics as that does.
     pub fn unpack(&self, packed: &[u32], payload: &mut [u8]) {
         let payload: &mut [u32] = bytemuck::cast_slice_mut(&mut payload[..self.bytes()]);
         let (head, mut columns) = payload.split_at_mut(self.head_words());

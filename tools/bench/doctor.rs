@@ -3,7 +3,7 @@
 //! Every check stands for itself: one that fails says what is wrong in plain words, and the others go on. The verdict names the flags to
 //! use.
 //!
-//! Not here: the comparison with the CPU (`render/device_check`), and timings against the floor of each stage
+//! Not here: the comparison with the CPU (`render/device_check`, `train/inputs/page_check`), and timings against the floor of each stage
 //! (`cargo bench --bench gpu`).
 //!
 //! Invariant: the doctor writes into its own folder only, and its scenes are generated.
@@ -14,12 +14,13 @@ use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
-use gsscale::config::values::Chosen;
+use gsscale::config::values::{Choice, Chosen};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::densify::strategy::StrategyName;
 use gsscale::gpu::{AdapterSummary, DeviceChoice, DeviceKind, Gpu, GpuOptions};
 use gsscale::optim::method::OptimizerPlace;
+use gsscale::optim::moments::Moments;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::device_check::{self, DeviceVerdict, View, scene, view};
 use gsscale::render::gpu::GpuRenderer;
@@ -142,7 +143,8 @@ fn advice(checks: &[Check], kind: DeviceKind) -> String {
         return "train with --device cpu: this GPU or its driver computes something else; an update of the driver may help".into();
     }
     if failed("pages on it") {
-        return "train with --optimizer-on host, the default: the optimizer computes something else on this GPU".into();
+        return "train with --optimizer-on host, the default: the check of pages on this GPU failed, as said above"
+            .into();
     }
     if kind == DeviceKind::Software {
         return "it computes what the CPU computes, but it is a driver in software: train with --device cpu, which is faster".into();
@@ -201,10 +203,14 @@ impl Doctor<'_> {
 
     /// Steps of the optimizer in pages on the device.
     fn pages(&self) -> Result<(String, Value), String> {
-        match page_check::check(&mut self.renderer(false)?).map_err(|e| e.to_string())? {
-            None => Ok(("two steps of the optimizer agree with the CPU".into(), Value::Null)),
-            Some(difference) => Err(difference),
+        for moments in [Moments::F32, Moments::Bf16] {
+            if let Some(difference) =
+                page_check::check(&mut self.renderer(false)?, moments).map_err(|e| e.to_string())?
+            {
+                return Err(format!("with --moments {}: {difference}", moments.word()));
+            }
         }
+        Ok(("steps of the optimizer agree with the CPU, with moments of 32 and of 16 bits".into(), Value::Null))
     }
 
     fn same_bytes(&self) -> Result<(String, Value), String> {

@@ -9,6 +9,7 @@ use crate::config::values::Device;
 use crate::gpu::DeviceChoice;
 use crate::gpu::{DeviceKind, Gpu, GpuError, GpuOptions};
 use crate::optim::method::OptimizerPlace;
+use crate::optim::moments::Moments;
 use crate::render::RenderError;
 use crate::render::Renderer;
 use crate::render::cpu::CpuRenderer;
@@ -61,24 +62,33 @@ impl OpenedDevice {
     }
 }
 
+/// What a renderer is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DeviceUse {
+    Training,
+    /// Pictures alone: no pages are updated.
+    Pictures,
+}
+
 /// The renderer of `--device`. `auto` uses a working hardware GPU, else the CPU; it never uses a software adapter, since the
 /// CPU renderer is faster.
 /// Errors: the named device does not exist, cannot be used, or differs from the CPU; a device was lost.
-pub fn renderer(config: &TrainConfig) -> Result<OpenedDevice, TrainError> {
+pub fn renderer(config: &TrainConfig, use_of: DeviceUse) -> Result<OpenedDevice, TrainError> {
     match &config.device {
         Device::Cpu => Ok(OpenedDevice::cpu(None)),
         // A search for a device leaves drivers in the process, whatever comes of it.
         Device::Gpu(choice) => {
             let before = host_bytes_now().unwrap_or(0);
-            let opened = of_gpu(config, choice)?;
+            let opened = of_gpu(config, choice, use_of)?;
             Ok(OpenedDevice { driver: host_bytes_now().unwrap_or(0).saturating_sub(before), ..opened })
         }
     }
 }
 
-fn of_gpu(config: &TrainConfig, choice: &DeviceChoice) -> Result<OpenedDevice, TrainError> {
+fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, use_of: DeviceUse) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
-    match difference_from_cpu(choice, config.optimizer_on.0 == Some(OptimizerPlace::Device)) {
+    let updates_pages = use_of == DeviceUse::Training && config.optimizer_on.0 == Some(OptimizerPlace::Device);
+    match difference_from_cpu(choice, updates_pages.then_some(config.moments)) {
         Ok(Some(difference)) => return without_device(choice, &difference),
         Ok(None) => {}
         Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => return Err(error.into()),
@@ -125,24 +135,30 @@ struct Difference {
     is_of_pages: bool,
 }
 
-/// The first difference between the device and the CPU, of pages as well if the device `updates_pages`, found in about a second. The device is opened for this alone and closed
+/// The first difference between the device and the CPU, found in about a second; of the optimizer as well, with these moments, if the device
+/// updates pages. The device is opened for this alone and closed
 /// before the run opens it, so that nothing of the comparison stays on it. A software driver is compared only if
 /// `GSSCALE_CHECK_DEVICE` is set: the tests compare every stage on software drivers. A device that cannot be opened is not
 /// compared: opening it for the run says why.
 /// Errors: those of the device, which say nothing about its results.
-fn difference_from_cpu(choice: &DeviceChoice, updates_pages: bool) -> Result<Option<Difference>, RenderError> {
+fn difference_from_cpu(choice: &DeviceChoice, of_pages: Option<Moments>) -> Result<Option<Difference>, RenderError> {
     let Ok(gpu) = Gpu::open_with(choice, &GpuOptions::default()) else { return Ok(None) };
     if gpu.summary().kind == DeviceKind::Software && std::env::var_os("GSSCALE_CHECK_DEVICE").is_none() {
         return Ok(None);
     }
     let mut device = GpuRenderer::new(gpu)?;
-    Ok(match device_check::check(&mut device)? {
-        DeviceVerdict::Differs(problem) => Some(Difference { problem, is_of_pages: false }),
-        DeviceVerdict::Agrees(_) if updates_pages => {
-            page_check::check(&mut device)?.map(|problem| Difference { problem, is_of_pages: true })
+    if let DeviceVerdict::Differs(problem) = device_check::check(&mut device)? {
+        return Ok(Some(Difference { problem, is_of_pages: false }));
+    }
+    let Some(moments) = of_pages else { return Ok(None) };
+    match page_check::check(&mut device, moments) {
+        Ok(problem) => Ok(problem.map(|problem| Difference { problem, is_of_pages: true })),
+        Err(error @ RenderError::Device(GpuError::DeviceLost { .. })) => Err(error),
+        Err(error) => {
+            crate::tell!("warning: pages on the GPU are used without a comparison with the CPU: {error}");
+            Ok(None)
         }
-        DeviceVerdict::Agrees(_) => None,
-    })
+    }
 }
 
 /// The nearest existing folder above the spill directory, for unnamed temporary files on its drive. The spill directory

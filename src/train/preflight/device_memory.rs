@@ -15,7 +15,7 @@ use crate::render::device_needs::{DeviceNeeds, ViewSizes};
 use crate::scene::page_layout::PageLayout;
 use crate::train::error::TrainError;
 use crate::train::memory::{INDEX_BYTES, MemoryEstimate};
-use crate::train::step::device_slots::{SLOTS_SHARE, device_bytes, slots_in};
+use crate::train::step::device_slots::{SLOTS_SHARE, slots_in};
 use crate::train::step::pages::PagedScene;
 
 /// The needs of the largest view that was probed, grown to the cap on Gaussians; `None` without a device.
@@ -114,7 +114,7 @@ pub(crate) fn refusal(
 
 fn slot_bytes(config: &TrainConfig) -> u64 {
     let layout = PageLayout { rows: config.page_rows as usize, sh_degree: config.sh_degree };
-    device_bytes(layout, config.moments == Moments::Bf16)
+    layout.bytes_on_device(config.moments == Moments::Bf16)
 }
 
 /// The lines of the plan about the device; empty without one. `memory` is the estimate to describe.

@@ -138,7 +138,7 @@ impl FirstPages<'_> {
         let pages_most = host_mem.map_or(u64::MAX, |bytes| bytes / TIMED_SHARE / frame_bytes);
         let Some(view) = self.median_view(pages_most) else { return Ok(None) };
         let scene = self.pages_of(view, &options, host_mem)?;
-        let renderer = machine::renderer(self.config)?.renderer;
+        let renderer = machine::renderer(self.config, machine::DeviceUse::Pictures)?.renderer;
         let mut trainer = Trainer::of_scene(scene, &self.start.dataset, renderer, options);
         let probed = trainer.probe_views(&self.start.dataset, &[view; TIMED_STEPS])?;
         Ok(Some(StepTime { seconds: probed.seconds * STEP_OVER_RENDERING, device: trainer.renderer.device() }))

@@ -240,7 +240,7 @@ pub(crate) fn begin(
     if config.up == Up::Auto {
         options.up = start.up()?;
     }
-    let OpenedDevice { mut renderer, word, driver } = machine::renderer(config)?;
+    let OpenedDevice { mut renderer, word, driver } = machine::renderer(config, machine::DeviceUse::Training)?;
     // On from here, so that probing allocates what the steps need.
     renderer.weigh_rows(options.strategy.needs_weights())?;
     if options.optimizer_on == OptimizerPlace::Device && renderer.pages().is_none() {

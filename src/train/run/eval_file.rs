@@ -166,7 +166,7 @@ impl<'a> Evaluator<'a> {
         check_photos_fit(&dataset, host_budget(config.host_mem.0))?;
         dataset.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
         let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-        let OpenedDevice { renderer, word, .. } = machine::renderer(config)?;
+        let OpenedDevice { renderer, word, .. } = machine::renderer(config, machine::DeviceUse::Pictures)?;
         if let Some(word) = word {
             crate::tell!("{word}");
         }

@@ -60,7 +60,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 /// After a step that lacked memory, no step is recorded for this number of steps.
 const STEPS_WITHOUT: u32 = 16;
-/// Spare room of a list, rows, beyond the number that is expected.
+/// Spare room of the columns, rows, beyond the number that is expected.
 const ROWS_MORE: u64 = 256;
 
 /// What became of a step to record.

@@ -173,11 +173,6 @@ pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
 }
 
-/// Bytes of a payload in a slot.
-pub fn device_bytes(layout: PageLayout, is_packed: bool) -> u64 {
-    (if is_packed { layout.packed_bytes() } else { layout.bytes() }) as u64
-}
-
 /// Layout of a page's payload as its frame holds it; `None` for a page whose payload must not be copied ahead: it has no rows, no frame,
 /// or events to apply first.
 fn layout_ahead(scene: &PagedScene, page: PageNo) -> Option<PageLayout> {
@@ -566,7 +561,7 @@ impl SlotCache {
     fn count_fewest(&mut self, pinned: &[&PinnedPage]) {
         let with_rows = pinned.iter().filter(|page| page.meta.rows > 0);
         let is_packed = self.is_packed;
-        let bytes = with_rows.map(|page| (page.page, device_bytes(page.layout(), is_packed)));
+        let bytes = with_rows.map(|page| (page.page, page.layout().bytes_on_device(is_packed)));
         self.fewest.step(self.slots.frames_max(), bytes);
     }
 
@@ -589,7 +584,7 @@ impl SlotCache {
 
     /// Bytes of a payload in a slot.
     fn bytes_of(&self, layout: PageLayout) -> u64 {
-        device_bytes(layout, self.is_packed)
+        layout.bytes_on_device(self.is_packed)
     }
 
     /// A free slot for the payload of a page, which is to be copied there; `None` where no slot is free.

@@ -172,7 +172,7 @@ const IN_FLIGHT: &str = "GSSCALE_STEPS_IN_FLIGHT";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum StepFault {
-    /// Its list of rows has room for one row.
+    /// Its columns have room for one row.
     Rows,
     /// Its lists of tiles have room for one intersection.
     Isects,
