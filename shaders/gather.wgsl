@@ -42,9 +42,9 @@ struct GatherUniforms {
     split_reach: f32,
     /// Number, in the batch, of the first listed row that is bound.
     first_bound: u32,
-    /// The pages of this dispatch, in their turn, and the chunks of each.
-    first_page: u32,
-    end_page: u32,
+    /// The turns of the pages of this dispatch, and the chunks of each page.
+    first_turn: u32,
+    end_turn: u32,
     chunks: u32,
     pad: u32,
 }
@@ -229,16 +229,16 @@ fn place(workgroup: Group, place: SubgroupPlace) {
     }
 }
 
-/// The rows of a workgroup; behind the pages a workgroup fills entries without a row, as far as there are some.
+/// The chunk of a workgroup. Workgroups behind those of the pages fill entries without a row, as far as there are any.
 fn chunk(workgroup: Group) -> Chunk {
     let n = linear_group(workgroup);
-    let turn = u.first_page + n / u.chunks;
-    if turn < u.end_page {
-        let p = pages[turn].in_turn;
+    let turn = u.first_turn + n / u.chunks;
+    if turn < u.end_turn {
+        let p = pages[turn].page_from_turn;
         return chunk_of(pages[p], p, n % u.chunks, CHUNK_ROWS, u.first_bound, u.row_count);
     }
     let last = pages[u.page_count - 1u];
-    let first = CHUNK_ROWS * (n - (u.end_page - u.first_page) * u.chunks);
+    let first = CHUNK_ROWS * (n - (u.end_turn - u.first_turn) * u.chunks);
     let begin = max(first, max(last.first_listed + last.listed, u.first_bound) - u.first_bound);
     let end = min(first + CHUNK_ROWS, u.row_count);
     return Chunk(NO_PAGE, 0u, begin, max(end, begin) - begin);

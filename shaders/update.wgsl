@@ -38,9 +38,9 @@ struct UpdateUniforms {
     step_sizes: array<vec4<f32>, 2>,
     /// Number, in the batch, of the first listed row that is bound.
     first_bound: u32,
-    /// The pages of this dispatch, in their turn, and the chunks of each.
-    first_page: u32,
-    end_page: u32,
+    /// The turns of the pages of this dispatch, and the chunks of each page.
+    first_turn: u32,
+    end_turn: u32,
     chunks: u32,
 }
 
@@ -170,14 +170,14 @@ fn step_float(column: u32, e: u32, at: u32, words: u32, d: Decays, value: f32, g
 #endif
 }
 
-/// The rows of a workgroup, in chunks of `size`.
+/// The chunk of a workgroup, of at most `size` rows.
 fn chunk(workgroup: Group, size: u32) -> Chunk {
     let n = linear_group(workgroup);
-    let turn = u.first_page + n / u.chunks;
-    if turn >= u.end_page || gate[0] != 0u {
+    let turn = u.first_turn + n / u.chunks;
+    if turn >= u.end_turn || gate[0] != 0u {
         return Chunk();
     }
-    let p = pages[turn].in_turn;
+    let p = pages[turn].page_from_turn;
     return chunk_of(pages[p], p, n % u.chunks, size, u.first_bound, u.row_count);
 }
 

@@ -253,7 +253,7 @@ fn load(args: &Args) -> InputResult<Scene> {
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
     let frame_bytes = transfer_bytes(capacity_bytes(config.page_rows as usize, config.sh_degree));
-    // Payloads on a device, all of which packing shortens about alike.
+    // Packing shortens the payload of every page by about the same share.
     let full = PageLayout { rows: config.page_rows as usize, sh_degree: config.sh_degree };
     let on_device = full.bytes_on_device(config.moments == Moments::Bf16);
     let share = on_device as f64 / full.bytes() as f64;

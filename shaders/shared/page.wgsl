@@ -17,8 +17,8 @@ struct DevicePage {
     first_listed: u32,
     /// Listed rows.
     listed: u32,
-    /// At index i: number of the i-th page, slab after slab.
-    in_turn: u32,
+    /// Number of the page that comes in turn i, in entry i. Turns follow the slabs: the pages of a slab are neighbours.
+    page_from_turn: u32,
 }
 
 /// Rows of a chunk of columns.
@@ -36,8 +36,8 @@ struct Chunk {
     rows: u32,
 }
 
-/// Chunk number `n`, of `size` rows, of page `p`: those of its rows that the bound columns hold, which begin at `first_bound` in the
-/// batch and are `bound`.
+/// The rows of chunk `n` of page `p`, in chunks of `size` listed rows. Of these only those count that the bound columns hold: `bound` listed
+/// rows of the batch, from number `first_bound` on.
 fn chunk_of(page: DevicePage, p: u32, n: u32, size: u32, first_bound: u32, bound: u32) -> Chunk {
     let begin = max(page.first_listed + min(size * n, page.listed), first_bound);
     let end = min(page.first_listed + min(size * n + size, page.listed), first_bound + bound);

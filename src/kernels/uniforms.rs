@@ -207,8 +207,8 @@ crate::wgsl_struct! {
         pub split_scale: f32,
         pub split_reach: f32,
         pub first_bound: u32,
-        pub first_page: u32,
-        pub end_page: u32,
+        pub first_turn: u32,
+        pub end_turn: u32,
         pub chunks: u32,
         pub pad: u32,
     }
@@ -225,8 +225,8 @@ crate::wgsl_struct! {
         pub weighs: u32,
         pub step_sizes: [[f32; 4]; 2],
         pub first_bound: u32,
-        pub first_page: u32,
-        pub end_page: u32,
+        pub first_turn: u32,
+        pub end_turn: u32,
         pub chunks: u32,
     }
 }
@@ -292,8 +292,8 @@ crate::wgsl_struct! {
         pub first_listed: u32,
         /// Listed rows.
         pub listed: u32,
-        /// At index i: number of the i-th page, slab after slab.
-        pub in_turn: u32,
+        /// Number of the page that comes in turn i, in entry i. Turns follow the slabs: the pages of a slab are neighbours.
+        pub page_from_turn: u32,
     }
 
     /// What an update did to a page, and its bounds: `PageResult` in `shaders/shared/page.wgsl`.
@@ -331,7 +331,7 @@ impl DevicePage {
     /// A page whose payload begins at word `base` of a slab.
     pub fn new(layout: PageLayout, slab: u32, base: u32, first_row: u32) -> DevicePage {
         let (rows, sh_n_width) = (layout.rows as u32, sh_n_width(layout.sh_degree) as u32);
-        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, listed: 0, in_turn: 0 }
+        DevicePage { rows, slab, base, sh_n_width, first_row, first_listed: 0, listed: 0, page_from_turn: 0 }
     }
 }
 

@@ -105,11 +105,11 @@ impl PageTable {
         let reaches = |page: &DevicePage| {
             !self.is_known || (page.first_listed < rows.end && page.first_listed + page.listed > rows.start)
         };
-        let mut of_dispatch = PageChunks { pages: 0..0, chunks: 1 };
-        let in_turn = self.pages.iter().map(|entry| &self.pages[entry.in_turn as usize]);
+        let mut of_dispatch = PageChunks { turns: 0..0, chunks: 1 };
+        let in_turn = self.pages.iter().map(|entry| &self.pages[entry.page_from_turn as usize]);
         for (turn, page) in (0..).zip(in_turn).filter(|(_, page)| page.slab == slab && reaches(page)) {
-            let first = if of_dispatch.pages.is_empty() { turn } else { of_dispatch.pages.start };
-            of_dispatch.pages = first..turn + 1;
+            let first = if of_dispatch.turns.is_empty() { turn } else { of_dispatch.turns.start };
+            of_dispatch.turns = first..turn + 1;
             let rows = if self.is_known { page.listed } else { page.rows };
             of_dispatch.chunks = of_dispatch.chunks.max(rows.div_ceil(size));
         }
@@ -119,15 +119,15 @@ impl PageTable {
 
 /// The chunks of rows on which a dispatch works.
 struct PageChunks {
-    /// In the order of slabs.
-    pages: Range<u32>,
+    /// The turns of the pages.
+    turns: Range<u32>,
     /// Chunks of each page.
     chunks: u32,
 }
 
 impl PageChunks {
     fn workgroups(&self) -> u32 {
-        self.pages.len() as u32 * self.chunks
+        self.turns.len() as u32 * self.chunks
     }
 }
 
@@ -182,7 +182,7 @@ impl DevicePages {
         }
         let mut in_turn: Vec<u32> = (0..entries.len() as u32).collect();
         in_turn.sort_by_key(|page| entries[*page as usize].slab);
-        entries.iter_mut().zip(in_turn).for_each(|(entry, page)| entry.in_turn = page);
+        entries.iter_mut().zip(in_turn).for_each(|(entry, page)| entry.page_from_turn = page);
         let on_device = recorder.buffer_with("page table", &entries)?;
         Ok(PageTable { pages: entries, is_known: !listed_rows.is_empty(), on_device })
     }
@@ -262,15 +262,15 @@ impl DevicePages {
             let (splats, v_splats) = (splats.window(window), v_splats.window(window));
             for slab in table.slabs() {
                 let of_dispatch = table.chunks(slab, &bound, CHUNK_ROWS);
-                if of_dispatch.pages.is_empty() {
+                if of_dispatch.turns.is_empty() {
                     continue;
                 }
                 let uniforms = UpdateUniforms {
                     slab,
                     row_count: window.rows,
                     first_bound: bound.start,
-                    first_page: of_dispatch.pages.start,
-                    end_page: of_dispatch.pages.end,
+                    first_turn: of_dispatch.turns.start,
+                    end_turn: of_dispatch.turns.end,
                     chunks: of_dispatch.chunks,
                     ..uniforms
                 };
@@ -424,7 +424,7 @@ impl RowSource for PageRows<'_> {
             let mut filled = if batch.listed.is_empty() { window.rows.div_ceil(CHUNK_ROWS) } else { 0 };
             for slab in table.slabs() {
                 let of_dispatch = table.chunks(slab, &bound, CHUNK_ROWS);
-                if of_dispatch.pages.is_empty() {
+                if of_dispatch.turns.is_empty() {
                     continue;
                 }
                 let uniforms = GatherUniforms {
@@ -432,8 +432,8 @@ impl RowSource for PageRows<'_> {
                     row_count: window.rows,
                     sh_n_width,
                     first_bound: bound.start,
-                    first_page: of_dispatch.pages.start,
-                    end_page: of_dispatch.pages.end,
+                    first_turn: of_dispatch.turns.start,
+                    end_turn: of_dispatch.turns.end,
                     chunks: of_dispatch.chunks,
                     ..uniforms
                 };

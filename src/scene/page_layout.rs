@@ -36,7 +36,7 @@ impl PageLayout {
         self.bytes() - 4 * self.column_words().sum::<usize>()
     }
 
-    /// Bytes of the payload on a device whose moments are packed, or are not.
+    /// Bytes of the payload on a device, with packed moments if `is_packed`.
     pub fn bytes_on_device(&self, is_packed: bool) -> u64 {
         (if is_packed { self.packed_bytes() } else { self.bytes() }) as u64
     }
@@ -61,7 +61,7 @@ impl PageLayout {
         }
     }
 
-    /// The payload of [`PageLayout::pack`], which panics as that does.
+    /// Restores the payload that [`PageLayout::pack`] packed. Panics if one of both is too short, or the payload not aligned to 4 bytes.
     pub fn unpack(&self, packed: &[u32], payload: &mut [u8]) {
         let payload: &mut [u32] = bytemuck::cast_slice_mut(&mut payload[..self.bytes()]);
         let (head, mut columns) = payload.split_at_mut(self.head_words());

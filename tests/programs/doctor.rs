@@ -2,7 +2,7 @@
 
 use crate::support::a_device;
 use crate::support::scenes::stderr;
-use crate::support::workdir::{BENCH, TRAIN, Workdir};
+use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir};
 use serde_json::Value;
 use std::process::{Command, Output};
 
@@ -84,4 +84,10 @@ fn a_wrong_constant_is_found_and_its_stage_is_named() {
     }
     let on_host = run(of_pages, "");
     assert!(on_host.status.success(), "{}", stderr(&on_host));
+
+    // Pictures of a run with its pages on a sound device need no update of pages.
+    work.train("scene --out sound --quiet --device gpu --optimizer-on device --steps 1");
+    let mut eval = work.command(EVAL, "sound --device gpu");
+    let eval = eval.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", of_pages).output().unwrap();
+    assert!(eval.status.success(), "{}", stderr(&eval));
 }

@@ -73,21 +73,21 @@ pub enum DeviceUse {
 /// The renderer of `--device`. `auto` uses a working hardware GPU, else the CPU; it never uses a software adapter, since the
 /// CPU renderer is faster.
 /// Errors: the named device does not exist, cannot be used, or differs from the CPU; a device was lost.
-pub fn renderer(config: &TrainConfig, use_of: DeviceUse) -> Result<OpenedDevice, TrainError> {
+pub fn renderer(config: &TrainConfig, device_use: DeviceUse) -> Result<OpenedDevice, TrainError> {
     match &config.device {
         Device::Cpu => Ok(OpenedDevice::cpu(None)),
         // A search for a device leaves drivers in the process, whatever comes of it.
         Device::Gpu(choice) => {
             let before = host_bytes_now().unwrap_or(0);
-            let opened = of_gpu(config, choice, use_of)?;
+            let opened = of_gpu(config, choice, device_use)?;
             Ok(OpenedDevice { driver: host_bytes_now().unwrap_or(0).saturating_sub(before), ..opened })
         }
     }
 }
 
-fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, use_of: DeviceUse) -> Result<OpenedDevice, TrainError> {
+fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, device_use: DeviceUse) -> Result<OpenedDevice, TrainError> {
     let is_auto = *choice == DeviceChoice::Auto;
-    let updates_pages = use_of == DeviceUse::Training && config.optimizer_on.0 == Some(OptimizerPlace::Device);
+    let updates_pages = device_use == DeviceUse::Training && config.optimizer_on.0 == Some(OptimizerPlace::Device);
     match difference_from_cpu(choice, updates_pages.then_some(config.moments)) {
         Ok(Some(difference)) => return without_device(choice, &difference),
         Ok(None) => {}

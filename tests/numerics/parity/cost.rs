@@ -153,6 +153,12 @@ fn on_pages(gpu: &mut GpuRenderer, (rows, camera): &(Columns, Camera), host: Ste
     (cost, Step { room, pages: Some([1, gpu.slot_bytes(), 4 * tables as u64, 4 * recent as u64]), ..host })
 }
 
+/// Bytes of a row's page that a step moves, with so many bytes of moments a value: values and moments of means and scales in the cull, of
+/// all in the gather; the update reads moments and writes all.
+fn page_bytes_of_row(moments: u64) -> u64 {
+    (6 + 59) * (4 + moments) + 59 * (moments + 4 + moments)
+}
+
 /// Few and many rows, few and many tiles: scans of one and of several blocks, sorts of one and of two digits.
 #[test]
 fn a_step_costs_what_the_model_says() {
@@ -175,6 +181,16 @@ fn a_step_costs_what_the_model_says() {
     let large = Step { rows: 1 << 20, room: 5 << 20, isects: 5 << 20, size: [1024; 2], pages: None };
     let costs = [large, Step { pages: Some([500, 0, 100 << 10, 6400]), ..large }].map(|step| cost(&step));
     println!("1 M rows, 5 M intersections, 1 M pixels, on the host and on the device: {costs:?}");
+    for (bits, moments) in [(32, 8), (16, 4)] {
+        let bytes = costs[1].bytes + large.rows * page_bytes_of_row(moments);
+        // Bytes a second, arithmetic of 116 GFLOP of rasterizing a second, 4 microseconds a launch.
+        let ms =
+            |rate: f64, flops: f64| 1e3 * (bytes as f64 / rate + 116e9 / flops + 4e-6 * costs[1].dispatches as f64);
+        let [laptop, h100] = [ms(256e9, 15e12), ms(2.8e12, 45e12)];
+        println!(
+            "moments of {bits} bits: {bytes} bytes with the pages; RTX 4070 Laptop {laptop:.1} ms, H100 {h100:.1} ms"
+        );
+    }
     assert!(costs.iter().all(|cost| cost.dispatches <= 45));
 }
 

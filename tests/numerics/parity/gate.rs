@@ -103,7 +103,7 @@ fn rows_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
     let slab: &[u32] = bytemuck::cast_slice(&payload);
     for (count, room) in [(1u32, 64u32), (700, 16_000), (700, 9000), (256, 1)] {
         let mut draws = Stream::new(3, Purpose::Test, u64::from(count), 0);
-        let page = |p| DevicePage { in_turn: p, ..DevicePage::new(layout, 0, 0, 40 * p) };
+        let page = |p| DevicePage { page_from_turn: p, ..DevicePage::new(layout, 0, 0, 40 * p) };
         let mut pages: Vec<DevicePage> = (0..count).map(page).collect();
         let counts: Vec<u32> = (0..count).map(|_| draws.below(41) as u32).collect();
         let found: Vec<u32> = (0..40 * count).map(|_| draws.below(40) as u32).collect();
@@ -117,7 +117,7 @@ fn rows_are_placed_padded_and_cut_on_the_device_as_by_the_twins() {
             [3, 4, 3, 1].map(|width| recorder.buffer_with("column", &vec![7.0f32; width * room as usize]).unwrap());
         let uniforms = GatherUniforms {
             row_count: room,
-            end_page: count,
+            end_turn: count,
             chunks: 1,
             ..GatherUniforms::new(&camera(), &numbers, 1, &splits, count)
         };
