@@ -61,12 +61,12 @@ fn buses_slow_steps_and_change_no_loss() {
     }
     let folder = TempDir::new().unwrap();
     let scene = city(folder.path(), 6, 64, 48, 600);
-    let args = [text(&scene), "--steps", "16", "--warm-up", "8", "--rounds", "1", "--shares", "0.2,2"];
+    let args = [text(&scene), "--steps", "10", "--warm-up", "4", "--rounds", "1", "--shares", "0.2,2"];
     let bus = |args: &[&str]| collected(|print| bus::start(&bus::Args::parse_from(arguments(args)), print));
     let lines = bus(&args).unwrap();
     let [slow, slower] = &lines[..] else { panic!("{lines:?}") };
     for line in [slow, slower] {
-        assert_eq!((&line["same_losses"], number(line, "steps")), (&Value::Bool(true), 8.0), "{line}");
+        assert_eq!((&line["same_losses"], number(line, "steps")), (&Value::Bool(true), 6.0), "{line}");
         assert!(number(line, "download_seconds_median") > 0.0 && number(line, "ratio_hidden_none") >= 1.0, "{line}");
         // A step cannot be faster than its uploads.
         assert!(number(line, "seconds_per_step_median") > number(line, "upload_seconds_median"), "{line}");

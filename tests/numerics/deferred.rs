@@ -114,9 +114,9 @@ fn values_follow_dense_adam_in_f64() {
 /// A long run: each step sees a random fiftieth of the rows, and opacities are reset every 3,000 steps. Two values of a
 /// row have gradients: a position, whose learning rate decays, and the opacity.
 #[test]
-fn ten_thousand_rows_follow_dense_adam_over_a_long_run_with_resets() {
+fn thousands_of_rows_follow_dense_adam_over_a_long_run_with_resets() {
     const RUN: u32 = 50_000;
-    let (rows, resets) = (10_000, 3_000);
+    let (rows, resets) = (4_000, 3_000);
     let cap = (0.02f32 / 0.98).ln();
     let rates = Rates::new(3.0, RUN);
     let adam = DeferredAdam::new(rates, AdamConfig::default(), SimdPath::best());

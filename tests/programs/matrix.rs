@@ -136,21 +136,16 @@ features! {
             assert!(rows.iter().max() > Some(&1150) && (550..=600).contains(rows.last().unwrap()), "{rows:?}");
         };
 
-    halves: || Workdir::wide_city(8000),
-        "--moments bf16 --grow-grad2d 0.001 --refine-start 20 --refine-every 25 --reset-every 45 --sh-every 30",
-        without ["--moments f32"],
-        shows |_| ();
-
     // Every row is updated at every step, also in pages that no view of it sees.
     dense: || Workdir::city(60, 48, 32, 4000),
-        "--optimizer dense --refine-start 5 --refine-every 6 --refine-stop 30 --reset-every 15 --steps 40 --sh-every 10 \
+        "--optimizer dense --refine-start 5 --refine-every 6 --refine-stop 20 --reset-every 11 --steps 26 --sh-every 8 \
          --grow-grad2d 0.00005 --view-order tour",
         without ["--optimizer deferred"],
         shows |work| assert!(work.count("alone", "gaussians") > 4050);
 
     // A scene without points.
     sparse: || {
-            let work = Workdir::city_of(24, [96, 64], 3000, 3);
+            let work = Workdir::city_of(20, [64, 48], 3000, 3);
             let mut model = TextModel::of(&work.scene());
             (model.points, model.colors) = (Vec::new(), Vec::new());
             model.write(&work.scene());
@@ -160,7 +155,7 @@ features! {
         without ["--optimizer deferred", "--sweep-points=off"],
         shows |work| assert!(work.count("alone", "gaussians") < 50_000, "it began at random points");
 
-    // Photos with EXIF data that state other exposures, which are where the values start.
+    // Photos with EXIF data that state other exposures, which are where the values start. Moments have 16 bits.
     appearance: || {
             let work = Workdir::city_of(24, [64, 48], 3000, 8);
             let photos = work.photos();
@@ -168,8 +163,8 @@ features! {
             photos.iter().enumerate().for_each(|(i, photo)| add_exif(photo, &settings(i)));
             work
         },
-        "--appearance full --refine-start 60 --refine-every 30 --grow-grad2d 0.001",
-        without ["--appearance off", "--appearance exposure"],
+        "--appearance full --moments bf16 --refine-start 60 --refine-every 30 --grow-grad2d 0.001 --reset-every 45 --sh-every 30",
+        without ["--appearance off", "--appearance exposure", "--moments f32"],
         shows |work| assert_eq!(work.json("alone/appearance.json")["exposures_from_exif"], 22);
 
     // All that the results of a run may be, upright, of a scene in the axes of structure from motion; and all remedies for photos at once.
@@ -192,25 +187,25 @@ features! {
         };
 
     gpu: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on host --steps 60 --refine-start 20 --refine-every 15 --grow-grad2d 0.001 --reset-every 25",
+        "--device gpu --optimizer-on host --steps 36 --refine-start 10 --refine-every 8 --grow-grad2d 0.001 --reset-every 15",
         without ["--refine-every 1000"],
         shows |_| ();
 
     // Rounds, resets, raises and a cap with pages that are newer on the device than in memory.
     gpu_pages: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on device --steps 54 --refine-start 9 --refine-every 10 --grow-grad2d 0.0005 --reset-every 25 \
-         --sh-every 15 --max-gaussians 7000 --log-every 1",
+        "--device gpu --optimizer-on device --steps 36 --refine-start 6 --refine-every 7 --grow-grad2d 0.0005 --reset-every 16 \
+         --sh-every 10 --max-gaussians 7000 --log-every 1",
         without ["--reset-every 0"],
         shows |work| {
             assert!(work.count("alone", "gaussians") > 6100);
-            let slots = &work.metrics("alone")[53]["slots"];
+            let slots = &work.metrics("alone")[35]["slots"];
             assert!(slots["loads"].as_u64() > Some(100), "the device holds no page: {slots}");
             assert!(slots["cleared"].as_u64() > Some(50), "rounds took all pages to the host: {slots}");
         };
 
     // The device weighs rows, and a round judges them by that. Moments have 16 bits.
     gpu_recycles: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on device --strategy long-axis --steps 70 --refine-start 9 --refine-every 10 --max-gaussians 6300 \
+        "--device gpu --optimizer-on device --strategy long-axis --steps 36 --refine-start 6 --refine-every 7 --max-gaussians 6300 \
          --recycle 0.05 --view-order shuffle --moments bf16",
         without ["--recycle 0", "--moments f32"],
         shows |work| assert!(work.metrics("alone").last().unwrap()["slots"]["cleared"].as_u64() > Some(0));
@@ -284,13 +279,15 @@ fn possible_rows() -> Vec<Row> {
     rows.filter(is_possible).collect()
 }
 
-/// The rows of the matrix: one after the other, each the possible row with the most pairs that no row before it has.
+/// The rows of the matrix: one after the other, each the possible row with the most pairs that no row before it has. Of equal
+/// ones the remainder decides, which was found by trying: 96 rows instead of 98.
 fn matrix() -> Vec<Row> {
     let possible = possible_rows();
     let (mut is_open, mut rows) = (vec![false; 1 << 16], Vec::new());
     possible.iter().flat_map(pairs).for_each(|pair| is_open[pair] = true);
     while is_open.contains(&true) {
-        let best = possible.iter().max_by_key(|row| pairs(row).filter(|pair| is_open[*pair]).count()).unwrap();
+        let gain = |(i, row): &(usize, &Row)| (pairs(row).filter(|pair| is_open[*pair]).count(), i % 11);
+        let (_, best) = possible.iter().enumerate().max_by_key(gain).unwrap();
         pairs(best).for_each(|pair| is_open[pair] = false);
         rows.push(*best);
     }
@@ -312,7 +309,7 @@ fn the_matrix_has_every_pair() {
         }
     }
     println!("{} of {} rows", rows.len(), possible.len());
-    assert!(rows.len() < 150, "{} rows take too long", rows.len());
+    assert!(rows.len() < 100, "{} rows take too long", rows.len());
 }
 
 /// The files of a run that tell no time, and the logged values that do not.

@@ -78,7 +78,6 @@ fn masking_what_stands_on_one_photo_only_wins_decibels() {
     let boxes = disturbed(&work, "boxes", &Disturbance::Boxes { count: 20, are_masked: false });
     let steps = format!("{STEPS} --steps 1200");
     boxes.run("c", &format!("{steps} --robust-pixels=off"));
-    boxes.run("d", &format!("{steps} --robust-pixels"));
     let said = boxes.run("e", &steps);
     assert!(said.contains("masked from here on"), "{said}");
     let said = disturbed(&work, "clean", &Disturbance::Nothing).run("b", &steps);
@@ -86,12 +85,9 @@ fn masking_what_stands_on_one_photo_only_wins_decibels() {
     let contradicted = ["b", "e"].map(|out| work.summary(out)["contradicted_share"].as_f64().unwrap());
     println!("contradicted: {:.2} % of the clean city, {:.2} %", 100.0 * contradicted[0], 100.0 * contradicted[1]);
     assert!(2.0 * contradicted[0] < contradicted[1], "{contradicted:?}");
-    let [with, masking, by_itself] = ["c", "d", "e"].map(|out| work.psnr(out));
-    println!(
-        "boxes {with:.2} dB, masking {masking:.2} dB, by itself {by_itself:.2} dB, {:.1} %",
-        100.0 * masked(&work, "d")
-    );
-    assert!(masking > with + 0.3 && by_itself > with + 0.3, "{masking} {by_itself} {with}");
+    let [with, masking] = ["c", "e"].map(|out| work.psnr(out));
+    println!("boxes {with:.2} dB, masked by itself {masking:.2} dB, {:.1} %", 100.0 * masked(&work, "e"));
+    assert!(masking > with + 0.3, "{masking} {with}");
     assert!(["b", "c"].iter().all(|out| work.summary(out)["masked_share"].is_null()));
     let reports =
         ["b", "e"].map(|out| work.text(&format!("{out}/report.html")).contains("Parts of photos that contradict"));
@@ -133,7 +129,7 @@ fn a_gpu_masks_and_names_what_the_cpu_does() {
         let scene = disturbed(&work, name, &how);
         let [cpu, gpu] = ["cpu", "gpu"].map(|device| {
             let out = format!("{name}-{device}");
-            scene.run(&out, &format!("--steps 210 --strategy none {flag} --device {device}"));
+            scene.run(&out, &format!("--steps 150 --strategy none {flag} --device {device}"));
             out
         });
         println!("{name}: {:.3} dB on the CPU, {:.3} dB on the GPU", work.psnr(&cpu), work.psnr(&gpu));
@@ -155,7 +151,7 @@ fn pages_on_a_device_give_the_same_bytes_without_wrong_views() {
     let Some(()) = a_device() else { return };
     let work = Workdir::city(24, 96, 64, 1500);
     let swapped = disturbed(&work, "swapped", &SWAPPED);
-    let flags = "--steps 130 --strategy none --robust-views --device gpu --optimizer-on device --page-rows 32 --view-order shuffle";
+    let flags = "--steps 90 --strategy none --robust-views --device gpu --optimizer-on device --page-rows 32 --view-order shuffle";
     for (out, slots) in [("all", "64MiB"), ("few", "5MiB")] {
         swapped.run(out, &format!("{flags} --device-mem {slots}"));
     }
