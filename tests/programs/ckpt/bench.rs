@@ -1,14 +1,9 @@
 //! Runs that are stopped early, and the output of `gsscale-ckpt` on their stores.
 
 use crate::support::scenes::stderr;
-use crate::support::workdir::{CKPT, Running, Workdir, split_ply};
-use gsscale::page::engine::open::{IoEngine, open_engine};
-use gsscale::page::folder::protocol_files::DriveFolder;
-use gsscale::page::folder::spill_dir::SpillDir;
-use gsscale::page::format::codec::Codec;
-use gsscale::page::map::opening::Opened;
+use crate::support::workdir::{CKPT, Running, Workdir, open_store, split_ply};
 use gsscale::page::map::opening::StoredPage;
-use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule, commit_config};
+use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ops::Deref;
@@ -145,10 +140,7 @@ pub fn generations(listed: &Value) -> Vec<u64> {
 
 /// Names generations, as the trainer does.
 pub fn pin(spill: &Path, names: &[(&str, u64)]) {
-    let dir = SpillDir::open(spill, true).unwrap();
-    let mut opened = Opened::open(Box::new(DriveFolder::new(spill)), commit_config(dir.format().store)).unwrap();
-    let engine = open_engine(IoEngine::Pread, spill, 1).unwrap();
-    let mut store = opened.paged_store(engine.store, dir.format().layout, Codec::Raw).unwrap();
+    let (_lock, mut opened, mut store) = open_store(spill);
     let names: Vec<(String, u64)> = names.iter().map(|(name, generation)| ((*name).to_string(), *generation)).collect();
     opened.commits.pin(&mut store, &names, &[]).unwrap();
 }

@@ -6,6 +6,15 @@ use super::scenes::{self, TextModel, classic, stderr};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::{PlyContent, read_ply};
+#[cfg(unix)]
+use gsscale::page::{
+    engine::open::{IoEngine, open_engine},
+    folder::{protocol_files::DriveFolder, spill_dir::SpillDir},
+    format::codec::Codec,
+    map::opening::Opened,
+    tool::reading::commit_config,
+    versions::paged_store::PagedStore,
+};
 use gsscale::scene::columns::Columns;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -82,9 +91,7 @@ impl Workdir {
 
     /// With a city of which a view sees less than half.
     pub fn wide_city(points: u32) -> Workdir {
-        let work = Workdir::new();
-        scenes::wide_city(work.0.path(), points);
-        work
+        Workdir::city_of(30, [48, 36], points, 12)
     }
 
     /// With a city of this size and of these many blocks.
@@ -384,6 +391,16 @@ impl<'a> Running<'a> {
 /// Sends a signal; false if the process has ended.
 pub fn send(child: &Child, signal: &str) -> bool {
     Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
+}
+
+/// The store of a run that has ended, opened as the trainer opens it.
+#[cfg(unix)]
+pub fn open_store(folder: &Path) -> (SpillDir, Opened, PagedStore) {
+    let spill = SpillDir::open(folder, true).unwrap();
+    let opened = Opened::open(Box::new(DriveFolder::new(folder)), commit_config(spill.format().store)).unwrap();
+    let engine = open_engine(IoEngine::Pread, folder, 2).unwrap().store;
+    let store = opened.paged_store(engine, spill.format().layout, Codec::Raw).unwrap();
+    (spill, opened, store)
 }
 
 pub fn copy_folder(from: &Path, to: &Path) {
