@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The Python that can import `module`; `None` after a printed skip.
-fn python_with(module: &str) -> Option<String> {
+pub(super) fn python_with(module: &str) -> Option<String> {
     let python = std::env::var("GSSCALE_PYTHON").unwrap_or_else(|_| "python3".to_string());
     let imported = Command::new(&python).args(["-c", &format!("import {module}")]).output();
     if imported.is_ok_and(|output| output.status.success()) {
