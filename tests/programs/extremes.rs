@@ -166,16 +166,6 @@ fn a_run_that_sees_loses_or_draws_no_gaussian_stops() {
 }
 
 #[test]
-fn numbers_that_f32_rounds_to_a_limit_are_refused_by_name() {
-    let work = small_city();
-    for flag in ["--init-opacity", "--max-alpha"] {
-        stopped(&work, "out", &format!("{flag} 0.99999998"), &[flag]);
-    }
-    // Each step took as long as twenty others while the clamp was searched float by float.
-    done(&work, "sharp", "--steps 30 --max-alpha 0.999999");
-}
-
-#[test]
 fn remedies_name_what_helps() {
     let work = small_city();
     gaussians(&work, "first.ply", |_| {});
