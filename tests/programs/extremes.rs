@@ -52,8 +52,7 @@ fn gaussians(work: &Workdir, file: &str, change: impl Fn(&mut Columns)) {
 
 /// Every page of every generation is intact and finite.
 fn assert_intact(work: &Workdir, store: &str) {
-    let output = work.output(CKPT, &format!("verify {store} --deep"));
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
+    work.succeeds(CKPT, &format!("verify {store} --deep"));
 }
 
 #[test]

@@ -5,7 +5,7 @@ use super::clients::python_with;
 use crate::support::exif::{add_exif, tiff_of_place};
 use crate::support::scenes::stderr;
 use crate::support::shared::real_scene;
-use crate::support::workdir::{POSES, TRAIN, Workdir, says};
+use crate::support::workdir::{POSES, TRAIN, Workdir, says, succeeded};
 use glam::{DMat3, DVec3};
 use gsscale::dataset::exif::GpsPlace;
 use gsscale::dataset::model::RawScene;
@@ -60,10 +60,7 @@ fn flight(work: &Workdir, with_gps: bool) -> Option<Vec<GpsPlace>> {
 }
 
 fn poses(work: &Workdir, flags: &str, program: &[&str]) -> String {
-    let output = work.command(POSES, flags).args(program).output().unwrap();
-    let told = stderr(&output);
-    assert!(output.status.success(), "{told}");
-    told
+    stderr(&succeeded(work.command(POSES, flags).args(program).output().unwrap()))
 }
 
 /// The scene, of which at least 16 of 18 photos must have poses.
@@ -154,8 +151,7 @@ fn a_folder_of_photos_becomes_a_scene_by_colmap() {
     let told = poses(&work, "photos --max-resolution 500 --features 1000", &["--colmap", "colmap"]);
     says(&told, &["18 photos of 1 camera(s), 0 with GPS; COLMAP ", "next: gsscale-train photos"]);
     found(&work.path("photos"));
-    let said = work.command(TRAIN, "photos --out out --dry-run --poses auto").output().unwrap();
-    assert!(said.status.success(), "{}", stderr(&said));
+    work.succeeds(TRAIN, "photos --out out --dry-run --poses auto");
 }
 
 #[test]

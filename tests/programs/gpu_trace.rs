@@ -4,7 +4,7 @@
 use super::gpu_flights::{Span, spans_of};
 use crate::support::a_device;
 use crate::support::scenes::stderr;
-use crate::support::workdir::{TRAIN, Workdir};
+use crate::support::workdir::{TRAIN, Workdir, succeeded};
 use std::process::Output;
 
 fn on_bus(work: &Workdir, bus: &str, flags: &str) -> Output {
@@ -18,8 +18,7 @@ fn an_emulated_bus_takes_its_time_and_changes_no_byte() {
     for place in ["host", "device"] {
         let flags = format!("scene --overwrite --steps 12 --device gpu --optimizer-on {place} --quiet");
         work.train(&format!("{flags} --out plain"));
-        let output = on_bus(&work, "100MB/s,300us", &format!("{flags} --out slow --trace {place}.json"));
-        assert!(output.status.success(), "{}", stderr(&output));
+        succeeded(on_bus(&work, "100MB/s,300us", &format!("{flags} --out slow --trace {place}.json")));
         assert!(work.ply("plain") == work.ply("slow"), "{place}: a slow bus gives another scene");
         let spans = spans_of(&work, &format!("{place}.json"));
         for span in spans.iter().filter(|span| ["upload", "read back"].contains(&span.name.as_str())) {
@@ -44,8 +43,7 @@ fn payloads_of_the_next_step_go_up_before_the_gradients_of_this_one_are_waited_f
     let flags = "scene --steps 60 --strategy none --sh-every 0 --log-every 1 --device gpu --optimizer-on device --page-rows 32 \
         --view-order shuffle --quiet";
     work.train(&format!("{flags} --out whole"));
-    let output = on_bus(&work, "1GB/s,20us", &format!("{flags} --out few --trace trace --device-mem 5MiB"));
-    assert!(output.status.success(), "{}", stderr(&output));
+    succeeded(on_bus(&work, "1GB/s,20us", &format!("{flags} --out few --trace trace --device-mem 5MiB")));
     assert!(work.ply("whole") == work.ply("few"), "copies ahead give another scene");
     let spans = spans_of(&work, "trace");
     // Before its first step a run draws some views to measure them.

@@ -85,9 +85,7 @@ impl Bench {
     }
 
     pub fn ckpt(&self, flags: &str) -> String {
-        let output = self.ckpt_output(flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        String::from_utf8(output.stdout).unwrap()
+        self.printed(CKPT, flags)
     }
 
     /// The output with `--json`.

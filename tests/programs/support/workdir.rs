@@ -2,7 +2,7 @@
 
 #[cfg(target_os = "linux")]
 use super::memory_group::MemoryGroup;
-use super::scenes::{self, TextModel, classic, stderr};
+use super::scenes::{self, TextModel, classic, stderr, told};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::{PlyContent, read_ply};
@@ -30,6 +30,13 @@ pub const CKPT: &str = env!("CARGO_BIN_EXE_gsscale-ckpt");
 pub const POSES: &str = env!("CARGO_BIN_EXE_gsscale-poses");
 pub const VIEW: &str = env!("CARGO_BIN_EXE_gsscale-view");
 pub const BENCH: &str = env!("CARGO_BIN_EXE_gsscale-bench");
+
+/// The output of a program, which must have succeeded.
+#[track_caller]
+pub fn succeeded(output: Output) -> Output {
+    assert!(output.status.success(), "{}", told(&output));
+    output
+}
 
 /// A temporary folder; its scene, if it has one, is `scene`.
 pub struct Workdir(TempDir);
@@ -157,11 +164,21 @@ impl Workdir {
         self.command(program, flags).output().unwrap()
     }
 
+    /// Runs a program, which must succeed.
+    pub fn succeeds(&self, program: &str, flags: &str) -> Output {
+        let output = self.output(program, flags);
+        assert!(output.status.success(), "{flags}: {}", told(&output));
+        output
+    }
+
+    /// What a program that succeeds prints.
+    pub fn printed(&self, program: &str, flags: &str) -> String {
+        String::from_utf8(self.succeeds(program, flags).stdout).unwrap()
+    }
+
     /// Runs the trainer, which must succeed; returns stderr.
     pub fn train(&self, flags: &str) -> String {
-        let output = self.output(TRAIN, flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        stderr(&output)
+        stderr(&self.succeeds(TRAIN, flags))
     }
 
     /// Trains `scene` into `out` quietly, on the CPU unless the flags say otherwise; returns the Gaussians.
@@ -185,10 +202,14 @@ impl Workdir {
         said
     }
 
+    /// What a program that succeeds prints as JSON, and what it says.
+    pub fn json_and_words(&self, program: &str, flags: &str) -> (Value, String) {
+        let output = self.succeeds(program, flags);
+        (serde_json::from_slice(&output.stdout).unwrap(), stderr(&output))
+    }
+
     pub fn json_of(&self, program: &str, flags: &str) -> Value {
-        let output = self.output(program, flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        serde_json::from_slice(&output.stdout).unwrap()
+        self.json_and_words(program, flags).0
     }
 
     /// The PSNR of the held-out photos that `gsscale-eval` finds.
