@@ -8,7 +8,6 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
-use std::process::Output;
 
 /// Rounds, resets and raises of the SH degree before the stop; pages that split.
 const BUSY: &str = "scene --steps 400 --page-rows 32 --grow-grad2d 0.001 --refine-start 15 --refine-every 10 --refine-stop 100 \
@@ -79,11 +78,7 @@ impl Bench {
         self.begin(&format!("--resume out --quiet {more}")).after_lines("out", lines + 3)
     }
 
-    /// `gsscale-ckpt` with these flags.
-    pub fn ckpt_output(&self, flags: &str) -> Output {
-        self.output(CKPT, flags)
-    }
-
+    /// What `gsscale-ckpt` prints.
     pub fn ckpt(&self, flags: &str) -> String {
         self.printed(CKPT, flags)
     }
@@ -95,7 +90,7 @@ impl Bench {
 
     /// The message of a failing call, which has all of these words.
     pub fn fails(&self, flags: &str, words: &[&str]) -> String {
-        let output = self.ckpt_output(flags);
+        let output = self.output(CKPT, flags);
         let said = stderr(&output);
         assert!(matches!(output.status.code(), Some(1 | 2)), "{flags}: {output:?}");
         assert!(words.iter().all(|word| said.contains(word)), "{flags}: {words:?}: {said}");
