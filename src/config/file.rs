@@ -656,15 +656,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn files_override_defaults_and_unknown_keys_are_refused() {
-        let config = TrainConfig::parse("steps = 7\nimage-cache = \"64MiB\"\n[resolved]\nversion = \"x\"\n");
-        let config = config.unwrap_or_default();
-        assert_eq!((config.steps, config.image_cache), (7, ByteSize(64 << 20)));
-        let error = TrainConfig::parse("stepz = 7").err().unwrap_or_default();
-        assert!(error.contains("stepz"), "{error}");
-    }
-
-    #[test]
     fn values_out_of_range_are_refused_by_name() {
         let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
         assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));

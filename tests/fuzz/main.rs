@@ -29,6 +29,8 @@ mod allocation;
 #[allow(dead_code)] // other tests use all of it
 #[path = "../support/exif.rs"]
 mod exif;
+#[path = "../support/hush.rs"]
+mod hush;
 mod mutate;
 mod scene_folder;
 mod targets;
@@ -61,19 +63,6 @@ pub struct Target {
 
 /// Allocations are counted for the whole process, so one target runs at a time.
 static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
-
-/// Panics inside redb become errors of the store; their messages would hide others.
-fn hush_library_panics() {
-    static ONCE: std::sync::Once = std::sync::Once::new();
-    ONCE.call_once(|| {
-        let default = std::panic::take_hook();
-        std::panic::set_hook(Box::new(move |info| {
-            if !info.location().is_some_and(|l| l.file().contains("redb")) {
-                default(info);
-            }
-        }));
-    });
-}
 
 /// Ends the process if a case does not end.
 fn watch(name: &'static str, is_over: &AtomicBool) {
@@ -133,7 +122,7 @@ fn corpus(name: &str) -> Vec<PathBuf> {
 
 fn fuzz(target: fn() -> Target) {
     let _alone = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
-    hush_library_panics();
+    hush::hush_library_panics();
     let target = target();
     let is_over = AtomicBool::new(false);
     std::thread::scope(|scope| {

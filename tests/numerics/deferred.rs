@@ -52,7 +52,7 @@ fn grads_at(rows: &[u32], sh_degree: u8, step: u32) -> Columns {
 }
 
 /// All rows after `now` steps.
-fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
+pub fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
     catch_up::evaluate_all(&[state.view()], state.sh_degree(), adam, now)
 }
 

@@ -1,5 +1,6 @@
 //! Densification rounds and resets: decisions equal a plain second implementation, the cap holds. (Late events: `storage::pages`.)
 
+use crate::deferred::evaluate_all;
 use crate::support::apply_event::apply_event;
 use crate::support::rounds::{SEED, adam, scene, touch};
 use gsscale::base::rng::hash64;
@@ -12,17 +13,11 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::bounds::{SplitLimits, page_bounds};
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::rates::Rates;
-use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::columns::Column;
 use gsscale::scene::events::{Event, EventKind, RoundThresholds};
 use gsscale::scene::log_scales::LogScaleRange;
 use gsscale::scene::state::SceneState;
-use gsscale::train::step::catch_up;
 use std::collections::HashMap;
-
-/// All rows after `now` steps.
-fn evaluate_all(state: &SceneState, adam: &DeferredAdam, now: u32) -> Columns {
-    catch_up::evaluate_all(&[state.view()], state.sh_degree(), adam, now)
-}
 
 #[test]
 fn a_round_does_what_a_plain_implementation_does() {

@@ -13,7 +13,7 @@
 //! | lists longer than the memory | ranges of tiles, the same bytes | splats_that_fill_large_photos_stay_within_the_memory |
 //! | fewer intersections than tiles | only their tiles are drawn | three_splats_on_many_tiles_are_drawn_alone |
 //! | a thousand opaque layers | alpha is clamped, blending stops; finite | an_opaque_scene_has_the_gradients_of_finite_differences, a_thousand_opaque_layers_stay_finite |
-//! | opacities of exactly 0 and 1 | read as 1e-6 and .999999 | log_scales_and_opacities_of_a_ply_are_brought_into_range_and_said, numbers_that_f32_rounds_to_a_limit_are_refused_by_name |
+//! | opacities of exactly 0 and 1 | read as 1e-6 and .999999 | log_scales_and_opacities_of_a_ply_are_brought_into_range_and_said, values_out_of_range_are_refused_by_name |
 //! | Gaussians that were never seen, in a round | no statistics, so no growth; nothing is divided by zero | only_drawn_rows_count_and_the_histogram_follows, a_round_does_what_a_plain_implementation_does |
 //! | equal points, one point | a size from the scene; trains | unusual_scenes_train, degenerate_clouds_get_sane_scales |
 //! | flat photos, photos below a window, masks of everything | SSIM as defined, a loss; a run of such masks stops | flat_bright_patches_and_equal_pictures, small_and_empty_pictures_have_a_loss, a_run_whose_masks_are_all_black_stops |

@@ -1,16 +1,11 @@
 //! `gsscale-bench` as a user calls it: help texts, a run on a scene, and refused arguments.
 
-use crate::support::scenes::stderr;
 use crate::support::workdir::{BENCH, Workdir};
 
 #[test]
 fn help_lists_the_measurements_and_each_has_help() {
     let work = Workdir::new();
-    let said = |flags: &str| {
-        let output = work.output(BENCH, flags);
-        assert!(output.status.success(), "{}", stderr(&output));
-        String::from_utf8(output.stdout).unwrap()
-    };
+    let said = |flags: &str| work.printed(BENCH, flags);
     let help = said("help");
     assert_eq!(said("--help"), help);
     let commands: Vec<&str> =

@@ -136,8 +136,7 @@ fn another_prior_is_refused(cells: &Cells) {
     *rows.last_mut().unwrap() ^= 1;
     cells.0.write(ply, rows);
     cells.0.remove("city/prior/store");
-    let imported = cells.0.output(CKPT, &format!("import {ply} --out city/prior/store --page-rows 32"));
-    assert!(imported.status.success(), "{}", told(&imported));
+    cells.0.succeeds(CKPT, &format!("import {ply} --out city/prior/store --page-rows 32"));
     std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
     cells.refuses("run city --cell 0", &["it is not the prior that was cut"]);
 }

@@ -5,15 +5,14 @@
 //! a folder with `splat-transform` (`npm install @playcanvas/splat-transform@3.7.0`, then `node_modules/.bin`). `.ci/run` installs
 //! them.
 
-use crate::support::scenes::stderr;
-use crate::support::workdir::Workdir;
+use crate::support::workdir::{Workdir, succeeded};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
 /// The Python that can import `module`; `None` after a printed skip.
-fn python_with(module: &str) -> Option<String> {
+pub(super) fn python_with(module: &str) -> Option<String> {
     let python = std::env::var("GSSCALE_PYTHON").unwrap_or_else(|_| "python3".to_string());
     let imported = Command::new(&python).args(["-c", &format!("import {module}")]).output();
     if imported.is_ok_and(|output| output.status.success()) {
@@ -25,8 +24,7 @@ fn python_with(module: &str) -> Option<String> {
 
 /// Runs a script and parses the JSON that it prints last.
 fn run_script(python: &str, script: &str, args: &[&Path]) -> Value {
-    let output = Command::new(python).args(["-c", script]).args(args).output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
+    let output = succeeded(Command::new(python).args(["-c", script]).args(args).output().unwrap());
     let out = String::from_utf8(output.stdout).unwrap();
     serde_json::from_str(out.lines().last().unwrap()).unwrap()
 }
@@ -141,8 +139,7 @@ fn splat_transform() -> Option<PathBuf> {
 }
 
 fn convert(work: &Workdir, program: &Path, flags: &str) {
-    let output = Command::new(program).arg("-w").args(flags.split(' ')).current_dir(work.path("")).output().unwrap();
-    assert!(output.status.success(), "{flags}: {}", stderr(&output));
+    succeeded(Command::new(program).arg("-w").args(flags.split(' ')).current_dir(work.path("")).output().unwrap());
 }
 
 fn rows_of(work: &Workdir, ply: &str) -> u64 {

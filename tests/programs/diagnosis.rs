@@ -23,9 +23,7 @@ fn switched_on(
         write_disturbed(&work.path(name), &dataset, disturbance, SEED).unwrap();
     }
     let flags = format!("{name} --dry-run --steps 300 --device cpu --test-after {} {more}", made.test_after);
-    let output = work.output(TRAIN, &flags);
-    let said = told(&output);
-    assert!(output.status.success(), "{said}");
+    let said = told(&work.succeeds(TRAIN, &flags));
     let words: Vec<&str> = said.split_whitespace().collect();
     let flags = match words.windows(4).position(|four| four == ["so", "this", "run", "has"]) {
         Some(at) => {

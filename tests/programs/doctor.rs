@@ -2,7 +2,7 @@
 
 use crate::support::a_device;
 use crate::support::scenes::stderr;
-use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir};
+use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, succeeded};
 use serde_json::Value;
 use std::process::{Command, Output};
 
@@ -21,8 +21,7 @@ fn json(text: &str) -> Value {
 fn a_sound_device_is_told_from_one_with_too_little_memory() {
     let Some(()) = a_device() else { return };
     let work = Workdir::new();
-    let sound = doctor(&work, &[], None);
-    assert!(sound.status.success(), "{}", stderr(&sound));
+    succeeded(doctor(&work, &[], None));
     let found = json(&work.text("doctor/doctor.json"));
     let checks = found["checks"].as_array().unwrap();
     assert!(checks.len() == 3 && checks.iter().all(|check| check["verdict"] == "good"), "{found}");
@@ -30,9 +29,8 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
     let has_subgroups = &found["subgroups"];
 
     // A driver whose subgroups hold their invocations in another order computes without them, and is sound.
-    let shuffled =
-        doctor(&work, &["--out", "shuffled"], Some("scan.wgsl:workgroup_scan(1u=workgroup_scan(place.lane & 1u"));
-    assert!(shuffled.status.success(), "{}", stderr(&shuffled));
+    let other_order = "scan.wgsl:workgroup_scan(1u=workgroup_scan(place.lane & 1u";
+    succeeded(doctor(&work, &["--out", "shuffled"], Some(other_order)));
     let found = json(&work.text("shuffled/doctor.json"));
     assert_eq!((has_subgroups.as_bool(), found["subgroups"].as_bool()), (Some(true), Some(false)), "{found}");
 
@@ -82,12 +80,10 @@ fn a_wrong_constant_is_found_and_its_stage_is_named() {
         assert!(!refused.status.success() && said.contains(stage) && said.contains(remedy), "{said}");
         assert!(!work.path("run/point_cloud.ply").exists());
     }
-    let on_host = run(of_pages, "");
-    assert!(on_host.status.success(), "{}", stderr(&on_host));
+    succeeded(run(of_pages, ""));
 
     // Pictures of a run with its pages on a sound device need no update of pages.
     work.train("scene --out sound --quiet --device gpu --optimizer-on device --steps 1");
     let mut eval = work.command(EVAL, "sound --device gpu");
-    let eval = eval.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", of_pages).output().unwrap();
-    assert!(eval.status.success(), "{}", stderr(&eval));
+    succeeded(eval.env("GSSCALE_CHECK_DEVICE", "1").env("GSSCALE_SHADER_FAULT", of_pages).output().unwrap());
 }

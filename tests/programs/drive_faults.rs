@@ -21,7 +21,6 @@ use gsscale::page::map::commit::{CommitConfig, RESERVE_NAME};
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::pager::{Pager, PagerConfig};
-use gsscale::paging::prefetch::Transfers;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::page_layout::capacity_bytes;
 use gsscale::train::commits::checkpoint::Checkpoint;
@@ -129,7 +128,6 @@ impl World {
             frames: self.frames,
             prefetch_bytes: 1 << 20,
             plan_bytes: 1 << 20,
-            transfers: Transfers::Overlap,
             ..PagerConfig::in_memory(PAGE_ROWS as usize, config.sh_degree)
         };
         let (dataset, scene) = start.into_pages(Pager::new(sizes, store), &options, &config, None)?;

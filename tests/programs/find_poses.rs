@@ -1,10 +1,11 @@
 //! `gsscale-poses` on photos of a flight without their model, through pycolmap and COLMAP where they are installed
 //! (`GSSCALE_PYTHON`, `colmap` on the PATH), and what it refuses without any program.
 
+use super::clients::python_with;
 use crate::support::exif::{add_exif, tiff_of_place};
 use crate::support::scenes::stderr;
 use crate::support::shared::real_scene;
-use crate::support::workdir::{POSES, TRAIN, Workdir, says};
+use crate::support::workdir::{POSES, TRAIN, Workdir, says, succeeded};
 use glam::{DMat3, DVec3};
 use gsscale::dataset::exif::GpsPlace;
 use gsscale::dataset::model::RawScene;
@@ -19,22 +20,14 @@ const QUICK: &str = "--max-resolution 600 --features 1500";
 /// Metres of a unit of brighton's model.
 const METRES: f64 = 8.26;
 
-/// Whether a program says something that begins so; prints a skip otherwise.
-fn is_installed(program: &str, arguments: &[&str], words: &str) -> bool {
-    let said = Command::new(program).args(arguments).env("QT_QPA_PLATFORM", "offscreen").output();
-    let is_there = said.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).contains(words));
+/// Whether COLMAP is installed; prints a skip otherwise.
+fn has_colmap() -> bool {
+    let said = Command::new("colmap").arg("help").env("QT_QPA_PLATFORM", "offscreen").output();
+    let is_there = said.is_ok_and(|output| String::from_utf8_lossy(&output.stdout).contains("COLMAP"));
     if !is_there {
-        println!("SKIPPED: {program} {} does not say '{words}'", arguments.join(" "));
+        println!("SKIPPED: colmap is not installed");
     }
     is_there
-}
-
-fn python() -> String {
-    std::env::var("GSSCALE_PYTHON").unwrap_or_else(|_| "python3".to_string())
-}
-
-fn has_pycolmap() -> bool {
-    is_installed(&python(), &["-c", "import pycolmap; print(pycolmap.__version__)"], ".")
 }
 
 /// Where the cameras of the model stand: metres east, north and up of their middle, if the flight looked straight down.
@@ -67,10 +60,7 @@ fn flight(work: &Workdir, with_gps: bool) -> Option<Vec<GpsPlace>> {
 }
 
 fn poses(work: &Workdir, flags: &str, program: &[&str]) -> String {
-    let output = work.command(POSES, flags).args(program).output().unwrap();
-    let told = stderr(&output);
-    assert!(output.status.success(), "{told}");
-    told
+    stderr(&succeeded(work.command(POSES, flags).args(program).output().unwrap()))
 }
 
 /// The scene, of which at least 16 of 18 photos must have poses.
@@ -84,12 +74,9 @@ fn found(scene: &Path) -> RawScene {
 #[test]
 fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     let work = Workdir::new();
-    if !has_pycolmap() {
-        return;
-    }
+    let Some(python) = python_with("pycolmap") else { return };
     let Some(places) = flight(&work, true) else { return };
-    let program = ["--python".to_string(), python()];
-    let program = [program[0].as_str(), &program[1]];
+    let program = ["--python", python.as_str()];
     let told = poses(&work, &format!("photos --out scan {QUICK}"), &program);
     says(&told, &["18 photos of 1 camera(s), 18 with GPS", "about 153 pairs", "forecast:", "of 18 photos have poses"]);
     says(&told, &["in metres east, north and up of 4", "next: gsscale-train scan"]);
@@ -100,12 +87,8 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     let number = |key: &str| origin[key].as_f64().unwrap();
     let altitude = Some(number("altitude"));
     let origin = GpsPlace { latitude: number("latitude"), longitude: number("longitude"), altitude };
-    let names: Vec<String> = {
-        let mut names: Vec<_> =
-            std::fs::read_dir(work.path("photos")).unwrap().map(|e| e.unwrap().file_name()).collect();
-        names.sort();
-        names.into_iter().map(|name| name.into_string().unwrap()).collect()
-    };
+    let names = work.files("photos").into_keys().map(|name| name.into_os_string().into_string().unwrap());
+    let names: Vec<String> = names.collect();
     let mut errors: Vec<f64> = raw
         .views
         .iter()
@@ -161,15 +144,14 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
 #[test]
 fn a_folder_of_photos_becomes_a_scene_by_colmap() {
     let work = Workdir::new();
-    if !is_installed("colmap", &["help"], "COLMAP") || flight(&work, false).is_none() {
+    if !has_colmap() || flight(&work, false).is_none() {
         return;
     }
     // Debian's COLMAP compares in four times the time of newer ones.
     let told = poses(&work, "photos --max-resolution 500 --features 1000", &["--colmap", "colmap"]);
     says(&told, &["18 photos of 1 camera(s), 0 with GPS; COLMAP ", "next: gsscale-train photos"]);
     found(&work.path("photos"));
-    let said = work.command(TRAIN, "photos --out out --dry-run --poses auto").output().unwrap();
-    assert!(said.status.success(), "{}", stderr(&said));
+    work.succeeds(TRAIN, "photos --out out --dry-run --poses auto");
 }
 
 #[test]
@@ -194,8 +176,8 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     }
     refused("card", &["sub-folders", "DCIM/", "--out"]);
     // A folder of the name of ours, and photos in the place of links.
-    if has_pycolmap() {
-        let program = format!("--python {}", python());
+    if let Some(python) = python_with("pycolmap") {
+        let program = format!("--python {python}");
         std::fs::create_dir(work.path("scene/poses")).unwrap();
         work.write("scene/poses/notes.txt", "mine");
         refused(&format!("scene {program}"), &["scene/poses", "not a work folder of gsscale-poses"]);

@@ -1,7 +1,7 @@
 //! Dry run, plan and run say the same of the same run: memory, drive, bytes written, Gaussians at the end. And the guess of a
 //! run without a cap is of the right size.
 
-use crate::support::scenes::{stderr, told};
+use crate::support::scenes::told;
 use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::base::units::{format_bytes, format_grouped};
 use serde_json::Value;
@@ -12,9 +12,7 @@ fn planned(work: &Workdir, flags: &str) -> (Value, String) {
     // As `Workdir::run`.
     let strategy = if flags.contains("--strategy") { "" } else { "--strategy default" };
     let flags = format!("scene --schedule classic {strategy} {flags}");
-    let output = work.output(PLAN, &flags);
-    assert!(output.status.success(), "{flags}: {}", stderr(&output));
-    (work.json_of(PLAN, &format!("{flags} --json")), String::from_utf8(output.stdout).unwrap())
+    (work.json_of(PLAN, &format!("{flags} --json")), work.printed(PLAN, &flags))
 }
 
 /// The lines of a plan about memory and pages, unfolded: those that no clock and no free space changes.

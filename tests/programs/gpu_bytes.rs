@@ -26,7 +26,7 @@ fn replays(bench: &Bench, name: &str) -> (usize, u64) {
     };
     // Those that were not taken, and those behind them.
     let given_up = spans.iter().filter(|s| s.name == "give up");
-    let steps = given_up.map(|s| s.step..=s.step + s.args["behind"].as_u64().unwrap());
+    let steps = given_up.map(|s| s.step()..=s.step() + s.args["behind"].as_u64().unwrap());
     let pages: Vec<u64> = steps.map(|steps| steps.map(pages_of).sum()).collect();
     (pages.len(), 2 * pages.iter().sum::<u64>() * capacity_bytes(32, 3) as u64)
 }
@@ -79,7 +79,7 @@ fn a_step_that_is_taken_again_takes_up_at_most_two_payloads_for_each_of_its_page
     let behind = spans.iter().filter(|s| s.name == "finish step" && s.args["in_flight"].as_u64() == Some(2));
     let mut faults = String::new();
     for (i, span) in behind.step_by(4).enumerate() {
-        write!(faults, "{}@{},", ["rows", "isects", "closed"][i % 3], span.step).unwrap();
+        write!(faults, "{}@{},", ["rows", "isects", "closed"][i % 3], span.step()).unwrap();
     }
     assert!(bench.run("faults", "2", &faults, &more));
     same(&bench.result("faults"), &bench.result("sound"), &faults);

@@ -11,13 +11,13 @@ const SELDOM: &str = "--commit-every 0.5";
 /// some steps farther. Commits come by time, so another run may be some submissions off.
 fn submissions_in_flight(spans: &[Span]) -> Vec<usize> {
     let mut stretches: Vec<Vec<(u64, usize)>> = Vec::new();
-    for span in spans.iter().filter(|s| s.name == "record step" && s.args["recorded"].as_u64() > Some(s.step)) {
+    for span in spans.iter().filter(|s| s.name == "record step" && s.args["recorded"].as_u64() > Some(s.step())) {
         let submission = spans.iter().filter(|s| s.name == "submit" && s.began < span.began).count();
         match stretches.last_mut() {
-            Some(stretch) if stretch.last().is_some_and(|(step, _)| step + 1 == span.step) => {
-                stretch.push((span.step, submission));
+            Some(stretch) if stretch.last().is_some_and(|(step, _)| step + 1 == span.step()) => {
+                stretch.push((span.step(), submission));
             }
-            _ => stretches.push(vec![(span.step, submission)]),
+            _ => stretches.push(vec![(span.step(), submission)]),
         }
     }
     let submissions = spans.iter().filter(|s| s.name == "submit").count();

@@ -16,12 +16,29 @@ use std::process::Command;
 const RUN: &str = "scene --device gpu --optimizer-on device --steps 90 --refine-start 9 --refine-every 30 --grow-grad2d 0.0005 \
     --reset-every 60 --sh-every 50 --max-gaussians 7000 --page-rows 32 --view-order groups:4 --log-every 1 --quiet --keep-checkpoint";
 
-/// Events of a trace: name, beginning and end in microseconds, the step that the host was at, and the values of an event.
+/// A span of a trace; times in microseconds.
+#[derive(Debug, serde::Deserialize)]
 pub(super) struct Span {
     pub name: String,
+    #[serde(rename = "ts")]
     pub began: f64,
-    pub step: u64,
+    pub dur: f64,
     pub args: Value,
+}
+
+impl Span {
+    pub fn of(&self, key: &str) -> u64 {
+        self.args[key].as_u64().unwrap_or_else(|| panic!("{key} of {self:?}"))
+    }
+
+    /// The step that the host was at.
+    pub fn step(&self) -> u64 {
+        self.of("step")
+    }
+}
+
+pub(super) fn spans_of(work: &Workdir, trace: &str) -> Vec<Span> {
+    serde_json::from_slice(&work.bytes(trace)).unwrap()
 }
 
 #[derive(PartialEq)]
@@ -86,16 +103,7 @@ impl Bench {
     }
 
     pub fn spans(&self, name: &str) -> Vec<Span> {
-        let trace = self.json(&format!("{name}.trace"));
-        let span = |event: &Value| {
-            Some(Span {
-                name: event["name"].as_str()?.to_string(),
-                began: event["ts"].as_f64()?,
-                step: event["args"]["step"].as_u64()?,
-                args: event["args"].clone(),
-            })
-        };
-        trace.as_array().unwrap().iter().filter_map(span).collect()
+        spans_of(self, &format!("{name}.trace"))
     }
 }
 
@@ -114,7 +122,7 @@ fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it()
     // Those that are finished while another one is in flight, and the others.
     let finished = |behind: bool| {
         let of = move |s: &&Span| s.name == "finish step" && (s.args["in_flight"].as_u64() == Some(2)) == behind;
-        spans.iter().filter(of).map(|s| s.step).collect::<Vec<u64>>()
+        spans.iter().filter(of).map(|s| s.step()).collect::<Vec<u64>>()
     };
     let [with_other, alone] = [finished(true), finished(false)];
     assert!(with_other.len() > 20 && alone.len() >= 3, "{with_other:?}, {alone:?}");
@@ -176,10 +184,10 @@ fn the_next_step_is_submitted_before_this_one_is_waited_for() {
     let mut both = 0;
     for step in 0..89 {
         let of = |name: &str, key: &str, value: &str| {
-            let is_it = |s: &&Span| s.step == step && s.name == name && s.args[key].as_str() == Some(value);
+            let is_it = |s: &&Span| s.step() == step && s.name == name && s.args[key].as_str() == Some(value);
             spans.iter().filter(is_it).map(|s| s.began).collect::<Vec<f64>>()
         };
-        let is_ahead = |s: &&Span| s.name == "record step" && s.step == step && s.args["recorded"] == step + 1;
+        let is_ahead = |s: &&Span| s.name == "record step" && s.step() == step && s.args["recorded"] == step + 1;
         let Some(record) = spans.iter().find(is_ahead).map(|s| s.began) else { continue };
         // The last submission of a recorded step is its backward pass with gate and update.
         let submitted = of("submit", "what", "backward").into_iter().filter(|at| *at > record).fold(f64::MAX, f64::min);
@@ -197,7 +205,7 @@ fn the_next_step_is_submitted_before_this_one_is_waited_for() {
 fn took_payloads_up(spans: &[Span], step: u64) -> Option<bool> {
     let began = |names: [&str; 2], of_update: bool| -> Vec<f64> {
         let is_update = |s: &Span| ["what", "for"].iter().any(|key| s.args[*key].as_str() == Some("update"));
-        let is_it = |s: &&Span| s.step == step && names.contains(&s.name.as_str()) && (!of_update || is_update(s));
+        let is_it = |s: &&Span| s.step() == step && names.contains(&s.name.as_str()) && (!of_update || is_update(s));
         spans.iter().filter(is_it).map(|s| s.began).collect()
     };
     let batches = began(["rows out"; 2], false);

@@ -203,9 +203,7 @@ fn devices_are_listed_and_an_unknown_one_is_refused() {
     assert!(["--device", "'no such device'", "--list-devices"].iter().all(|word| said.contains(word)), "{said}");
     assert!(!work.exists("run"), "bad input leaves nothing behind");
     // `auto` never takes a software adapter.
-    let output = work.output(TRAIN, "scene --dry-run");
-    let said = told(&output);
-    assert!(output.status.success(), "{said}");
+    let said = told(&work.succeeds(TRAIN, "scene --dry-run"));
     let has_hardware = gsscale::gpu::list_adapters()
         .iter()
         .any(|a| a.kind != gsscale::gpu::DeviceKind::Software && a.refusal.is_none());

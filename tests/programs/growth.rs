@@ -11,11 +11,7 @@ const DECIDES: &str = "scene --out out --overwrite --strategy long-axis --device
 #[test]
 fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     let work = Workdir::city(20, 64, 48, 500);
-    let run = |more: &str| {
-        let output = work.output(TRAIN, &format!("{DECIDES} {more}"));
-        assert!(output.status.success(), "{}", told(&output));
-        told(&output)
-    };
+    let run = |more: &str| told(&work.succeeds(TRAIN, &format!("{DECIDES} {more}")));
     let planned = run("--dry-run");
     assert!(planned.contains("held-out training photos") && planned.contains("--quality"), "{planned}");
     let said = run("--quality archive");

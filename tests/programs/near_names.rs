@@ -35,17 +35,13 @@ fn models_whose_names_nearly_match_train_as_if_they_matched() {
     let (expected, said) = run(&work);
     assert!(!said.contains("other names"), "{said}");
     type Rename<'a> = &'a dyn Fn(&str) -> String;
-    let rename: [(&str, Rename); 12] = [
+    let rename: [(&str, Rename); 8] = [
         ("another case", &|name| name.replace(".jpg", ".JPG")),
         ("another ending", &|name| name.replace(".jpg", ".ARW")),
-        ("no ending", &|name| name.replace(".jpg", "")),
-        ("their folder in front", &|name| format!("images/{name}")),
         ("another folder in front", &|name| format!("flight/{name}")),
         ("an absolute path inside", &|name| scene.join("images").join(name).to_str().unwrap().to_string()),
         ("an absolute path of another machine", &|name| format!("/home/bob/my city/images/{name}")),
         ("a path of Windows", &|name| format!("C:\\Users\\Bob\\city\\images\\{name}")),
-        ("a path of a Windows share", &|name| format!("\\\\nas\\city\\images\\{name}")),
-        ("a path of WSL", &|name| format!("/mnt/c/city/{name}")),
         ("a climbing path", &|name| format!("../../city/images/{name}")),
         ("an address of a file", &|name| format!("file:///home/bob/images/{name}")),
     ];
@@ -103,13 +99,7 @@ fn transforms_and_exports_find_photos_as_models_do() {
     model.write_transforms(&scene);
     let (expected, _) = run(&work);
     let json = fs::read_to_string(scene.join("transforms.json")).unwrap();
-    for (what, prefix) in [
-        ("absolute", "/home/bob/scene/images/"),
-        ("climbing", "../images/"),
-        ("Windows", "C:\\\\scene\\\\images\\\\"),
-        ("no folder", ""),
-        ("case", "Images/"),
-    ] {
+    for (what, prefix) in [("absolute", "/home/bob/scene/images/"), ("Windows", "C:\\\\scene\\\\images\\\\")] {
         let changed = json.replace("images/", prefix).replace("\"points.ply\"", "\"/home/bob/scene/points.ply\"");
         fs::write(scene.join("transforms.json"), changed).unwrap();
         let (ply, said) = run(&work);
@@ -172,7 +162,7 @@ fn masks_in_the_forms_of_other_programs_are_used_and_named() {
     let (expected, said) = run(&work);
     assert!(expected != unmasked && !said.contains("masks:"), "{said}");
     fs::remove_dir_all(&masks).unwrap();
-    for form in ["masks/X.jpg.mask.png", "masks/X_mask.png", "mask/X.png", "MASKS/X.PNG", "images/X.mask.png"] {
+    for form in ["masks/X_mask.png", "images/X.mask.png"] {
         write_masks(&model, [255, 0], |name| scene.join(form.replace('X', name.trim_end_matches(".jpg"))));
         let (ply, said) = run(&work);
         assert!(ply == expected && said.contains("masks: 12 of the form X"), "{form}: {said}");

@@ -1,7 +1,7 @@
 //! The program `gsscale`: its commands are the programs, links with their names too; completions and man pages.
 
 use crate::support::scenes::{classic, stderr, stdout};
-use crate::support::workdir::{Workdir, says};
+use crate::support::workdir::{Workdir, says, succeeded};
 use gsscale::config::file::{KEYS, Shown};
 use std::process::Command;
 
@@ -13,9 +13,8 @@ fn commands_are_the_programs() {
     let told = stdout(&work.output(GSSCALE, ""));
     says(&told, &["gsscale train --demo", "gsscale poses", "gsscale view"]);
     let flags = ["scene", "--steps", "7", "--device", "cpu"];
-    let trained =
-        work.command(GSSCALE, "train").args(flags).args(["--out", "out"]).args(classic(&flags)).output().unwrap();
-    assert!(trained.status.success(), "{}", stderr(&trained));
+    let mut train = work.command(GSSCALE, "train");
+    succeeded(train.args(flags).args(["--out", "out"]).args(classic(&flags)).output().unwrap());
     assert!(work.ply("out") == work.run("expected", "--steps 7"));
     says(&stdout(&work.output(GSSCALE, "help plan")), &["Usage: gsscale plan [OPTIONS] <SCENE>"]);
     // Remedies and examples name the command as the user called it.

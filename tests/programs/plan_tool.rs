@@ -7,13 +7,11 @@ use serde_json::Value;
 const PLAN: &str = env!("CARGO_BIN_EXE_gsscale-plan");
 
 fn plan(work: &Workdir, flags: &str) -> String {
-    let output = work.output(PLAN, &format!("scene {flags}"));
-    assert!(output.status.success(), "{flags}: {}", stderr(&output));
-    String::from_utf8(output.stdout).unwrap()
+    work.printed(PLAN, &format!("scene {flags}"))
 }
 
 fn json(work: &Workdir, flags: &str) -> Value {
-    serde_json::from_str(&plan(work, &format!("{flags} --json"))).unwrap()
+    work.json_of(PLAN, &format!("scene {flags} --json"))
 }
 
 fn refuses(work: &Workdir, flags: &str, words: &[&str]) {
@@ -178,10 +176,9 @@ fn a_run_says_what_it_takes_of_the_life_of_a_drive() {
     let work = Workdir::city(150, 96, 64, 8000);
     let drive = "--page-rows 16 --frames 330 --view-order shuffle --strategy none --spill-dir spill";
     // Enough steps for some 900 GiB.
-    let output = work.output(TRAIN, &format!("scene --dry-run --steps 2000000 {drive}"));
+    let output = work.succeeds(TRAIN, &format!("scene --dry-run --steps 2000000 {drive}"));
     // Long lines are folded.
     let said = told(&output).replace("\n        ", " ");
-    assert!(output.status.success(), "{said}");
     let told =
         said.split("without commits, ").nth(1).and_then(|rest| rest.split(" % of the rated").next()).expect(&said);
     let share = told.parse::<f64>().expect(&said) / 100.0;

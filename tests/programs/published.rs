@@ -146,13 +146,6 @@ fn a_file_of_ones_own_is_read_as_strictly() {
     assert!(said.contains("rubble, building"), "{said}");
 }
 
-/// Runs `gsscale-bench`, and returns its line of figures and what it said.
-fn bench(work: &Workdir, flags: &str) -> (Value, String) {
-    let output = work.output(BENCH, flags);
-    assert!(output.status.success(), "{flags}: {}", stderr(&output));
-    (serde_json::from_slice(&output.stdout).unwrap(), stderr(&output))
-}
-
 /// Writes a look-alike to the folder of its layout's name, which it returns.
 fn lookalike(work: &Workdir, layout: Layout) -> &'static str {
     let options = CityOptions { seed: 5, views: 24, width: 96, height: 64, points: 1500, ..CityOptions::default() };
@@ -169,7 +162,7 @@ fn a_run_is_set_beside_the_published_one() {
     let work = Workdir::new();
     let data = lookalike(&work, Layout::ColmapMerged);
     let before = work.files(data);
-    let (line, said) = bench(&work, &format!("{RUBBLE} {SHORT} --tier S2 --color-correct affine"));
+    let (line, said) = work.json_and_words(BENCH, &format!("{RUBBLE} {SHORT} --tier S2 --color-correct affine"));
     assert_eq!(
         (&line["tier"], &line["layout"], &line["comparable"]),
         (&"S2".into(), &"colmap-merged".into(), &false.into())
@@ -199,8 +192,9 @@ fn a_run_is_set_beside_the_published_one() {
     assert!(before == work.files(data), "nothing is written into the dataset");
     // The same figures again without training. Another SSIM or LPIPS gives no difference to the published one.
     lpips_weights(&work.path(""));
-    let again =
-        |more: &str| bench(&work, &format!("{RUBBLE} --no-train --quiet --lpips lpips_alex.safetensors {more}")).0;
+    let again = |more: &str| {
+        work.json_and_words(BENCH, &format!("{RUBBLE} --no-train --quiet --lpips lpips_alex.safetensors {more}")).0
+    };
     let signed = again("");
     assert_eq!(signed["ours"]["lpips_variant"], "alex, signed");
     let distance = signed["ours"]["test"]["lpips"].as_f64().unwrap();
@@ -226,7 +220,7 @@ fn a_run_is_set_beside_the_published_one() {
 fn the_defaults_of_gsscale_are_set_beside_both() {
     let work = Workdir::new();
     lookalike(&work, Layout::ColmapMerged);
-    let (line, said) = bench(&work, &format!("{RUBBLE} {SHORT} --with-defaults"));
+    let (line, said) = work.json_and_words(BENCH, &format!("{RUBBLE} {SHORT} --with-defaults"));
     let psnr = |line: &Value, of: &str| line[of]["test"]["psnr"].as_f64().unwrap();
     assert!(psnr(&line, "with_defaults") != psnr(&line, "ours"), "two different rules");
     assert_eq!(line["with_defaults"]["ssim_variant"], "reflect");
@@ -239,7 +233,7 @@ fn the_defaults_of_gsscale_are_set_beside_both() {
     assert_eq!((of_paper.steps, of_defaults.steps), (30, 30));
     says(&said, &["ours, defaults", "with the defaults of gsscale: "]);
     assert!(work.text("out/published.html").contains("ours, defaults"));
-    let (again, _) = bench(&work, &format!("{RUBBLE} --with-defaults --no-train --quiet"));
+    let (again, _) = work.json_and_words(BENCH, &format!("{RUBBLE} --with-defaults --no-train --quiet"));
     // The PLY holds unit quaternions.
     assert!((psnr(&again, "with_defaults") - psnr(&line, "with_defaults")).abs() < 0.01);
 }

@@ -23,16 +23,9 @@ fn sweep(list: &str, more: &str) -> String {
     format!("sweep {list} scene --out out --page-rows 16 --strategy none --pace-steps 0 {more}")
 }
 
-/// What a sweep that succeeds prints.
-fn said(work: &Workdir, flags: &str) -> String {
-    let output = work.output(BENCH, flags);
-    assert!(output.status.success(), "{flags}: {}", stderr(&output));
-    String::from_utf8(output.stdout).unwrap()
-}
-
-/// The same with `--json`: a line for each run.
+/// What a sweep that succeeds prints with `--json`: a line for each run.
 fn lines(work: &Workdir, flags: &str) -> Vec<Value> {
-    parse(&said(work, &format!("{flags} --json")))
+    parse(&work.printed(BENCH, &format!("{flags} --json")))
 }
 
 fn of<'a>(records: &'a [Value], name: &str, seed: u64) -> &'a Value {
@@ -66,7 +59,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     check_page(&work, "out/scene/sweep.html", &["the same, byte for byte", "seconds waiting"]);
     assert!(names(&work, "out/scene/spill").is_empty(), "scratch is removed");
     // Finished runs are not repeated. Without --json, the end is a table of them, in the order of the list.
-    let table = said(&work, &plain);
+    let table = work.printed(BENCH, &plain);
     let words: Vec<&str> =
         table.lines().filter_map(|line| line.strip_prefix("| ")?.split_whitespace().next()).collect();
     assert_eq!(words, ["run", "naive", "deferred", "planned", "overlap", "memory"], "{table}");
@@ -79,7 +72,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
     let slow = paced.iter_mut().find(|rung| rung["name"] == "memory").unwrap();
     (slow["pace"]["seconds"], slow["seconds"]) = (6.0.into(), 90.0.into());
     work.write(results, paced.iter().map(|rung| format!("{rung}\n")).collect::<String>());
-    let (converted, measured) = (said(&work, &plain), said(&work, &flags));
+    let (converted, measured) = (work.printed(BENCH, &plain), work.printed(BENCH, &flags));
     assert!(converted.contains(" 30.0 |") && converted.contains("converted to the median pace"), "{converted}");
     assert!(measured.contains(" 90.0 |") && measured.contains("times as measured"), "{measured}");
 }
@@ -88,7 +81,7 @@ fn rungs_of_the_ladder_cost_less_and_less_and_end_alike() {
 fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     let work = large_city();
     let flags = sweep("pareto", "--steps 20 --seeds 1,2 --other-seeds 2 --only optimizer,budget,sh,resolution");
-    let planned = said(&work, &format!("{flags} --list-runs")).matches("to do").count();
+    let planned = work.printed(BENCH, &format!("{flags} --list-runs")).matches("to do").count();
     assert!(planned >= 16 && !work.exists("out"), "listing runs nothing");
 
     // Killed in the middle of a run.
@@ -124,7 +117,7 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
         "half runs are removed: {runs:?}"
     );
     assert!(lines(&work, &flags).is_empty(), "all are done");
-    let table = said(&work, &flags);
+    let table = work.printed(BENCH, &flags);
     assert!(table.starts_with("| run ") && table.contains("the same bits") && !table.contains('{'), "{table}");
 
     // The figures that follow from the settings.
@@ -142,7 +135,7 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
     check_page(&work, "out/scene/sweep.html", &["Pareto front", "the same bits", "CPU seconds"]);
     // As the help says: all runs of the sweep on one page, the reference first.
     let folders: Vec<String> = runs.iter().map(|name| format!("out/scene/runs/{name}")).collect();
-    said(&work, &format!("compare {} --out compare.html", folders.join(" ")));
+    work.printed(BENCH, &format!("compare {} --out compare.html", folders.join(" ")));
     let figure = format!("<td class=\"number\">{:.3}</td>", number(small, "psnr"));
     let marks = ["PSNR and SSIM are of evaluated.json", "trained with data-factor 2 instead of 1", "are left out"];
     check_page(&work, "compare.html", &[&marks[..], &["PSNR of training views", &figure]].concat());
@@ -172,7 +165,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
         refuses(flags, words);
     }
     let on_device = sweep("ladder-gpu", "--share 70 --device-mem 6MiB --list-runs --device");
-    assert_eq!(said(&work, &format!("{on_device} gpu")).matches("to do").count(), 6);
+    assert_eq!(work.printed(BENCH, &format!("{on_device} gpu")).matches("to do").count(), 6);
     refuses(&format!("{on_device} cpu"), "use --device auto or gpu");
     let list = "seeds = [1]\n[base]\nsteps = 4\n[view]\ntitle = \"own\"\nreference = \"plain\"\nfigures = [\"psnr\"]\n\
                 charts = []\n[[group]]\nname = \"\"\nruns = [{ name = \"plain\" }, RUN]\n";

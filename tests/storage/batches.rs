@@ -12,9 +12,7 @@ use gsscale::page::format::codec::Codec;
 use gsscale::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::error::PagingError;
-use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
-use gsscale::paging::prefetch::Transfers;
 use gsscale::render::RenderOptions;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::camera::Camera;
@@ -65,15 +63,8 @@ fn scene(faults: Option<&Faults>) -> PagedScene {
     let config = PagedStoreConfig { store: 5, layout, codec: Codec::Raw, generation: 1, serial: 0 };
     let engine = FaultyEngine::new(Box::new(MemoryEngine::new()), faults.clone());
     let store = PagedStore::new(Box::new(engine), config);
-    let config = PagerConfig {
-        page_rows: options.page_rows,
-        sh_degree: options.sh_degree,
-        frames: FRAMES,
-        policy: EvictPolicy::FarthestNextUse,
-        prefetch_bytes: 1 << 20,
-        plan_bytes: 1 << 20,
-        transfers: Transfers::Overlap,
-    };
+    let in_memory = PagerConfig::in_memory(options.page_rows, options.sh_degree);
+    let config = PagerConfig { frames: FRAMES, prefetch_bytes: 1 << 20, plan_bytes: 1 << 20, ..in_memory };
     PagedScene::new(&columns(), Pager::new(config, store), &options).unwrap()
 }
 
@@ -162,12 +153,8 @@ fn a_full_drive_never_tears_a_step() {
     for nth in 0..8 {
         let faults = Faults::new();
         let mut scene = scene(Some(&faults));
-        faults.add(
-            Operation::Create,
-            faults.count(Operation::Create) + nth,
-            true,
-            Fault::Error(ErrorKind::StorageFull),
-        );
+        let first = faults.count(Operation::Create) + nth;
+        faults.add(Operation::Create, first, true, Fault::Error(ErrorKind::StorageFull));
         for s in 0..STEPS {
             while let Err(error) = step(&mut scene, s) {
                 assert!(error.is_out_of_space() && !matches!(error, TrainError::Torn { .. }), "{error}");

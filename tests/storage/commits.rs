@@ -16,7 +16,8 @@ use gsscale::page::map::entries::{MapBatch, MapError};
 use gsscale::page::map::manifest::Manifest;
 use gsscale::page::map::opening::Opened;
 use gsscale::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, commit_config};
-use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
+use gsscale::page::versions::page_error::PageError;
+use gsscale::page::versions::paged_store::{PageDone, PageMoved, PagedStore};
 use gsscale::page::versions::slots::SlotLayout;
 use redb::backends::InMemoryBackend;
 use redb::{Builder, ReadableDatabase, StorageBackend, TableDefinition};
@@ -26,7 +27,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 const CONFIG: CommitConfig = CommitConfig { store: 77, cache_bytes: 1 << 20, reserve_bytes: 1 << 20 };
-const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
+pub(super) const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
 
 fn create(folder: &Path) -> Result<Opened, CommitError> {
     Opened::create(Box::new(DriveFolder::new(folder)), CONFIG)
@@ -36,19 +37,38 @@ fn open(folder: &Path) -> Result<Opened, CommitError> {
     Opened::open(Box::new(DriveFolder::new(folder)), CONFIG)
 }
 
-fn pages_of(opened: &Opened, folder: &Path) -> PagedStore {
+pub(super) fn pages_of(opened: &Opened, folder: &Path) -> PagedStore {
     let engine = open_engine(IoEngine::Pread, folder, 2).unwrap().store;
     opened.paged_store(engine, LAYOUT, Codec::Raw).unwrap()
 }
 
-fn write(store: &mut PagedStore, page: u32, fill: u8) -> SlotRef {
+/// A spill directory with an empty store, as a run makes it.
+fn create_spill(at: &Path) -> (SpillDir, CommitConfig, Commits, PagedStore) {
+    let spill = SpillDir::create(at, LAYOUT, false).unwrap();
+    let config = commit_config(spill.format().store);
+    let opened = Opened::create(Box::new(DriveFolder::new(at)), config).unwrap();
+    let store = pages_of(&opened, at);
+    (spill, config, opened.commits, store)
+}
+
+pub(super) fn try_write(store: &mut PagedStore, page: u32, fill: u8) -> Result<SlotRef, PageError> {
     let mut buffer = store.new_buffer();
     buffer.as_mut_slice()[HEADER_BYTES..].fill(fill);
-    store.write(1, PageId::initial(page), &[fill], 100, buffer).unwrap();
+    store.write(1, PageId::initial(page), &[fill], 100, buffer).map_err(|(error, _)| error)?;
+    let PageMoved::Written(slot) = next_done(store).result? else { panic!("not a write") };
+    Ok(slot)
+}
+
+fn write(store: &mut PagedStore, page: u32, fill: u8) -> SlotRef {
+    try_write(store, page, fill).unwrap()
+}
+
+fn next_done(store: &mut PagedStore) -> PageDone {
     let mut done = Vec::new();
-    store.complete(true, &mut done);
-    let Ok(PageMoved::Written(slot)) = done.remove(0).result else { panic!("not written") };
-    slot
+    while done.is_empty() {
+        store.complete(true, &mut done);
+    }
+    done.remove(0)
 }
 
 fn commit(commits: &mut Commits, store: &mut PagedStore, changed: &[(u32, Option<SlotRef>)], pin: Option<&str>) -> u64 {
@@ -61,15 +81,15 @@ fn commit(commits: &mut Commits, store: &mut PagedStore, changed: &[(u32, Option
     commits.commit(store, &mut Vec::new(), &cut).unwrap()
 }
 
-fn read(store: &mut PagedStore, page: u32, slot: &SlotRef) -> u8 {
+pub(super) fn try_read(store: &mut PagedStore, page: u32, slot: &SlotRef) -> Result<u8, PageError> {
     let buffer = store.new_buffer();
     store.read(5, PageId::initial(page), slot, buffer);
-    let mut done = Vec::new();
-    while done.is_empty() {
-        store.complete(true, &mut done);
-    }
-    done[0].result.as_ref().unwrap();
-    done[0].buffer.as_slice()[HEADER_BYTES]
+    let end = next_done(store);
+    end.result.map(|_| end.buffer.as_slice()[HEADER_BYTES])
+}
+
+fn read(store: &mut PagedStore, page: u32, slot: &SlotRef) -> u8 {
+    try_read(store, page, slot).unwrap()
 }
 
 #[test]
@@ -130,11 +150,7 @@ fn two_segments(at: &Path) {
 fn a_segment_without_kept_pages_may_be_gone() {
     let parent = tempfile::tempdir().unwrap();
     let at = parent.path().join("store");
-    let spill = SpillDir::create(&at, LAYOUT, false).unwrap();
-    let config = commit_config(spill.format().store);
-    let opened = Opened::create(Box::new(DriveFolder::new(&at)), config).unwrap();
-    let mut store = pages_of(&opened, &at);
-    let mut commits = opened.commits;
+    let (spill, config, mut commits, mut store) = create_spill(&at);
     let mut slots: Vec<SlotRef> = (0..5).map(|page| write(&mut store, page, 7)).collect();
     let changed = |pages: Range<u32>, slots: &[SlotRef]| -> Vec<(u32, Option<SlotRef>)> {
         pages.map(|page| (page, Some(slots[page as usize]))).collect()
@@ -217,19 +233,15 @@ fn hostile_maps_are_refused() {
     let at = folder.path();
     two_segments(at);
     let opened = open(at).unwrap();
-    let (mut store, page) = (pages_of(&opened, at), opened.pages[0].page);
+    let mut store = pages_of(&opened, at);
     let mut commits = opened.commits;
     for segment in [u32::MAX, u32::MAX - 1, 1 << 20] {
         let mut slot = opened.pages[0].slot;
         slot.place.segment = segment;
-        let changes = [PageChange { page, version: Some((slot, vec![9])) }];
-        let cut = Cut { changes: &changes, run_state: b"", note: b"", pin: None };
-        commits.commit(&mut store, &mut Vec::new(), &cut).unwrap();
+        commit(&mut commits, &mut store, &[(0, Some(slot))], None);
         // The map is in memory twice only while it is read.
-        let folder = Box::new(DriveFolder::new(at));
-        let again = Opened::open(folder, CONFIG).unwrap();
         let engine = open_engine(IoEngine::Pread, at, 2).unwrap().store;
-        let error = again.paged_store(engine, LAYOUT, Codec::Raw).unwrap_err();
+        let error = open(at).unwrap().paged_store(engine, LAYOUT, Codec::Raw).unwrap_err();
         assert!(matches!(&error, CommitError::Segments(what) if what.contains("seg-")), "{error}");
     }
     for (latest, next) in [(1, u64::MAX), (1, 1 << 32), (u64::MAX - 1, u64::MAX)] {
@@ -248,11 +260,7 @@ fn hostile_maps_are_refused() {
 fn hostile_maps_cost_readers_nothing() {
     let parent = tempfile::tempdir().unwrap();
     let at = parent.path().join("store");
-    let spill = SpillDir::create(&at, LAYOUT, false).unwrap();
-    let config = commit_config(spill.format().store);
-    let opened = Opened::create(Box::new(DriveFolder::new(&at)), config).unwrap();
-    let mut store = pages_of(&opened, &at);
-    let mut commits = opened.commits;
+    let (spill, _, mut commits, mut store) = create_spill(&at);
     let good = write(&mut store, 0, 7);
     for segment in [u32::MAX, u32::MAX - 1, 1 << 20] {
         let mut slot = good;

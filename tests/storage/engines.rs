@@ -344,7 +344,7 @@ fn outlive_the_signal_of_large_files() {
 }
 
 /// Limits the size of files: writes beyond `bytes` fail. `None` lifts the limit.
-fn limit_files(bytes: Option<u64>) {
+pub(super) fn limit_files(bytes: Option<u64>) {
     let maximum = getrlimit(Resource::Fsize).maximum;
     setrlimit(Resource::Fsize, Rlimit { current: bytes.or(maximum), maximum }).unwrap();
 }

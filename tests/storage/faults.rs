@@ -12,7 +12,7 @@
 //! | ENOSPC | no poison: the same call works when there is space; the reserve is used | store: a_full_drive_is_survived; paging: a_full_drive_can_be_waited_for; commits: the_reserve_is_filled_whole_and_exists_until_it_is_given_up |
 //! | limit on the length of files | as ENOSPC, for segments and the map | faults: a_limit_on_the_length_of_files_is_a_full_drive |
 //! | flipped bit in a page or its header | found and named, never returned as good | store: every_flipped_bit_is_found_and_named |
-//! | flipped bit in map, witness or FORMAT | refused, or nothing is different | faults: a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless; spill_dir: left_over_directories_are_refused_with_the_remedy |
+//! | flipped bit in map, witness or FORMAT | refused, or nothing is different | faults: a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless; spill_dir: left_over_directories_are_refused_with_the_remedy; src/page/format/spill_format: every_flipped_bit_and_every_cut_is_found |
 //! | misdirected read or write, lost write | named as damage, at both places | store: misdirected_and_lost_transfers_are_found |
 //! | old map put back | refused | commits: the_witness_detects_a_stale_map_that_redb_accepts |
 //! | old map and old witness put back | that older generation, whole; pages that were overwritten since are named | faults: an_older_map_with_its_witness_is_that_generation_or_names_pages |
@@ -32,26 +32,26 @@
 //! No tests of their own: no memory and a panic in a worker end the process, which is a kill, and nothing is committed
 //! meanwhile; other endianness does not compile.
 
+use super::commits::{pages_of, try_read, try_write};
+#[cfg(unix)]
+use super::engines::limit_files;
 #[cfg(unix)]
 use crate::support::child::in_child;
+use crate::support::hush::hush_library_panics;
 use gsscale::base::ids::PageId;
-use gsscale::page::engine::open::{IoEngine, open_engine};
 use gsscale::page::folder::protocol_files::DriveFolder;
-use gsscale::page::format::codec::Codec;
-use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
+use gsscale::page::format::slot_header::SlotRef;
 use gsscale::page::map::commit::{CommitConfig, CommitError, Commits, Cut, MAP_NAME, PageChange, WITNESS_NAME};
 use gsscale::page::map::manifest::Manifest;
 use gsscale::page::map::opening::Opened;
 use gsscale::page::versions::page_error::PageError;
-use gsscale::page::versions::paged_store::{PageMoved, PagedStore};
-use gsscale::page::versions::slots::SlotLayout;
+use gsscale::page::versions::paged_store::PagedStore;
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 const CONFIG: CommitConfig = CommitConfig { store: 77, cache_bytes: 1 << 18, reserve_bytes: 0 };
-const LAYOUT: SlotLayout = SlotLayout { slot_bytes: 8192, slots_per_segment: 4 };
 
 /// An open store and the pages of its last commit.
 struct Store {
@@ -62,8 +62,7 @@ struct Store {
 
 impl Store {
     fn new(at: &Path, opened: Opened) -> Store {
-        let engine = open_engine(IoEngine::Pread, at, 2).unwrap().store;
-        let pages = opened.paged_store(engine, LAYOUT, Codec::Raw).unwrap();
+        let pages = pages_of(&opened, at);
         let mut slots = vec![None; 64];
         for page in &opened.pages {
             slots[(page.page.to_bits() >> 32) as usize] = Some(page.slot);
@@ -80,14 +79,7 @@ impl Store {
     }
 
     fn write(&mut self, page: u32, fill: u8) -> Result<(), PageError> {
-        let mut buffer = self.pages.new_buffer();
-        buffer.as_mut_slice()[HEADER_BYTES..].fill(fill);
-        self.pages.write(1, PageId::initial(page), &[fill], 100, buffer).map_err(|(error, _)| error)?;
-        let mut done = Vec::new();
-        while done.is_empty() {
-            self.pages.complete(true, &mut done);
-        }
-        let PageMoved::Written(slot) = done.remove(0).result? else { panic!("not a write") };
+        let slot = try_write(&mut self.pages, page, fill)?;
         if let Some(before) = self.slots[page as usize].replace(slot) {
             self.pages.free(&before);
         }
@@ -105,15 +97,7 @@ impl Store {
     }
 
     fn read(&mut self, page: u32) -> Result<u8, PageError> {
-        let slot = self.slots[page as usize].unwrap();
-        let buffer = self.pages.new_buffer();
-        self.pages.read(5, PageId::initial(page), &slot, buffer);
-        let mut done = Vec::new();
-        while done.is_empty() {
-            self.pages.complete(true, &mut done);
-        }
-        let end = done.remove(0);
-        end.result.map(|_| end.buffer.as_slice()[HEADER_BYTES])
+        try_read(&mut self.pages, page, &self.slots[page as usize].unwrap())
     }
 }
 
@@ -161,12 +145,7 @@ fn a_flipped_bit_anywhere_in_the_map_is_noticed_or_harmless() {
         file.write(0, bytes).unwrap();
         Manifest::open(file, CONFIG.store, sequence, CONFIG.cache_bytes).map(|(_, content)| content)
     };
-    std::panic::set_hook(Box::new(|info| {
-        // Panics of redb become errors.
-        if !info.location().is_some_and(|l| l.file().contains("redb")) {
-            eprintln!("{info}");
-        }
-    }));
+    hush_library_panics();
     let good = open(&bytes).unwrap();
     let used: Vec<usize> = (0..bytes.len()).filter(|&at| bytes[at] != 0 || at < 512).collect();
     let stride = if std::env::var_os("GSSCALE_FLIPS").is_some() { 1 } else { 7 };
@@ -240,25 +219,20 @@ fn a_folder_that_is_moved_away_keeps_its_commits() {
 #[test]
 #[cfg(unix)]
 fn a_limit_on_the_length_of_files_is_a_full_drive() {
-    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
     if !in_child(module_path!(), "a_limit_on_the_length_of_files_is_a_full_drive") {
         return;
     }
     let folder = tempfile::tempdir().unwrap();
-    let limit = |bytes: Option<u64>| {
-        let maximum = getrlimit(Resource::Fsize).maximum;
-        setrlimit(Resource::Fsize, Rlimit { current: bytes.or(maximum), maximum }).unwrap();
-    };
     let mut store = Store::create(folder.path());
     (0..4).for_each(|page| store.write(page, 1).unwrap());
     store.commit().unwrap();
     // Neither a segment of 32 KiB nor the map may be written beyond the first 16 KiB.
-    limit(Some(16 << 10));
+    limit_files(Some(16 << 10));
     let error = store.write(4, 1).unwrap_err();
     assert!(error.is_out_of_space(), "{error}");
     let error = store.commit().unwrap_err();
     assert!(error.is_out_of_space(), "{error}");
-    limit(None);
+    limit_files(None);
     store.write(4, 1).unwrap();
     let latest = store.commit().unwrap();
     drop(store);

@@ -48,14 +48,6 @@ pub fn city(folder: &Path, views: u32, width: u32, height: u32, points: u32) -> 
     scene
 }
 
-/// A city of 12 by 12 blocks: each of its 30 views of 48x36 sees less than half of it.
-pub fn wide_city(folder: &Path, points: u32) -> PathBuf {
-    let scene = folder.join("scene");
-    let size = CityOptions { seed: 5, views: 30, width: 48, height: 36, points, ..CityOptions::default() };
-    write_city(&scene, &CityOptions { blocks: Some(12), supersample: 1, ..size }, &|_, _| {}).unwrap();
-    scene
-}
-
 impl TextModel {
     pub fn of(scene: &Path) -> TextModel {
         let raw = read_scene(scene, &ReadOptions::default()).unwrap();

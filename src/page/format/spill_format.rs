@@ -237,12 +237,6 @@ mod tests {
     }
 
     #[test]
-    fn unknown_compatible_features_are_ignored() {
-        let compatible = 0x8000;
-        assert_eq!(SpillFormat::from_bytes(&with(49, 0x80)), Ok(SpillFormat { compatible, ..sample() }));
-    }
-
-    #[test]
     fn newer_versions_and_impossible_sizes_are_refused() {
         let changed = |at: usize, value: u8| SpillFormat::from_bytes(&with(at, value)).expect_err("read");
         assert_eq!(changed(8, 2), FormatError::Version { found: 2, features: KNOWN_FEATURES });

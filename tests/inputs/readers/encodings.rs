@@ -1,15 +1,13 @@
 //! Text of scenes in encodings of other programs: byte order marks, UTF-16, names in code pages, numbers that are none, and the
 //! separators of a CSV.
 
-use super::write::{model, refused, scene_folder, warned};
+use super::write::{HEADER, model, refused, scene_folder, warned};
 use gsscale::base::error::InputResult;
 use gsscale::dataset::model::RawScene;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use std::fs;
 use std::path::Path;
 use tempfile::TempDir;
-
-const HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2";
 
 fn read(folder: &Path) -> InputResult<RawScene> {
     read_scene(folder, &ReadOptions::default())

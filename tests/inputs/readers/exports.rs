@@ -1,6 +1,6 @@
 //! OpenSfM's `reconstruction.json` and RealityCapture's CSV: lenses, what is refused, and the words of errors.
 
-use super::write::{refused, scene_folder, warned};
+use super::write::{HEADER, refused, scene_folder, warned};
 use gsscale::dataset::model::{Lens, RawScene};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use serde_json::{Value, json};
@@ -86,8 +86,6 @@ fn the_largest_reconstruction_is_read() {
     assert_eq!(read.views.len(), 2);
     warned(&read, &["2 reconstructions", "2 of 3 photos"]);
 }
-
-const HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2";
 
 /// A folder with a photo a.png of 40x30 pixels, and this CSV.
 fn csv(text: &str) -> TempDir {

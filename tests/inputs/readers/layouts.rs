@@ -1,6 +1,7 @@
 //! The layouts of published datasets: look-alikes of a generated city are read as that city, and hostile folders are
 //! refused.
 
+use super::transforms_good::read;
 use super::write::refused;
 use crate::support::lookalike::write_lookalike;
 use glam::DVec3;
@@ -22,10 +23,6 @@ fn lookalike(layout: Layout) -> TempDir {
     let options = CityOptions { views: VIEWS, width: 48, height: 32, points: 60, ..CityOptions::default() };
     write_lookalike(folder.path(), &options, layout, TEST_EVERY);
     folder
-}
-
-fn read(folder: &Path) -> RawScene {
-    read_scene(folder, &ReadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
 }
 
 fn refusal(folder: &Path) -> String {

@@ -35,7 +35,7 @@ fn png(path: &Path, width: u32, height: u32) {
     image::RgbImage::new(width, height).save(path).unwrap();
 }
 
-fn read(folder: &Path) -> RawScene {
+pub fn read(folder: &Path) -> RawScene {
     read_scene(folder, &ReadOptions::default()).unwrap_or_else(|e| panic!("{e}"))
 }
 

@@ -6,6 +6,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use tempfile::TempDir;
 
+/// The first line of a CSV of RealityCapture.
+pub const HEADER: &str = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2";
+
 #[derive(Clone)]
 pub struct Cam {
     pub id: u32,

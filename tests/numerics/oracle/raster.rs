@@ -1,8 +1,10 @@
 //! The renderer, forward and backward, against the float64 reference, and a short training run.
 
+use crate::support::dense_adam::DenseAdam;
 use crate::support::fixture::{Fixture, RASTER_FILES, split_sh};
 use crate::support::paths;
 use gsscale::base::simd::SimdPath;
+use gsscale::optim::adam::AdamConfig;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, PictureGradient, RenderOptions, Renderer, SsimPadding};
 use gsscale::scene::camera::Camera;
@@ -199,29 +201,6 @@ fn rows_that_never_contribute_get_exact_zeros() {
     }
 }
 
-/// Dense Adam of one array, torch's semantics (the subject here is the gradient, so the optimizer is written out).
-struct Adam {
-    m: Vec<f64>,
-    v: Vec<f64>,
-}
-
-impl Adam {
-    fn new(values: &[f32]) -> Adam {
-        Adam { m: vec![0.0; values.len()], v: vec![0.0; values.len()] }
-    }
-
-    fn update(&mut self, step: usize, rate: f64, values: &mut [f32], grads: &[f32]) {
-        let (c1, c2) = (1.0 - 0.9f64.powi(step as i32), 1.0 - 0.999f64.powi(step as i32));
-        for i in 0..values.len() {
-            let g = f64::from(grads[i]);
-            self.m[i] = 0.9 * self.m[i] + 0.1 * g;
-            self.v[i] = 0.999 * self.v[i] + 0.001 * g * g;
-            let change = rate / c1 * self.m[i] / ((self.v[i] / c2).sqrt() + 1e-15);
-            values[i] = (f64::from(values[i]) - change) as f32;
-        }
-    }
-}
-
 /// The arrays of rows with the column of learning rates that each follows.
 fn parameters(c: &mut Columns) -> [(&mut Vec<f32>, usize); 6] {
     let Columns { means, quats, scales, opacities, sh0, sh_n, .. } = c;
@@ -250,7 +229,8 @@ fn a_short_training_run_follows_the_reference() {
     let loss = LossOptions { ssim_lambda: 0.2, padding: SsimPadding::Same, simd: options.simd };
     let mut renderer = CpuRenderer::new();
     let mut grads = Gradients::default();
-    let mut adams = parameters(&mut rows).map(|(values, _)| Adam::new(values));
+    let mut adams = parameters(&mut rows)
+        .map(|(values, _)| DenseAdam::new(AdamConfig::default(), values.iter().copied().map(f64::from).collect()));
     let curve = file.f64("curve_f64");
     let mut psnr = 0.0;
     for step in 1..=file.shape("lrs")[0] {
@@ -265,7 +245,9 @@ fn a_short_training_run_follows_the_reference() {
         assert!(step > 100 || (value.loss - want[0]).abs() < limit, "step {step}: {} want {}", value.loss, want[0]);
         let all = parameters(&mut rows).into_iter().zip(parameters(&mut grads.columns));
         for (((values, column), (g, _)), adam) in all.zip(&mut adams) {
-            adam.update(step, file.f64("lrs")[5 * (step - 1) + column], values, g);
+            let grads: Vec<f64> = g.iter().copied().map(f64::from).collect();
+            adam.step(&grads, file.f64("lrs")[5 * (step - 1) + column]);
+            values.iter_mut().zip(&adam.values).for_each(|(value, exact)| *value = *exact as f32);
         }
     }
     let want = curve[curve.len() - 1];

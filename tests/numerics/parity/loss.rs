@@ -1,5 +1,6 @@
 //! image_loss: value, parts and gradient.
 
+use super::pages::read;
 use crate::support::gpu::open;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -56,16 +57,10 @@ fn on_gpu(gpu: &Gpu, image: &Image, target: &Target, options: &LossOptions) -> (
     let rgb = recorder.buffer_with("rgb", &image.rgb).unwrap();
     let target_pixels = recorder.buffer_with("target", &words).unwrap();
     let v_rgb = recorder.buffer_with("v_rgb", &vec![f32::NAN; image.rgb.len()]).unwrap();
-    let sums = stage
-        .run(gpu, &mut recorder, size, &plan, &rgb.view(), &target_pixels.view(), &v_rgb.view())
-        .unwrap()
-        .map(|sums| recorder.read_back("image_loss", &sums.view()).unwrap());
-    let v_rgb = recorder.read_back("image_loss", &v_rgb.view()).unwrap();
+    let sums = stage.run(gpu, &mut recorder, size, &plan, &rgb.view(), &target_pixels.view(), &v_rgb.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    let sums = sums.map_or([0.0; 4], |bytes| bytes.to_vec::<[f32; 4]>().unwrap()[0]);
-    let mut v_rgb: Vec<f32> = v_rgb.to_vec().unwrap();
-    v_rgb.truncate(image.rgb.len());
-    (value(&plan, sums), v_rgb)
+    let sums = sums.map_or([0.0; 4], |sums| read::<[f32; 4]>(gpu, &sums, 1)[0]);
+    (value(&plan, sums), read(gpu, &v_rgb, image.rgb.len()))
 }
 
 #[track_caller]

@@ -20,7 +20,7 @@ use gsscale::optim::adam::AdamConfig;
 use gsscale::optim::deferred::DeferredAdam;
 use gsscale::optim::drift::DriftTables;
 use gsscale::optim::rates::Rates;
-use gsscale::render::gpu_pages::{DevicePages, PageBatch, UpdateBuffers};
+use gsscale::render::gpu_pages::{DevicePages, PageBatch, PageTable, PagesView, UpdateBuffers};
 use gsscale::render::gpu_rows::{DeviceColumns, RowGradients, RowSource, SplatRows};
 use gsscale::render::pages::{DeviceSlot, PageRules, SlotPage};
 use gsscale::scene::columns::{Column, Columns};
@@ -208,6 +208,16 @@ impl<'g> OnDevice<'g> {
         OnDevice { gpu, pages, slots }
     }
 
+    /// The geometry of the listed rows.
+    fn geometry(&self, view: &PagesView, (batch, table): &(PageBatch, PageTable)) -> DeviceColumns {
+        let columns = DeviceColumns::new(self.gpu, batch.rows, self.slots[0].layout.sh_degree).unwrap();
+        let mut recorder = self.gpu.begin("parity");
+        let all = 0..batch.rows as usize;
+        self.pages.source(view, batch, table).geometry(self.gpu, &mut recorder, &columns, &all).unwrap();
+        self.gpu.submit(recorder).unwrap();
+        columns
+    }
+
     fn payloads(&self) -> Vec<Vec<u32>> {
         let mut payloads: Vec<Vec<u32>> = self.slots.iter().map(|page| vec![0; page.layout.bytes() / 4]).collect();
         let mut copies: Vec<(SlotPage, &mut [u8])> =
@@ -257,18 +267,15 @@ fn rows_of_pages_are_listed_and_gathered_as_dense_adam_has_them() {
         let Some(gpu) = device(&world) else { return };
         let on = OnDevice::new(&gpu, &world);
         let view = begin_view(&gpu, &on.pages, &camera(), &world.adam.at(now).numbers());
-        let (batch, table) = on.pages.list(&gpu, &view, &on.slots).unwrap();
-        let listed = listed_rows(&gpu, &batch, &on.slots);
+        let list_of_device = on.pages.list(&gpu, &view, &on.slots).unwrap();
+        let batch = &list_of_device.0;
+        let listed = listed_rows(&gpu, batch, &on.slots);
         assert!(listed.is_sorted(), "lists are in the order of pages and rows");
         // A row at the edge of the cull's slack may be listed on one side alone.
         let differ = listed.iter().filter(|row| !list.contains(row)).count()
             + list.iter().filter(|row| !listed.contains(row)).count();
         assert!(differ <= 2, "{differ} rows of {} differ", list.len());
-        let columns = DeviceColumns::new(&gpu, batch.rows, sh_degree).unwrap();
-        let mut recorder = gpu.begin("parity");
-        let all = 0..batch.rows as usize;
-        on.pages.source(&view, &batch, &table).geometry(&gpu, &mut recorder, &columns, &all).unwrap();
-        gpu.submit(recorder).unwrap();
+        let columns = on.geometry(&view, &list_of_device);
         let of_device: Vec<Vec<f32>> =
             columns.columns().map(|(_, buffer, width)| read(&gpu, buffer, width * batch.rows as usize)).collect();
         assert_gathered(&world, &listed, &of_device, "device");
@@ -284,13 +291,9 @@ fn dispatches_work_on_the_pages_of_their_slab() {
     let workgroups = [one, four].map(|gpu| {
         let on = OnDevice::new(gpu, &world);
         let view = begin_view(gpu, &on.pages, &camera(), &world.adam.at(40).numbers());
-        let (batch, table) = on.pages.list(gpu, &view, &on.slots).unwrap();
-        let columns = DeviceColumns::new(gpu, batch.rows, 1).unwrap();
+        let listed = on.pages.list(gpu, &view, &on.slots).unwrap();
         let before = gpu.traffic().work;
-        let mut recorder = gpu.begin("parity");
-        let all = 0..batch.rows as usize;
-        on.pages.source(&view, &batch, &table).geometry(gpu, &mut recorder, &columns, &all).unwrap();
-        gpu.submit(recorder).unwrap();
+        on.geometry(&view, &listed);
         let after = gpu.traffic().work;
         [after.dispatches - before.dispatches, after.workgroups - before.workgroups]
     });
@@ -551,13 +554,8 @@ fn moments_of_16_bits_are_rounded_as_by_the_twin_and_packed_in_slots() {
 fn assert_bounds_of_device(on: &OnDevice<'_>, world: &World, results: &[PageResult]) {
     for later in [1, 3, 50, 199] {
         let view = begin_view(on.gpu, &on.pages, &camera(), &world.adam.at(world.now + later).numbers());
-        let (batch, table) = on.pages.list(on.gpu, &view, &on.slots).unwrap();
-        let listed = listed_rows(on.gpu, &batch, &on.slots);
-        let columns = DeviceColumns::new(on.gpu, batch.rows, world.layouts[0].sh_degree).unwrap();
-        let mut recorder = on.gpu.begin("parity");
-        let all = 0..batch.rows as usize;
-        on.pages.source(&view, &batch, &table).geometry(on.gpu, &mut recorder, &columns, &all).unwrap();
-        on.gpu.submit(recorder).unwrap();
+        let list = on.pages.list(on.gpu, &view, &on.slots).unwrap();
+        let (listed, columns) = (listed_rows(on.gpu, &list.0, &on.slots), on.geometry(&view, &list));
         let mut outside = 0;
         for (column, buffer, width) in columns.columns() {
             let values: Vec<f32> = read(on.gpu, buffer, width * listed.len());

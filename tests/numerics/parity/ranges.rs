@@ -1,13 +1,13 @@
 //! Views that device memory cannot hold at once: rows in chunks, pictures in ranges of tiles. The results have the bits of the
 //! view that fits, for any budget and any binding, down to the least that is stated.
 
-use super::frame::{batches_of, bits, photo, renderer, results_with, scene};
+use super::frame::{bits, in_batches, photo, renderer, results_with, scene};
 use gsscale::gpu::{GpuError, GpuOptions};
 use gsscale::render::device_needs::DeviceNeeds;
 use gsscale::render::gpu::GpuRenderer;
-use gsscale::render::{Gradients, LossOptions, RenderError, RenderOptions, Renderer, RowBatches, SsimPadding};
+use gsscale::render::{LossOptions, RenderError, RenderOptions, Renderer, RowBatches, SsimPadding};
 use gsscale::scene::camera::Camera;
-use gsscale::scene::columns::{Column, Columns};
+use gsscale::scene::columns::Columns;
 
 /// A view whose Gaussians cross many tile columns.
 pub fn wide_scene(rows: usize) -> (Columns, Camera) {
@@ -125,8 +125,9 @@ fn the_list_of_one_tile_is_cut_front_to_back() {
         let Some(mut gpu) = renderer(&GpuOptions { budget: Some(budget), ..GpuOptions::default() }) else { return };
         let got = results_with(&mut gpu, &view, &options, &target, &loss).unwrap();
         assert!(bits(&got) == want, "{budget} bytes");
-        let batches = in_batches(&mut gpu, &view, &options, &[0, 2222, rows], &target, &loss);
-        assert!(batches == want, "{budget} bytes, in batches");
+        let batches = (&[0, 2222, rows][..], RowBatches::Several);
+        let got = in_batches(&mut gpu, &view, &options, batches, &target, &loss);
+        assert!(bits(&got) == want, "{budget} bytes, in batches");
         println!("{budget} bytes: {} parts", gpu.ranges());
         most = most.max(gpu.ranges());
     }
@@ -144,41 +145,10 @@ fn batches_in_little_memory_change_no_bit() {
     let budget = Some(least(&whole));
     let Some(mut gpu) = renderer(&GpuOptions { budget, ..GpuOptions::default() }) else { return };
     for ends in [&[0, 3000][..], &[0, 1501, 3000], &[0, 1, 1, 777, 3000]] {
-        let got = in_batches(&mut gpu, &view, &options, ends, &target, &loss);
-        assert!(got == want, "batches end at {ends:?}");
+        let got = in_batches(&mut gpu, &view, &options, (ends, RowBatches::Several), &target, &loss);
+        assert!(bits(&got) == want, "batches end at {ends:?}");
         assert!(gpu.ranges() > 1);
     }
-}
-
-/// The bits of a view whose rows come in batches, in the order of [`bits`].
-fn in_batches(
-    gpu: &mut GpuRenderer,
-    (rows, camera): &(Columns, Camera),
-    options: &RenderOptions,
-    ends: &[usize],
-    target: &gsscale::scene::image::Target,
-    loss: &LossOptions,
-) -> Vec<u32> {
-    let batches = batches_of(rows, ends);
-    gpu.begin_view(camera, options, RowBatches::Several).unwrap();
-    batches.iter().for_each(|batch| gpu.rows_in(batch).unwrap());
-    gpu.picture().unwrap();
-    gpu.loss(target, loss).unwrap();
-    gpu.picture_back().unwrap();
-    let mut parts: Vec<Gradients> = vec![Gradients::default(); batches.len()];
-    for (i, batch) in batches.iter().enumerate().rev() {
-        gpu.rows_out(i, batch, &mut parts[i]).unwrap();
-    }
-    let value = gpu.loss_value().unwrap();
-    let mut grads = Gradients::default();
-    for part in &parts {
-        for column in Column::ALL {
-            grads.columns.column_mut(column).extend_from_slice(part.columns.column(column));
-        }
-        grads.means2d.extend_from_slice(&part.means2d);
-        grads.radii.extend_from_slice(&part.radii);
-    }
-    bits(&super::frame::Results { image: gpu.image().unwrap().clone(), value, grads })
 }
 
 #[test]

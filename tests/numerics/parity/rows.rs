@@ -80,11 +80,8 @@ fn on_cpu(rows: &Columns, camera: &Camera, degree: u8, v: &[[f32; 12]]) -> Resul
 fn read<'g>(gpu: &'g Gpu, buffer: &Buffer, stage: impl FnOnce(&mut Recorder<'g>)) -> Vec<f32> {
     let mut recorder = gpu.begin("parity");
     stage(&mut recorder);
-    let bytes = recorder.read_back("parity", &buffer.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    let mut values: Vec<f32> = bytes.to_vec().unwrap();
-    values.truncate((buffer.size() / 4) as usize);
-    values
+    super::pages::read(gpu, buffer, (buffer.size() / 4) as usize)
 }
 
 /// The same on the device; sh_fwd and the backward stages get the CPU's splats.

@@ -1,6 +1,7 @@
 //! The tile stages on the device against their twins on the CPU.
 
 use super::cost::Cost;
+use super::pages::read;
 use crate::support::gpu;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
@@ -77,9 +78,8 @@ fn gpu_scan(gpu: &Gpu, stages: &TileStages, values: &[u32]) -> Vec<u32> {
     let from = recorder.buffer_with("values", values).unwrap();
     let to = gpu.buffer("sums", 4 * (values.len() as u64 + 1)).unwrap();
     stages.scan(gpu, &mut recorder, &from.view(), values.len() as u32, &to.view()).unwrap();
-    let back = recorder.read_back("sums", &to.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    back.to_vec().unwrap()
+    read(gpu, &to, usize::MAX)
 }
 
 #[test]
@@ -127,10 +127,8 @@ fn gpu_sort(gpu: &Gpu, stages: &TileStages, keys: &[u32], live: u32, bits: u32) 
     };
     let live = recorder.buffer_with("count", &[77, live]).unwrap();
     let sorted = stages.sort(gpu, &mut recorder, &live.view(), 1, keys.len() as u32, bits, pairs).unwrap();
-    let keys = recorder.read_back("keys", &sorted.keys.view()).unwrap();
-    let values = recorder.read_back("values", &sorted.values.view()).unwrap();
     gpu.submit(recorder).unwrap();
-    (keys.to_vec().unwrap(), values.to_vec().unwrap())
+    (read(gpu, &sorted.keys, usize::MAX), read(gpu, &sorted.values, usize::MAX))
 }
 
 /// Footprints of a view, with culled rows among them.
@@ -301,20 +299,9 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     let unusable = recorder.buffer_zeroed("unusable", 4).unwrap();
     let (into, to, fold) = (&mut recorder, (&to, &unusable), Fold::Whole);
     stages.back.backward(gpu, into, &from, &ranks, &frame, &pixels, demand, picture, to, fold).unwrap();
-    let read = [
-        &ranks.order,
-        &frame.row_from_isect,
-        &frame.isects,
-        &frame.tile_offsets,
-        &pixels.rgb,
-        &pixels.t_final,
-        &v_splats,
-    ]
-    .map(|b| recorder.read_back("results", &b.view()).unwrap());
     gpu.submit(recorder).unwrap();
-    let [order, row_from_isect, isects, tile_offsets, rgb, t_final, v_splats] = read;
-    let (order, rows_of) = (order.to_vec::<u32>().unwrap(), row_from_isect.to_vec::<u32>().unwrap());
-    let (isects, starts) = (isects.to_vec::<u32>().unwrap(), tile_offsets.to_vec::<u32>().unwrap());
+    let words = [&ranks.order, &frame.row_from_isect, &frame.isects, &frame.tile_offsets];
+    let [order, rows_of, isects, starts] = words.map(|words| read::<u32>(gpu, words, usize::MAX));
     let visible = scene.projected.radii.iter().filter(|r| **r != [0, 0]).count();
     let count = (grid.width * grid.height) as usize;
     let tile =
@@ -322,9 +309,9 @@ fn on_gpu(gpu: &Gpu, stages: &mut TileStages, scene: &Scene, v_rgb: &[f32], v_al
     Outcome {
         order: order[..visible].to_vec(),
         lists: (0..grid.tiles()).map(tile).collect(),
-        rgb: rgb.to_vec::<f32>().unwrap()[..3 * count].to_vec(),
-        t_final: t_final.to_vec::<f32>().unwrap()[..count].to_vec(),
-        gradients: v_splats.to_vec::<[f32; 12]>().unwrap()[..rows as usize]
+        rgb: read(gpu, &pixels.rgb, 3 * count),
+        t_final: read(gpu, &pixels.t_final, count),
+        gradients: read::<[f32; 12]>(gpu, &v_splats, rows as usize)
             .iter()
             .map(|v| [v[0], v[1], v[4], v[5], v[6], v[8], v[9], v[10], v[3]])
             .collect(),
@@ -474,13 +461,8 @@ fn dispatches_beyond_65_535_workgroups_fold() {
         let (_, frame, pixels, demand) = forward(&gpu, &mut stages, &splats.view(), rows, scene.blend);
         assert_eq!(demand.isects, 4150 * 4095);
         assert!(demand.isects > 65_535 * 256);
-        let mut recorder = gpu.begin("read");
-        let read = [&frame.row_from_isect, &frame.isects, &frame.tile_offsets, &pixels.rgb]
-            .map(|b| recorder.read_back("results", &b.view()).unwrap());
-        gpu.submit(recorder).unwrap();
-        let [rows_of, isects, starts, rgb] = read;
-        let (rows_of, isects) = (rows_of.to_vec::<u32>().unwrap(), isects.to_vec::<u32>().unwrap());
-        let starts = starts.to_vec::<u32>().unwrap();
+        let words = [&frame.row_from_isect, &frame.isects, &frame.tile_offsets];
+        let [rows_of, isects, starts] = words.map(|words| read::<u32>(&gpu, words, usize::MAX));
         for tile in 0..4095u32 {
             assert_eq!(starts[tile as usize], tile * rows);
             for (row, isect) in (0..rows).zip(&isects[(tile * rows) as usize..]) {
@@ -488,7 +470,6 @@ fn dispatches_beyond_65_535_workgroups_fold() {
             }
         }
         // alpha is 0.9 at every pixel: three of them, then the fourth would bring T to 1e-4 or, by rounding, not.
-        let rgb: Vec<f32> = rgb.to_vec().unwrap();
-        assert!(rgb[..16 * 65_520].iter().all(|red| (red - 0.5).abs() < 1e-3));
+        assert!(read::<f32>(&gpu, &pixels.rgb, 16 * 65_520).iter().all(|red| (red - 0.5).abs() < 1e-3));
     }
 }

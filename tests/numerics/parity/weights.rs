@@ -1,6 +1,6 @@
 //! Blending weights of rows on a device, alone and times the squared error of the picture, against those of the CPU.
 
-use super::frame::{batches_of, bits, photo, renderer, results_with, scene};
+use super::frame::{bits, in_batches, photo, renderer, results_with, scene};
 use super::ranges::{least, wide_scene};
 use gsscale::gpu::GpuOptions;
 use gsscale::render::cpu::CpuRenderer;
@@ -63,18 +63,8 @@ fn weights_have_the_same_bits_for_any_cut() {
     whole.set_capacity(100);
     assert!(results_with(&mut whole, &view, &options, &target, &loss).unwrap().grads.weights == want);
     assert!(whole.frames_rerecorded() > 0);
-    let batches = batches_of(&view.0, &[0, 1100, rows]);
-    whole.begin_view(&view.1, &options, RowBatches::Several).unwrap();
-    batches.iter().for_each(|batch| whole.rows_in(batch).unwrap());
-    whole.picture().unwrap();
-    whole.loss(&target, &loss).unwrap();
-    whole.picture_back().unwrap();
-    let (mut weights, mut grads) = (vec![Vec::new(); batches.len()], Gradients::default());
-    for (number, batch) in batches.iter().enumerate().rev() {
-        whole.rows_out(number, batch, &mut grads).unwrap();
-        weights[number] = grads.weights.clone();
-    }
-    assert!(weights.concat() == want);
+    let batches = (&[0, 1100, rows][..], RowBatches::Several);
+    assert!(in_batches(&mut whole, &view, &options, batches, &target, &loss).grads.weights == want);
     let least = least(&whole);
     let mut most = 0;
     for budget in [least, least + least / 4] {

@@ -1,19 +1,13 @@
 //! Runs that are stopped early, and the output of `gsscale-ckpt` on their stores.
 
 use crate::support::scenes::stderr;
-use crate::support::workdir::{CKPT, Running, Workdir, split_ply};
-use gsscale::page::engine::open::{IoEngine, open_engine};
-use gsscale::page::folder::protocol_files::DriveFolder;
-use gsscale::page::folder::spill_dir::SpillDir;
-use gsscale::page::format::codec::Codec;
-use gsscale::page::map::opening::Opened;
+use crate::support::workdir::{CKPT, Running, Workdir, open_store, split_ply};
 use gsscale::page::map::opening::StoredPage;
-use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule, commit_config};
+use gsscale::page::tool::reading::{Access, StoreReader, WitnessRule};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ops::Deref;
 use std::path::{Path, PathBuf};
-use std::process::Output;
 
 /// Rounds, resets and raises of the SH degree before the stop; pages that split.
 const BUSY: &str = "scene --steps 400 --page-rows 32 --grow-grad2d 0.001 --refine-start 15 --refine-every 10 --refine-stop 100 \
@@ -84,15 +78,9 @@ impl Bench {
         self.begin(&format!("--resume out --quiet {more}")).after_lines("out", lines + 3)
     }
 
-    /// `gsscale-ckpt` with these flags.
-    pub fn ckpt_output(&self, flags: &str) -> Output {
-        self.output(CKPT, flags)
-    }
-
+    /// What `gsscale-ckpt` prints.
     pub fn ckpt(&self, flags: &str) -> String {
-        let output = self.ckpt_output(flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        String::from_utf8(output.stdout).unwrap()
+        self.printed(CKPT, flags)
     }
 
     /// The output with `--json`.
@@ -102,7 +90,7 @@ impl Bench {
 
     /// The message of a failing call, which has all of these words.
     pub fn fails(&self, flags: &str, words: &[&str]) -> String {
-        let output = self.ckpt_output(flags);
+        let output = self.output(CKPT, flags);
         let said = stderr(&output);
         assert!(matches!(output.status.code(), Some(1 | 2)), "{flags}: {output:?}");
         assert!(words.iter().all(|word| said.contains(word)), "{flags}: {words:?}: {said}");
@@ -145,10 +133,7 @@ pub fn generations(listed: &Value) -> Vec<u64> {
 
 /// Names generations, as the trainer does.
 pub fn pin(spill: &Path, names: &[(&str, u64)]) {
-    let dir = SpillDir::open(spill, true).unwrap();
-    let mut opened = Opened::open(Box::new(DriveFolder::new(spill)), commit_config(dir.format().store)).unwrap();
-    let engine = open_engine(IoEngine::Pread, spill, 1).unwrap();
-    let mut store = opened.paged_store(engine.store, dir.format().layout, Codec::Raw).unwrap();
+    let (_lock, mut opened, mut store) = open_store(spill);
     let names: Vec<(String, u64)> = names.iter().map(|(name, generation)| ((*name).to_string(), *generation)).collect();
     opened.commits.pin(&mut store, &names, &[]).unwrap();
 }

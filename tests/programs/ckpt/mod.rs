@@ -7,7 +7,7 @@ mod bench;
 mod fixture;
 
 use crate::support::scenes::{self, stderr};
-use crate::support::workdir::{TRAIN, least_memory};
+use crate::support::workdir::{CKPT, TRAIN, least_memory};
 use bench::{Bench, Ply, changed_pages, generations, pin};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
@@ -315,7 +315,7 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     flip_in_page(&bench, &names[0], IN_PAYLOAD);
     assert!(bench.ckpt_json("verify out")["faults"].as_array().unwrap().is_empty(), "headers do not know");
     let (file, offset) = flip_in_page(&bench, &names[1], 20);
-    let output = bench.ckpt_output("verify out --deep --json");
+    let output = bench.output(CKPT, "verify out --deep --json");
     assert_eq!(output.status.code(), Some(1));
     let verdict: Value = serde_json::from_slice(&output.stdout).unwrap();
     let fault = |fault: &Value| ["generation", "page", "kind"].map(|key| fault[key].to_string().replace('"', ""));
@@ -325,7 +325,7 @@ fn flipped_bits_in_pages_are_named_and_older_versions_take_their_place() {
     faults.sort();
     want.sort();
     assert_eq!(faults, want);
-    let words = String::from_utf8(bench.ckpt_output("verify out --deep").stdout).unwrap();
+    let words = String::from_utf8(bench.output(CKPT, "verify out --deep").stdout).unwrap();
     assert!(words.contains("2 faults") && words.contains(&format!("{file} offset {offset}")), "{words}");
     // Commands that need the pages name a damaged one; no partial copy is left.
     bench.fails("clone out copy", &["page ", "remedy"]);
@@ -381,7 +381,7 @@ fn a_lost_map_is_rebuilt_from_the_slots() {
     let want = bench.ply("out");
     std::fs::remove_file(bench.path("spill/map.redb")).unwrap();
     bench.fails("ls out", &["no page map", "salvage"]);
-    let output = bench.ckpt_output("verify out");
+    let output = bench.output(CKPT, "verify out");
     assert_eq!(output.status.code(), Some(1));
     assert!(String::from_utf8_lossy(&output.stdout).contains("FAULT map"));
     let done = bench.ckpt_json("salvage out --out rescued");
@@ -471,7 +471,7 @@ fn segments_that_are_cut_short_or_gone_are_named() {
     let bytes = first.metadata().unwrap().len();
     first.set_len(bytes / 2 + 4096 + 512).unwrap();
     let faults = || -> Vec<Value> {
-        let output = bench.ckpt_output("verify out --json");
+        let output = bench.output(CKPT, "verify out --json");
         assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
         serde_json::from_slice::<Value>(&output.stdout).unwrap()["faults"].as_array().unwrap().clone()
     };

@@ -1,11 +1,8 @@
 //! Kept checkpoints: named checkpoints, and finished runs continued to more steps.
 
 use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
+use crate::support::workdir::open_store;
 use gsscale::checkpoint::run_state::RunState;
-use gsscale::page::folder::protocol_files::DriveFolder;
-use gsscale::page::folder::spill_dir::SpillDir;
-use gsscale::page::map::commit::CommitConfig;
-use gsscale::page::map::opening::Opened;
 
 /// Named checkpoints keep their steps and evaluations; a run returns to one of them.
 #[test]
@@ -17,9 +14,8 @@ fn saves_are_named_checkpoints() {
         bench.train(&bench.flags(place, more));
         assert!(bench.ply("out") == alone.ply && bench.exists("out/point_cloud_000120.ply"));
         let folder = bench.checkpoint(place);
-        let spill = SpillDir::open(&folder, false).unwrap();
-        let config = CommitConfig { store: spill.format().store, cache_bytes: 1 << 20, reserve_bytes: 0 };
-        let commits = Opened::open(Box::new(DriveFolder::new(&folder)), config).unwrap().commits;
+        let (lock, opened, _) = open_store(&folder);
+        let commits = opened.commits;
         let generations = commits.generations();
         let state = |generation| RunState::from_bytes(&commits.run_state(generation).unwrap()).unwrap().trainer;
         let saved = generations.pins().iter().map(|(name, &generation)| (name.as_str(), state(generation)));
@@ -36,7 +32,7 @@ fn saves_are_named_checkpoints() {
         // Returns to a name and continues from there.
         let back = generations.pins()["step-120"];
         commits.rollback(back).unwrap();
-        drop(spill);
+        drop(lock);
         std::fs::remove_file(bench.path("out/point_cloud.ply")).unwrap();
         bench.go_on("--keep-checkpoint=false");
         assert!(bench.ply("out") == alone.ply, "{place:?}: the scene is another after going back");

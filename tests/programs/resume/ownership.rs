@@ -1,8 +1,8 @@
 //! Ownership of checkpoints: a run touches only the checkpoint that it made, wherever other checkpoints lie.
 
 use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
-use crate::support::scenes::{stderr, text};
-use crate::support::workdir::{CKPT, TRAIN, copy_folder};
+use crate::support::scenes::text;
+use crate::support::workdir::{CKPT, TRAIN, copy_folder, succeeded};
 use std::path::Path;
 use std::process::Command;
 
@@ -191,8 +191,7 @@ fn the_output_folder_is_synced_after_its_config_was_renamed() {
     let out = bench.path("out");
     let traced = "-f -y -s 4096 -e trace=rename,renameat,renameat2,fsync,mkdir,mkdirat -o trace";
     let flags = format!("{traced} {TRAIN} {BUSY} --steps 2");
-    let output = bench.command("strace", &flags).arg("--out").arg(&out).output().unwrap();
-    assert!(output.status.success(), "{}", stderr(&output));
+    succeeded(bench.command("strace", &flags).arg("--out").arg(&out).output().unwrap());
     let said = bench.text("trace");
     let lines: Vec<&str> = said.lines().collect();
     let synced = |folder: &Path| format!("<{}>)", folder.display());

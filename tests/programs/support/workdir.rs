@@ -2,10 +2,19 @@
 
 #[cfg(target_os = "linux")]
 use super::memory_group::MemoryGroup;
-use super::scenes::{self, TextModel, classic, stderr};
+use super::scenes::{self, TextModel, classic, stderr, told};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::{PlyContent, read_ply};
+#[cfg(unix)]
+use gsscale::page::{
+    engine::open::{IoEngine, open_engine},
+    folder::{protocol_files::DriveFolder, spill_dir::SpillDir},
+    format::codec::Codec,
+    map::opening::Opened,
+    tool::reading::commit_config,
+    versions::paged_store::PagedStore,
+};
 use gsscale::scene::columns::Columns;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -21,6 +30,13 @@ pub const CKPT: &str = env!("CARGO_BIN_EXE_gsscale-ckpt");
 pub const POSES: &str = env!("CARGO_BIN_EXE_gsscale-poses");
 pub const VIEW: &str = env!("CARGO_BIN_EXE_gsscale-view");
 pub const BENCH: &str = env!("CARGO_BIN_EXE_gsscale-bench");
+
+/// The output of a program, which must have succeeded.
+#[track_caller]
+pub fn succeeded(output: Output) -> Output {
+    assert!(output.status.success(), "{}", told(&output));
+    output
+}
 
 /// A temporary folder; its scene, if it has one, is `scene`.
 pub struct Workdir(TempDir);
@@ -82,9 +98,7 @@ impl Workdir {
 
     /// With a city of which a view sees less than half.
     pub fn wide_city(points: u32) -> Workdir {
-        let work = Workdir::new();
-        scenes::wide_city(work.0.path(), points);
-        work
+        Workdir::city_of(30, [48, 36], points, 12)
     }
 
     /// With a city of this size and of these many blocks.
@@ -150,11 +164,21 @@ impl Workdir {
         self.command(program, flags).output().unwrap()
     }
 
+    /// Runs a program, which must succeed.
+    pub fn succeeds(&self, program: &str, flags: &str) -> Output {
+        let output = self.output(program, flags);
+        assert!(output.status.success(), "{flags}: {}", told(&output));
+        output
+    }
+
+    /// What a program that succeeds prints.
+    pub fn printed(&self, program: &str, flags: &str) -> String {
+        String::from_utf8(self.succeeds(program, flags).stdout).unwrap()
+    }
+
     /// Runs the trainer, which must succeed; returns stderr.
     pub fn train(&self, flags: &str) -> String {
-        let output = self.output(TRAIN, flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        stderr(&output)
+        stderr(&self.succeeds(TRAIN, flags))
     }
 
     /// Trains `scene` into `out` quietly, on the CPU unless the flags say otherwise; returns the Gaussians.
@@ -178,10 +202,14 @@ impl Workdir {
         said
     }
 
+    /// What a program that succeeds prints as JSON, and what it says.
+    pub fn json_and_words(&self, program: &str, flags: &str) -> (Value, String) {
+        let output = self.succeeds(program, flags);
+        (serde_json::from_slice(&output.stdout).unwrap(), stderr(&output))
+    }
+
     pub fn json_of(&self, program: &str, flags: &str) -> Value {
-        let output = self.output(program, flags);
-        assert!(output.status.success(), "{flags}: {}", stderr(&output));
-        serde_json::from_slice(&output.stdout).unwrap()
+        self.json_and_words(program, flags).0
     }
 
     /// The PSNR of the held-out photos that `gsscale-eval` finds.
@@ -384,6 +412,16 @@ impl<'a> Running<'a> {
 /// Sends a signal; false if the process has ended.
 pub fn send(child: &Child, signal: &str) -> bool {
     Command::new("kill").args([&format!("-{signal}"), &child.id().to_string()]).status().unwrap().success()
+}
+
+/// The store of a run that has ended, opened as the trainer opens it.
+#[cfg(unix)]
+pub fn open_store(folder: &Path) -> (SpillDir, Opened, PagedStore) {
+    let spill = SpillDir::open(folder, true).unwrap();
+    let opened = Opened::open(Box::new(DriveFolder::new(folder)), commit_config(spill.format().store)).unwrap();
+    let engine = open_engine(IoEngine::Pread, folder, 2).unwrap().store;
+    let store = opened.paged_store(engine, spill.format().layout, Codec::Raw).unwrap();
+    (spill, opened, store)
 }
 
 pub fn copy_folder(from: &Path, to: &Path) {

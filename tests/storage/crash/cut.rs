@@ -2,7 +2,7 @@
 //! follows later.
 
 use super::life::{End, Life};
-use super::oracle::{Acknowledged, Snapshot, fill, payload_bytes};
+use super::oracle::{fill, payload_bytes};
 use gsscale::base::ids::PageId;
 use gsscale::page::format::slot_header::{HEADER_BYTES, SlotRef};
 use gsscale::page::map::commit::{Cut, PageChange};
@@ -113,15 +113,7 @@ impl Life<'_> {
         let changes: Vec<PageChange> = frozen.changed.iter().map(change).collect();
         let run_state = generation.to_le_bytes().repeat(2);
         let cut = Cut { changes: &changes, run_state: &run_state, note: b"frozen", pin };
-        if generation <= self.oracle.highest {
-            return Err(End::Violation(format!("generation {generation} comes a second time")));
-        }
-        let snapshot = Snapshot { pages: frozen.pages.clone(), run_state: cut.run_state.to_vec() };
-        let after = |after: &mut Acknowledged| {
-            after.latest = generation;
-            after.pins.extend(pin.map(|name| (name.to_string(), generation)));
-        };
-        self.oracle.begin(after, Some((generation, snapshot)));
+        self.begin(generation, frozen.pages.clone(), &cut)?;
         match self.commits.commit_cut(&mut self.store, &mut Vec::new(), generation, &cut) {
             Err(error) if error.is_out_of_space() => {
                 self.thaw();

@@ -184,11 +184,12 @@ impl Life<'_> {
         let run_state = self.next_version.to_le_bytes().repeat(1 + self.changed.len());
         let cut = Cut { changes: &changes, run_state: &run_state, note: b"note", pin };
         let mut done = Vec::new();
-        self.begin(&cut)?;
+        let pages: BTreeMap<PageId, u64> = self.pages.iter().map(|(page, held)| (*page, held.version)).collect();
+        self.begin(self.store.generation(), pages.clone(), &cut)?;
         let mut result = self.commits.commit(&mut self.store, &mut done, &cut);
         // A correct process stops after an error; a confused process may retry and must be refused.
         if result.as_ref().is_err_and(|error| !error.is_out_of_space()) {
-            self.begin(&cut)?;
+            self.begin(self.store.generation(), pages, &cut)?;
             result = result.or_else(|error| self.commits.commit(&mut self.store, &mut done, &cut).map_err(|_| error));
         }
         self.take_ends(done)?;
@@ -201,12 +202,11 @@ impl Life<'_> {
         Ok(())
     }
 
-    fn begin(&mut self, cut: &Cut<'_>) -> Result<(), End> {
-        let generation = self.store.generation();
+    /// A commit of these pages with their versions begins.
+    pub fn begin(&mut self, generation: u64, pages: BTreeMap<PageId, u64>, cut: &Cut<'_>) -> Result<(), End> {
         if generation <= self.oracle.highest {
             return Err(End::Violation(format!("generation {generation} comes a second time")));
         }
-        let pages = self.pages.iter().map(|(page, held)| (*page, held.version)).collect();
         let snapshot = Snapshot { pages, run_state: cut.run_state.to_vec() };
         let change = |after: &mut Acknowledged| {
             after.latest = generation;

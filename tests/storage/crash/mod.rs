@@ -16,6 +16,7 @@ mod random;
 mod script;
 mod tamper;
 
+use crate::support::hush::hush_library_panics;
 use disk::Fault;
 use random::run_many;
 use std::time::Instant;
@@ -25,20 +26,6 @@ const CRASHES: u64 = 50_000;
 /// Crashes within which every mutant must be noticed.
 #[cfg(debug_assertions)]
 const MUTANT_CRASHES: u64 = 20_000;
-
-/// Panics inside redb become errors of the store; their messages would hide those of the tests.
-fn hush_library_panics() {
-    static ONCE: std::sync::Once = std::sync::Once::new();
-    ONCE.call_once(|| {
-        let default = std::panic::take_hook();
-        std::panic::set_hook(Box::new(move |info| {
-            let is_mutant = std::thread::current().name() == Some("mutant");
-            if !is_mutant && !info.location().is_some_and(|l| l.file().contains("redb")) {
-                default(info);
-            }
-        }));
-    });
-}
 
 #[test]
 fn no_acknowledged_commit_is_lost_and_no_wrong_byte_returned() {

@@ -10,10 +10,8 @@ use gsscale::page::format::slot_header::HEADER_BYTES;
 use gsscale::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use gsscale::page::versions::slots::SlotLayout;
 use gsscale::paging::error::PagingError;
-use gsscale::paging::frames::evict::EvictPolicy;
 use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
-use gsscale::paging::prefetch::Transfers;
 use gsscale::scene::camera::Camera;
 use gsscale::scene::page_layout::{PageLayout, capacity_bytes};
 use gsscale::scene::page_meta::{PageBounds, PageMeta};
@@ -24,15 +22,8 @@ pub const PAGE_ROWS: usize = 6;
 pub const SH_DEGREE: u8 = 1;
 
 pub fn config(frames: usize) -> PagerConfig {
-    PagerConfig {
-        page_rows: PAGE_ROWS,
-        sh_degree: SH_DEGREE,
-        frames,
-        policy: EvictPolicy::FarthestNextUse,
-        prefetch_bytes: 8 * 8192,
-        plan_bytes: 1 << 20,
-        transfers: Transfers::Overlap,
-    }
+    let in_memory = PagerConfig::in_memory(PAGE_ROWS, SH_DEGREE);
+    PagerConfig { frames, prefetch_bytes: 8 * 8192, plan_bytes: 1 << 20, ..in_memory }
 }
 
 /// A store in memory that fails as `faults` says.

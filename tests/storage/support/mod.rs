@@ -8,5 +8,7 @@ pub mod child;
 #[path = "../../support/faulty_engine.rs"]
 pub mod faulty_engine;
 pub mod guarded;
+#[path = "../../support/hush.rs"]
+pub mod hush;
 #[path = "../../support/rounds.rs"]
 pub mod rounds;
