@@ -258,8 +258,8 @@ impl Pager {
     /// they are now, ascending by id. [`Pager::pin_batch`] pins them.
     /// Errors: a page could not be written since the last call.
     pub fn begin_view(&mut self, step: u32, camera: &Camera) -> Result<Vec<PageNo>, PagingError> {
-        self.tier.mover.resume_writes();
-        if let Some(error) = self.tier.mover.take_failure() {
+        self.tier.mover.writes_stopped = false;
+        if let Some(error) = self.tier.mover.failed_write.take() {
             return Err(error);
         }
         let pages = self.pages_of_view(camera);
@@ -306,7 +306,7 @@ impl Pager {
         let what = format!("the view of step {step}");
         let pinned = match Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker) {
             // The failed write that left no frame says more than the lack of frames.
-            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.tier.mover.take_failure().unwrap_or(error)),
+            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.tier.mover.failed_write.take().unwrap_or(error)),
             pinned => pinned?,
         };
         if self.tier.mover.has_store() {
@@ -394,7 +394,7 @@ impl Pager {
             Err(error) => error,
             frame => return frame,
         };
-        let cause = self.tier.mover.take_failure().unwrap_or(error);
+        let cause = self.tier.mover.failed_write.take().unwrap_or(error);
         if !cause.is_out_of_space() {
             return Err(cause);
         }
@@ -494,8 +494,8 @@ impl Pager {
         debug_assert_eq!(tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
         tier.cuts.frozen = None;
         // Pages whose write failed are still dirty: they are written again here.
-        tier.mover.take_failure();
-        tier.mover.resume_writes();
+        tier.mover.failed_write = None;
+        tier.mover.writes_stopped = false;
         tier.wait_until_below(1)?;
         let mut dirty: Vec<PageNo> =
             tier.frames.held().map(|(_, held)| held.page).filter(|&p| tier.frames.is_dirty(p)).collect();
