@@ -184,7 +184,8 @@ impl<M> FrameTable<M> {
 
     /// A page as a victim; `None` if it is not resident.
     pub fn as_victim(&self, page: PageNo) -> Option<Victim> {
-        self.find(page).filter(|&f| self.frames[f].state == FrameState::Resident).map(|f| self.victim_in(f))
+        let frame = self.find(page).map(|frame| &self.frames[frame]).filter(|f| f.state == FrameState::Resident)?;
+        Some(Victim { page, dirty: frame.dirty, next_use: frame.next_use })
     }
 
     /// Whether a page in memory differs from its version in the tier below.
@@ -331,11 +332,6 @@ impl<M> FrameTable<M> {
             let candidate = self.frames[frame].candidate();
             self.order_of(frame).insert(candidate);
         }
-    }
-
-    fn victim_in(&self, frame: usize) -> Victim {
-        let Frame { page, dirty, next_use, .. } = self.frames[frame];
-        Victim { page, dirty, next_use }
     }
 
     fn order_of(&mut self, frame: usize) -> &mut EvictOrder {
