@@ -251,7 +251,7 @@ impl Pager {
     /// since the last call. Nothing is pinned then, and every page keeps what it holds.
     pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
         let pages = self.begin_view(step, camera)?;
-        self.pin_batch(step, &pages)
+        self.pin_batch(step, &pages, false)
     }
 
     /// Begins 0-based `step` on the view of `camera`; returns every page with rows that the camera may see by the bounds as
@@ -289,24 +289,17 @@ impl Pager {
         pages
     }
 
-    /// Pins the next batch of a step's view, in this order, leaving out pages without rows. Blocks only for pages that are not
-    /// in memory.
+    /// Pins the next batch of a step's view, in this order, leaving out pages without rows; again if `is_again`, on the way out: a step
+    /// that has changed rows already leaves a failed write to the next step. Blocks only for pages that are not in memory.
     /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
-    pub fn pin_batch(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        self.pin_batch_for(step, pages, Asker::Step)
-    }
-
-    /// As [`Pager::pin_batch`], for a step that has changed rows already: a failed write is left to the next step.
-    /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
-    pub fn pin_batch_again(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        self.pin_batch_for(step, pages, Asker::RestOfStep)
-    }
-
-    fn pin_batch_for(&mut self, step: u32, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
+    pub fn pin_batch(&mut self, step: u32, pages: &[PageNo], is_again: bool) -> Result<Vec<PinnedPage>, PagingError> {
+        let asker = if is_again { Asker::RestOfStep } else { Asker::Step };
         let what = format!("the view of step {step}");
         let pinned = match Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker) {
             // The failed write that left no frame says more than the lack of frames.
-            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.tier.mover.failed_write.take().unwrap_or(error)),
+            Err(error @ PagingError::WorkingSet { .. }) => {
+                return Err(self.tier.mover.failed_write.take().unwrap_or(error));
+            }
             pinned => pinned?,
         };
         if self.tier.mover.has_store() {

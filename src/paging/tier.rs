@@ -229,8 +229,7 @@ impl Tier {
             if leaving >= wanted + self.frames.excess() {
                 return Ok(false);
             }
-            let victim =
-                if self.mover.writes_stopped { self.frames.clean_victim() } else { self.frames.victim() };
+            let victim = if self.mover.writes_stopped { self.frames.clean_victim() } else { self.frames.victim() };
             match victim {
                 Some(victim) if !victim.dirty => {
                     self.evict(victim.page);
