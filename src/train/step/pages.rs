@@ -188,7 +188,7 @@ impl PagedScene {
         match effect_of(&event.kind) {
             Effect::RaiseShDegree { degree } => self.rules.sh_degree = degree,
             Effect::Round(round) => {
-                self.rows_bound += round.promised(self.rows_bound, &self.histogram);
+                self.rows_bound += round.promised(&self.histogram);
                 self.histogram.clear();
             }
             Effect::ResetOpacity { .. } => {}
@@ -232,7 +232,7 @@ impl PagedScene {
         replay: PageReplay,
         added: &mut Vec<PinnedPage>,
     ) -> Result<(), TrainError> {
-        let PageReplay { edit, rounds, .. } = replay;
+        let PageReplay { edit, rounds } = replay;
         if let PageEdit::Replaced(parts) = &edit {
             self.store_parts(page, parts, added)?;
         } else {
