@@ -22,7 +22,6 @@ use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::{Chosen, checkpoint_folder};
-use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
@@ -285,7 +284,7 @@ fn resume_from(
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &restore_options(&options, &state), &state)?,
+        false => PagedScene::restore(pager, &options, &state)?,
         true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
@@ -388,20 +387,13 @@ fn finished_outcome(
     }))
 }
 
-fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
-    let histogram = GradHistogram::from_filled(&state.histogram);
-    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
-    let events = state.event_log().map_err(CommitError::Contradiction)?;
-    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
-}
-
 /// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
 fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
     let then = config_before(&then, &state.origin.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old = restore_options(&RunOptions::new(&then, state.origin.dataset.scene_scale), state);
-    let mut pages = restore_pages(pager, &old, state)?;
+    let old = RunOptions::new(&then, state.origin.dataset.scene_scale);
+    let mut pages = PagedScene::restore(pager, &old, state)?;
     if pages.change_rules(options, state.trainer.step)? {
         crate::tell!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
     }
@@ -418,12 +410,6 @@ fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath)
     let of_class = of_class.map(|path| on(Some(path)));
     let mut all = std::iter::once(on(path)).chain(of_class).chain([on(then.simd.0), on(None)]);
     all.find(|c| is_supported(limits::simd_path(c)))
-}
-
-/// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
-/// degree. Accepted changes of keys may give another first degree now.
-fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
-    RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options.clone() }
 }
 
 /// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or

@@ -9,6 +9,7 @@
 use super::catch_up::{evaluate_all, gather, visible_rows};
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
+use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::densify::replay::{PageEdit, PageReplay, PendingEvents};
 use crate::densify::stats::GradHistogram;
@@ -17,6 +18,7 @@ use crate::optim::bounds::{SplitLimits, page_bounds};
 use crate::optim::deferred::DeferredAdam;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::page::format::slot_header::HEADER_BYTES;
+use crate::page::map::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
 use crate::paging::pinned::PinnedPage;
@@ -130,24 +132,21 @@ impl PagedScene {
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
 
-    /// A scene from the pages and the shared state of a checkpoint.
-    pub(crate) fn restore(
-        pager: Pager,
-        options: &RunOptions,
-        events: EventLog,
-        histogram: GradHistogram,
-        [rows, rows_bound]: [u64; 2],
-    ) -> PagedScene {
+    /// A scene from the pages and the state of a commit.
+    /// Errors: no run can have written the state; those of a decoded state are checked.
+    pub(crate) fn restore(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, CommitError> {
         let mut rules = SceneRules::new(options);
-        // Replay the logged raises: the configured schedule may have changed since.
-        rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
-        for event in events.events() {
+        rules.events = state.event_log().map_err(CommitError::Contradiction)?;
+        // Replay the logged raises: the configured schedule, and its first degree, may have changed since.
+        rules.sh_degree = state.origin.sh_degree_start.min(options.sh_degree);
+        for event in rules.events.events() {
             if let EventKind::RaiseShDegree { degree } = event.kind {
                 rules.sh_degree = degree;
             }
         }
-        rules.events = events;
-        PagedScene { pager, rules, histogram, rows, rows_bound }
+        let histogram = GradHistogram::from_filled(&state.histogram);
+        let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
+        Ok(PagedScene { pager, rules, histogram, rows: state.rows, rows_bound: state.rows_bound })
     }
 
     /// Adds a page of first Gaussians.

@@ -15,13 +15,11 @@ use crate::base::text::read_text;
 use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
-use crate::densify::stats::GradHistogram;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::LEVELS_MAX;
 use crate::optim::drift::STEP_BYTES;
-use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -175,11 +173,8 @@ pub(super) fn scene_at(
         plan_bytes: 0,
         transfers: Transfers::Overlap,
     };
-    let events = state.event_log().map_err(CommitError::Contradiction)?;
-    let histogram = GradHistogram::from_filled(&state.histogram);
-    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
-    let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, events.len())?;
-    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
+    let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, state.events.len())?;
+    Ok(PagedScene::restore(pager, options, state)?)
 }
 
 /// Selection of the rows for the file.
