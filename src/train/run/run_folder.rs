@@ -170,7 +170,7 @@ pub(super) fn train_into(
         live.set_metrics(out.join(METRICS_FILE));
         LivePage::new(live, scene_name(&request.scene))
     });
-    let mut progress = RunProgress::new(config.steps, request.quiet).after(trainer.steps_done());
+    let mut progress = RunProgress::new(trainer.steps_done(), config.steps, request.quiet);
     let before = trainer.scene.pager.stats();
     metrics.start_clock(trainer.train_seconds());
     let looped = TrainingLoop {
