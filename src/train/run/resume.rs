@@ -79,7 +79,7 @@ impl ResumeRequest {
 /// Errors: no run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // Do not read or remove files of an active run.
-    let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
+    let lock = if request.out.is_dir() { out_folder::lock(&request.out)? } else { None };
     if let Some((config, scene)) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
         drop(lock);
         crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
