@@ -35,8 +35,8 @@ use crate::scene::state::SceneState;
 use crate::train::error::{TrainError, not_stored};
 use crate::train::inputs::dataset_print::{GaussiansPrint, points_print, view_print};
 use crate::train::inputs::gaussian_pages::{
-    GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead, PositionSample, file_warnings, giants_warning,
-    remove_giants, truncate_sh,
+    GaussianFile, GaussianWriter, GaussiansRead, PositionSample, file_warnings, giants_warning, remove_giants,
+    truncate_sh,
 };
 use crate::train::inputs::machine::folder_beside;
 use crate::train::memory::check_photos_fit;
@@ -361,7 +361,7 @@ impl Start {
                 taken.map(|_| ())
             }
             FirstRows::Gaussians(file) => {
-                let mut rows = GaussianWriter::new(&file.path, GaussianSpace { folder, memory: budget.bytes });
+                let mut rows = GaussianWriter::new(&file.path, budget);
                 let read = file.read(&mut |columns| rows.push_all(columns));
                 read.and_then(|_| rows.finish()).and_then(|rows| rows.for_each_page(fill, &mut take_state))
             }
