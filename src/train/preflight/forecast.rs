@@ -11,9 +11,7 @@
 //! those of the drive only through the number of commits in the time of the run.
 
 use super::device_memory;
-use super::plan::{
-    Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most, train_cameras,
-};
+use super::plan::{Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
@@ -591,7 +589,7 @@ fn drive_use(
     step_seconds: [f64; 2],
     drive: DriveRate,
 ) -> DriveUse {
-    let cameras = train_cameras(dataset);
+    let cameras = dataset.train_cameras();
     let index = trainer.scene.pager.index();
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
     let sh_degree = config.sh_degree;

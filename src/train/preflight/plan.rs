@@ -15,7 +15,6 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::paging::plan::batches;
 use crate::paging::simulation::replay::automatic_order;
-use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
@@ -81,10 +80,6 @@ fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usi
         list.len()
     });
     batches::cut_views(pages, frames as usize, pages_most)
-}
-
-pub(super) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
-    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
 }
 
 /// Pages, frames and drive space of a run.
@@ -415,7 +410,7 @@ fn auto_order(
     plan: &TierPlan,
 ) -> InputResult<Order> {
     let [now, most] = plan.pages;
-    let cameras = train_cameras(dataset);
+    let cameras = dataset.train_cameras();
     let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
     let frames = if frames >= most { now } else { frames * now / most };
     // A run whose views fit now is planned as one whose views fit.
@@ -599,8 +594,7 @@ pub(super) fn estimate(
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-
-    const MIB: u64 = 1 << 20;
+    use crate::base::units::MIB;
 
     /// A scene whose widest view takes 80 MiB of splats, in a run whose other parts take 100 MiB.
     fn estimate() -> MemoryEstimate {

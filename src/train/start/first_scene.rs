@@ -481,7 +481,7 @@ fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> Inp
             "give points with --init-ply, or let --init-points N draw them in the views' frusta",
         ));
     }
-    let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+    let cameras = dataset.train_cameras();
     let count = config.init_points as usize;
     // In aerial and object captures the subject lies within a few camera spreads of the cameras.
     let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);

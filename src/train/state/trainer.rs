@@ -98,11 +98,6 @@ fn strategy_in(order: &ViewOrder, strategy: &Arc<dyn Strategy>) -> Arc<dyn Strat
     strategy.for_regions(order.regional_epoch()).unwrap_or_else(|| Arc::clone(strategy))
 }
 
-fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
-    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    ViewOrder::new(order, seed, &cameras)
-}
-
 /// The largest sizes of the views of [`Trainer::probe_views`].
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Probed {
@@ -144,7 +139,7 @@ impl Trainer {
 
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
-        let order = view_order(options.view_order, options.seed, dataset);
+        let order = ViewOrder::new(options.view_order, options.seed, &dataset.train_cameras());
         let options = RunOptions { strategy: strategy_in(&order, &options.strategy), ..options };
         Trainer {
             scene,
@@ -227,7 +222,7 @@ impl Trainer {
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
         let options = &mut self.options;
         options.view_order = order;
-        let order = view_order(order, options.seed, dataset);
+        let order = ViewOrder::new(order, options.seed, &dataset.train_cameras());
         // The rules of the pages hold the strategy of the config.
         options.strategy = strategy_in(&order, &self.scene.rules.strategy);
         self.turns = Turns::new(order, dataset.train_views(), &options.strategy, options.steps);

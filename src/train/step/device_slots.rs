@@ -158,12 +158,6 @@ pub fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
 }
 
-/// Number of slots, for payloads of at most `payload` bytes, in a device memory of `device_mem` bytes beside the memory
-/// of a view.
-pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
-    usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
-}
-
 /// There is no slot for a page of a batch.
 pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()

@@ -340,7 +340,7 @@ impl PagedScene {
     }
 
     /// Pages with rows, in the order of their ids.
-    fn pages_with_rows(&self) -> Vec<PageNo> {
+    pub(crate) fn pages_with_rows(&self) -> Vec<PageNo> {
         let index = self.pager.index();
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.retain(|p| index[p.index()].rows > 0);

@@ -198,22 +198,18 @@ impl RowChoice {
 
     /// Pages that may hold a row inside the box, in the order of their ids.
     fn pages(&self, scene: &PagedScene) -> Vec<PageNo> {
-        let index = scene.pager.index();
-        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        let mut pages = scene.pages_with_rows();
+        let Some(crop) = self.crop else { return pages };
         pages.retain(|p| {
-            let bounds = &index[p.index()].bounds;
-            index[p.index()].rows > 0
-                && self.crop.is_none_or(|crop| {
-                    // Slightly wider than the box, because the conversion to dataset coordinates rounds.
-                    let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
-                    (0..3).all(|i| {
-                        let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
-                        let (lo, hi) = (at(bounds.lo[i]), at(bounds.hi[i]));
-                        hi + slack(hi) >= crop[i] && lo - slack(lo) <= crop[3 + i]
-                    })
-                })
+            let bounds = &scene.pager.index()[p.index()].bounds;
+            // Slightly wider than the box, because the conversion to dataset coordinates rounds.
+            let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
+            (0..3).all(|i| {
+                let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
+                let (lo, hi) = (at(bounds.lo[i]), at(bounds.hi[i]));
+                hi + slack(hi) >= crop[i] && lo - slack(lo) <= crop[3 + i]
+            })
         });
-        pages.sort_unstable_by_key(|p| index[p.index()].id);
         pages
     }
 
