@@ -87,8 +87,7 @@ pub fn apply_edits(state: &mut SceneState, edits: &RoundEdits) {
     // If the reservation fails, `append` fails too, with the allocator's own message.
     let _ = state.try_reserve_exact(edits.added.rows());
     state.append(&edits.added);
-    state.grad2d.fill(0.0);
-    state.count.fill(0);
+    state.view_mut().clear_statistics();
 }
 
 /// Caps the opacities of the rows of a view and clears the moments of the opacities. A row whose opacity is at most the

@@ -227,7 +227,6 @@ impl EditedRows<'_, '_> {
 /// Clears the statistics of rows; returns whether a row had statistics.
 fn clear_statistics(rows: &mut RowsMut<'_>) -> bool {
     let had_statistics = rows.count.iter().any(|&n| n != 0) || rows.grad2d.iter().any(|&g| g.to_bits() != 0);
-    rows.grad2d.fill(0.0);
-    rows.count.fill(0);
+    rows.clear_statistics();
     had_statistics
 }

@@ -289,6 +289,10 @@ impl Pager {
         pages
     }
 
+    pub fn rows_of(&self, pages: &[PageNo]) -> u64 {
+        pages.iter().map(|&page| u64::from(self.tier.index.meta(page).rows)).sum()
+    }
+
     /// Pins the next batch of a step's view, in this order, leaving out pages without rows; again if `is_again`, on the way out: a step
     /// that has changed rows already leaves a failed write to the next step. Blocks only for pages that are not in memory.
     /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.

@@ -202,10 +202,10 @@ impl Trainer {
             let (pages_most, began) = (self.memory.pages_most, Instant::now());
             let rows = rehearse(&mut now, camera, &render, &mut comparison, pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
-            let index = self.scene.pager.index();
-            let pages = self.scene.pager.pages_of_view(camera);
-            let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
-            self.memory.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
+            let pager = &self.scene.pager;
+            let pages = pager.pages_of_view(camera);
+            let is_whole = pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
+            self.memory.note_view(rows, pager.rows_of(&pages) as usize, is_whole);
             (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
             let sizes = self.renderer.device_sizes();
             probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.widest(sizes)));
@@ -241,11 +241,6 @@ impl Trainer {
         self.state.step
     }
 
-    /// Index in `dataset.views` of the next step's view.
-    pub fn next_view(&mut self) -> usize {
-        self.turns.view_at(self.state.step, &self.photos)
-    }
-
     /// Seconds spent in steps.
     pub fn train_seconds(&self) -> f64 {
         self.state.train_seconds
@@ -277,7 +272,7 @@ impl Trainer {
         trace::set_step(self.state.step);
         let _span = trace::span("step");
         self.log_due_events(dataset, targets)?;
-        let view = self.next_view();
+        let view = self.turns.view_at(self.state.step, &self.photos);
         targets.prefetch(&self.turns.coming(self.state.step, PREFETCH_VIEWS, &self.photos));
         if !self.is_ahead() {
             let camera = photos::camera(&self.photos, dataset, view);
