@@ -382,7 +382,12 @@ impl SlotCache {
         }
         let written = device_of(renderer).and_then(|device| Ok(device.write_slots(&copies)?));
         if let Err(error) = written {
-            self.forget(&copies);
+            for page in missing {
+                if let Some(in_use) = self.in_use.remove(&page.page) {
+                    self.slots.unpin(page.page, in_use.slot, false);
+                    self.slots.evict(page.page);
+                }
+            }
             return Err(error);
         }
         self.traffic.loads += copies.len() as u64;
@@ -586,19 +591,6 @@ impl SlotCache {
         })?;
         self.slots.finish_load(page, slot);
         Some(slot)
-    }
-
-    /// Gives up slots that were not filled.
-    fn forget(&mut self, copies: &[(SlotPage, &[u8])]) {
-        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other.slot == *slot);
-        let pages: Vec<PageNo> =
-            self.in_use.iter().filter(|(_, in_use)| unfilled(&in_use.slot)).map(|(page, _)| *page).collect();
-        for page in pages {
-            if let Some(in_use) = self.in_use.remove(&page) {
-                self.slots.unpin(page, in_use.slot, false);
-                self.slots.evict(page);
-            }
-        }
     }
 
     /// The pages of a batch in the slots that `SlotCache::load` gave them.
