@@ -73,7 +73,6 @@ impl MemoryEstimate {
         self.base + self.copies + self.view + self.staging + self.targets + self.index
     }
 
-    /// All parts.
     pub fn total(&self) -> u64 {
         self.fixed() + self.frames
     }

@@ -231,7 +231,6 @@ struct Goal {
     /// Accepted differences.
     changes: Changes,
     start: Start,
-    /// Digest of the dataset.
     print: DatasetPrint,
 }
 

@@ -64,7 +64,6 @@ pub(super) struct PastRun {
 
 /// Facts with which a run begins or resumes.
 pub(super) struct Begun {
-    /// Digest of the dataset.
     pub print: DatasetPrint,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
