@@ -501,21 +501,8 @@ impl Trainer {
         let _span = trace::span("evaluate");
         self.drain()?;
         let render = self.render_options();
-        let views = dataset.test_views();
-        self.run_memory().fit_frames_to_widest(views.iter().map(|&view| &dataset.views[view].camera));
-        let predicted = self.photos.iter().find_map(|parameter| parameter.predict(dataset, &views));
-        let corrects = predicted.is_some();
-        let request = EvalRequest {
-            views: &views,
-            predicted,
-            ssim: self.options.ssim_variant,
-            pictures,
-            lpips: None,
-            // Beside predicted colours, the best that a correction could do.
-            color_correct: self.options.color_correct.or(corrects.then_some(ColorCorrect::Affine)),
-            appearance: self.options.photos.appearance,
-            progress,
-        };
+        let request = EvalRequest::of_held_out(dataset, &self.options, &self.photos, pictures, progress);
+        self.run_memory().fit_frames_to_widest(request.views.iter().map(|&view| &dataset.views[view].camera));
         let test = evaluate(&mut self.now(), dataset, targets, &render, &request)?;
         let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
         self.state.test = test.map(of).or(self.state.test);
