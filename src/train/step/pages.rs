@@ -446,13 +446,8 @@ impl PagedScene {
                 })
                 .collect();
             let tables = pinned.iter().zip(&copies);
-            let mut tables: Vec<Rows<'_>> =
-                tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)).collect();
-            let mut first_row = 0;
-            for table in &mut tables {
-                table.first_row = first_row;
-                first_row += table.rows();
-            }
+            let tables =
+                numbered(tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)));
             let done = each(rules, &tables);
             drop(tables);
             self.pager.release(pinned);
@@ -464,13 +459,17 @@ impl PagedScene {
 
 /// The rows of the pages as tables with consecutive row numbers.
 pub fn row_tables(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
-    let mut first_row = 0;
-    let mut tables = Vec::with_capacity(pages.len());
-    for page in pages {
-        tables.push(page.rows(first_row));
-        first_row += page.meta.rows as usize;
-    }
-    tables
+    numbered(pages.iter().map(|page| page.rows(0)))
+}
+
+fn numbered<'a>(tables: impl Iterator<Item = Rows<'a>>) -> Vec<Rows<'a>> {
+    let mut rows = 0;
+    let number = |table: Rows<'a>| {
+        let first_row = rows;
+        rows += table.rows();
+        Rows { first_row, ..table }
+    };
+    tables.map(number).collect()
 }
 
 /// Partitions Gaussians in memory into first pages of at most `fill` rows, stored with `sh_degree`, and passes each to
