@@ -321,10 +321,8 @@ pub(super) fn plan_and_train(
 
 /// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
 fn spill_dir_flag(request: &RunRequest) -> String {
-    let [kept, now] = [TrainConfig::read(&request.out.join(CONFIG_FILE)), Ok(request.config.clone())]
-        .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
-    match now {
-        Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
-        _ => String::new(),
-    }
+    let folder = |config: TrainConfig| with_absolute_paths(config).spill_dir;
+    let (kept, now) = (TrainConfig::read(&request.out.join(CONFIG_FILE)).map(folder), folder(request.config.clone()));
+    let is_known = now.is_empty() || kept.is_ok_and(|kept| kept == now);
+    if is_known { String::new() } else { format!(" --spill-dir {now}") }
 }

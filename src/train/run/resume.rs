@@ -226,22 +226,15 @@ fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> R
     run(&request.to_run(&earlier.scene, config, Existing::BeginAgain))
 }
 
-/// What a run resumes with.
-struct Goal {
-    /// Accepted differences.
-    changes: Changes,
-    start: Start,
-    print: DatasetPrint,
-}
-
-/// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Changes no file.
+/// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Returns the accepted differences
+/// and what the run resumes with. Changes no file.
 /// Errors: the run has done more steps, its settings or its dataset changed, or its scene is not there.
 fn goal(
     request: &ResumeRequest,
     earlier: &Earlier,
     config: &mut TrainConfig,
     state: &RunState,
-) -> Result<Goal, TrainError> {
+) -> Result<(Changes, Start, DatasetPrint), TrainError> {
     let (file, scene) = (&earlier.path, &earlier.scene);
     if let Ok(then) = TrainConfig::parse(&state.origin.config) {
         keep_rates(config, &request.keys, &then);
@@ -262,7 +255,7 @@ fn goal(
     changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
     changes.numbers.extend(first_degree_change(&start, state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
-    Ok(Goal { changes, start, print })
+    Ok((changes, start, print))
 }
 
 /// Resumes from a checkpoint.
@@ -275,7 +268,7 @@ fn resume_from(
     machine::set_up(&config)?;
     let host_mem = host_budget(config.host_mem.0);
     let state = stored.run_state.clone();
-    let Goal { changes, start, print } = goal(request, earlier, &mut config, &state)?;
+    let (changes, start, print) = goal(request, earlier, &mut config, &state)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
@@ -496,7 +489,7 @@ fn committed(
     mut config: TrainConfig,
     state: &RunState,
 ) -> Result<String, TrainError> {
-    let changes = goal(request, earlier, &mut config, state)?.changes;
+    let (changes, ..) = goal(request, earlier, &mut config, state)?;
     let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
     let mut text = steps_to_do(&request.out, &from, state.trainer.step, &config);
     for change in changes.free.iter().chain(&changes.numbers) {
@@ -508,12 +501,9 @@ fn committed(
 fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> String {
     let left = config.steps.saturating_sub(done);
     let [done, all, more] = [done, config.steps, left].map(|steps| format_grouped(steps.into()));
-    let time = match seconds_of_a_step(out) {
-        Some(seconds) => {
-            format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
-        }
-        None => String::new(),
-    };
+    let time = seconds_of_a_step(out).map_or(String::new(), |seconds| {
+        format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
+    });
     let rates = text_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
     format!(
         "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",
