@@ -37,7 +37,7 @@ use gsscale::train::inputs::machine::set_up;
 use gsscale::train::preflight::first_look::{LookFor, first_look};
 use gsscale::train::preflight::forecast::{Forecast, STEP_GROWTH};
 use gsscale::train::run::begin::forecast;
-use gsscale::train::step::device_slots::slots_of_budget;
+use gsscale::train::step::device_slots::slots_in;
 use output::{json_of, json_of_forecast, report};
 use serde_json::json;
 use std::ffi::OsString;
@@ -249,7 +249,7 @@ fn load(args: &Args) -> InputResult<Scene> {
         step: args.step_seconds.is_none() && args.lists.is_none(),
     };
     let look = first_look(&path, &config, &folder_for(&config), look_for).map_err(not_planned)?;
-    let cameras: Vec<Camera> = look.dataset.train_views().iter().map(|&v| look.dataset.views[v].camera).collect();
+    let cameras = look.dataset.train_cameras();
     let grown = |bytes: usize| (bytes as f64 * args.growth) as u64;
     let slot = |&bytes: &u32| grown(transfer_bytes(bytes as usize)).min(u64::from(u32::MAX)) as u32;
     let frame_bytes = transfer_bytes(capacity_bytes(config.page_rows as usize, config.sh_degree));
@@ -445,7 +445,7 @@ fn device_rows(args: &Args, scene: &Scene, rows: &[Row], bus: EmulatedBus) -> In
     let slot_bytes = scene.payload_most;
     let slots = match config.device_mem.0 {
         0 => pages,
-        budget => pages.min(slots_of_budget(budget, slot_bytes)),
+        budget => pages.min(usize::try_from(slots_in(budget, slot_bytes)).unwrap_or(usize::MAX)),
     };
     if slots == 0 {
         let problem = format!("a page takes {}, which is more than the share for pages", format_bytes(slot_bytes));

@@ -657,19 +657,18 @@ mod tests {
 
     #[test]
     fn values_out_of_range_are_refused_by_name() {
-        let bad = TrainConfig { sh_degree: 4, ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("--sh-degree")));
-        // As a 32-bit number this is half.
-        let bad = TrainConfig { prune_opa: 0.499_999_999, ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("--prune-opa")));
-        // As 32-bit numbers these are 1 and 0.
-        for init_opacity in [0.999_999_98, 1e-60] {
-            let bad = TrainConfig { init_opacity, ..TrainConfig::default() };
-            assert!(bad.check().is_err_and(|e| e.to_string().contains("--init-opacity")));
+        let good = TrainConfig::default;
+        assert!(good().check().is_ok());
+        for (bad, key) in [
+            (TrainConfig { sh_degree: 4, ..good() }, "--sh-degree"),
+            // As 32-bit numbers these are a half, 1, 0 and 1.
+            (TrainConfig { prune_opa: 0.499_999_999, ..good() }, "--prune-opa"),
+            (TrainConfig { init_opacity: 0.999_999_98, ..good() }, "--init-opacity"),
+            (TrainConfig { init_opacity: 1e-60, ..good() }, "--init-opacity"),
+            (TrainConfig { max_alpha: 0.999_999_98, ..good() }, "--max-alpha"),
+        ] {
+            assert!(bad.check().is_err_and(|e| e.to_string().contains(key)), "{key}");
         }
-        let bad = TrainConfig { max_alpha: 0.999_999_98, ..TrainConfig::default() };
-        assert!(bad.check().is_err_and(|e| e.to_string().contains("--max-alpha")));
-        assert!(TrainConfig::default().check().is_ok());
     }
 
     #[test]

@@ -131,6 +131,11 @@ impl Dataset {
         self.views_of(Split::Test)
     }
 
+    /// The cameras of the training views, in their order.
+    pub fn train_cameras(&self) -> Vec<Camera> {
+        self.train_views().into_iter().map(|view| self.views[view].camera).collect()
+    }
+
     fn views_of(&self, split: Split) -> Vec<usize> {
         (0..self.views.len()).filter(|&i| self.views[i].split == split).collect()
     }

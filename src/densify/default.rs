@@ -5,7 +5,7 @@
 //! are reset so late in the planned run that they cannot recover.
 
 use super::ops::{child_log_scale, sigma};
-use super::stats::{GradHistogram, bin_above, rows_from_bin};
+use super::stats::{GradHistogram, bin_above};
 use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
@@ -130,12 +130,8 @@ impl Round for RoundThresholds {
         sigmoid(extremes.lowest_opacity) >= self.prune_opacity * (1.0 + 1e-5) && extremes.sigma_max <= self.prune_scale
     }
 
-    fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
-        histogram.rows_from_bin(bin_above(self.grow_grad2d))
-    }
-
-    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
-        rows_from_bin(rows, bin_above(self.grow_grad2d))
+    fn grows_from_bin(&self) -> u32 {
+        bin_above(self.grow_grad2d)
     }
 }
 

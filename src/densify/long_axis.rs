@@ -19,9 +19,7 @@
 //! and of statistics; 3. nothing is drawn at random.
 
 use super::growth::GrowthRule;
-use super::stats::{
-    DrawnRows, GradHistogram, WEIGHED_VIEWS, accumulate_scores, reaches_bin, rows_from_bin, weight_bin,
-};
+use super::stats::{DrawnRows, GradHistogram, WEIGHED_VIEWS, accumulate_scores, reaches_bin, weight_bin};
 use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy};
 use crate::base::math::sigmoid;
 use crate::optim::bounds::SplitLimits;
@@ -195,12 +193,8 @@ impl Round for LongAxisRound {
         sigmoid(extremes.lowest_opacity) >= self.prune_opacity * (1.0 + 1e-5)
     }
 
-    fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
-        histogram.rows_from_bin(self.split_from_bin)
-    }
-
-    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
-        rows_from_bin(rows, self.split_from_bin)
+    fn grows_from_bin(&self) -> u32 {
+        self.split_from_bin
     }
 }
 
@@ -274,12 +268,12 @@ mod tests {
         let score = |row: &usize| state.grad2d[*row];
         let least = grown.iter().map(score).fold(f32::INFINITY, f32::min);
         assert!(kept.iter().map(score).all(|kept| kept < least));
-        assert_eq!(round.promised(1000, &histogram), grown.len() as u64);
+        assert_eq!(round.promised(&histogram), grown.len() as u64);
         assert_eq!(round.promised_rows(&state.view()), grown.len() as u64);
         assert!(round.may_edit(&state.view()) && !round.may_edit(&SceneState::default().view()));
         // Without room nothing grows, and rows without statistics never do.
         let full = strategy.round(700, RowCount::unlimited(1300), &histogram);
-        assert_eq!(full.promised(1300, &histogram), 0);
+        assert_eq!(full.promised(&histogram), 0);
         assert!(!round.splits(0.0, 0) && !round.splits(0.0, 9));
     }
 
@@ -309,7 +303,7 @@ mod tests {
             let removed = (0..1000).filter(|&row| round.fate(&facts(&state, row)) == Fate::Prune).count();
             // A bin of large weights holds several rows.
             assert!((480..=500).contains(&removed), "{removed}");
-            assert_eq!(round.promised(1000, &histogram), 0, "nothing grows");
+            assert_eq!(round.promised(&histogram), 0, "nothing grows");
         }
         let round = strategy.round(700, RowCount { allowed: 1000, ..RowCount::unlimited(1000) }, &histogram);
         assert_eq!(round.remove_below_bin, 0);

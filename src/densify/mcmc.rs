@@ -20,7 +20,7 @@
 //! afterwards, contain it; 4. a split in place moves no mean and enlarges no row, so no bounds need room for a round.
 
 use super::ops::rotation;
-use super::stats::{DrawnRows, GradHistogram, accumulate_scores, reaches_bin, rows_from_bin};
+use super::stats::{DrawnRows, GradHistogram, accumulate_scores, reaches_bin};
 use super::strategy::{Extremes, Fate, Round, RoundSteps, RowCount, RowFacts, Strategy, ViewGradients};
 use crate::base::math::sigmoid;
 use crate::base::rng::{Purpose, Stream};
@@ -182,12 +182,8 @@ impl Round for RelocationRound {
         sigmoid(extremes.lowest_opacity) > self.dead_opacity * (1.0 + 1e-5)
     }
 
-    fn promised(&self, _: u64, histogram: &GradHistogram) -> u64 {
-        histogram.rows_from_bin(self.copy_from_bin)
-    }
-
-    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
-        rows_from_bin(rows, self.copy_from_bin)
+    fn grows_from_bin(&self) -> u32 {
+        self.copy_from_bin
     }
 }
 
@@ -243,14 +239,14 @@ mod tests {
             let chosen: Vec<usize> = (0..ROWS).filter(|&row| fate(&round, &state, row) == Fate::SplitInPlace).collect();
             // A bin is under 1 % wide, and keys spread over several doublings: a bin holds some ten of the 1,000.
             assert!((970..=1000).contains(&chosen.len()), "{}", chosen.len());
-            assert_eq!(round.promised(0, &histogram), chosen.len() as u64);
+            assert_eq!(round.promised(&histogram), chosen.len() as u64);
             assert_eq!(round.promised_rows(&state.view()), chosen.len() as u64);
             assert!(round.may_edit(&state.view()));
             chosen.iter().for_each(|row| copies[row % 4] += 1);
             assert_eq!(fate(&round, &state, ROWS - 1), Fate::Prune);
             // With room for 90 there are at most 90 births.
             let full = McmcStrategy { max_gaussians: ROWS as u64 + 90, ..strategy };
-            let births = full.round(RowCount::unlimited(ROWS as u64), &histogram).promised(0, &histogram);
+            let births = full.round(RowCount::unlimited(ROWS as u64), &histogram).promised(&histogram);
             assert!((80..=90).contains(&births), "{births}");
         }
         let all = copies.iter().sum::<usize>() as f64;

@@ -30,30 +30,18 @@ const IN_PLACE_CHILDREN: usize = 2;
 /// Least opacity of such a child.
 const IN_PLACE_OPACITY_LEAST: f32 = 0.005;
 
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct RoundCounts {
-    pub duplicated: usize,
-    /// Rows that were replaced by two children.
-    pub split: usize,
-    /// Pruned rows, including new rows.
-    pub pruned: usize,
-}
-
 #[derive(Debug, Clone)]
 pub struct RoundEdits {
     /// Rows to remove, numbered in the view, ascending.
     pub removed: Vec<u32>,
     /// Rows to append.
     pub added: SceneState,
-    /// Numbers of rows by kind of edit, over the kept rows and the added ones.
-    pub counts: RoundCounts,
 }
 
 /// Computes the edits of a round to the rows of a view; changes no row.
 pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, seed: u64, event: u64) -> RoundEdits {
     let mut removed = Vec::new();
     let mut new_rows = NewRows { columns: Columns::zeros(0, rows.columns.sh_degree), uid: Vec::new() };
-    let mut counts = RoundCounts::default();
     let mut block = [0.0; BLOCK_LANES];
     let (mut log_scales, mut opacities) = (vec![0.0; rows.rows()], vec![0.0; rows.rows()]);
     values.sizes_and_opacities(rows, &mut log_scales, &mut opacities);
@@ -74,26 +62,11 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
         let uid = |child: u64| child_uid(rows.uid[row], event, child);
         let children = match fate {
             Fate::Keep => continue,
-            Fate::Prune => {
-                counts.pruned += 1;
-                None
-            }
             Fate::Duplicate { pruned: false } => {
-                counts.duplicated += 1;
                 new_rows.push(uid(0), &block);
                 continue;
             }
-            Fate::Duplicate { pruned: true } => {
-                // Row and copy are both pruned.
-                counts.duplicated += 1;
-                counts.pruned += 2;
-                None
-            }
-            Fate::Split { children_pruned: true } => {
-                counts.split += 1;
-                counts.pruned += 2;
-                None
-            }
+            Fate::Prune | Fate::Duplicate { pruned: true } | Fate::Split { children_pruned: true } => None,
             Fate::Split { children_pruned: false } => {
                 Some([0, 1].map(|child| split_child(&block, seed, uid(child), event)))
             }
@@ -101,12 +74,11 @@ pub fn plan_round<V: RowsNow>(values: &V, rows: &Rows<'_>, round: &dyn Round, se
             Fate::SplitInPlace => Some([in_place_child(&block); IN_PLACE_CHILDREN]),
         };
         removed.push(row as u32);
-        counts.split += usize::from(children.is_some());
         for (child, block) in (0..).zip(children.iter().flatten()) {
             new_rows.push(uid(child), block);
         }
     }
-    RoundEdits { removed, added: new_rows.into_state(values.now()), counts }
+    RoundEdits { removed, added: new_rows.into_state(values.now()) }
 }
 
 /// Applies the edits of all rows of a table. Clears the statistics.
@@ -115,8 +87,7 @@ pub fn apply_edits(state: &mut SceneState, edits: &RoundEdits) {
     // If the reservation fails, `append` fails too, with the allocator's own message.
     let _ = state.try_reserve_exact(edits.added.rows());
     state.append(&edits.added);
-    state.grad2d.fill(0.0);
-    state.count.fill(0);
+    state.view_mut().clear_statistics();
 }
 
 /// Caps the opacities of the rows of a view and clears the moments of the opacities. A row whose opacity is at most the

@@ -9,7 +9,7 @@
 //! outgrew its capacity is split once, after the last event, by the positions of its rows at that event. A row grows in
 //! at most one of the rounds that a page missed, so a page has at most doubled by then.
 
-use super::ops::{self, RoundCounts, RoundEdits};
+use super::ops::{self, RoundEdits};
 use super::strategy::{Effect, Extremes, Round, effect_of};
 use crate::base::ids::PageId;
 use crate::optim::bounds::{SplitLimits, lowest_opacity, page_bounds};
@@ -25,18 +25,16 @@ use std::sync::OnceLock;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PageRound {
-    pub event: usize,
     /// Rows after the round minus rows before.
     pub rows_change: i64,
     /// Growth of this page that [`Round::promised`] counted when the round was logged.
     pub promised: u64,
-    /// Numbers of edited rows.
-    pub counts: RoundCounts,
 }
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub enum PageEdit {
     /// No byte changed; the page stays clean.
+    #[default]
     Unchanged,
     /// Statistics were cleared in place, and nothing else changed.
     Cleared,
@@ -46,13 +44,11 @@ pub enum PageEdit {
     Replaced(Vec<(PageId, SceneState)>),
 }
 
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct PageReplay {
     pub edit: PageEdit,
     /// The rounds among the events, in order.
     pub rounds: Vec<PageRound>,
-    /// Rows that opacity resets rewrote.
-    pub reset_rows: usize,
 }
 
 /// Bounds on the rows of a page whose payload lies on a device.
@@ -144,9 +140,7 @@ impl<'a> PendingEvents<'a> {
                 _ if id.is_frozen() => {}
                 Effect::ResetOpacity { max_opacity } => {
                     let at = self.at(index);
-                    let reset_rows = rows.in_place(|rows| ops::reset_opacity_rows(at, rows, max_opacity));
-                    replay.reset_rows += reset_rows;
-                    if reset_rows > 0 {
+                    if rows.in_place(|rows| ops::reset_opacity_rows(at, rows, max_opacity)) > 0 {
                         replay.edit = PageEdit::InPlace;
                     }
                     extremes = None;
@@ -174,14 +168,13 @@ impl<'a> PendingEvents<'a> {
         extremes: &mut Option<Extremes>,
     ) -> (PageRound, Option<RoundEdits>) {
         let promised = round.promised_rows(rows);
-        let mut done = PageRound { event: index, rows_change: 0, promised, counts: RoundCounts::default() };
+        let mut done = PageRound { rows_change: 0, promised };
         let by_bounds = promised == 0 && !round.may_edit(rows);
         if by_bounds && round.keeps_all(extremes.get_or_insert_with(|| self.extremes(rows))) {
             return (done, None);
         }
         let edits = ops::plan_round(self.at(index), rows, round, self.seed, index as u64);
         done.rows_change = edits.added.rows() as i64 - edits.removed.len() as i64;
-        done.counts = edits.counts;
         let is_nothing = edits.removed.is_empty() && edits.added.rows() == 0;
         (done, (!is_nothing).then_some(edits))
     }
@@ -203,12 +196,6 @@ impl<'a> PendingEvents<'a> {
         let mean = |i: usize| at.evaluate_element(&rows, Column::Means, i / 3, i % 3);
         let means: Vec<f32> = (0..rows.rows() * 3).map(mean).collect();
         split_page(id, state, &means, self.page_rows)
-    }
-}
-
-impl Default for PageReplay {
-    fn default() -> Self {
-        PageReplay { edit: PageEdit::Unchanged, rounds: Vec::new(), reset_rows: 0 }
     }
 }
 
@@ -240,7 +227,6 @@ impl EditedRows<'_, '_> {
 /// Clears the statistics of rows; returns whether a row had statistics.
 fn clear_statistics(rows: &mut RowsMut<'_>) -> bool {
     let had_statistics = rows.count.iter().any(|&n| n != 0) || rows.grad2d.iter().any(|&g| g.to_bits() != 0);
-    rows.grad2d.fill(0.0);
-    rows.count.fill(0);
+    rows.clear_statistics();
     had_statistics
 }

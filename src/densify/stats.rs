@@ -8,8 +8,7 @@
 //! added to this histogram, adds to [`GradHistogram::uncounted`].
 
 use crate::scene::columns::Gradients;
-pub use crate::scene::rows::mean_grad2d;
-use crate::scene::rows::{Rows, RowsMut};
+use crate::scene::rows::{Rows, RowsMut, mean_grad2d};
 use crate::scene::sightings::{is_full, mean_weight, views, with_view};
 
 /// Bins: one per value of the upper 16 bits of a non-negative f32, so 128 per doubling.
@@ -45,11 +44,6 @@ impl GradHistogram {
             *histogram.bins.get_mut(usize::from(bin))? = rows;
         }
         Some(histogram)
-    }
-
-    /// Counts a row with this mean.
-    pub fn add(&mut self, mean: f32) {
-        self.bins[bin(mean)] += 1;
     }
 
     pub fn add_rows(&mut self, rows: &Rows<'_>) {
@@ -297,7 +291,7 @@ mod tests {
     #[test]
     fn what_a_device_counted_is_added_and_never_wraps() {
         let mut histogram = GradHistogram::default();
-        [0.5, 0.5, 2.0].into_iter().for_each(|mean| histogram.add(mean));
+        [0.5, 0.5, 2.0].into_iter().for_each(|score| histogram.add_row(score, 1));
         let mut changes = vec![0; BINS];
         (changes[bin(0.5)], changes[bin(2.0)], changes[bin(8.0)]) = (u32::MAX, u32::MAX, 1);
         histogram.add_changes(&changes);

@@ -8,7 +8,7 @@
 //! the same fate whenever it is applied.
 
 use super::growth::GrowthRule;
-use super::stats::{DrawnRows, GradHistogram, accumulate};
+use super::stats::{DrawnRows, GradHistogram, accumulate, rows_from_bin};
 use crate::optim::bounds::SplitLimits;
 use crate::scene::columns::{Columns, Gradients};
 use crate::scene::events::EventKind;
@@ -225,13 +225,20 @@ pub trait Round: Sync {
     /// missed many rounds then computes its bounds once instead of deciding every row in every round.
     fn keeps_all(&self, extremes: &Extremes) -> bool;
 
+    /// The first bin of scores whose rows may grow: whether a row grows must follow from the bin of its score.
+    fn grows_from_bin(&self) -> u32;
+
     /// The most rows that the round adds, from the histogram alone, when the round is logged: pages apply the round later, and the cap
-    /// must hold until they have. The scene has at most `rows` rows. So whether a row grows must follow from the bin of its score.
-    fn promised(&self, rows: u64, histogram: &GradHistogram) -> u64;
+    /// must hold until they have.
+    fn promised(&self, histogram: &GradHistogram) -> u64 {
+        histogram.rows_from_bin(self.grows_from_bin())
+    }
 
     /// The part of [`Round::promised`] for a page with these rows that has not applied the round yet. The sum over all pages is at most
     /// [`Round::promised`].
-    fn promised_rows(&self, rows: &Rows<'_>) -> u64;
+    fn promised_rows(&self, rows: &Rows<'_>) -> u64 {
+        rows_from_bin(rows, self.grows_from_bin())
+    }
 }
 
 #[derive(Clone, Copy)]

@@ -122,7 +122,6 @@ impl<'a, const W: usize> Table<'a, W> {
     }
 }
 
-/// A mutable [`Table`].
 pub(super) struct TableMut<'a, const W: usize> {
     means: &'a mut [[f32; 3]],
     quats: &'a mut [[f32; 4]],

@@ -48,9 +48,9 @@ pub(super) struct Mover {
     /// Reads and writes in flight that were started ahead of their need, bytes.
     ahead: [usize; 2],
     /// A write that failed while nobody waited for it.
-    failed_write: Option<PagingError>,
-    /// A write failed, and no step has asked for pages since.
-    writes_stopped: bool,
+    pub failed_write: Option<PagingError>,
+    /// A write failed, and no step has asked for pages since: no other write begins ahead of its need.
+    pub writes_stopped: bool,
 }
 
 impl Mover {
@@ -186,35 +186,15 @@ impl Mover {
         }
     }
 
-    /// No more writes until a step asks for pages again.
-    pub fn refuse_writes(&mut self) {
-        self.writes_stopped = true;
-    }
-
     /// No more writes until a step asks for pages again, which gets the error.
     pub fn stop_writes(&mut self, error: PagingError) {
-        self.refuse_writes();
+        self.writes_stopped = true;
         self.keep_failure(error);
     }
 
     /// Keeps an error for the next step; the first one counts.
     pub fn keep_failure(&mut self, error: PagingError) {
         self.failed_write.get_or_insert(error);
-    }
-
-    /// The write that failed while nobody waited for it.
-    pub fn take_failure(&mut self) -> Option<PagingError> {
-        self.failed_write.take()
-    }
-
-    /// Writes may begin again.
-    pub fn resume_writes(&mut self) {
-        self.writes_stopped = false;
-    }
-
-    /// Whether a write failed and no step has asked for pages since.
-    pub fn are_writes_stopped(&self) -> bool {
-        self.writes_stopped
     }
 
     fn may_be_ahead(&self, direction: Direction) -> bool {

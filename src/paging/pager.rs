@@ -251,15 +251,15 @@ impl Pager {
     /// since the last call. Nothing is pinned then, and every page keeps what it holds.
     pub fn acquire(&mut self, step: u32, camera: &Camera) -> Result<Vec<PinnedPage>, PagingError> {
         let pages = self.begin_view(step, camera)?;
-        self.pin_batch(step, &pages)
+        self.pin_batch(step, &pages, false)
     }
 
     /// Begins 0-based `step` on the view of `camera`; returns every page with rows that the camera may see by the bounds as
     /// they are now, ascending by id. [`Pager::pin_batch`] pins them.
     /// Errors: a page could not be written since the last call.
     pub fn begin_view(&mut self, step: u32, camera: &Camera) -> Result<Vec<PageNo>, PagingError> {
-        self.tier.mover.resume_writes();
-        if let Some(error) = self.tier.mover.take_failure() {
+        self.tier.mover.writes_stopped = false;
+        if let Some(error) = self.tier.mover.failed_write.take() {
             return Err(error);
         }
         let pages = self.pages_of_view(camera);
@@ -289,24 +289,21 @@ impl Pager {
         pages
     }
 
-    /// Pins the next batch of a step's view, in this order, leaving out pages without rows. Blocks only for pages that are not
-    /// in memory.
-    /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
-    pub fn pin_batch(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        self.pin_batch_for(step, pages, Asker::Step)
+    pub fn rows_of(&self, pages: &[PageNo]) -> u64 {
+        pages.iter().map(|&page| u64::from(self.tier.index.meta(page).rows)).sum()
     }
 
-    /// As [`Pager::pin_batch`], for a step that has changed rows already: a failed write is left to the next step.
+    /// Pins the next batch of a step's view, in this order, leaving out pages without rows; again if `is_again`, on the way out: a step
+    /// that has changed rows already leaves a failed write to the next step. Blocks only for pages that are not in memory.
     /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
-    pub fn pin_batch_again(&mut self, step: u32, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        self.pin_batch_for(step, pages, Asker::RestOfStep)
-    }
-
-    fn pin_batch_for(&mut self, step: u32, pages: &[PageNo], asker: Asker) -> Result<Vec<PinnedPage>, PagingError> {
+    pub fn pin_batch(&mut self, step: u32, pages: &[PageNo], is_again: bool) -> Result<Vec<PinnedPage>, PagingError> {
+        let asker = if is_again { Asker::RestOfStep } else { Asker::Step };
         let what = format!("the view of step {step}");
         let pinned = match Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker) {
             // The failed write that left no frame says more than the lack of frames.
-            Err(error @ PagingError::WorkingSet { .. }) => return Err(self.tier.mover.take_failure().unwrap_or(error)),
+            Err(error @ PagingError::WorkingSet { .. }) => {
+                return Err(self.tier.mover.failed_write.take().unwrap_or(error));
+            }
             pinned => pinned?,
         };
         if self.tier.mover.has_store() {
@@ -394,7 +391,7 @@ impl Pager {
             Err(error) => error,
             frame => return frame,
         };
-        let cause = self.tier.mover.take_failure().unwrap_or(error);
+        let cause = self.tier.mover.failed_write.take().unwrap_or(error);
         if !cause.is_out_of_space() {
             return Err(cause);
         }
@@ -494,8 +491,8 @@ impl Pager {
         debug_assert_eq!(tier.frames.count(FrameState::Pinned), 0, "a step holds pages");
         tier.cuts.frozen = None;
         // Pages whose write failed are still dirty: they are written again here.
-        tier.mover.take_failure();
-        tier.mover.resume_writes();
+        tier.mover.failed_write = None;
+        tier.mover.writes_stopped = false;
         tier.wait_until_below(1)?;
         let mut dirty: Vec<PageNo> =
             tier.frames.held().map(|(_, held)| held.page).filter(|&p| tier.frames.is_dirty(p)).collect();

@@ -125,7 +125,7 @@ impl Tier {
     pub fn write_frozen(&mut self) {
         let most = (self.mover.ahead_max / 2 / self.mover.frame_bytes).max(FROZEN_WRITES_LEAST);
         let started = Instant::now();
-        while !self.mover.are_writes_stopped()
+        while !self.mover.writes_stopped
             && self.mover.has_staging()
             && self.cuts.writing() < most
             && let Some(page) = self.cuts.next_waiting()
@@ -229,8 +229,7 @@ impl Tier {
             if leaving >= wanted + self.frames.excess() {
                 return Ok(false);
             }
-            let victim =
-                if self.mover.are_writes_stopped() { self.frames.clean_victim() } else { self.frames.victim() };
+            let victim = if self.mover.writes_stopped { self.frames.clean_victim() } else { self.frames.victim() };
             match victim {
                 Some(victim) if !victim.dirty => {
                     self.evict(victim.page);
@@ -243,7 +242,7 @@ impl Tier {
                     }
                 }
                 _ if !asker.fails_on_write_error()
-                    && self.mover.are_writes_stopped()
+                    && self.mover.writes_stopped
                     && self.mover.in_flight() == 0
                     && self.frames.held_by_callers() == 0 =>
                 {
@@ -260,7 +259,7 @@ impl Tier {
     /// Errors: `error`, if it ends the call of `asker`.
     pub fn stop_writes(&mut self, error: PagingError, asker: Asker) -> Result<(), PagingError> {
         if asker.fails_on_write_error() {
-            self.mover.refuse_writes();
+            self.mover.writes_stopped = true;
             return Err(error);
         }
         self.mover.stop_writes(error);

@@ -222,6 +222,11 @@ impl RowsMut<'_> {
             count: self.count,
         }
     }
+
+    pub fn clear_statistics(&mut self) {
+        self.grad2d.fill(0.0);
+        self.count.fill(0);
+    }
 }
 
 /// Mean growth score (gradient norm) per view that drew the row; 0 without views.

@@ -76,6 +76,14 @@ pub enum TrainError {
 }
 
 impl TrainError {
+    /// An error after which the pages may hold half a step.
+    pub(crate) fn torn(error: impl Into<TrainError>) -> TrainError {
+        match error.into() {
+            torn @ TrainError::Torn { .. } => torn,
+            error => TrainError::Torn { source: Box::new(error) },
+        }
+    }
+
     /// Whether the cause is a lack of drive space, so that a later attempt may succeed.
     pub fn is_out_of_space(&self) -> bool {
         match self {

@@ -12,8 +12,7 @@
 //! depends on the budget.
 
 use crate::base::error::{InputError, InputResult};
-use crate::base::machine::memory_available;
-use crate::base::machine::{host_bytes_now, status_field};
+use crate::base::machine::{host_bytes_now, memory_available, status_field};
 use crate::base::units::{format_bytes, format_bytes_up, format_grouped};
 use crate::dataset::loader::{Dataset, View};
 use crate::dataset::target_cache::TargetCache;
@@ -74,7 +73,6 @@ impl MemoryEstimate {
         self.base + self.copies + self.view + self.staging + self.targets + self.index
     }
 
-    /// All parts.
     pub fn total(&self) -> u64 {
         self.fixed() + self.frames
     }

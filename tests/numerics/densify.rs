@@ -29,7 +29,7 @@ fn a_round_does_what_a_plain_implementation_does() {
     let thresholds = RoundThresholds { grow_grad2d: 3e-4, split_scale: 0.01, prune_opacity: 0.005, prune_scale: 0.05 };
     let event = Event { step: 80, kind: EventKind::Densify(thresholds) };
     let (before, now) = (state.clone(), evaluate_all(&state, &adam, 81));
-    let (round, _) = apply_event(&mut state, &adam, SEED, 7, &event);
+    apply_event(&mut state, &adam, SEED, 7, &event);
     let after = evaluate_all(&state, &adam, 81);
     let row_after: HashMap<u64, usize> = state.uid.iter().enumerate().map(|(row, &uid)| (uid, row)).collect();
     let (mut duplicated, mut split, mut pruned, mut rows) = (0, 0, 0, 0);
@@ -71,7 +71,6 @@ fn a_round_does_what_a_plain_implementation_does() {
         }
     }
     assert!(duplicated > 50 && split > 50 && pruned > 50, "{duplicated} {split} {pruned}: the case is too easy");
-    assert_eq!((round.duplicated, round.split, round.pruned), (duplicated, split, pruned));
     assert_eq!(state.rows(), rows);
     assert!(state.grad2d.iter().all(|&g| g == 0.0) && state.count.iter().all(|&n| n == 0));
 }
@@ -83,9 +82,7 @@ fn row_is_drawn(uid: u64, step: u32) -> bool {
 /// Recounts the histogram of the rows of a table.
 fn histogram_of(state: &SceneState) -> GradHistogram {
     let mut histogram = GradHistogram::default();
-    for (&grad2d, &count) in state.grad2d.iter().zip(&state.count).filter(|(_, n)| **n > 0) {
-        histogram.add(gsscale::densify::stats::mean_grad2d(grad2d, count));
-    }
+    histogram.add_rows(&state.view());
     histogram
 }
 
@@ -121,7 +118,7 @@ fn a_reset_caps_opacities_for_good_and_spares_rows_that_it_does_not_change() {
     }
     let (before, now) = (state.clone(), evaluate_all(&state, &adam, 31));
     let event = Event { step: 30, kind: EventKind::ResetOpacity { max_opacity: 0.01 } };
-    let (_, reset_rows) = apply_event(&mut state, &adam, SEED, 0, &event);
+    let reset_rows = apply_event(&mut state, &adam, SEED, 0, &event);
     let after = evaluate_all(&state, &adam, 31);
     let cap = gsscale::base::math::logit(0.01);
     let later = evaluate_all(&state, &adam, 2000);

@@ -167,7 +167,7 @@ impl World {
         }
         checkpoint.commit(&mut trainer, &mut metrics)?;
         plan(faults);
-        let (mut progress, stop) = (RunProgress::new(config.steps, true), StopFlag::default());
+        let (mut progress, stop) = (RunProgress::new(0, config.steps, true), StopFlag::default());
         let looped = TrainingLoop {
             trainer: &mut trainer,
             dataset: &dataset,

@@ -221,7 +221,7 @@ fn pages_that_return_stay_longer_than_pages_that_are_done() {
     let batches: Vec<&[PageNo]> = numbers.chunks(FRAMES / 2).collect();
     pager.set_use_in_step(0, numbers.iter().copied(), UseInStep::Coming);
     for (i, batch) in batches.iter().enumerate() {
-        let pinned = pager.pin_batch(0, batch).unwrap();
+        let pinned = pager.pin_batch(0, batch, false).unwrap();
         let how = if i % 2 == 0 { UseInStep::Returning } else { UseInStep::Done };
         pager.set_use_in_step(0, batch.iter().copied(), how);
         pager.release(pinned);

@@ -252,7 +252,7 @@ impl InPages<'_> {
     /// Updates the statistics and the bound on the rows when an event enters the log.
     fn log_event(&mut self, event: Event) {
         if let Effect::Round(round) = effect_of(&event.kind) {
-            self.rows_bound += round.promised(self.rows_bound as u64, &self.histogram) as i64;
+            self.rows_bound += round.promised(&self.histogram) as i64;
             self.histogram.clear();
         }
     }

@@ -38,7 +38,7 @@ impl Facts {
             RunOptions { sh_degree_start: prepared.sh_degree_start, ..RunOptions::new(config, dataset.scene_scale) };
         let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
         let scene = PagedScene::new(columns, pager, &options)?;
-        let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
+        let cameras = dataset.train_cameras();
         let views = ViewPages::new(scene.pager.index(), &cameras);
         let pixels_of = |camera: &Camera| camera.pixels() as u64;
         let pixels =

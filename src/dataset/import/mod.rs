@@ -52,7 +52,7 @@ pub struct Budget<'a> {
 impl<'a> Budget<'a> {
     /// The memory of one list: at most four lists are alive that are not halves of halves, and those add up to one
     /// more. The rest of the budget is for working memory.
-    fn space(&self) -> SpoolSpace<'a> {
+    pub fn space(&self) -> SpoolSpace<'a> {
         SpoolSpace { folder: self.folder, memory: self.bytes / 10 }
     }
 

@@ -88,17 +88,14 @@ impl EvictOrder {
         self.policy
     }
 
-    /// Number of pages in the order.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether the order has no page.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// Whether a page is in the order.
     pub fn contains(&self, page: PageNo) -> bool {
         self.uses.get(page.index()).is_some_and(Option::is_some)
     }

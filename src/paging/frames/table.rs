@@ -125,7 +125,6 @@ impl<M> FrameTable<M> {
         self.frames().saturating_sub(self.frames_max)
     }
 
-    /// Number of frames in a state.
     pub fn count(&self, state: FrameState) -> usize {
         self.counts[state as usize]
     }
@@ -184,7 +183,8 @@ impl<M> FrameTable<M> {
 
     /// A page as a victim; `None` if it is not resident.
     pub fn as_victim(&self, page: PageNo) -> Option<Victim> {
-        self.find(page).filter(|&f| self.frames[f].state == FrameState::Resident).map(|f| self.victim_in(f))
+        let frame = self.find(page).map(|frame| &self.frames[frame]).filter(|f| f.state == FrameState::Resident)?;
+        Some(Victim { page, dirty: frame.dirty, next_use: frame.next_use })
     }
 
     /// Whether a page in memory differs from its version in the tier below.
@@ -200,25 +200,18 @@ impl<M> FrameTable<M> {
     /// Takes a free frame for a page that has no number yet, with memory from `make` where the frame has none; `None` when no
     /// frame is free. Ends with [`FrameTable::adopt`] or [`FrameTable::take_back`].
     pub fn lend(&mut self, make: impl FnOnce() -> M) -> Option<M> {
-        if let Some(frame) = self.free.pop() {
-            self.set_state(frame as usize, FrameState::Lent);
-            self.lent.push(frame);
-            return self.frames[frame as usize].memory.take();
-        }
-        (self.frames() < self.frames_max).then(|| {
-            match self.retired.pop() {
-                Some(frame) => {
-                    self.set_state(frame as usize, FrameState::Lent);
-                    self.lent.push(frame);
-                }
-                None => {
-                    self.lent.push(self.frames.len() as u32);
-                    self.frames.push(Frame::lent());
-                    self.counts[FrameState::Lent as usize] += 1;
-                }
-            }
-            make()
-        })
+        let frame = match self.free.pop() {
+            Some(frame) => frame,
+            None if self.frames() >= self.frames_max => return None,
+            None => self.retired.pop().unwrap_or_else(|| {
+                self.frames.push(Frame::lent());
+                self.counts[FrameState::Lent as usize] += 1;
+                self.frames.len() as u32 - 1
+            }),
+        };
+        self.set_state(frame as usize, FrameState::Lent);
+        self.lent.push(frame);
+        Some(self.frames[frame as usize].memory.take().unwrap_or_else(make))
     }
 
     /// Takes a lent frame back.
@@ -331,11 +324,6 @@ impl<M> FrameTable<M> {
             let candidate = self.frames[frame].candidate();
             self.order_of(frame).insert(candidate);
         }
-    }
-
-    fn victim_in(&self, frame: usize) -> Victim {
-        let Frame { page, dirty, next_use, .. } = self.frames[frame];
-        Victim { page, dirty, next_use }
     }
 
     fn order_of(&mut self, frame: usize) -> &mut EvictOrder {

@@ -25,8 +25,6 @@ pub struct FewestReads {
     spare: VecDeque<u32>,
     /// No interval reaches back before this step: the step before it has no spare frame.
     first: u32,
-    /// Pages read.
-    pages: u64,
     /// Bytes read.
     bytes: u64,
     /// For the order in which the pages of a step are looked at.
@@ -34,11 +32,6 @@ pub struct FewestReads {
 }
 
 impl FewestReads {
-    /// Pages that had to be read.
-    pub fn pages(&self) -> u64 {
-        self.pages
-    }
-
     pub fn bytes(&self) -> u64 {
         self.bytes
     }
@@ -76,7 +69,6 @@ impl FewestReads {
         let order = std::mem::take(&mut self.order);
         for &(last, page, bytes) in &order {
             if !self.keep(last, now) {
-                self.pages += 1;
                 self.bytes += bytes;
             }
             self.set_last_use(page, now);

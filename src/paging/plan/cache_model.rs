@@ -118,10 +118,6 @@ impl CacheModel {
         self.frames
     }
 
-    pub fn holds(&self, page: PageNo) -> bool {
-        self.idle.contains(page) || self.is_present(page)
-    }
-
     /// Takes the cache through one step that needs `pages`, each named once. `next_use` tells the first step after this one
     /// that needs a page, as far as known. `change` is overwritten. Steps must ascend.
     /// Errors: there are fewer frames than pages; nothing has changed then.

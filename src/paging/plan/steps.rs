@@ -10,7 +10,6 @@
 
 use crate::base::ids::PageNo;
 use std::collections::VecDeque;
-use std::fmt;
 use std::ops::Range;
 
 /// Bytes that one use of one page takes at most: 4 in the list of its step, and 4 in the queue of its page, which grows by
@@ -155,17 +154,4 @@ impl Plan {
 /// The pages of `of` that are not in `list`; both ascend.
 pub(super) fn missing_from<'a>(list: &'a [PageNo], of: &'a [PageNo]) -> impl Iterator<Item = PageNo> + 'a {
     of.iter().copied().filter(|page| list.binary_search(page).is_err())
-}
-
-impl fmt::Display for Plan {
-    /// One line a step: its pages.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let steps = self.steps();
-        write!(f, "plan of steps {}..{}, {} entries", steps.start, steps.end, self.uses_held)?;
-        for (step, pages) in steps.zip(&self.steps) {
-            write!(f, "\nstep {step}:")?;
-            pages.iter().try_for_each(|page| write!(f, " {}", page.0))?;
-        }
-        Ok(())
-    }
 }

@@ -299,18 +299,6 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// As [`Checkpoint::commit`], but a lack of space is only a warning.
-    /// Errors: as [`Checkpoint::commit`], except for space.
-    pub fn commit_or_warn(&mut self, trainer: &mut Trainer, metrics: &mut MetricsLog) -> Result<(), TrainError> {
-        match self.commit(trainer, metrics) {
-            Err(error) if error.is_out_of_space() => {
-                crate::tell!("warning: the last steps are not committed: {error}");
-                Ok(())
-            }
-            done => done,
-        }
-    }
-
     fn acknowledged(&mut self, step: u32, cut: Instant, waited: f64, bytes: u64) {
         self.done += 1;
         self.last_step = Some(step);
@@ -407,10 +395,9 @@ impl Checkpoint {
     ) -> Result<(), TrainError> {
         let other = self.other_drive(&lacks);
         let is_of_results = self.is_only_of_results(&lacks);
-        let needed = match other {
-            Some(_) => OTHER_BYTES,
-            None if is_of_results => OTHER_BYTES,
-            None => {
+        let needed = match other.is_some() || is_of_results {
+            true => OTHER_BYTES,
+            false => {
                 // The first commit of a run in memory stores all pages.
                 let pager = &trainer.scene.pager;
                 let all = (pager.index().len() * pager.frame_bytes()) as u64;
@@ -491,6 +478,18 @@ impl Checkpoint {
         let TrainError::Input(error) = error else { return None };
         let folder = error.file.parent().filter(|folder| folder.is_dir())?;
         (!is_same_drive(folder, &self.folder)).then(|| folder.to_path_buf())
+    }
+}
+
+/// The result of a commit after the last step, for which a lack of space is only a warning.
+/// Errors: that of the commit, except for space.
+pub(crate) fn warn_of_space(committed: Result<(), TrainError>) -> Result<(), TrainError> {
+    match committed {
+        Err(error) if error.is_out_of_space() => {
+            crate::tell!("warning: the last steps are not committed: {error}");
+            Ok(())
+        }
+        committed => committed,
     }
 }
 

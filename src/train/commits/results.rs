@@ -22,7 +22,6 @@ use crate::exchange::sink::Written;
 use crate::exchange::start_view::{StartView, settings_path};
 use crate::page::folder::file_system::free_bytes;
 use crate::report::run_files::PLY_FILE;
-use crate::scene::camera::Camera;
 use crate::scene::rotation::Rotation;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
@@ -225,7 +224,7 @@ impl ExportChoice {
             means.filter(|mean| mean.iter().all(|x| x.is_finite())).for_each(|mean| sample.add(mean.map(f64::from)));
             Ok::<(), TrainError>(())
         })?;
-        let cameras: Vec<Camera> = dataset.train_views().iter().map(|&view| dataset.views[view].camera).collect();
+        let cameras = dataset.train_cameras();
         let start = StartView::choose(&cameras, &sample.kept);
         let photos = SeeingPhotos::new(&cameras, &sample.kept);
         let mut counts = Vec::new();

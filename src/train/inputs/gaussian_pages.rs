@@ -10,7 +10,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::even_sample::EvenSample;
 use crate::base::ids::PageId;
-use crate::dataset::import::{Grown, PageSpace, Spool, SpoolSpace, SpoolWriter, paginate};
+use crate::dataset::import::{Budget, Grown, PageSpace, Spool, SpoolWriter, paginate};
 use crate::dataset::loader::View;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::SceneMeta;
@@ -23,7 +23,7 @@ use crate::scene::state::SceneState;
 use rayon::prelude::*;
 use std::path::{Path, PathBuf};
 
-/// Gaussians transformed into the local frame together.
+/// Gaussians that are transformed together.
 const ROWS_AT_ONCE: usize = 1024;
 
 /// A Gaussian with its number in the file.
@@ -89,45 +89,41 @@ impl GaussianFile {
     /// Passes the Gaussians to `take` in batches, in the file's order, without those that are too far away or too large.
     /// Errors: the file cannot be read, or `take` failed.
     pub fn read(&self, take: &mut dyn FnMut(&Columns) -> InputResult<()>) -> InputResult<GaussiansRead> {
-        let none = || Columns::zeros(0, self.sh_degree);
-        let (mut some, mut far, mut giants) = (none(), 0, 0);
-        let mut hand_on = |mut columns: Columns| {
+        let (mut far, mut giants) = (0, 0);
+        let meta = stream_columns(&self.path, self.sh_degree, &mut |mut columns| {
             far += to_local(&mut columns, &self.meta, self.origin, self.scale);
             giants += remove_giants(&mut columns, self.log_scales);
             take(&truncate_sh(columns, self.sh_degree_most))
-        };
-        let meta = stream_gaussians(&self.path, &mut |values| {
-            push_row(&mut some, values);
-            match some.rows() {
-                ROWS_AT_ONCE => hand_on(std::mem::replace(&mut some, none())),
-                _ => Ok(()),
-            }
         })?;
-        hand_on(some)?;
         Ok(GaussiansRead { meta, far, giants })
     }
 }
 
-/// Resources for the import of Gaussians.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct GaussianSpace<'a> {
-    /// An existing folder for temporary files.
-    pub folder: &'a Path,
-    /// Bytes of memory.
-    pub memory: usize,
-}
-
-impl<'a> GaussianSpace<'a> {
-    fn of_list(&self) -> SpoolSpace<'a> {
-        SpoolSpace { folder: self.folder, memory: self.memory / 10 }
-    }
+/// Passes the Gaussians of a file of this SH degree to `take` in batches, in the file's order; the last one may be empty.
+/// Errors: the file cannot be read, or `take` failed.
+pub(crate) fn stream_columns(
+    file: &Path,
+    sh_degree: u8,
+    take: &mut dyn FnMut(Columns) -> InputResult<()>,
+) -> InputResult<SceneMeta> {
+    let none = || Columns::zeros(0, sh_degree);
+    let mut some = none();
+    let meta = stream_gaussians(file, &mut |values| {
+        push_row(&mut some, values);
+        match some.rows() {
+            ROWS_AT_ONCE => take(std::mem::replace(&mut some, none())),
+            _ => Ok(()),
+        }
+    })?;
+    take(some)?;
+    Ok(meta)
 }
 
 /// Collects Gaussians while they are read.
 pub(crate) struct GaussianWriter<'a> {
     /// The source file, for messages.
     file: &'a Path,
-    space: GaussianSpace<'a>,
+    budget: Budget<'a>,
     rows: SpoolWriter<GaussianRow>,
     next: u32,
     width: usize,
@@ -135,8 +131,8 @@ pub(crate) struct GaussianWriter<'a> {
 
 impl<'a> GaussianWriter<'a> {
     /// An empty writer.
-    pub fn new(file: &'a Path, space: GaussianSpace<'a>) -> Self {
-        GaussianWriter { file, space, rows: SpoolWriter::new(space.of_list()), next: 0, width: ROW_HEAD }
+    pub fn new(file: &'a Path, budget: Budget<'a>) -> Self {
+        GaussianWriter { file, budget, rows: SpoolWriter::new(budget.space()), next: 0, width: ROW_HEAD }
     }
 
     /// Adds the rows of `columns`.
@@ -166,13 +162,13 @@ impl<'a> GaussianWriter<'a> {
     /// Errors: the folder cannot be written.
     pub fn finish(self) -> InputResult<GaussianSpool<'a>> {
         let sh_degree = (0..=3).find(|&d| sh_n_width(d) == self.width - ROW_HEAD).unwrap_or(0);
-        Ok(GaussianSpool { space: self.space, rows: self.rows.finish()?, sh_degree })
+        Ok(GaussianSpool { budget: self.budget, rows: self.rows.finish()?, sh_degree })
     }
 }
 
 /// Gaussians after reading, in memory and temporary files.
 pub(crate) struct GaussianSpool<'a> {
-    space: GaussianSpace<'a>,
+    budget: Budget<'a>,
     rows: Spool<GaussianRow>,
     pub sh_degree: u8,
 }
@@ -191,9 +187,9 @@ impl GaussianSpool<'_> {
         fill: usize,
         take: &mut dyn FnMut(PageId, SceneState) -> InputResult<()>,
     ) -> InputResult<()> {
-        let GaussianSpool { space, rows, sh_degree } = self;
-        let records = (space.memory / 2 / (2 * size_of::<GaussianRow>())).max(fill);
-        let space = PageSpace { list: space.of_list(), records };
+        let GaussianSpool { budget, rows, sh_degree } = self;
+        let records = (budget.bytes / 2 / (2 * size_of::<GaussianRow>())).max(fill);
+        let space = PageSpace { list: budget.space(), records };
         paginate(rows, fill, space, &mut |id, rows| take(id, state_of(rows, sh_degree)))?;
         Ok(())
     }
@@ -350,8 +346,7 @@ impl PositionSample {
         let mut away: Vec<f32> = views
             .iter()
             .map(|view| {
-                let m = &view.camera.viewmat;
-                let centre = [0, 1, 2].map(|k| -(m[0][k] * m[0][3] + m[1][k] * m[1][3] + m[2][k] * m[2][3]));
+                let centre = view.camera.centre();
                 let nearest = [0, 1, 2].map(|k| centre[k].max(low[k]).min(high[k]));
                 distance(centre, nearest) / diagonal
             })

@@ -88,10 +88,9 @@ pub(crate) fn refusal(
     if !matches!(error, TrainError::Render(RenderError::Device(GpuError::OutOfBudget { .. }))) {
         return error;
     }
-    let index = scene.pager.index();
     let of_view = |&view: &usize| {
         let camera = &dataset.views[view].camera;
-        let rows = scene.pager.pages_of_view(camera).iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let rows = scene.pager.rows_of(&scene.pager.pages_of_view(camera));
         ViewSizes { rows, isects: 0, pixels: camera.pixels() as u64 }
     };
     let largest = views.iter().map(of_view).fold(ViewSizes::default(), ViewSizes::widest);

@@ -11,9 +11,7 @@
 //! those of the drive only through the number of commits in the time of the run.
 
 use super::device_memory;
-use super::plan::{
-    Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most, train_cameras,
-};
+use super::plan::{Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most};
 use crate::base::error::{InputError, InputResult};
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
@@ -310,25 +308,26 @@ impl Forecast {
         let drive_seconds = f64::from(steps) * waits_and_writes.waits;
         let seconds = f64::from(steps) * by_power.min(by_rows) + drive_seconds;
         let is_in_memory = config.residence() == Residence::Memory;
-        let drive_bytes = (tiers.pages[0] as f64 * growth).ceil() as u64 * tiers.frame_bytes;
+        let pages_then = (tiers.pages[0] as f64 * growth).ceil() as u64;
+        let drive_bytes = pages_then * tiers.frame_bytes;
         let state_bytes = last * row_bytes(config.sh_degree) as u64;
         let (commits, commit_bytes_most) = commits(config, state_bytes, seconds);
-        let pages_then = tiers.pages[0] as f64 * growth;
         // The first commit of a run in memory chooses the segments.
         let segment_bytes = match tiers.segment_bytes {
-            0 => SlotLayout::new(tiers.frame_bytes as usize, pages_then.ceil() as u64).segment_bytes(),
+            0 => SlotLayout::new(tiers.frame_bytes as usize, pages_then).segment_bytes(),
             bytes => bytes,
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
-        let of_all = of_first * tiers.pages[0] + of_last * pages_then.ceil() as u64;
-        let slots = slots_of(pages_then.ceil() as u64, of_all, measured.changed_share);
+        let of_all = of_first * tiers.pages[0] + of_last * pages_then;
+        let slots = slots_of(pages_then, of_all, measured.changed_share);
         // A run that makes a second commit fills one more segment: evicted versions wait there until the next commit frees them, and
         // the scene gains pages after its first commit.
         let is_short = first_commit_seconds(config).is_none_or(|first| seconds < 2.0 * first);
         let extra_segment = if is_short { 0 } else { segment_bytes };
         let beside = extra_segment + if is_in_memory { 0 } else { reserve_bytes(segment_bytes) };
         let drive_bytes_peak = beside + store_bytes_peak(slots, tiers.frame_bytes, segment_bytes);
-        let mut forecast = Forecast {
+        let bytes_of_steps = drive.import + waits_and_writes.written * f64::from(steps);
+        Forecast {
             gaussians: [rows, last],
             reach,
             if_kept: None,
@@ -340,16 +339,12 @@ impl Forecast {
             drive_bytes,
             drive_bytes_peak,
             ply_bytes: ply_bytes(config, last),
-            bytes_written: 0.0,
+            bytes_written: if is_in_memory { 0.0 } else { bytes_of_steps },
             commit_bytes_most,
             seconds,
             shorter: Vec::new(),
             drive_seconds,
-        };
-        if !is_in_memory {
-            forecast.bytes_written = drive.import + waits_and_writes.written * f64::from(steps);
         }
-        forecast
     }
 
     /// Whether every page has a frame at the end.
@@ -591,7 +586,7 @@ fn drive_use(
     step_seconds: [f64; 2],
     drive: DriveRate,
 ) -> DriveUse {
-    let cameras = train_cameras(dataset);
+    let cameras = dataset.train_cameras();
     let index = trainer.scene.pager.index();
     let steps = config.steps.min(PLAYED_EPOCHS * cameras.len() as u32);
     let sh_degree = config.sh_degree;

@@ -15,7 +15,6 @@ use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::paging::plan::batches;
 use crate::paging::simulation::replay::automatic_order;
-use crate::scene::camera::Camera;
 use crate::scene::columns::row_width;
 use crate::scene::page_meta::PageMeta;
 use crate::scene::partition::first_fill;
@@ -83,10 +82,6 @@ fn cut_views(dataset: &Dataset, index: &[PageMeta], frames: u64, pages_most: usi
     batches::cut_views(pages, frames as usize, pages_most)
 }
 
-pub(super) fn train_cameras(dataset: &Dataset) -> Vec<Camera> {
-    dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect()
-}
-
 /// Pages, frames and drive space of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TierPlan {
@@ -139,7 +134,7 @@ pub(super) fn plan_tiers(
     plan.frames = Some(frames);
     plan.cut_views = cut_views(dataset, trainer.scene.pager.index(), frames, trainer.memory.pages_most);
     if config.view_order.0.is_none() {
-        trainer.set_view_order(auto_order(config, dataset, trainer, frames, &plan)?, dataset);
+        trainer.set_view_order(auto_order(config, dataset, trainer, frames, plan.pages)?, dataset);
     }
     warn_of_growth(config, &plan, host_mem, memory);
     Ok(plan)
@@ -183,19 +178,16 @@ fn plan_frames(
     memory: &mut [MemoryEstimate; 3],
 ) -> InputResult<(u64, Option<u64>)> {
     let need = LargestNeed { frame_bytes: plan.frame_bytes, pages: plan.largest_view.pages };
-    let (FirstFrames { frames, pages_most }, host_mem) = first_frames(config, &need, asked, &memory[0])?;
-    trainer.memory.pages_most = pages_most;
-    trainer.scene.pager.allow_frames(frames as usize);
-    trainer.scene.pager.limit_frames(frames as usize);
+    let (first, host_mem) = first_frames(config, &need, asked, &memory[0])?;
+    trainer.memory.pages_most = first.pages_most;
+    trainer.scene.pager.allow_frames(first.frames as usize);
+    trainer.scene.pager.limit_frames(first.frames as usize);
     if let Some(budget) = host_mem.filter(|_| config.frames == 0) {
-        let first = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
-        trainer.memory.budget = Some(HostBudget { is_raised: host_mem != asked, ..first });
+        let budget = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
+        trainer.memory.budget = Some(HostBudget { is_raised: host_mem != asked, ..budget });
     }
-    for memory in memory {
-        memory.frames = memory.frames.min(frames * plan.frame_bytes);
-        in_batches(config, memory, pages_most, plan.frame_bytes);
-    }
-    Ok((frames, host_mem))
+    memory.iter_mut().for_each(|memory| reduce(config, memory, first, plan.frame_bytes));
+    Ok((first.frames, host_mem))
 }
 
 /// What the largest view needs.
@@ -319,13 +311,12 @@ fn frames_of_budget(
 /// Reduces the estimate of a grown scene to `budget` as the run will do: by fewer frames and, if these do not hold the largest view of
 /// the grown scene (`need`), by views in batches. Returns the number of frames.
 fn shrink_to_budget(config: &TrainConfig, need: &LargestNeed, budget: u64, memory: &mut MemoryEstimate) -> u64 {
-    let FirstFrames { frames, pages_most } = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
+    let first = whole_views(need, Some(budget), memory).unwrap_or_else(|| {
         let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
         FirstFrames::of_batches(config, left, need.frame_bytes, memory.copies > 0)
     });
-    in_batches(config, memory, pages_most, need.frame_bytes);
-    memory.frames = memory.frames.min(frames.saturating_mul(need.frame_bytes));
-    frames
+    reduce(config, memory, first, need.frame_bytes);
+    first.frames
 }
 
 /// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
@@ -349,9 +340,10 @@ pub(super) fn limit_memory(
     frames_at_end
 }
 
-/// Reduces the estimate to batches of `pages_most` pages: rows of a view, and copies of a round.
-fn in_batches(config: &TrainConfig, memory: &mut MemoryEstimate, pages_most: usize, frame_bytes: u64) {
-    let pages = pages_most as u64;
+/// Reduces the estimate to these frames, and to batches of that many pages: rows of a view, and copies of a round.
+fn reduce(config: &TrainConfig, memory: &mut MemoryEstimate, to: FirstFrames, frame_bytes: u64) {
+    memory.frames = memory.frames.min(to.frames.saturating_mul(frame_bytes));
+    let pages = to.pages_most as u64;
     let working = pages.saturating_mul(page_working(config)).min(memory.working);
     memory.view -= memory.working - working;
     memory.working = working;
@@ -412,14 +404,13 @@ fn auto_order(
     dataset: &Dataset,
     trainer: &Trainer,
     frames: u64,
-    plan: &TierPlan,
+    [now, most]: [u64; 2],
 ) -> InputResult<Order> {
-    let [now, most] = plan.pages;
-    let cameras = train_cameras(dataset);
+    let cameras = dataset.train_cameras();
     let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
-    let frames = if frames >= most { now } else { frames * now / most };
     // A run whose views fit now is planned as one whose views fit.
-    let least = if plan.frames.is_some_and(|frames| frames as usize >= views.most()) { views.most() } else { 1 };
+    let least = if frames as usize >= views.most() { views.most() } else { 1 };
+    let frames = if frames >= most { now } else { frames * now / most };
     let frames = (frames as usize).max(least);
     automatic_order(&views, &cameras, now as usize, frames, config.seed, PLAN_BYTES as u64)
         .map_err(|e| InputError::new("--view-order", e.to_string(), "name one: shuffle, groups:N or tour"))
@@ -599,8 +590,7 @@ pub(super) fn estimate(
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-
-    const MIB: u64 = 1 << 20;
+    use crate::base::units::MIB;
 
     /// A scene whose widest view takes 80 MiB of splats, in a run whose other parts take 100 MiB.
     fn estimate() -> MemoryEstimate {

@@ -54,20 +54,19 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let (request, config) = (&request, &request.config);
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         check_first_drive(config, start.rows)?;
-        if !request.quiet {
-            crate::say!("{known}");
-        }
+        tell_plan(request, &known);
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let FirstTrainer { dataset, trainer, tiers, begun } = first_trainer(request, start, host_mem)?;
     plan_and_train(request, &dataset, tiers, trainer, Begun { diagnosis, ..begun })
 }
 
-/// Prints a part of the plan: to standard output where it is what was asked for.
+/// Prints a part of the plan, unless the run is quiet: to standard output where it is what was asked for.
 fn tell_plan(request: &RunRequest, text: &str) {
-    match request.dry_run {
-        true => crate::say!("{text}"),
-        false => crate::tell!("{text}"),
+    match (request.quiet, request.dry_run) {
+        (true, _) => {}
+        (false, true) => crate::say!("{text}"),
+        (false, false) => crate::tell!("{text}"),
     }
 }
 
@@ -75,7 +74,7 @@ fn tell_plan(request: &RunRequest, text: &str) {
 fn adapt_schedule(request: &RunRequest, start: &Start) -> RunRequest {
     let mut request = request.clone();
     let photos = start.dataset.train_views().len();
-    if let Some(steps) = new_run::adapt_schedule(&mut request.config, photos).filter(|_| !request.quiet) {
+    if let Some(steps) = new_run::adapt_schedule(&mut request.config, photos) {
         let steps = format_grouped(steps.into());
         let text = format!("photos  {photos} to train on, few for so many steps: those after {steps} change little");
         tell_plan(&request, &text);
@@ -106,8 +105,7 @@ fn adapt_to_photos(
             Start::read(&request.scene, &request.config, host_mem)?
         }
     };
-    let is_told = diagnosis.is_some() || asked != Remedies::default();
-    if is_told && !request.quiet {
+    if diagnosis.is_some() || asked != Remedies::default() {
         tell_plan(&request, &plan_text::describe_photos(diagnosis.as_ref(), &before, &request.config));
     }
     Ok((request, start, diagnosis))
@@ -133,22 +131,16 @@ fn with_useful_points(
         None if contradict => "since those of the scene have not the colours that photos show there",
         _ => return Ok((start, diagnosis, false)),
     };
-    if !request.quiet {
-        tell_plan(request, &format!("points  first points are sought where photos agree, {reason}"));
-    }
+    tell_plan(request, &format!("points  first points are sought where photos agree, {reason}"));
     let (swept, is_swept) = start.with_swept_points(&request.scene, &request.config)?;
     let said = swept.diagnose()?;
     // Points at which photos agree have the colours of the photos. Others are no better than those of the scene.
     if is_swept && said.as_ref().is_some_and(Diagnosis::points_fit) {
-        if !request.quiet {
-            let count = format_grouped(swept.rows);
-            tell_plan(request, &format!("        {count} Gaussians begin at such points (see --sweep-points)"));
-        }
+        let count = format_grouped(swept.rows);
+        tell_plan(request, &format!("        {count} Gaussians begin at such points (see --sweep-points)"));
         return Ok((swept, said, true));
     }
-    if !request.quiet {
-        tell_plan(request, "        too few are found");
-    }
+    tell_plan(request, "        too few are found");
     let start = if is_swept { Start::read(&request.scene, &request.config, host_mem)? } else { swept };
     Ok((start, diagnosis, false))
 }
@@ -294,10 +286,8 @@ pub(super) fn plan_and_train(
     let config = &request.config;
     trainer.start_photos(dataset).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let forecast = plan_run(config, dataset, &tiers, &mut trainer, begun.host_mem, begun.driver, DriveRate::COMMON)?;
-    if !request.quiet {
-        let plan = plan_text::describe(config, [&request.scene, &request.out], dataset, &trainer, &forecast, &tiers);
-        tell_plan(request, &plan);
-    }
+    let plan = plan_text::describe(config, [&request.scene, &request.out], dataset, &trainer, &forecast, &tiers);
+    tell_plan(request, &plan);
     let slots = trainer.scene.pager.slot_space().map_or(0, |slots| slots.total);
     let stored = slots * forecast.tiers.frame_bytes;
     check_drive_of_results(config, &request.out, &forecast, stored, begun.past.is_some())?;
@@ -331,10 +321,8 @@ pub(super) fn plan_and_train(
 
 /// ` --spill-dir FOLDER` if the config.toml could not be rewritten and so does not name the run's checkpoint.
 fn spill_dir_flag(request: &RunRequest) -> String {
-    let [kept, now] = [TrainConfig::read(&request.out.join(CONFIG_FILE)), Ok(request.config.clone())]
-        .map(|config| config.map(|config| with_absolute_paths(config).spill_dir));
-    match now {
-        Ok(now) if !now.is_empty() && !kept.is_ok_and(|kept| kept == now) => format!(" --spill-dir {now}"),
-        _ => String::new(),
-    }
+    let folder = |config: TrainConfig| with_absolute_paths(config).spill_dir;
+    let (kept, now) = (TrainConfig::read(&request.out.join(CONFIG_FILE)).map(folder), folder(request.config.clone()));
+    let is_known = now.is_empty() || kept.is_ok_and(|kept| kept == now);
+    if is_known { String::new() } else { format!(" --spill-dir {now}") }
 }

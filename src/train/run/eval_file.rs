@@ -16,7 +16,6 @@ use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::photos::exposure::{AppearanceMode, read_values};
 use crate::photos::{PhotoOptions, PhotoParameters, first_parameters};
-use crate::render::color_correct::ColorCorrect;
 use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::{RenderOptions, Renderer};
@@ -247,21 +246,10 @@ impl<'a> Evaluator<'a> {
         let (mut pages, run) = self.pages(&columns)?;
         let gaussians = columns.rows() as u64;
         drop(columns);
-        let views = self.dataset.test_views();
-        let shown = Count::new("views compared", views.len() as u32, false);
-        let predicted = self.photos.iter().find_map(|parameter| parameter.predict(&self.dataset, &views));
-        // Beside predicted colours, the best that a correction could do.
-        let color_correct = run.color_correct.or(predicted.is_some().then_some(ColorCorrect::Affine));
-        let request = EvalRequest {
-            views: &views,
-            predicted,
-            ssim: run.ssim_variant,
-            pictures,
-            lpips: self.lpips,
-            color_correct,
-            appearance: run.photos.appearance,
-            progress: &|done| shown.show(done),
-        };
+        let shown = Count::new("views compared", self.dataset.test_views().len() as u32, false);
+        let progress = |done: u32| shown.show(done);
+        let request = EvalRequest::of_held_out(&self.dataset, &run, &self.photos, pictures, &progress);
+        let request = EvalRequest { lpips: self.lpips, ..request };
         let working = &mut WorkingSet::default();
         let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *self.renderer };
         let test = evaluate(&mut now, &self.dataset, &self.targets, &run.render, &request)?;

@@ -38,21 +38,17 @@ const LOCK: &str = ".gsscale-lock";
 /// File that shows that an output folder can be written; removed at once.
 const PROBE: &str = ".gsscale-probe";
 
-/// The lock on an output folder, held until dropped.
-#[derive(Debug)]
-pub(crate) struct OutLock(#[allow(dead_code)] Option<File>); // the lock is held by the open file
-
-/// Locks an existing output folder. On file systems without locks this does nothing.
+/// Locks an existing output folder for as long as the file is open. On file systems without locks this does nothing.
 /// Errors: another process trains into the folder.
-pub(crate) fn lock(out: &Path) -> InputResult<OutLock> {
+pub(crate) fn lock(out: &Path) -> InputResult<Option<File>> {
     let file = OpenOptions::new().write(true).create(true).truncate(false).open(out.join(LOCK));
-    let Ok(file) = file else { return Ok(OutLock(None)) };
+    let Ok(file) = file else { return Ok(None) };
     match file.try_lock() {
         Err(TryLockError::WouldBlock) => {
             let remedy = "wait for it to end, stop it (Ctrl-C commits first), or choose another --out";
             Err(InputError::new(out, "another process trains into this folder", remedy))
         }
-        _ => Ok(OutLock(Some(file))),
+        _ => Ok(Some(file)),
     }
 }
 
@@ -198,7 +194,9 @@ fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
         RunFile::File(name) => remove_file(&out.join(name)),
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
-        RunFile::Exports => exports(out).try_for_each(|(format, file)| format.remove(&file)),
+        RunFile::Exports => ExportFormat::ALL
+            .into_iter()
+            .try_for_each(|format| format.beside(&out.join(PLY_FILE)).map_or(Ok(()), |file| format.remove(&file))),
         RunFile::Photos => photos::files().try_for_each(|name| remove_file(&out.join(name))),
         RunFile::Pictures(folder) => {
             remove_in(&out.join(folder), |path| path.extension().is_some_and(|e| e == "png"), true)
@@ -212,12 +210,6 @@ pub(super) fn check_results(out: &Path, format: ExportFormat) -> InputResult<()>
     let ply = out.join(PLY_FILE);
     ExportFormat::Ply.check_removable(&ply)?;
     format.beside(&ply).map_or(Ok(()), |file| format.check_removable(&file))
-}
-
-/// The exports that a run can have written beside its PLY.
-fn exports(out: &Path) -> impl Iterator<Item = (ExportFormat, PathBuf)> {
-    let ply = out.join(PLY_FILE);
-    ExportFormat::ALL.into_iter().filter_map(move |format| Some((format, format.beside(&ply)?)))
 }
 
 fn remove_file(path: &Path) -> InputResult<()> {

@@ -22,7 +22,6 @@ use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::{Chosen, checkpoint_folder};
-use crate::densify::stats::GradHistogram;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
@@ -80,7 +79,7 @@ impl ResumeRequest {
 /// Errors: no run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // Do not read or remove files of an active run.
-    let lock = if request.out.is_dir() { Some(out_folder::lock(&request.out)?) } else { None };
+    let lock = if request.out.is_dir() { out_folder::lock(&request.out)? } else { None };
     if let Some((config, scene)) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
         drop(lock);
         crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
@@ -227,23 +226,15 @@ fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> R
     run(&request.to_run(&earlier.scene, config, Existing::BeginAgain))
 }
 
-/// What a run resumes with.
-struct Goal {
-    /// Accepted differences.
-    changes: Changes,
-    start: Start,
-    /// Digest of the dataset.
-    print: DatasetPrint,
-}
-
-/// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Changes no file.
+/// Checks that a run may go on from `state` with `config`, whose rate schedule becomes that of the run. Returns the accepted differences
+/// and what the run resumes with. Changes no file.
 /// Errors: the run has done more steps, its settings or its dataset changed, or its scene is not there.
 fn goal(
     request: &ResumeRequest,
     earlier: &Earlier,
     config: &mut TrainConfig,
     state: &RunState,
-) -> Result<Goal, TrainError> {
+) -> Result<(Changes, Start, DatasetPrint), TrainError> {
     let (file, scene) = (&earlier.path, &earlier.scene);
     if let Ok(then) = TrainConfig::parse(&state.origin.config) {
         keep_rates(config, &request.keys, &then);
@@ -264,7 +255,7 @@ fn goal(
     changes.add_dataset(&start.dataset, &state.origin.dataset, &print);
     changes.numbers.extend(first_degree_change(&start, state, &print));
     changes.check(&start.dataset.image_folder, request.accept_changes)?;
-    Ok(Goal { changes, start, print })
+    Ok((changes, start, print))
 }
 
 /// Resumes from a checkpoint.
@@ -277,7 +268,7 @@ fn resume_from(
     machine::set_up(&config)?;
     let host_mem = host_budget(config.host_mem.0);
     let state = stored.run_state.clone();
-    let Goal { changes, start, print } = goal(request, earlier, &mut config, &state)?;
+    let (changes, start, print) = goal(request, earlier, &mut config, &state)?;
     let (renderer, options, driver) = begin(request.quiet, &config, &start)?;
     print_resume(request, &state, &config, &changes, &*renderer);
     let dataset = start.into_dataset();
@@ -285,7 +276,7 @@ fn resume_from(
     tiers.notes.iter().for_each(|note| crate::tell!("warning: {note}"));
     let has_changed = !changes.numbers.is_empty();
     let pages = match has_changed {
-        false => restore_pages(pager, &restore_options(&options, &state), &state)?,
+        false => PagedScene::restore(pager, &options, &state)?,
         true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
@@ -388,20 +379,13 @@ fn finished_outcome(
     }))
 }
 
-fn restore_pages(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
-    let histogram = GradHistogram::from_filled(&state.histogram);
-    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
-    let events = state.event_log().map_err(CommitError::Contradiction)?;
-    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
-}
-
 /// The pages of a run that resumes with changed rules, updated to its last step by the old rules.
 fn pages_with_new_rules(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, TrainError> {
     let then = TrainConfig::parse(&state.origin.config).map_err(CommitError::Contradiction)?;
     let then = config_before(&then, &state.origin.simd, SimdPath::is_supported)
         .ok_or_else(|| CommitError::Contradiction("no instruction path of this machine is known".to_string()))?;
-    let old = restore_options(&RunOptions::new(&then, state.origin.dataset.scene_scale), state);
-    let mut pages = restore_pages(pager, &old, state)?;
+    let old = RunOptions::new(&then, state.origin.dataset.scene_scale);
+    let mut pages = PagedScene::restore(pager, &old, state)?;
     if pages.change_rules(options, state.trainer.step)? {
         crate::tell!("warning: the statistics of the rows differed from the run's histogram, which is counted anew");
     }
@@ -418,12 +402,6 @@ fn config_before(then: &TrainConfig, simd: &str, is_supported: impl Fn(SimdPath)
     let of_class = of_class.map(|path| on(Some(path)));
     let mut all = std::iter::once(on(path)).chain(of_class).chain([on(then.simd.0), on(None)]);
     all.find(|c| is_supported(limits::simd_path(c)))
-}
-
-/// The options for restoring pages: with the SH degree of the run's first step, from which its events raised the
-/// degree. Accepted changes of keys may give another first degree now.
-fn restore_options(options: &RunOptions, state: &RunState) -> RunOptions {
-    RunOptions { sh_degree_start: state.origin.sh_degree_start, ..options.clone() }
 }
 
 /// The difference if the run would start with another SH degree now: a sign of changed input. For the same points or
@@ -511,7 +489,7 @@ fn committed(
     mut config: TrainConfig,
     state: &RunState,
 ) -> Result<String, TrainError> {
-    let changes = goal(request, earlier, &mut config, state)?.changes;
+    let (changes, ..) = goal(request, earlier, &mut config, state)?;
     let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
     let mut text = steps_to_do(&request.out, &from, state.trainer.step, &config);
     for change in changes.free.iter().chain(&changes.numbers) {
@@ -523,12 +501,9 @@ fn committed(
 fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> String {
     let left = config.steps.saturating_sub(done);
     let [done, all, more] = [done, config.steps, left].map(|steps| format_grouped(steps.into()));
-    let time = match seconds_of_a_step(out) {
-        Some(seconds) => {
-            format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
-        }
-        None => String::new(),
-    };
+    let time = seconds_of_a_step(out).map_or(String::new(), |seconds| {
+        format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
+    });
     let rates = text_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
     format!(
         "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",

@@ -33,8 +33,7 @@ use crate::report::run_files::{
     CONFIG_FILE, DIAGNOSIS_FILE, EVENTS_FOLDER, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, SUMMARY_FILE,
 };
 use crate::report::run_report::write_run_report;
-use crate::scene::page_meta::PageBounds;
-use crate::train::commits::checkpoint::Checkpoint;
+use crate::train::commits::checkpoint::{Checkpoint, warn_of_space};
 use crate::train::commits::results::{ExportChoice, Results, export, scene_meta};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
@@ -65,7 +64,6 @@ pub(super) struct PastRun {
 
 /// Facts with which a run begins or resumes.
 pub(super) struct Begun {
-    /// Digest of the dataset.
     pub print: DatasetPrint,
     /// SH degree of the first step.
     pub sh_degree_start: u8,
@@ -170,7 +168,7 @@ pub(super) fn train_into(
         live.set_metrics(out.join(METRICS_FILE));
         LivePage::new(live, scene_name(&request.scene))
     });
-    let mut progress = RunProgress::new(config.steps, request.quiet).after(trainer.steps_done());
+    let mut progress = RunProgress::new(trainer.steps_done(), config.steps, request.quiet);
     let before = trainer.scene.pager.stats();
     metrics.start_clock(trainer.train_seconds());
     let looped = TrainingLoop {
@@ -243,12 +241,7 @@ fn write_results(
     });
     if (config.keep_checkpoint || exported.is_err()) && tested.is_ok() {
         // Commit again, with the result of the evaluation. A run whose export failed is resumed from this commit.
-        match results.write(Results::commit) {
-            Err(error) if error.is_out_of_space() => {
-                crate::tell!("warning: the last steps are not committed: {error}");
-            }
-            done => done?,
-        }
+        warn_of_space(results.write(Results::commit))?;
     }
     let trainer = &*results.trainer;
     let (rows_skipped, steps_skipped) = trainer.skipped();
@@ -447,7 +440,8 @@ fn page_tiles(dataset: &Dataset, trainer: &Trainer) -> Vec<PageTile> {
             views[page.index()] += 1;
         }
     }
-    let seen: Vec<usize> = (0..index.len()).filter(|&i| is_finite(&index[i].bounds)).collect();
+    let is_finite = |&page: &usize| index[page].bounds.lo.iter().chain(&index[page].bounds.hi).all(|x| x.is_finite());
+    let seen: Vec<usize> = (0..index.len()).filter(is_finite).collect();
     // The view from above is along the axis in which page centres differ least.
     let centre = |i: usize, axis: usize| f64::from(index[i].bounds.lo[axis]) + f64::from(index[i].bounds.hi[axis]);
     let spread = |axis: usize| {
@@ -464,8 +458,4 @@ fn page_tiles(dataset: &Dataset, trainer: &Trainer) -> Vec<PageTile> {
         resident: pager.is_in_memory(PageNo(i as u32)),
     };
     seen.iter().map(tile).collect()
-}
-
-fn is_finite(bounds: &PageBounds) -> bool {
-    bounds.lo.iter().chain(&bounds.hi).all(|x| x.is_finite())
 }

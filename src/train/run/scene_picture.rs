@@ -121,7 +121,7 @@ pub(super) fn overview(scene: &PagedScene, dataset: &Dataset) -> u32 {
 fn check_picture(trainer: &Trainer, camera: &Camera) -> InputResult<()> {
     let Some(budget) = trainer.memory.budget.filter(|_| !trainer.scene.is_in_memory()) else { return Ok(()) };
     let pager = &trainer.scene.pager;
-    let rows: u64 = pager.pages_of_view(camera).iter().map(|page| u64::from(pager.index()[page.index()].rows)).sum();
+    let rows = pager.rows_of(&pager.pages_of_view(camera));
     let needed = trainer.renderer.host_bytes_for_rows(rows);
     if needed <= trainer.renderer.host_bytes_of_rows().max(budget.bytes / PICTURE_SHARE) {
         return Ok(());

@@ -16,7 +16,7 @@ use crate::dataset::target_cache::TargetCache;
 use crate::paging::error::PagingError;
 use crate::render::Traffic;
 use crate::report::run_files::saved_ply_name;
-use crate::train::commits::checkpoint::Checkpoint;
+use crate::train::commits::checkpoint::{Checkpoint, warn_of_space};
 use crate::train::commits::results::save;
 use crate::train::error::TrainError;
 use crate::train::inputs::signals::StopFlag;
@@ -208,7 +208,7 @@ impl TrainingLoop<'_> {
     fn commit_last(&mut self) -> Result<(), TrainError> {
         let Some(checkpoint) = self.checkpoint.as_deref_mut() else { return Ok(()) };
         match self.trainer.steps_done() < self.trainer.options.steps || checkpoint.needs_last_commit() {
-            true => checkpoint.commit_or_warn(self.trainer, self.metrics),
+            true => warn_of_space(checkpoint.commit(self.trainer, self.metrics)),
             false => Ok(()),
         }
     }

@@ -130,19 +130,17 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
     let first = ShownScene::open(request, 0, false)?;
     request.saved.iter().for_each(|folder| live.set_metrics(folder.join(METRICS_FILE)));
-    let status = Status {
-        name: scene_name(scene),
-        overview: overview(&first.trainer.scene, &first.dataset),
-        picture_percent: 100,
-        saved: request.saved.as_deref().map_or_else(Vec::new, saved_steps),
-        ..Status::default()
-    };
-    let saved = status.saved.clone();
+    let overview = overview(&first.trainer.scene, &first.dataset);
+    let saved = request.saved.as_deref().map_or_else(Vec::new, saved_steps);
     let tell = |shown: &ShownScene| {
-        let counts = counts(&shown.trainer, &shown.dataset);
-        let Status { gaussians, pages, pages_in_memory, views, held_out, .. } = counts;
-        let step = shown.step;
-        live.set_status(Status { step, gaussians, pages, pages_in_memory, views, held_out, ..status.clone() });
+        live.set_status(Status {
+            name: scene_name(scene),
+            step: shown.step,
+            overview,
+            picture_percent: 100,
+            saved: saved.clone(),
+            ..counts(&shown.trainer, &shown.dataset)
+        });
     };
     tell(&first);
     // Until here, Ctrl-C ends the program at once; the pages go at the next start.

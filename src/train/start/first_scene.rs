@@ -16,7 +16,7 @@ use crate::config::limits::{self, RunOptions};
 use crate::dataset::colmap;
 use crate::dataset::frame::Extent;
 use crate::dataset::import::{Budget, Cloud, ImportOptions, LocalCloud, PointSource, import_points};
-use crate::dataset::loader::{Dataset, LoadOptions, load_dataset, load_dataset_with_cloud};
+use crate::dataset::loader::{Dataset, load_dataset, load_dataset_with_cloud};
 use crate::dataset::model::{PointCloud, RawScene, TakePoint};
 use crate::dataset::plane_sweep;
 use crate::dataset::read::{ReadOptions, read_scene};
@@ -35,69 +35,42 @@ use crate::scene::state::SceneState;
 use crate::train::error::{TrainError, not_stored};
 use crate::train::inputs::dataset_print::{GaussiansPrint, points_print, view_print};
 use crate::train::inputs::gaussian_pages::{
-    GaussianFile, GaussianSpace, GaussianWriter, GaussiansRead, PositionSample, file_warnings, giants_warning,
-    remove_giants, truncate_sh,
+    GaussianFile, GaussianWriter, GaussiansRead, PositionSample, file_warnings, giants_warning, remove_giants,
+    truncate_sh,
 };
 use crate::train::inputs::machine::folder_beside;
 use crate::train::memory::check_photos_fit;
 use crate::train::step::pages::{PagedScene, first_pages};
 use crate::train::stores::StoredStart;
 use rayon::prelude::*;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Memory of an import without a budget, bytes.
 const BUDGET_DEFAULT: u64 = 1 << 30;
 /// The input of the first Gaussians gets 1/3 of the budget.
 const BUDGET_SHARE: u64 = 3;
 
-/// What the start of a run needs of its config.
-struct FirstOptions {
-    read: ReadOptions,
-    load: LoadOptions,
-    /// Without the scene scale.
-    init: InitOptions,
-    /// Highest SH degree of the run.
-    sh_degree: u8,
-    max_gaussians: u64,
-    init_ply: Option<PathBuf>,
-    pages_file: Option<PathBuf>,
-    init_points: u32,
-    /// Whether Gaussians may exceed memory.
-    spills: bool,
+/// The file or store of Gaussians or points that the user gave, if any.
+fn init_ply(config: &TrainConfig) -> Option<&Path> {
+    Some(Path::new(&config.init_ply)).filter(|path| !path.as_os_str().is_empty())
 }
 
-impl FirstOptions {
-    fn new(config: &TrainConfig) -> FirstOptions {
-        FirstOptions {
-            read: limits::read_options(config),
-            load: limits::load_options(config),
-            init: limits::init_options(config),
-            sh_degree: config.sh_degree,
-            max_gaussians: config.max_gaussians,
-            init_ply: (!config.init_ply.is_empty()).then(|| PathBuf::from(&config.init_ply)),
-            pages_file: (!config.pages_file.is_empty()).then(|| PathBuf::from(&config.pages_file)),
-            init_points: config.init_points,
-            spills: config.residence().spill_dir().is_some(),
-        }
-    }
+/// The store from which the run begins, if it begins from one.
+fn store(config: &TrainConfig) -> Option<&Path> {
+    init_ply(config).filter(|path| path.is_dir())
+}
 
-    /// The store from which the run begins, if it begins from one.
-    fn store(&self) -> Option<&Path> {
-        self.init_ply.as_deref().filter(|path| path.is_dir())
+/// Refuses a start without Gaussians, or with more than --max-gaussians.
+fn check_rows(config: &TrainConfig, from: &Path, rows: u64) -> InputResult<()> {
+    if rows == 0 {
+        let problem = "all first Gaussians are too far from the cameras or too large";
+        return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
     }
-
-    /// Refuses a start without Gaussians, or with more than --max-gaussians.
-    fn check_rows(&self, from: &Path, rows: u64) -> InputResult<()> {
-        if rows == 0 {
-            let problem = "all first Gaussians are too far from the cameras or too large";
-            return Err(InputError::new(from, problem, "give a PLY of this scene with --init-ply"));
-        }
-        if self.max_gaussians > 0 && rows > self.max_gaussians {
-            let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
-            return Err(InputError::new(from, problem, "raise --max-gaussians or start from fewer"));
-        }
-        Ok(())
+    if config.max_gaussians > 0 && rows > config.max_gaussians {
+        let problem = format!("the start has {rows} Gaussians, above --max-gaussians");
+        return Err(InputError::new(from, problem, "raise --max-gaussians or start from fewer"));
     }
+    Ok(())
 }
 
 /// Fewest points of a plane sweep that a run begins from.
@@ -137,27 +110,22 @@ impl Start {
     /// Reads the scene. Points that can be streamed take no more memory than `host_mem` allows.
     /// Errors: as [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
-        let options = FirstOptions::new(config);
-        if !options.spills && options.store().is_none() {
-            return Start::in_memory(scene, &options, host_mem)?.with_photos_that_fit(host_mem);
+        if config.residence().spill_dir().is_none() && store(config).is_none() {
+            return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
         }
-        Start::with(scene, &options, &folder_beside(Path::new(&config.spill_dir)), host_mem)
+        Start::look(scene, config, &folder_beside(Path::new(&config.spill_dir)), host_mem)
     }
 
     /// As [`Start::read`], for inspection of a run's start: avoids creating Gaussians. `folder` holds unnamed temporary
     /// files for data that exceeds memory.
     /// Errors: as [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
-        Start::with(scene, &FirstOptions::new(config), folder, host_mem)
-    }
-
-    fn with(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
-        let start = match options.store() {
-            Some(store) => Start::of_store(scene, options, store, host_mem)?,
-            None if options.init_ply.as_deref().is_some_and(is_tree) => Start::in_memory(scene, options, host_mem)?,
-            None => match Start::stream(scene, options, &budget(folder, host_mem))? {
+        let start = match store(config) {
+            Some(store) => Start::of_store(scene, config, store, host_mem)?,
+            None if init_ply(config).is_some_and(is_tree) => Start::in_memory(scene, config, host_mem)?,
+            None => match Start::stream(scene, config, &budget(folder, host_mem))? {
                 Some(start) => start,
-                None => Start::in_memory(scene, options, host_mem)?,
+                None => Start::in_memory(scene, config, host_mem)?,
             },
         };
         start.with_photos_that_fit(host_mem)
@@ -169,9 +137,9 @@ impl Start {
         Ok(self)
     }
 
-    fn in_memory(scene: &Path, options: &FirstOptions, host_mem: Option<u64>) -> InputResult<Start> {
-        check_gaussians_fit(options, host_mem)?;
-        let Prepared { dataset, columns, sh_degree_start, is_random } = prepare_with(scene, options)?;
+    fn in_memory(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        check_gaussians_fit(config, host_mem)?;
+        let Prepared { dataset, columns, sh_degree_start, is_random } = prepare_silently(scene, config)?;
         let points = match dataset.points.as_slice() {
             [] => {
                 let mut print = GaussiansPrint::default();
@@ -186,35 +154,35 @@ impl Start {
     }
 
     /// From the Gaussians of a store.
-    fn of_store(scene: &Path, options: &FirstOptions, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+    fn of_store(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
         let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
         let mut store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
             TrainError::Input(error) => error,
             other => InputError::new(folder, other.to_string(), "see the cause"),
         })?;
-        if let Some(file) = &options.pages_file {
-            store.keep_listed(file)?;
+        if !config.pages_file.is_empty() {
+            store.keep_listed(Path::new(&config.pages_file))?;
         }
-        let mut raw = read_scene(scene, &options.read)?;
+        let mut raw = read_scene(scene, &limits::read_options(config))?;
         raw.points = PointCloud::default();
-        let dataset = load_dataset(raw, &options.load)?;
+        let dataset = load_dataset(raw, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let rows = store.rows_at_most();
-        options.check_rows(folder, rows)?;
-        let sh_degree_start = store.sh_degree().max(options.init.sh_degree);
+        check_rows(config, folder, rows)?;
+        let sh_degree_start = store.sh_degree().max(limits::first_sh_degree(config));
         let points = store.digest()?;
         let from = FirstRows::Store(Box::new(store));
         Ok(Start { dataset, sh_degree_start, rows, own_rows: rows, points, from })
     }
 
     /// From the Gaussians of a file, which are read once here to know that all of them can be.
-    fn of_gaussians(scene: &Path, options: &FirstOptions, mut raw: RawScene, file: &Path) -> InputResult<Start> {
+    fn of_gaussians(scene: &Path, config: &TrainConfig, mut raw: RawScene, file: &Path) -> InputResult<Start> {
         raw.points = PointCloud::default();
-        let mut dataset = load_dataset(raw, &options.load)?;
+        let mut dataset = load_dataset(raw, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let frame = (dataset.frame.origin.to_array(), dataset.frame.scale);
         let range = LogScaleRange::of_scene(dataset.scene_scale);
-        let gaussians = GaussianFile::open(file, options.sh_degree, frame, range)?;
+        let gaussians = GaussianFile::open(file, config.sh_degree, frame, range)?;
         let (mut print, mut rows) = (GaussiansPrint::default(), 0);
         let GaussiansRead { meta, far, giants } = gaussians.read(&mut |columns| {
             print.add(columns);
@@ -223,18 +191,19 @@ impl Start {
         })?;
         dataset.warnings.extend(file_warnings(file, &meta, far));
         dataset.warnings.extend(giants_warning(file, giants));
-        options.check_rows(file, rows)?;
-        let sh_degree_start = gaussians.sh_degree.max(options.init.sh_degree);
+        check_rows(config, file, rows)?;
+        let sh_degree_start = gaussians.sh_degree.max(limits::first_sh_degree(config));
         let from = FirstRows::Gaussians(gaussians);
         Ok(Start { dataset, sh_degree_start, rows, own_rows: rows, points: print.digest(), from })
     }
 
     /// `None` where neither points nor Gaussians are in a file.
-    fn stream(scene: &Path, options: &FirstOptions, budget: &Budget<'_>) -> InputResult<Option<Start>> {
-        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..options.read.clone() })?;
-        let Some(file) = options.init_ply.clone().or_else(|| raw.points_path.take()) else { return Ok(None) };
+    fn stream(scene: &Path, config: &TrainConfig, budget: &Budget<'_>) -> InputResult<Option<Start>> {
+        let mut raw = read_scene(scene, &ReadOptions { points_later: true, ..limits::read_options(config) })?;
+        let given = init_ply(config).map(Path::to_path_buf);
+        let Some(file) = given.or_else(|| raw.points_path.take()) else { return Ok(None) };
         if is_ply(&file) && ply::holds_gaussians(&file)? {
-            return Start::of_gaussians(scene, options, raw, &file).map(Some);
+            return Start::of_gaussians(scene, config, raw, &file).map(Some);
         }
         let mut warnings = Vec::new();
         let cloud = Cloud::gather(budget, |take| read_points(&file, &mut warnings, take))?;
@@ -242,17 +211,24 @@ impl Start {
             return Ok(None);
         }
         raw.warnings.append(&mut warnings);
-        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &options.load)?;
+        let (dataset, local) = load_dataset_with_cloud(raw, &cloud, &limits::load_options(config))?;
         check_train_views(scene, &dataset)?;
         let extent = local.extent;
         let (points, rows) = points_print(&local)?;
         if rows == 0 {
             return Ok(None);
         }
-        let init = InitOptions { scene_scale: dataset.scene_scale, ..options.init };
+        let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
         let rows = init.max_gaussians.map_or(rows, |most| rows.min(most as u64));
         let from = FirstRows::Points { cloud, extent, init };
-        Ok(Some(Start { dataset, sh_degree_start: options.init.sh_degree, rows, own_rows: rows, points, from }))
+        Ok(Some(Start {
+            dataset,
+            sh_degree_start: limits::first_sh_degree(config),
+            rows,
+            own_rows: rows,
+            points,
+            from,
+        }))
     }
 
     /// The direction of the dataset that is up, by its cameras and points; `None` without cameras. The same for streamed and
@@ -298,17 +274,16 @@ impl Start {
     /// scene's own points, so that a resumed run does not search again.
     /// Errors: as [`prepare`].
     pub(crate) fn with_swept_points(mut self, scene: &Path, config: &TrainConfig) -> InputResult<(Start, bool)> {
-        let options = FirstOptions::new(config);
-        let (points, colors) = plane_sweep::sweep(&self.dataset, options.init.seed);
+        let (points, colors) = plane_sweep::sweep(&self.dataset, config.seed);
         if points.len() < SWEPT_LEAST {
             return Ok((self, false));
         }
         // Not both in memory.
         self.from = FirstRows::Columns { columns: Columns::default(), is_random: false };
         (self.dataset.points, self.dataset.colors) = (points, colors);
-        let columns = first_gaussians(scene, &mut self.dataset, &options)?;
-        options.check_rows(scene, columns.rows() as u64)?;
+        let columns = first_gaussians(scene, &self.dataset, config)?;
         let rows = columns.rows() as u64;
+        check_rows(config, scene, rows)?;
         Ok((Start { rows, from: FirstRows::Columns { columns, is_random: false }, ..self }, true))
     }
 
@@ -386,7 +361,7 @@ impl Start {
                 taken.map(|_| ())
             }
             FirstRows::Gaussians(file) => {
-                let mut rows = GaussianWriter::new(&file.path, GaussianSpace { folder, memory: budget.bytes });
+                let mut rows = GaussianWriter::new(&file.path, budget);
                 let read = file.read(&mut |columns| rows.push_all(columns));
                 read.and_then(|_| rows.finish()).and_then(|rows| rows.for_each_page(fill, &mut take_state))
             }
@@ -427,7 +402,7 @@ pub struct Prepared {
 /// Reads the scene and creates the first Gaussians.
 /// Errors: the scene or the PLY is invalid.
 pub fn prepare(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
-    let mut prepared = prepare_with(scene, &FirstOptions::new(config))?;
+    let mut prepared = prepare_silently(scene, config)?;
     prepared.dataset.warnings.extend(prepared.is_random.then(|| random_points_warning(config)));
     Ok(prepared)
 }
@@ -441,11 +416,12 @@ pub(crate) fn random_points_warning(config: &TrainConfig) -> String {
     )
 }
 
-fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
-    let mut raw = read_scene(scene, &options.read)?;
+/// As [`prepare`], without the warning of random points.
+fn prepare_silently(scene: &Path, config: &TrainConfig) -> InputResult<Prepared> {
+    let mut raw = read_scene(scene, &limits::read_options(config))?;
     let mut gaussians = None;
     let mut dropped = None;
-    if let Some(path) = options.init_ply.clone().or(raw.points_path.clone()) {
+    if let Some(path) = init_ply(config).map(Path::to_path_buf).or(raw.points_path.clone()) {
         let content = if is_tree(&path) { None } else { Some(read_ply(&path)?) };
         match content {
             None => {
@@ -464,7 +440,7 @@ fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
         }
     }
     raw.warnings.extend(dropped);
-    let mut dataset = load_dataset(raw, &options.load)?;
+    let mut dataset = load_dataset(raw, &limits::load_options(config))?;
     check_train_views(scene, &dataset)?;
     let mut from = scene.to_path_buf();
     let is_random = gaussians.is_none() && dataset.points.is_empty();
@@ -475,12 +451,12 @@ fn prepare_with(scene: &Path, options: &FirstOptions) -> InputResult<Prepared> {
             let giants = remove_giants(&mut columns, LogScaleRange::of_scene(dataset.scene_scale));
             dataset.warnings.extend(file_warnings(&ply, &meta, far));
             dataset.warnings.extend(giants_warning(&ply, giants));
-            let in_use = columns.sh_degree.max(options.init.sh_degree);
-            (truncate_sh(columns, options.sh_degree), in_use)
+            let in_use = columns.sh_degree.max(limits::first_sh_degree(config));
+            (truncate_sh(columns, config.sh_degree), in_use)
         }
-        None => (first_gaussians(scene, &mut dataset, options)?, options.init.sh_degree),
+        None => (first_gaussians(scene, &dataset, config)?, limits::first_sh_degree(config)),
     };
-    options.check_rows(&from, columns.rows() as u64)?;
+    check_rows(config, &from, columns.rows() as u64)?;
     Ok(Prepared { dataset, columns, sh_degree_start, is_random })
 }
 
@@ -493,20 +469,20 @@ fn check_train_views(scene: &Path, dataset: &Dataset) -> InputResult<()> {
     Err(InputError::new(scene, problem, "hold out fewer photos: see --test-every and --test-after"))
 }
 
-fn first_gaussians(scene: &Path, dataset: &mut Dataset, options: &FirstOptions) -> InputResult<Columns> {
-    let init = InitOptions { scene_scale: dataset.scene_scale, ..options.init };
+fn first_gaussians(scene: &Path, dataset: &Dataset, config: &TrainConfig) -> InputResult<Columns> {
+    let init = InitOptions { scene_scale: dataset.scene_scale, ..limits::init_options(config) };
     if !dataset.points.is_empty() {
         return Ok(gaussians_from_points(&dataset.points, &dataset.colors, &init));
     }
-    if options.init_points == 0 {
+    if config.init_points == 0 {
         return Err(InputError::new(
             scene,
             "the dataset has no points and --init-points is 0",
             "give points with --init-ply, or let --init-points N draw them in the views' frusta",
         ));
     }
-    let cameras: Vec<_> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    let count = options.init_points as usize;
+    let cameras = dataset.train_cameras();
+    let count = config.init_points as usize;
     // In aerial and object captures the subject lies within a few camera spreads of the cameras.
     let (near, far) = (0.1 * dataset.scene_scale, 3.0 * dataset.scene_scale);
     let (points, colors) = random_points_in_frusta(&cameras, count, near, far, init.seed);
@@ -519,12 +495,12 @@ fn budget(folder: &Path, host_mem: Option<u64>) -> Budget<'_> {
 }
 
 /// Refuses a PLY of Gaussians that exceeds memory, by its header: without a spill directory the file is read whole.
-fn check_gaussians_fit(options: &FirstOptions, host_mem: Option<u64>) -> InputResult<()> {
-    let (Some(file), Some(budget)) = (options.init_ply.as_deref().filter(|file| is_ply(file)), host_mem) else {
+fn check_gaussians_fit(config: &TrainConfig, host_mem: Option<u64>) -> InputResult<()> {
+    let (Some(file), Some(budget)) = (init_ply(config).filter(|file| is_ply(file)), host_mem) else {
         return Ok(());
     };
     let rows = ply::stated_rows(file)?;
-    let bytes = rows.saturating_mul(row_width(options.sh_degree) as u64 * 4);
+    let bytes = rows.saturating_mul(row_width(config.sh_degree) as u64 * 4);
     if bytes <= budget || !ply::holds_gaussians(file)? {
         return Ok(());
     }

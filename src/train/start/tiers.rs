@@ -133,17 +133,16 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     let Some(spill_dir) = residence.spill_dir().filter(|_| !dry) else {
         tiers.planned_on = residence.spill_dir().map(drive_of);
         let engine = Box::new(MemoryEngine::new());
-        let codec = codec(config);
-        (tiers.engine, tiers.codec) = (engine.name().to_string(), codec);
-        let of_store = PagedStoreConfig { store: 0, layout, codec, generation: 1, serial: 1 };
+        (tiers.engine, tiers.codec) = (engine.name().to_string(), codec(config));
+        let of_store = PagedStoreConfig { store: 0, layout, codec: tiers.codec, generation: 1, serial: 1 };
         return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     };
     let spill = SpillDir::create(spill_dir, layout, false)?;
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory.
-    let (engine, codec) = tiers.take_spill(spill, config)?;
+    let engine = tiers.take_spill(spill, config)?;
     let opened = Opened::create(Box::new(folder), of_commits)?;
-    let store = opened.paged_store(engine, layout, codec)?;
+    let store = opened.paged_store(engine, layout, tiers.codec)?;
     let mut checkpoint = Checkpoint::new(opened.commits, spill_dir, commit_options(config));
     checkpoint.fill_reserve()?;
     tiers.checkpoint = Some(checkpoint);
@@ -172,8 +171,8 @@ impl Tiers {
         tiers.is_in_output = config.residence().spill_dir().is_none();
         tiers.segment_bytes = layout.segment_bytes();
         let folder = spill.folder().to_path_buf();
-        let (engine, codec) = tiers.take_spill(spill, config)?;
-        let store = opened.paged_store(engine, layout, codec)?;
+        let engine = tiers.take_spill(spill, config)?;
+        let store = opened.paged_store(engine, layout, tiers.codec)?;
         let pager = Pager::open(pager, store, &opened.pages, run_state.events.len())?;
         let mut checkpoint = Checkpoint::new(opened.commits, &folder, commit_options(config));
         checkpoint.is_optional = is_in_memory;
@@ -183,15 +182,14 @@ impl Tiers {
     }
 
     /// Takes over a spill directory and starts its I/O engine.
-    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<(Box<dyn PageEngine>, Codec)> {
+    fn take_spill(&mut self, spill: SpillDir, config: &TrainConfig) -> InputResult<Box<dyn PageEngine>> {
         self.notes.extend(spill.warnings().iter().filter(|_| !self.is_in_memory).cloned());
         let folder = spill.folder().to_path_buf();
         self.spill = Some(spill);
-        let codec = codec(config);
         let opened = open_engine(config.io, &folder, DEPTH)?;
         self.notes.extend(opened.notes);
-        (self.engine, self.codec) = (opened.store.name().to_string(), codec);
-        Ok((opened.store, codec))
+        (self.engine, self.codec) = (opened.store.name().to_string(), codec(config));
+        Ok(opened.store)
     }
 
     /// Sets up commits to the output folder `out` for a run in memory. Other runs stay unchanged: a run with a spill

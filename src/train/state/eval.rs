@@ -7,8 +7,10 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::png_rows::write_rgb_rows;
 use crate::base::whole_file::{write_whole, write_whole_with};
+use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::photos::PhotoParameters;
 use crate::photos::exposure::AppearanceMode;
 use crate::photos::exposure::fit::FittedPair;
 use crate::photos::exposure::picture::{LensPlane, Look};
@@ -31,7 +33,7 @@ const FIT_ROUNDS: usize = 10;
 /// Views and metrics of an evaluation.
 pub struct EvalRequest<'a> {
     /// Indices in `dataset.views`.
-    pub views: &'a [usize],
+    pub views: Vec<usize>,
     pub ssim: SsimVariant,
     /// Folder for pictures (render beside photo) and the figures of each view, created if missing; `None` for none.
     pub pictures: Option<&'a Path>,
@@ -45,6 +47,24 @@ pub struct EvalRequest<'a> {
     pub appearance: AppearanceMode,
     /// Called with the number of views done, after each.
     pub progress: &'a dyn Fn(u32),
+}
+
+impl<'a> EvalRequest<'a> {
+    /// That of the held-out views in a run with these options, whose `photos` may predict corrections; without LPIPS.
+    pub fn of_held_out(
+        dataset: &Dataset,
+        options: &RunOptions,
+        photos: &PhotoParameters,
+        pictures: Option<&'a Path>,
+        progress: &'a dyn Fn(u32),
+    ) -> EvalRequest<'a> {
+        let views = dataset.test_views();
+        let predicted = photos.iter().find_map(|parameter| parameter.predict(dataset, &views));
+        // Beside predicted colours, the best that a correction could do.
+        let color_correct = options.color_correct.or(predicted.is_some().then_some(ColorCorrect::Affine));
+        let (ssim, appearance) = (options.ssim_variant, options.photos.appearance);
+        EvalRequest { views, ssim, pictures, lpips: None, predicted, color_correct, appearance, progress }
+    }
 }
 
 /// Evaluates the scene on the requested views. Fully masked views have no

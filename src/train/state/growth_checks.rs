@@ -69,8 +69,7 @@ mod tests {
     use crate::paging::pager::{Pager, PagerConfig};
     use crate::render::cpu::CpuRenderer;
     use crate::scene::columns::Columns;
-    use crate::train::step::pages::PagedScene;
-    use crate::train::step::pages::WorkingSet;
+    use crate::train::step::pages::{PagedScene, WorkingSet};
 
     /// More pages than a batch of any size below, in front of a camera that sees all of them.
     fn scene(options: &RunOptions) -> PagedScene {

@@ -152,8 +152,7 @@ impl RunMemory<'_> {
     fn fit_frames_within(&mut self, camera: &Camera, may_raise: bool) {
         let Some(budget) = self.memory.budget.filter(|_| !self.scene.is_in_memory()) else { return };
         let pages = self.scene.pager.pages_of_view(camera);
-        let index = self.scene.pager.index();
-        let rows: u64 = pages.iter().map(|page| u64::from(index[page.index()].rows)).sum();
+        let rows = self.scene.pager.rows_of(&pages);
         let needed = pages.len();
         self.expect_rows(rows, budget);
         let view = self.view_memory_of(rows);

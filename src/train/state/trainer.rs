@@ -98,11 +98,6 @@ fn strategy_in(order: &ViewOrder, strategy: &Arc<dyn Strategy>) -> Arc<dyn Strat
     strategy.for_regions(order.regional_epoch()).unwrap_or_else(|| Arc::clone(strategy))
 }
 
-fn view_order(order: Order, seed: u64, dataset: &Dataset) -> ViewOrder {
-    let cameras: Vec<Camera> = dataset.train_views().iter().map(|&v| dataset.views[v].camera).collect();
-    ViewOrder::new(order, seed, &cameras)
-}
-
 /// The largest sizes of the views of [`Trainer::probe_views`].
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Probed {
@@ -144,7 +139,7 @@ impl Trainer {
 
     /// A trainer for a scene that was created with the same options.
     pub fn of_scene(scene: PagedScene, dataset: &Dataset, renderer: Box<dyn Renderer>, options: RunOptions) -> Trainer {
-        let order = view_order(options.view_order, options.seed, dataset);
+        let order = ViewOrder::new(options.view_order, options.seed, &dataset.train_cameras());
         let options = RunOptions { strategy: strategy_in(&order, &options.strategy), ..options };
         Trainer {
             scene,
@@ -207,10 +202,10 @@ impl Trainer {
             let (pages_most, began) = (self.memory.pages_most, Instant::now());
             let rows = rehearse(&mut now, camera, &render, &mut comparison, pages_most)?;
             seconds.push(began.elapsed().as_secs_f64());
-            let index = self.scene.pager.index();
-            let pages = self.scene.pager.pages_of_view(camera);
-            let is_whole = self.scene.pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
-            self.memory.note_view(rows, pages.iter().map(|page| index[page.index()].rows as usize).sum(), is_whole);
+            let pager = &self.scene.pager;
+            let pages = pager.pages_of_view(camera);
+            let is_whole = pager.pages_per_batch(pages.len()).min(pages_most) >= pages.len();
+            self.memory.note_view(rows, pager.rows_of(&pages) as usize, is_whole);
             (probed.pixels, probed.visible) = (probed.pixels.max(camera.pixels()), probed.visible.max(rows));
             let sizes = self.renderer.device_sizes();
             probed.device = sizes.map(|sizes| probed.device.map_or(sizes, |most| most.widest(sizes)));
@@ -227,7 +222,7 @@ impl Trainer {
     pub fn set_view_order(&mut self, order: Order, dataset: &Dataset) {
         let options = &mut self.options;
         options.view_order = order;
-        let order = view_order(order, options.seed, dataset);
+        let order = ViewOrder::new(order, options.seed, &dataset.train_cameras());
         // The rules of the pages hold the strategy of the config.
         options.strategy = strategy_in(&order, &self.scene.rules.strategy);
         self.turns = Turns::new(order, dataset.train_views(), &options.strategy, options.steps);
@@ -244,11 +239,6 @@ impl Trainer {
 
     pub fn steps_done(&self) -> u32 {
         self.state.step
-    }
-
-    /// Index in `dataset.views` of the next step's view.
-    pub fn next_view(&mut self) -> usize {
-        self.turns.view_at(self.state.step, &self.photos)
     }
 
     /// Seconds spent in steps.
@@ -282,7 +272,7 @@ impl Trainer {
         trace::set_step(self.state.step);
         let _span = trace::span("step");
         self.log_due_events(dataset, targets)?;
-        let view = self.next_view();
+        let view = self.turns.view_at(self.state.step, &self.photos);
         targets.prefetch(&self.turns.coming(self.state.step, PREFETCH_VIEWS, &self.photos));
         if !self.is_ahead() {
             let camera = photos::camera(&self.photos, dataset, view);
@@ -511,21 +501,8 @@ impl Trainer {
         let _span = trace::span("evaluate");
         self.drain()?;
         let render = self.render_options();
-        let views = dataset.test_views();
-        self.run_memory().fit_frames_to_widest(views.iter().map(|&view| &dataset.views[view].camera));
-        let predicted = self.photos.iter().find_map(|parameter| parameter.predict(dataset, &views));
-        let corrects = predicted.is_some();
-        let request = EvalRequest {
-            views: &views,
-            predicted,
-            ssim: self.options.ssim_variant,
-            pictures,
-            lpips: None,
-            // Beside predicted colours, the best that a correction could do.
-            color_correct: self.options.color_correct.or(corrects.then_some(ColorCorrect::Affine)),
-            appearance: self.options.photos.appearance,
-            progress,
-        };
+        let request = EvalRequest::of_held_out(dataset, &self.options, &self.photos, pictures, progress);
+        self.run_memory().fit_frames_to_widest(request.views.iter().map(|&view| &dataset.views[view].camera));
         let test = evaluate(&mut self.now(), dataset, targets, &render, &request)?;
         let of = |t: TestMetrics| LastTest { step: self.state.step, views: t.views, psnr: t.psnr, ssim: t.ssim };
         self.state.test = test.map(of).or(self.state.test);

@@ -67,10 +67,7 @@ pub trait RowBackend {
         pages: &[PageNo],
         is_again: bool,
     ) -> Result<Vec<PinnedPage>, TrainError> {
-        Ok(match is_again {
-            true => scene.pager.pin_batch_again(step, pages)?,
-            false => scene.pager.pin_batch(step, pages)?,
-        })
+        Ok(scene.pager.pin_batch(step, pages, is_again)?)
     }
 
     /// Brings the pinned frames up to date that events are about to change.

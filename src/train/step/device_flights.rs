@@ -105,14 +105,6 @@ impl StepToRecord<'_> {
     }
 }
 
-/// An error after which the pages of the device may hold half a step.
-fn torn(error: impl Into<TrainError>) -> TrainError {
-    match error.into() {
-        torn @ TrainError::Torn { .. } => torn,
-        error => TrainError::Torn { source: Box::new(error) },
-    }
-}
-
 /// The most steps in flight.
 const STEPS_IN_FLIGHT: usize = 2;
 
@@ -252,7 +244,7 @@ impl Flights {
             }
             Err(error) => {
                 self.release_flight(cache, scene, &pages);
-                Err(torn(error))
+                Err(TrainError::torn(error))
             }
         }
     }
@@ -267,8 +259,7 @@ impl Flights {
         pages: &[PageNo],
     ) -> Result<(), TrainError> {
         let new: Vec<PageNo> = pages.iter().copied().filter(|page| !self.pages.contains_key(page)).collect();
-        let pinned = cache
-            .pin(scene, renderer, (&new, self.pages.len()), |scene, others| scene.pager.pin_batch(step, others))?;
+        let pinned = cache.pin(scene, renderer, (&new, self.pages.len()), (step, false))?;
         self.pages.extend(pinned.into_iter().map(|page| (page.page, (page, 0))));
         for page in pages {
             if let Some((_, users)) = self.pages.get_mut(page) {
@@ -332,12 +323,12 @@ impl Flights {
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
     ) -> Result<Option<StepOutcome>, TrainError> {
-        let done = device_of(renderer)?.finish_step().map_err(torn)?;
+        let done = device_of(renderer)?.finish_step().map_err(TrainError::torn)?;
         let needs = RenderError::OutOfOrder { call: "finish", needs: "record" };
-        let flight = self.steps.pop_front().ok_or_else(|| torn(needs))?;
+        let flight = self.steps.pop_front().ok_or_else(|| TrainError::torn(needs))?;
         self.is_sure = done.closed == 0;
         if done.closed != 0 {
-            self.give_up(cache, scene, renderer, &flight).map_err(torn)?;
+            self.give_up(cache, scene, renderer, &flight).map_err(TrainError::torn)?;
             return Ok(None);
         }
         let outcome = self.take_over(cache, scene, &flight, &done);
@@ -424,6 +415,6 @@ impl Flights {
             return Ok(());
         }
         let problem = "a step moved the bounds of a page farther than an update can";
-        Err(torn(InputError::new("the pages on the device", problem, "report this as a bug")))
+        Err(TrainError::torn(InputError::new("the pages on the device", problem, "report this as a bug")))
     }
 }

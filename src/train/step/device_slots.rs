@@ -27,9 +27,6 @@
 //! device  ...................................│ copies ........................│      │ update ..........│ copies ....................│
 //! ```
 //!
-//! A step that is recorded without waiting has one such place, behind its update, and waits nowhere. So has a step of several batches, whose
-//! view needs all slots until its last update.
-//!
 //! The list of the next view's pages is computed from the bounds before this step, so it may lack pages or have superfluous ones. The
 //! pages that a step touches follow from the bounds at that step: a missing page is copied then, and a superfluous page changes no bit.
 //!
@@ -49,7 +46,6 @@ use crate::densify::replay::PageFacts;
 use crate::densify::strategy::Extremes;
 use crate::kernels::uniforms::PageSurvey;
 use crate::page::format::slot_header::HEADER_BYTES;
-use crate::paging::error::PagingError;
 use crate::paging::frames::evict::{Candidate, EvictPolicy, NEVER};
 use crate::paging::frames::table::{FrameState, FrameTable};
 use crate::paging::pinned::PinnedPage;
@@ -162,12 +158,6 @@ pub fn slots_in(room: u64, slot_bytes: u64) -> u64 {
     room / SLOTS_SHARE / 5 * 4 / slot_bytes.max(1)
 }
 
-/// Number of slots, for payloads of at most `payload` bytes, in a device memory of `device_mem` bytes beside the memory
-/// of a view.
-pub fn slots_of_budget(device_mem: u64, payload: u64) -> usize {
-    usize::try_from(slots_in(device_mem, payload)).unwrap_or(usize::MAX)
-}
-
 /// There is no slot for a page of a batch.
 pub(super) fn no_slot(device: &dyn PageRenderer) -> TrainError {
     RenderError::NoSlots { bytes: device.slot_bytes() }.into()
@@ -276,14 +266,14 @@ impl SlotCache {
         self.fit(scene, renderer)
     }
 
-    /// Pins the pages of a batch in the pager; those that are held are pinned already. Held pages give up frames that the batch
-    /// needs. Steps in flight have pinned `pages_in_flight` pages.
+    /// Pins the pages of a batch, as [`crate::paging::pager::Pager::pin_batch`]; those that are held are pinned already. Held pages give
+    /// up frames that the batch needs. Steps in flight have pinned `pages_in_flight` pages.
     pub fn pin(
         &mut self,
         scene: &mut PagedScene,
         renderer: &mut dyn Renderer,
         (pages, pages_in_flight): (&[PageNo], usize),
-        pin: impl FnOnce(&mut PagedScene, &[PageNo]) -> Result<Vec<PinnedPage>, PagingError>,
+        (step, is_again): (u32, bool),
     ) -> Result<Vec<PinnedPage>, TrainError> {
         let (own, others): (Vec<PageNo>, Vec<PageNo>) = pages.iter().partition(|page| self.held.contains_key(page));
         // As many frames again as the batch has pages: for pages that split, and for reads ahead.
@@ -291,7 +281,7 @@ impl SlotCache {
         let most = scene.pager.frames_max().saturating_sub(in_flight + others.len() + pages.len()).max(own.len());
         self.write_back_down_to(scene, renderer, most, pages)?;
         scene.pager.set_held(in_flight + self.held.len() - own.len());
-        let mut pinned = pin(scene, &others)?;
+        let mut pinned = scene.pager.pin_batch(step, &others, is_again)?;
         pinned.extend(own.iter().filter_map(|page| self.held.remove(page)));
         pinned.sort_unstable_by_key(|page| page.meta.id);
         Ok(pinned)
@@ -392,7 +382,12 @@ impl SlotCache {
         }
         let written = device_of(renderer).and_then(|device| Ok(device.write_slots(&copies)?));
         if let Err(error) = written {
-            self.forget(&copies);
+            for page in missing {
+                if let Some(in_use) = self.in_use.remove(&page.page) {
+                    self.slots.unpin(page.page, in_use.slot, false);
+                    self.slots.evict(page.page);
+                }
+            }
             return Err(error);
         }
         self.traffic.loads += copies.len() as u64;
@@ -598,19 +593,6 @@ impl SlotCache {
         Some(slot)
     }
 
-    /// Gives up slots that were not filled.
-    fn forget(&mut self, copies: &[(SlotPage, &[u8])]) {
-        let unfilled = |slot: &DeviceSlot| copies.iter().any(|(other, _)| other.slot == *slot);
-        let pages: Vec<PageNo> =
-            self.in_use.iter().filter(|(_, in_use)| unfilled(&in_use.slot)).map(|(page, _)| *page).collect();
-        for page in pages {
-            if let Some(in_use) = self.in_use.remove(&page) {
-                self.slots.unpin(page, in_use.slot, false);
-                self.slots.evict(page);
-            }
-        }
-    }
-
     /// The pages of a batch in the slots that `SlotCache::load` gave them.
     pub(super) fn loaded<'a>(&self, pinned: impl Iterator<Item = &'a PinnedPage>) -> Vec<SlotPage> {
         let in_slot =
@@ -724,7 +706,7 @@ impl SlotCache {
         let filled = self.fill_frames_of(renderer, &mut ending, of_steps);
         if let Err(error) = filled {
             ending.into_iter().rev().for_each(|leaving| self.leaving.push_front(leaving));
-            return Err(TrainError::Torn { source: Box::new(error) });
+            return Err(TrainError::torn(error));
         }
         scene.pager.release(ending.into_iter().filter_map(|leaving| leaving.pinned).collect());
         Ok(())

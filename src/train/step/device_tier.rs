@@ -184,10 +184,7 @@ impl RowBackend for DeviceRows<'_> {
         is_again: bool,
     ) -> Result<Vec<PinnedPage>, TrainError> {
         let in_flight = self.tier.flights.pinned_pages().len();
-        self.tier.cache.pin(scene, self.renderer, (pages, in_flight), |scene, others| match is_again {
-            true => scene.pager.pin_batch_again(step, others),
-            false => scene.pager.pin_batch(step, others),
-        })
+        self.tier.cache.pin(scene, self.renderer, (pages, in_flight), (step, is_again))
     }
 
     fn before_events(&mut self, scene: &PagedScene, pinned: &mut [PinnedPage]) -> Result<(), TrainError> {
@@ -237,7 +234,7 @@ impl RowBackend for DeviceRows<'_> {
         collects: bool,
     ) -> Result<UpdateCounts, TrainError> {
         let results = self.update_slots(scene, batch, pinned, collects);
-        let results = results.map_err(|error| TrainError::Torn { source: Box::new(error) })?;
+        let results = results.map_err(TrainError::torn)?;
         let mut counts = UpdateCounts::default();
         for (page, result) in pinned.iter_mut().filter(|page| page.meta.rows > 0).zip(results) {
             counts.updated += u64::from(result.updated);

@@ -9,6 +9,7 @@
 use super::catch_up::{evaluate_all, gather, visible_rows};
 use crate::base::ids::{PageId, PageNo};
 use crate::base::room;
+use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::densify::replay::{PageEdit, PageReplay, PendingEvents};
 use crate::densify::stats::GradHistogram;
@@ -17,6 +18,7 @@ use crate::optim::bounds::{SplitLimits, page_bounds};
 use crate::optim::deferred::DeferredAdam;
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::page::format::slot_header::HEADER_BYTES;
+use crate::page::map::commit::CommitError;
 use crate::paging::error::PagingError;
 use crate::paging::pager::Pager;
 use crate::paging::pinned::PinnedPage;
@@ -130,24 +132,21 @@ impl PagedScene {
         PagedScene { pager, rules, histogram, rows: 0, rows_bound: 0 }
     }
 
-    /// A scene from the pages and the shared state of a checkpoint.
-    pub(crate) fn restore(
-        pager: Pager,
-        options: &RunOptions,
-        events: EventLog,
-        histogram: GradHistogram,
-        [rows, rows_bound]: [u64; 2],
-    ) -> PagedScene {
+    /// A scene from the pages and the state of a commit.
+    /// Errors: no run can have written the state; those of a decoded state are checked.
+    pub(crate) fn restore(pager: Pager, options: &RunOptions, state: &RunState) -> Result<PagedScene, CommitError> {
         let mut rules = SceneRules::new(options);
-        // Replay the logged raises: the configured schedule may have changed since.
-        rules.sh_degree = options.sh_degree_start.min(options.sh_degree);
-        for event in events.events() {
+        rules.events = state.event_log().map_err(CommitError::Contradiction)?;
+        // Replay the logged raises: the configured schedule, and its first degree, may have changed since.
+        rules.sh_degree = state.origin.sh_degree_start.min(options.sh_degree);
+        for event in rules.events.events() {
             if let EventKind::RaiseShDegree { degree } = event.kind {
                 rules.sh_degree = degree;
             }
         }
-        rules.events = events;
-        PagedScene { pager, rules, histogram, rows, rows_bound }
+        let histogram = GradHistogram::from_filled(&state.histogram);
+        let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
+        Ok(PagedScene { pager, rules, histogram, rows: state.rows, rows_bound: state.rows_bound })
     }
 
     /// Adds a page of first Gaussians.
@@ -188,7 +187,7 @@ impl PagedScene {
         match effect_of(&event.kind) {
             Effect::RaiseShDegree { degree } => self.rules.sh_degree = degree,
             Effect::Round(round) => {
-                self.rows_bound += round.promised(self.rows_bound, &self.histogram);
+                self.rows_bound += round.promised(&self.histogram);
                 self.histogram.clear();
             }
             Effect::ResetOpacity { .. } => {}
@@ -232,7 +231,7 @@ impl PagedScene {
         replay: PageReplay,
         added: &mut Vec<PinnedPage>,
     ) -> Result<(), TrainError> {
-        let PageReplay { edit, rounds, .. } = replay;
+        let PageReplay { edit, rounds } = replay;
         if let PageEdit::Replaced(parts) = &edit {
             self.store_parts(page, parts, added)?;
         } else {
@@ -341,7 +340,7 @@ impl PagedScene {
     }
 
     /// Pages with rows, in the order of their ids.
-    fn pages_with_rows(&self) -> Vec<PageNo> {
+    pub(crate) fn pages_with_rows(&self) -> Vec<PageNo> {
         let index = self.pager.index();
         let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
         pages.retain(|p| index[p.index()].rows > 0);
@@ -447,13 +446,8 @@ impl PagedScene {
                 })
                 .collect();
             let tables = pinned.iter().zip(&copies);
-            let mut tables: Vec<Rows<'_>> =
-                tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)).collect();
-            let mut first_row = 0;
-            for table in &mut tables {
-                table.first_row = first_row;
-                first_row += table.rows();
-            }
+            let tables =
+                numbered(tables.map(|(page, copy)| copy.as_ref().map_or_else(|| page.rows(0), SceneState::view)));
             let done = each(rules, &tables);
             drop(tables);
             self.pager.release(pinned);
@@ -465,13 +459,17 @@ impl PagedScene {
 
 /// The rows of the pages as tables with consecutive row numbers.
 pub fn row_tables(pages: &[PinnedPage]) -> Vec<Rows<'_>> {
-    let mut first_row = 0;
-    let mut tables = Vec::with_capacity(pages.len());
-    for page in pages {
-        tables.push(page.rows(first_row));
-        first_row += page.meta.rows as usize;
-    }
-    tables
+    numbered(pages.iter().map(|page| page.rows(0)))
+}
+
+fn numbered<'a>(tables: impl Iterator<Item = Rows<'a>>) -> Vec<Rows<'a>> {
+    let mut rows = 0;
+    let number = |table: Rows<'a>| {
+        let first_row = rows;
+        rows += table.rows();
+        Rows { first_row, ..table }
+    };
+    tables.map(number).collect()
 }
 
 /// Partitions Gaussians in memory into first pages of at most `fill` rows, stored with `sh_degree`, and passes each to

@@ -234,9 +234,7 @@ impl Passes<'_, '_> {
             match out {
                 Ok(is_done) if is_done => return Ok(()),
                 Ok(_) => is_changed = several,
-                Err(error @ TrainError::Torn { .. }) => return Err(error),
-                Err(error) if is_changed => return Err(TrainError::Torn { source: Box::new(error) }),
-                Err(error) => return Err(error),
+                Err(error) => return Err(if is_changed { TrainError::torn(error) } else { error }),
             }
         }
         Ok(())

@@ -31,7 +31,6 @@ pub struct RolledBack {
     /// Dropped later generations.
     pub dropped: Vec<u64>,
     pub dropped_names: Vec<String>,
-    /// Whether the rollback was done.
     pub is_done: bool,
 }
 
@@ -84,11 +83,9 @@ pub struct Pruned {
     pub dropped_names: Vec<String>,
     /// Generations that are no longer kept.
     pub dropped: Vec<u64>,
-    /// Generations that are kept.
     pub kept: Vec<u64>,
     /// Bytes of freed slots, which the run can reuse; the segment files keep their length.
     pub bytes_freed: u64,
-    /// Whether the prune was done.
     pub is_done: bool,
 }
 

@@ -15,13 +15,11 @@ use crate::base::text::read_text;
 use crate::base::units::format_bytes;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
-use crate::densify::stats::GradHistogram;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::LEVELS_MAX;
 use crate::optim::drift::STEP_BYTES;
-use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -175,11 +173,8 @@ pub(super) fn scene_at(
         plan_bytes: 0,
         transfers: Transfers::Overlap,
     };
-    let events = state.event_log().map_err(CommitError::Contradiction)?;
-    let histogram = GradHistogram::from_filled(&state.histogram);
-    let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
-    let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, events.len())?;
-    Ok(PagedScene::restore(pager, options, events, histogram, [state.rows, state.rows_bound]))
+    let pager = Pager::open(config, store.paged_store(&pages, READERS)?, &pages, state.events.len())?;
+    Ok(PagedScene::restore(pager, options, state)?)
 }
 
 /// Selection of the rows for the file.
@@ -203,22 +198,18 @@ impl RowChoice {
 
     /// Pages that may hold a row inside the box, in the order of their ids.
     fn pages(&self, scene: &PagedScene) -> Vec<PageNo> {
-        let index = scene.pager.index();
-        let mut pages: Vec<PageNo> = (0..index.len() as u32).map(PageNo).collect();
+        let mut pages = scene.pages_with_rows();
+        let Some(crop) = self.crop else { return pages };
         pages.retain(|p| {
-            let bounds = &index[p.index()].bounds;
-            index[p.index()].rows > 0
-                && self.crop.is_none_or(|crop| {
-                    // Slightly wider than the box, because the conversion to dataset coordinates rounds.
-                    let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
-                    (0..3).all(|i| {
-                        let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
-                        let (lo, hi) = (at(bounds.lo[i]), at(bounds.hi[i]));
-                        hi + slack(hi) >= crop[i] && lo - slack(lo) <= crop[3 + i]
-                    })
-                })
+            let bounds = &scene.pager.index()[p.index()].bounds;
+            // Slightly wider than the box, because the conversion to dataset coordinates rounds.
+            let slack = |x: f64| x.abs() * 1e-6 + 1e-9;
+            (0..3).all(|i| {
+                let at = |x: f32| f64::from(x) * self.scale + self.origin[i];
+                let (lo, hi) = (at(bounds.lo[i]), at(bounds.hi[i]));
+                hi + slack(hi) >= crop[i] && lo - slack(lo) <= crop[3 + i]
+            })
         });
-        pages.sort_unstable_by_key(|p| index[p.index()].id);
         pages
     }
 

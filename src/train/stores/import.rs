@@ -16,31 +16,28 @@ use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::Up;
+use crate::dataset::import::Budget;
 use crate::exchange::frames::rotate_back;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::ply::{gaussians_header, holds_gaussians, push_row, stream_gaussians};
+use crate::exchange::ply::{gaussians_header, holds_gaussians};
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::stored::label;
-use crate::scene::columns::Columns;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
 use crate::scene::partition::first_fill;
 use crate::scene::rotation::VIEWER_UP;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::dataset_print::GaussiansPrint;
-use crate::train::inputs::gaussian_pages::{GaussianSpace, GaussianWriter, PositionSample, file_warnings};
+use crate::train::inputs::gaussian_pages::{GaussianWriter, PositionSample, file_warnings, stream_columns};
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Memory besides the rows: threads, the store's buffers and its map, bytes.
 const FIXED_BYTES: u64 = 48 * MIB;
-
-/// Gaussians turned back together.
-const ROWS_AT_ONCE: usize = 1024;
 
 #[derive(Debug, Clone)]
 pub struct ImportRequest {
@@ -77,9 +74,8 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         let remedy = "train on points with gsscale-train --init-ply";
         return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());
     }
-    let (memory, beside) = (memory_for_rows(request)?, folder_of(&request.out));
-    let space = GaussianSpace { folder: beside, memory };
-    let mut rows = GaussianWriter::new(&request.file, space);
+    let budget = Budget { folder: folder_of(&request.out), bytes: memory_for_rows(request)? };
+    let mut rows = GaussianWriter::new(&request.file, budget);
     let (meta, radius, points) = read_rows(&request.file, &mut rows)?;
     file_warnings(&request.file, &meta, 0).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let rows = rows.finish()?;
@@ -118,22 +114,13 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
 /// the units of the file, which no file states, and the digest of the Gaussians.
 fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMeta, f32, u64)> {
     let (header, sh_degree) = gaussians_header(file)?;
-    let none = || Columns::zeros(0, sh_degree);
-    let (mut some, mut sample, mut print) = (none(), PositionSample::default(), GaussiansPrint::default());
-    let mut hand_on = |mut columns: Columns| {
+    let (mut sample, mut print) = (PositionSample::default(), GaussiansPrint::default());
+    let meta = stream_columns(file, sh_degree, &mut |mut columns| {
         rotate_back(&mut columns, &header);
         sample.add(&columns.means);
         print.add(&columns);
         rows.push_all(&columns)
-    };
-    let meta = stream_gaussians(file, &mut |values| {
-        push_row(&mut some, values);
-        match some.rows() {
-            ROWS_AT_ONCE => hand_on(std::mem::replace(&mut some, none())),
-            _ => Ok(()),
-        }
     })?;
-    hand_on(some)?;
     Ok((meta, sample.radius().unwrap_or(1.0), print.digest()))
 }
 

@@ -377,13 +377,10 @@ pub fn verify(place: &StorePlace, deep: bool) -> Result<Verdict, TrainError> {
     for (page, slot, label) in versions {
         let mut fault = |kind, what: String| verdict.faults.push(fault_of_slot(kind, &page.to_string(), &slot, what));
         verdict.versions += 1;
-        let meta = match limits.map(|(limits, _)| limits.meta_of(page, &slot, &label)).transpose() {
-            Ok(meta) => meta,
-            Err(what) => {
-                fault("entry", what);
-                None
-            }
-        };
+        let meta = limits.map(|(limits, _)| limits.meta_of(page, &slot, &label)).transpose().unwrap_or_else(|what| {
+            fault("entry", what);
+            None
+        });
         if let Err(what) = reader.check_header(page, &slot) {
             fault("header", what);
             continue;

@@ -34,7 +34,6 @@ use crate::paging::stored::{check_values, label, layout_of, meta_from_label};
 use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
-use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
@@ -256,16 +255,11 @@ fn with_state(
 /// such a round nor leave the histogram.
 fn without_statistics(meta: &PageMeta, payload: &[u8]) -> Vec<u8> {
     let mut page = read_page(&layout_of(meta).rows(payload, 0));
-    clear_statistics(&mut page);
+    page.view_mut().clear_statistics();
     let mut words = vec![0u64; payload.len().div_ceil(8)];
     let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);
     let written = write_page(&page, bytes).bytes();
     bytes[..written].to_vec()
-}
-
-fn clear_statistics(page: &mut SceneState) {
-    page.grad2d.fill(0.0);
-    page.count.fill(0);
 }
 
 fn commit(mut copy: NewStore, state: &RunState, source: &SalvageSource) -> Result<(), TrainError> {
@@ -356,7 +350,7 @@ fn without_state(
         let mut page = read_page(&layout_of(meta).rows(payload, 0));
         page.raise_sh_degree(degree);
         if meta.events_applied < applied {
-            clear_statistics(&mut page);
+            page.view_mut().clear_statistics();
         }
         histogram.add_rows(&page.view());
         let bytes: &mut [u8] = bytemuck::cast_slice_mut(&mut words);

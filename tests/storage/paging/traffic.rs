@@ -47,7 +47,7 @@ fn belady(views: &[Vec<u32>], frames: usize, start: &[u32]) -> u64 {
     let mut bound = FewestReads::default();
     start.iter().for_each(|&page| bound.add(PageNo(page)));
     views.iter().for_each(|view| bound.step(frames, view.iter().map(|&page| (PageNo(page), 1))));
-    bound.pages()
+    bound.bytes()
 }
 
 fn pages_of(cameras: &[Camera]) -> Vec<Vec<u32>> {
