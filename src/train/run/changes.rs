@@ -5,8 +5,8 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::simd::SimdPath;
-use crate::checkpoint::run_state::{DatasetPrint, RunState};
-use crate::config::file::{Class, ConfigKey, KEYS, TrainConfig};
+use crate::checkpoint::run_state::DatasetPrint;
+use crate::config::file::{Class, ConfigKey, KEYS, Resolved, TrainConfig};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
 use serde::Deserialize;
@@ -56,12 +56,12 @@ pub(super) struct Changes {
 }
 
 impl Changes {
-    /// Compares the keys of `config` with those of the last commit.
-    /// Errors: the config of the commit cannot be read.
-    pub fn of_config(file: &Path, state: &RunState, config: &TrainConfig) -> InputResult<Changes> {
+    /// Compares the keys of `config` with those that were `written`, by a run on the instruction path `simd`.
+    /// Errors: what was written cannot be read.
+    pub fn of_config(file: &Path, written: &str, simd: &str, config: &TrainConfig) -> InputResult<Changes> {
         let broken = |e: String| InputError::new(file, e, "start the run again");
-        let written: toml::Table = state.origin.config.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
-        let then = TrainConfig::parse(&state.origin.config).map_err(broken)?;
+        let then = TrainConfig::parse(written).map_err(broken)?;
+        let written: toml::Table = written.parse().map_err(|e: toml::de::Error| broken(e.to_string()))?;
         let table = |config: &TrainConfig| {
             toml::Table::try_from(config).map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))
         };
@@ -86,7 +86,7 @@ impl Changes {
         if was != is {
             changes.numbers.push(format!("schedule-steps was {was} and is {is}"));
         }
-        changes.add_path(&state.origin.simd, limits::simd_path(config));
+        changes.add_path(simd, limits::simd_path(config));
         Ok(changes)
     }
 
@@ -141,6 +141,22 @@ impl Changes {
         }
     }
 
+    /// Adds the differences of `dataset` from that of a finished run, of which only the facts of its config.toml are left.
+    pub fn add_facts(&mut self, then: &Resolved, dataset: &Dataset) {
+        let counts = |train: usize, test: usize| format!("{train} photos to train on and {test} held out");
+        let there = counts(then.train_views, then.test_views);
+        let here = counts(dataset.train_views().len(), dataset.test_views().len());
+        if there != here {
+            self.numbers.push(format!("the scene had {there} and has {here}"));
+        }
+        // The scale may follow from points, which a run that goes on from Gaussians does not read.
+        let origin = dataset.frame.origin.to_array();
+        if then.origin.map(f64::to_bits) != origin.map(f64::to_bits) {
+            let line = format!("it is another scene: its cameras stood around {:?} and stand around {origin:?}", then.origin);
+            self.fixed.push(line);
+        }
+    }
+
     /// Refuses differences that exclude a resume, and differences in numbers without `accept`.
     /// Errors: there is such a difference.
     pub fn check(&self, place: &Path, accept: bool) -> InputResult<()> {
@@ -164,7 +180,6 @@ impl Changes {
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::checkpoint::run_state::{Origin, RunIdentity};
 
     #[test]
     fn another_path_changes_numbers_where_its_bits_are_others() {
@@ -194,18 +209,8 @@ mod tests {
         let without: String =
             text.lines().filter(|line| !line.starts_with("appearance")).map(|line| format!("{line}\n")).collect();
         assert!(without.len() < text.len());
-        let dataset = DatasetPrint {
-            views: Vec::new(),
-            first_rows: 1,
-            points: 0,
-            scene_scale: 1.0,
-            origin: [0.0; 3],
-            scale: 1.0,
-        };
-        let simd = limits::simd_path(&config).name().to_string();
-        let origin = Origin { config: without, simd, sh_degree_start: 0, dataset, run: RunIdentity::default() };
-        let state = RunState::without_history(origin, "cpu".to_string(), 1);
-        let changes = Changes::of_config(Path::new("config.toml"), &state, &config).unwrap();
+        let simd = limits::simd_path(&config).name();
+        let changes = Changes::of_config(Path::new("config.toml"), &without, simd, &config).unwrap();
         assert_eq!(changes.numbers, ["appearance was absent and is \"auto\""]);
         assert!(changes.free.is_empty() && changes.fixed.is_empty());
     }

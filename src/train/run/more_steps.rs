@@ -7,10 +7,11 @@
 //! without it, the rates stay at the values with which the schedule ended.
 //!
 //! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
-//! is renamed before the scene was found; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
+//! gets a name before everything is checked, and what the run could not resume with from a checkpoint is refused here, too, as far as
+//! config.toml tells it; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
 
 use super::begin::{FirstTrainer, first_trainer, plan_and_train};
-use super::changes::with_absolute_paths;
+use super::changes::{Changes, with_absolute_paths};
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, PastRun};
 use crate::base::error::{InputError, InputResult};
@@ -19,7 +20,7 @@ use crate::base::units::format_grouped;
 use crate::base::whole_file::sync_folder;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
-use crate::report::run_files::{METRICS_FILE, PLY_FILE, saved_ply_name};
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::{self, absolute};
 use crate::train::log::report::Summary;
@@ -40,22 +41,69 @@ pub(super) fn text_of_rates(config: &TrainConfig) -> Option<String> {
     })
 }
 
-/// Trains the finished run in the output folder of `request` from the PLY of its `summary` to the steps of the config. `file` is the content of
-/// its config.toml.
-/// Errors: the scene or the PLY is not there (nothing is changed then); else as [`super::begin::run`].
+/// A finished run that is to do more steps.
+pub(super) struct FinishedRun {
+    /// Content of its config.toml.
+    pub file: (TrainConfig, Resolved),
+    pub run: RunId,
+    pub summary: Summary,
+    /// What changed since, of the config; [`FinishedRun::start`] adds the dataset.
+    pub changes: Changes,
+    pub accepts_changes: bool,
+}
+
+impl FinishedRun {
+    /// The start of its next steps, from its result. Changes no file.
+    /// Errors: the scene or the result is not there, or too much has changed.
+    pub fn start(&mut self, request: &RunRequest) -> Result<Start, TrainError> {
+        let (scene, out) = (&request.scene, &request.out);
+        if !scene.exists() {
+            let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
+            return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
+        }
+        self.changes.check(&out.join(CONFIG_FILE), self.accepts_changes)?;
+        let result = if self.is_kept_in(out) { self.kept_path(out) } else { out.join(PLY_FILE) };
+        let init_ply = absolute(&result).to_string_lossy().into_owned();
+        let config = TrainConfig { init_ply, ..request.config.clone() };
+        let start = Start::read(scene, &config, host_budget(config.host_mem.0))?;
+        self.changes.add_facts(&self.file.1, &start.dataset);
+        self.changes.check(&start.dataset.image_folder, self.accepts_changes)?;
+        Ok(start)
+    }
+
+    /// Where its result stays.
+    fn kept_path(&self, out: &Path) -> PathBuf {
+        out.join(saved_ply_name(self.summary.steps))
+    }
+
+    /// Whether an earlier attempt has kept the result, and was cut off before its first commit. Its own result may have replaced the
+    /// first name already.
+    fn is_kept_in(&self, out: &Path) -> bool {
+        let kept = self.kept_path(out);
+        kept.is_file() && Path::new(&self.file.0.init_ply).file_name() == kept.file_name()
+    }
+}
+
+/// Trains the finished run in the output folder of `request` from its result to the steps of the config.
+/// Errors: as [`FinishedRun::start`]; else as [`super::begin::run`].
 pub(super) fn train_more_steps(
     mut request: RunRequest,
-    file: Option<(TrainConfig, Resolved)>,
-    run: RunId,
-    summary: &Summary,
+    mut finished: FinishedRun,
 ) -> Result<RunOutcome, TrainError> {
-    let (scene, out) = (request.scene.clone(), request.out.clone());
+    let out = request.out.clone();
     machine::set_up(&request.config)?;
-    if !scene.exists() {
-        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
-        return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
+    let start = finished.start(&request)?;
+    let first_rows = start.rows;
+    let host_mem = host_budget(request.config.host_mem.0);
+    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
+    let kept = finished.kept_path(&out);
+    if !finished.is_kept_in(&out) {
+        keep_result(&out, &kept)?;
     }
-    let kept = keep_result(&out, summary.steps)?;
+    let FinishedRun { file, run, summary, changes, .. } = finished;
+    for line in &changes.numbers {
+        crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
+    }
     crate::tell!(
         "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
          lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
@@ -66,17 +114,14 @@ pub(super) fn train_more_steps(
         crate::tell!("{rates}");
     }
     request.config.init_ply = absolute(&kept).to_string_lossy().into_owned();
-    let host_mem = host_budget(request.config.host_mem.0);
-    let start = Start::read(&scene, &request.config, host_mem)?;
     let past = PastRun {
         config: with_absolute_paths(request.config.clone()),
         metrics_bytes: metrics_until(&out, summary.steps),
         step: summary.steps,
         has_changed: false,
-        file,
-        first_rows: start.rows,
+        file: Some(file),
+        first_rows,
     };
-    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
     trainer.begin_after(summary.steps, summary.train_seconds);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }
@@ -89,17 +134,12 @@ fn metrics_until(out: &Path, step: u32) -> u64 {
     metrics.split_inclusive('\n').take_while(is_past).map(|line| line.len() as u64).sum()
 }
 
-/// Gives the result of `step` in `out` a second name, that of its step; returns that path. The first name stays, where viewers look for
-/// it, until the new result replaces it as a whole.
-fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
-    let (result, kept) = (out.join(PLY_FILE), out.join(saved_ply_name(step)));
-    if is_same(&result, &kept) {
-        // An earlier attempt was cut off before its first commit.
-        return Ok(kept);
-    }
+/// Gives the result in `out` a second name. The first one stays, where viewers look for it, until the new result replaces it as a whole.
+fn keep_result(out: &Path, kept: &Path) -> InputResult<()> {
+    let result = out.join(PLY_FILE);
     let doing = "keeping the result under the name of its step";
     let failed = |error: std::io::Error| InputError::io(&result, doing, &error);
-    let beside = out.join(format!(".{}.part", saved_ply_name(step)));
+    let beside = out.join(".kept.ply.part");
     let _ = std::fs::remove_file(&beside);
     // A second name costs no space; some file systems have none.
     if std::fs::hard_link(&result, &beside).is_err()
@@ -108,21 +148,8 @@ fn keep_result(out: &Path, step: u32) -> InputResult<PathBuf> {
         let _ = std::fs::remove_file(&beside);
         return Err(failed(error));
     }
-    std::fs::rename(&beside, &kept).map_err(failed)?;
+    std::fs::rename(&beside, kept).map_err(failed)?;
     // Where folders cannot be synced, the name is durable with the next sync of a file.
     let _ = sync_folder(out);
-    Ok(kept)
-}
-
-/// Whether both paths name one file.
-#[cfg(unix)]
-fn is_same(a: &Path, b: &Path) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let of = |path: &Path| std::fs::metadata(path).ok().map(|about| (about.dev(), about.ino()));
-    of(a).is_some() && of(a) == of(b)
-}
-
-#[cfg(not(unix))]
-fn is_same(_a: &Path, _b: &Path) -> bool {
-    false
+    Ok(())
 }

@@ -10,7 +10,7 @@
 
 use super::begin::{begin, plan_and_train, run};
 use super::changes::{Changes, kept_config};
-use super::more_steps::{text_of_rates, train_more_steps};
+use super::more_steps::{FinishedRun, text_of_rates, train_more_steps};
 use super::out_folder::{self, check_restart, has_results, settings_of_mark};
 use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, PastRun};
@@ -93,11 +93,9 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     // What lies in the place of a result is refused here, and not after the last step.
     config.export.formats().try_for_each(|format| out_folder::check_results(&request.out, format))?;
     let folder = config.residence().checkpoint_folder(&request.out);
-    if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
+    if let Some(finished) = result_to_continue(request, &earlier, &mut config, &folder)? {
         drop(lock);
-        keep_rates(&mut config, &request.keys, &earlier.config);
-        let goes_on = request.to_run(&earlier.scene, config, Existing::BeginAgain);
-        return train_more_steps(goes_on, earlier.file, earlier.run, &summary);
+        return train_more_steps(request.to_run(&earlier.scene, config, Existing::BeginAgain), finished);
     }
     let is_in_output = config.residence().spill_dir().is_none();
     let found = open_own(&folder, earlier.claim(request), is_in_output);
@@ -200,18 +198,27 @@ impl Earlier {
     }
 }
 
-/// The summary of a run that did all of its steps, has no checkpoint any more, and is to do more steps. A run that was to
-/// keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
+/// A run that did all of its steps, has no checkpoint any more, and is to do more steps, whose rate schedule becomes that of the run. A run
+/// that was to keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
+/// Errors: its config.toml cannot be read.
 fn result_to_continue(
     request: &ResumeRequest,
     earlier: &Earlier,
-    config: &TrainConfig,
+    config: &mut TrainConfig,
     folder: &Path,
-) -> Option<Summary> {
-    let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps)?;
+) -> InputResult<Option<FinishedRun>> {
+    let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps);
     // An attempt to go on that was killed before its first commit leaves a store without one.
     let is_gone = !SpillDir::exists_in(folder) || is_uncommitted(folder).is_ok_and(|is_empty| is_empty);
-    (is_gone && !earlier.config.keep_checkpoint && earlier.file.is_some()).then_some(summary)
+    let (Some(summary), Some(file)) = (summary.filter(|_| is_gone && !earlier.config.keep_checkpoint), &earlier.file)
+    else {
+        return Ok(None);
+    };
+    keep_rates(config, &request.keys, &earlier.config);
+    let text = std::fs::read_to_string(&earlier.path).map_err(|e| InputError::io(&earlier.path, "reading", &e))?;
+    let changes = Changes::of_config(&earlier.path, &text, &file.1.simd, config)?;
+    let accepts_changes = request.accept_changes;
+    Ok(Some(FinishedRun { file: file.clone(), run: earlier.run, summary, changes, accepts_changes }))
 }
 
 fn read_summary(out: &Path) -> Option<Summary> {
@@ -244,7 +251,7 @@ fn goal(
         let remedy = "give more, or roll the run back with gsscale-ckpt";
         return Err(InputError::new("--steps", problem, remedy).into());
     }
-    let mut changes = Changes::of_config(file, state, config)?;
+    let mut changes = Changes::of_config(file, &state.origin.config, &state.origin.simd, config)?;
     changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
         let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
@@ -453,7 +460,7 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
         return Ok(format!("resume  {out} was cut off before its first step: it begins again"));
     }
     let earlier = Earlier::find(request)?;
-    let config = earlier.config_now(request)?;
+    let mut config = earlier.config_now(request)?;
     machine::set_up(&config)?;
     let folder = config.residence().checkpoint_folder(&request.out);
     let state = match SpillDir::exists_in(&folder) {
@@ -466,12 +473,14 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
         let steps = format_grouped(summary.steps.into());
         return Ok(format!("resume  {out} is finished: all {steps} steps, with results; --steps N continues it"));
     }
-    if let Some(summary) = result_to_continue(request, &earlier, &config, &folder) {
+    if let Some(mut finished) = result_to_continue(request, &earlier, &mut config, &folder)? {
+        finished.start(&request.to_run(&earlier.scene, config.clone(), Existing::BeginAgain))?;
+        let FinishedRun { summary, changes, .. } = finished;
         let from = format!(
             "{} Gaussians of {PLY_FILE}",
             format_grouped(summary.gaussians.saturating_sub(summary.gaussians_left_out))
         );
-        return Ok(steps_to_do(&request.out, &from, summary.steps, &config));
+        return Ok(with_changes(steps_to_do(&request.out, &from, summary.steps, &config), &changes));
     }
     match state {
         Some(state) => committed(request, &earlier, config, &state),
@@ -491,11 +500,11 @@ fn committed(
 ) -> Result<String, TrainError> {
     let (changes, ..) = goal(request, earlier, &mut config, state)?;
     let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
-    let mut text = steps_to_do(&request.out, &from, state.trainer.step, &config);
-    for change in changes.free.iter().chain(&changes.numbers) {
-        text.push_str(&format!("\nchange  {change}"));
-    }
-    Ok(text)
+    Ok(with_changes(steps_to_do(&request.out, &from, state.trainer.step, &config), &changes))
+}
+
+fn with_changes(text: String, changes: &Changes) -> String {
+    changes.free.iter().chain(&changes.numbers).fold(text, |text, change| format!("{text}\nchange  {change}"))
 }
 
 fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> String {
