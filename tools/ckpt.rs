@@ -4,6 +4,7 @@
 use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
+use gsscale::base::say::aligned;
 use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_plain;
 use gsscale::config::values::ByteSize;
@@ -113,20 +114,6 @@ fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> R
     Ok(())
 }
 
-/// Formats rows of words as columns, the first left-aligned, the others right-aligned.
-fn table(rows: &[Vec<String>]) -> String {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..columns)
-        .map(|c| rows.iter().filter_map(|row| row.get(c)).map(|cell| cell.chars().count()).max().unwrap_or(0))
-        .collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().zip(&widths).enumerate();
-        let cells = cells.map(|(c, (cell, &w))| if c == 0 { format!("{cell:<w$}") } else { format!("{cell:>w$}") });
-        cells.collect::<Vec<_>>().join("  ").trim_end().to_string()
-    };
-    rows.iter().map(line).collect::<Vec<_>>().join("\n")
-}
-
 const LS_EXAMPLES: &str = "\
 Examples:
   gsscale-ckpt ls runs/village
@@ -152,10 +139,11 @@ fn run_ls(args: &Ls) -> Result<ExitCode, TrainError> {
         let heads = ["generation", "step", "PSNR", "Gaussians", "at most", "pages", "alone", "bytes", "names"];
         let mut rows = vec![heads.map(str::to_string).to_vec()];
         rows.extend(listed.generations.iter().map(ls_row));
-        let mut text = table(&rows);
-        if listed.generations.is_empty() {
-            text = "no commit yet".to_string();
-        }
+        let line = |row: &Vec<String>| row.join("  ").trim_end().to_string();
+        let mut text = match listed.generations.as_slice() {
+            [] => "no commit yet".to_string(),
+            _ => aligned(&rows).iter().map(line).collect::<Vec<_>>().join("\n"),
+        };
         text += &format!("\nsegment files: {}", format_bytes(listed.segment_bytes));
         if let Some(who) = &listed.used_by {
             text += &format!("\nin use ({who}): the state shown is that of the last commit");
