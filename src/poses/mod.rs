@@ -31,7 +31,7 @@ use geo::{Similarity, metres_from, robust_similarity};
 use glam::DVec3;
 use pairs::{ChosenBy, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos, modified_at};
-use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
+use program::{CHUNK, DATABASE, FeatureOptions, LIST, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs::{File, Metadata, TryLockError};
@@ -260,8 +260,8 @@ impl PoseSearch {
             let mut done = 0;
             for chunk in pairs.chunks(size) {
                 watch("pairs compared", done as u32, pairs.len() as u32);
-                write_whole(&work.join("chunk.txt"), self.lines_of(chunk).as_bytes())?;
-                self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, place, &mut |_| ())?;
+                write_whole(&work.join(CHUNK), self.lines_of(chunk).as_bytes())?;
+                self.program.run(Phase::Matches, &self.features, place, &mut |_| ())?;
                 done += chunk.len();
             }
             state.finish("matches", &work)?;
@@ -271,7 +271,7 @@ impl PoseSearch {
             make_folder(&work.join(SPARSE))?;
             let total = self.photos.len() as u32;
             let mut show = |line: &str| registered_in(line).into_iter().for_each(|n| watch("photos placed", n, total));
-            self.program.run(&Phase::Model, &self.features, place, &mut show)?;
+            self.program.run(Phase::Model, &self.features, place, &mut show)?;
             state.finish(SEARCH_END, &work)?;
         }
         self.write_scene(&work)
@@ -420,7 +420,7 @@ impl PoseSearch {
             let is_enough = one_camera && group.len() >= PHOTOS_FOR_OPENCV;
             let camera_model = if is_enough { "OPENCV" } else { "SIMPLE_RADIAL" };
             let names: String = group.iter().map(|&i| plain_name(i, &self.photos[i].name) + "\n").collect();
-            write_whole(&work.join("list.txt"), names.as_bytes())?;
+            write_whole(&work.join(LIST), names.as_bytes())?;
             let mut in_group = 0;
             let mut show = |line: &str| {
                 if line.contains("Processed file [") {
@@ -428,8 +428,8 @@ impl PoseSearch {
                     watch("photos searched for features", done + in_group, total);
                 }
             };
-            let phase = Phase::Features { list: "list.txt", camera_model, one_camera };
-            self.program.run(&phase, &self.features, (work, lock), &mut show)?;
+            let phase = Phase::Features { camera_model, one_camera };
+            self.program.run(phase, &self.features, (work, lock), &mut show)?;
             done += group.len() as u32;
         }
         state.finish("features", work)
