@@ -10,7 +10,7 @@ use super::prior::GAUSSIANS_SHARE;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
 use super::work::COPY_EVERY;
-use super::{City, check_machine_keys, check_range, config_of};
+use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -347,7 +347,7 @@ fn write_cell(
     std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "making the folder of the cell", &e))?;
     keys.insert("steps".into(), i64::from(planned.steps).into());
     keys.insert("max-gaussians".into(), (planned.max_gaussians as i64).into());
-    let text = toml::to_string(&keys).map_err(|e| InputError::new(&folder, e.to_string(), "report this as a bug"))?;
+    let text = toml_of(&folder, &keys)?;
     let mut views: Vec<usize> = draft.train.iter().chain(&draft.test).copied().collect();
     views.sort_unstable_by_key(|&view| &seen.views[view].name);
     let names: String = views.iter().map(|&view| format!("{}\n", seen.views[view].name)).collect();
