@@ -14,9 +14,8 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::say::as_called;
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
-use crate::photos::KINDS;
-use crate::photos::diagnosis;
 use crate::photos::parameter::Finding;
+use crate::photos::{KINDS, diagnosis};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
