@@ -70,8 +70,7 @@ impl NewStore {
         let part = refuse_existing(target)?;
         let spill = SpillDir::create(&part, layout, true)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
-            let opened: Opened =
-                Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
+            let opened = Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
             let engine = open_engine(IoEngine::Auto, &part, IN_FLIGHT)?;
             let store = opened.paged_store(engine.store, layout, codec)?;
             Ok((opened.commits, store))
