@@ -192,7 +192,6 @@ fn print_advice(folder: &Path, sweep: &Sweep) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -190,7 +190,6 @@ fn automatic(cost: CommitCost, bytes_per_hour: f64) -> f64 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

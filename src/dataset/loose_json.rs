@@ -120,7 +120,6 @@ impl<'de> Deserialize<'de> for Number {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

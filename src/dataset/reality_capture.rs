@@ -208,7 +208,6 @@ fn camera_to_world([heading, pitch, roll]: [f64; 3], centre: [f64; 3]) -> [[f64;
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -675,7 +675,6 @@ fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -168,7 +168,6 @@ pub fn camera_groups(photos: &[FoundPhoto]) -> Vec<Vec<usize>> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 pub(super) mod tests {
     use super::*;
     use crate::dataset::photo_header::PhotoFormat;

@@ -274,7 +274,6 @@ fn agreeing(a: &[Corner], b: &[Corner]) -> u16 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::dataset::photo_header::read_header;

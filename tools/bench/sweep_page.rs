@@ -236,7 +236,6 @@ fn points(settings: &[Setting], figure: &Figure, cost: &Figure) -> Option<Chart>
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -188,7 +188,6 @@ impl<T: Pod> Spool<T> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -203,7 +203,6 @@ impl Drop for TransferPool {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::page::engine::buffer::PageBuffer;

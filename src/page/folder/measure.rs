@@ -369,7 +369,6 @@ pub fn codec_for(bytes_per_second: f64) -> Codec {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -462,7 +462,6 @@ fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

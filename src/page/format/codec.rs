@@ -254,7 +254,6 @@ fn unhalve(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream, mix64};

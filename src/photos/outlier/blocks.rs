@@ -437,7 +437,6 @@ fn finding(_: &Value, summary: &Value) -> Option<Finding> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

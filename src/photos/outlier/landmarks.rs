@@ -55,7 +55,6 @@ pub fn contradicted_share(landmarks: &[[f32; 3]], views: &[ViewResiduals<'_>]) -
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
