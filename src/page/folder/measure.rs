@@ -42,7 +42,6 @@ pub struct Limits {
 /// One combination of engine, transfer size and queue depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Case {
-    /// The I/O engine.
     pub engine: IoEngine,
     pub bytes: usize,
     /// Transfers in flight.

@@ -36,7 +36,6 @@ pub struct SpillDir {
     warnings: Vec<String>,
     /// Whether this run created the folder, and so may remove it.
     made_folder: bool,
-    /// Holds the lock.
     lock: File,
 }
 

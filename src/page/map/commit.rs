@@ -73,7 +73,6 @@ pub struct Commits {
 }
 
 impl Commits {
-    /// The fixed settings.
     pub fn config(&self) -> CommitConfig {
         self.config
     }

@@ -13,7 +13,6 @@ use crate::photos::visible::visible_points;
 use crate::scene::camera::Camera;
 use rayon::prelude::*;
 
-/// Most landmarks of a run.
 pub const LANDMARKS_MOST: usize = 4096;
 /// A contradiction has at least this residual, of values in 0..1 ...
 const RESIDUAL_LEAST: f64 = 0.08;
