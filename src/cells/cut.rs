@@ -9,7 +9,6 @@ use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_d
 use super::prior::GAUSSIANS_SHARE;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
-use super::work::COPY_EVERY;
 use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
@@ -128,7 +127,6 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
         prior_degree: seen.sh_degree,
         network: request.network.max(1) as f64,
         machines: if request.machines == 0 { plan.cells.len() } else { request.machines },
-        copy_every: COPY_EVERY,
     };
     if let Some(larger) = request.as_if.filter(|_| request.dry_run) {
         basis.enlarge(&mut plan, larger);
