@@ -14,11 +14,7 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
-use gsscale::config::file::TrainConfig;
-use gsscale::config::limits::RunOptions;
-use gsscale::config::values::Chosen;
 use gsscale::gpu::{DeviceChoice, Gpu, GpuOptions, GpuResult};
-use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::Renderer;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::gpu::GpuRenderer;
@@ -26,14 +22,13 @@ use gsscale::scene::camera::Camera;
 use gsscale::scene::image::Target;
 use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::PagedScene;
 use gsscale::train::step::pages::WorkingSet;
 use gsscale::train::step::train_step::{StepView, train_step};
 use serde_json::{Map, json};
 use std::time::Instant;
 use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::device_bytes::{Counts, stage_bytes};
-use support::{Args, Hash, Seconds, checked, machine, time};
+use support::{Args, Hash, Seconds, checked, machine, paged, time};
 
 /// Views of a round.
 const VIEWS: usize = 8;
@@ -118,11 +113,7 @@ fn steps<R: Renderer>(
     [warm, rounds]: [usize; 2],
     isects: impl Fn(&R) -> u64,
 ) -> Run {
-    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
-    let options = RunOptions::new(&config, case.scene_scale);
-    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
-    let made = PagedScene::new(&case.columns, pager, &options);
-    let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
+    let (mut scene, options) = paged(&case.columns, case.scene_scale, simd);
     let mut working = WorkingSet::default();
     let stride = case.views.len().div_ceil(VIEWS);
     let views: Vec<&(Camera, Target)> = case.views.iter().step_by(stride).collect();
@@ -131,8 +122,7 @@ fn steps<R: Renderer>(
         for (camera, target) in &views {
             let (rows, comparison) = (&mut RowsInHost::new(renderer), &mut Comparison::new(target, options.loss));
             let view = StepView { step, camera, render: &options.render, collects: false, pages_most: usize::MAX };
-            let done = train_step(&mut scene, &mut working, rows, &view, comparison);
-            let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
+            let outcome = checked(train_step(&mut scene, &mut working, rows, &view, comparison));
             hash.add(outcome.loss.loss.to_bits());
             step += 1;
             if counted {

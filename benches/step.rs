@@ -21,10 +21,6 @@
 pub mod support;
 
 use gsscale::base::simd::SimdPath;
-use gsscale::config::file::TrainConfig;
-use gsscale::config::limits::RunOptions;
-use gsscale::config::values::Chosen;
-use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{
     Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches,
@@ -34,7 +30,7 @@ use gsscale::scene::columns::{Columns, row_width};
 use gsscale::scene::image::{Image, Target};
 use gsscale::train::step::batch::RowsInHost;
 use gsscale::train::step::comparison::Comparison;
-use gsscale::train::step::pages::{PagedScene, WorkingSet};
+use gsscale::train::step::pages::WorkingSet;
 use gsscale::train::step::train_step::{StepView, train_step};
 use serde_json::json;
 use std::time::{Duration, Instant};
@@ -42,7 +38,7 @@ use support::cases::{Case, PHOTO_CASES, photo_case, terrain_case};
 use support::cpu_bytes::{CpuCounts, part_bytes};
 use support::floor::{bare_blend_rate, copy_rate};
 use support::touched::touched;
-use support::{Args, Hash, Seconds, machine, median, time};
+use support::{Args, Hash, Seconds, checked, machine, median, paged, time};
 
 /// Size of a measurement.
 #[derive(Clone, Copy)]
@@ -148,11 +144,7 @@ struct StepResult {
 }
 
 fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult {
-    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
-    let options = RunOptions::new(&config, case.scene_scale);
-    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
-    let made = PagedScene::new(&case.columns, pager, &options);
-    let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
+    let (mut scene, options) = paged(&case.columns, case.scene_scale, simd);
     let mut working = WorkingSet::default();
     let mut renderer = Watched::default();
     let stride = case.views.len().div_ceil(effort.views);
@@ -169,8 +161,7 @@ fn run(case: &Case, simd: SimdPath, effort: Effort, floor: Floor) -> StepResult 
                 let (rows, comparison) =
                     (&mut RowsInHost::new(&mut renderer), &mut Comparison::new(target, options.loss));
                 let view = StepView { step, camera, render: &options.render, collects: true, pages_most: usize::MAX };
-                let done = train_step(&mut scene, &mut working, rows, &view, comparison);
-                let Ok(outcome) = done else { panic!("the step failed: {:?}", done.err()) };
+                let outcome = checked(train_step(&mut scene, &mut working, rows, &view, comparison));
                 renderer.note_end();
                 let stats = renderer.inner.stats();
                 let (pinned, rows) = (outcome.rows_pinned as f64, outcome.rows as f64);

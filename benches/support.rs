@@ -15,8 +15,13 @@ pub mod training;
 use gsscale::base::machine::cpu_model;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
+use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::RunOptions;
+use gsscale::config::values::Chosen;
+use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::scene::camera::Camera;
 use gsscale::scene::columns::Columns;
+use gsscale::train::step::pages::PagedScene;
 use std::time::{Duration, Instant};
 
 /// Unwraps a result that the measurement needs.
@@ -81,6 +86,14 @@ impl Args {
     pub fn wants(&self, case: &str) -> bool {
         self.only.is_empty() || self.only.iter().any(|word| case.contains(word.as_str()))
     }
+}
+
+/// The rows in pages in memory, and the options of a run whose colours have all bands from the first step.
+pub fn paged(columns: &Columns, scene_scale: f32, simd: SimdPath) -> (PagedScene, RunOptions) {
+    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
+    let options = RunOptions::new(&config, scene_scale);
+    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
+    (checked(PagedScene::new(columns, pager, &options)), options)
 }
 
 /// Wall and CPU seconds.

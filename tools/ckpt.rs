@@ -4,6 +4,7 @@
 use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
+use gsscale::base::say::aligned;
 use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_plain;
 use gsscale::config::values::ByteSize;
@@ -102,29 +103,15 @@ fn is_damaged_map(error: &TrainError) -> bool {
     )
 }
 
-/// Prints `value` as JSON or as text.
-fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<(), TrainError> {
+/// Prints `value` as JSON or as text: then a command has succeeded.
+fn print(json: bool, value: &impl Serialize, text: impl FnOnce() -> String) -> Result<ExitCode, TrainError> {
     let text = match json {
         true => serde_json::to_string_pretty(value)
             .map_err(|e| InputError::new("--json", format!("writing JSON failed: {e}"), "report this as a bug"))?,
         false => text(),
     };
     gsscale::say!("{}", text.trim_end_matches('\n'));
-    Ok(())
-}
-
-/// Formats rows of words as columns, the first left-aligned, the others right-aligned.
-fn table(rows: &[Vec<String>]) -> String {
-    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..columns)
-        .map(|c| rows.iter().filter_map(|row| row.get(c)).map(|cell| cell.chars().count()).max().unwrap_or(0))
-        .collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().zip(&widths).enumerate();
-        let cells = cells.map(|(c, (cell, &w))| if c == 0 { format!("{cell:<w$}") } else { format!("{cell:>w$}") });
-        cells.collect::<Vec<_>>().join("  ").trim_end().to_string()
-    };
-    rows.iter().map(line).collect::<Vec<_>>().join("\n")
+    Ok(ExitCode::SUCCESS)
 }
 
 const LS_EXAMPLES: &str = "\
@@ -152,17 +139,17 @@ fn run_ls(args: &Ls) -> Result<ExitCode, TrainError> {
         let heads = ["generation", "step", "PSNR", "Gaussians", "at most", "pages", "alone", "bytes", "names"];
         let mut rows = vec![heads.map(str::to_string).to_vec()];
         rows.extend(listed.generations.iter().map(ls_row));
-        let mut text = table(&rows);
-        if listed.generations.is_empty() {
-            text = "no commit yet".to_string();
-        }
+        let line = |row: &Vec<String>| row.join("  ").trim_end().to_string();
+        let mut text = match listed.generations.as_slice() {
+            [] => "no commit yet".to_string(),
+            _ => aligned(&rows).iter().map(line).collect::<Vec<_>>().join("\n"),
+        };
         text += &format!("\nsegment files: {}", format_bytes(listed.segment_bytes));
         if let Some(who) = &listed.used_by {
             text += &format!("\nin use ({who}): the state shown is that of the last commit");
         }
         text
-    })?;
-    Ok(ExitCode::SUCCESS)
+    })
 }
 
 fn ls_row(line: &GenerationLine) -> Vec<String> {
@@ -210,14 +197,13 @@ fn run_inspect(args: &Inspect) -> Result<ExitCode, TrainError> {
     match args.page {
         Some(page) => {
             let page = inspect_page(&place, args.generation.as_deref(), page)?;
-            print(args.json, &page, || page_text(&page))?;
+            print(args.json, &page, || page_text(&page))
         }
         None => {
             let store = inspect(&place, args.generation.as_deref())?;
-            print(args.json, &store, || store_text(&store))?;
+            print(args.json, &store, || store_text(&store))
         }
     }
-    Ok(ExitCode::SUCCESS)
 }
 
 fn store_text(s: &Inspected) -> String {
@@ -436,8 +422,7 @@ struct Prune {
 fn run_prune(args: &Prune) -> Result<ExitCode, TrainError> {
     let request = PruneRequest { names: args.names.clone(), keep: args.keep, dry_run: args.dry_run };
     let pruned = prune(&find_store(&args.dir)?, &request)?;
-    print(args.json, &pruned, || prune_text(&pruned))?;
-    Ok(ExitCode::SUCCESS)
+    print(args.json, &pruned, || prune_text(&pruned))
 }
 
 fn prune_text(pruned: &Pruned) -> String {
@@ -541,8 +526,7 @@ fn run_export(args: &Export) -> Result<ExitCode, TrainError> {
                 &format!("{} Gaussians are not finite, or too far for the format, and were left out\n", done.skipped);
         }
         text
-    })?;
-    Ok(ExitCode::SUCCESS)
+    })
 }
 
 const IMPORT_EXAMPLES: &str = "\
@@ -599,8 +583,7 @@ fn run_import(args: &Import) -> Result<ExitCode, TrainError> {
             text += &format!("{} Gaussians are not finite and were left out\n", done.dropped);
         }
         text
-    })?;
-    Ok(ExitCode::SUCCESS)
+    })
 }
 
 const CLONE_EXAMPLES: &str = "\
@@ -634,8 +617,7 @@ fn run_clone(args: &Clone) -> Result<ExitCode, TrainError> {
             format_bytes(done.bytes_read),
             done.to.display(),
         )
-    })?;
-    Ok(ExitCode::SUCCESS)
+    })
 }
 
 const SALVAGE_EXAMPLES: &str = "\
@@ -667,8 +649,7 @@ struct Salvage {
 fn run_salvage(args: &Salvage) -> Result<ExitCode, TrainError> {
     let request = SalvageRequest { to: args.out.clone(), config: args.config.clone() };
     let done = salvage(&find_store(&args.dir)?, &request)?;
-    print(args.json, &done, || salvage_text(&done))?;
-    Ok(ExitCode::SUCCESS)
+    print(args.json, &done, || salvage_text(&done))
 }
 
 fn salvage_text(done: &Salvaged) -> String {

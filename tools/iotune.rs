@@ -2,18 +2,17 @@
 //! library, prints.
 
 use clap::Parser;
+use gsscale::base::count::new_bar;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::say::exit_code;
 use gsscale::base::units::{format_bytes, parse_bytes};
 use gsscale::config::command_line::parse_plain;
 use gsscale::page::engine::open::IoEngine;
 use gsscale::page::folder::file_system::FileSystem;
-use gsscale::page::folder::measure::codec_for;
-use gsscale::page::folder::measure::{Case, Limits, MeasuredCase, Sweep, sweep};
+use gsscale::page::folder::measure::{Case, Limits, MeasuredCase, Sweep, codec_for, sweep};
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::transfer_bytes;
 use gsscale::scene::page_layout::capacity_bytes;
-use indicatif::{ProgressBar, ProgressStyle};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -84,10 +83,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         seconds: flags.seconds,
         written_bytes: flags.written,
     };
-    let bar = ProgressBar::new(1000);
-    if let Ok(style) = ProgressStyle::with_template("measuring {bar:40} {percent} %") {
-        bar.set_style(style);
-    }
+    let bar = new_bar(1000, "measuring {bar:40} {percent} %");
     let sweep = sweep(&flags.dir, &cases, limits, &mut |share| bar.set_position((share * 1000.0) as u64));
     bar.finish_and_clear();
     let sweep = sweep?;
@@ -196,7 +192,6 @@ fn print_advice(folder: &Path, sweep: &Sweep) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

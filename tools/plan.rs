@@ -10,13 +10,13 @@ use clap::Parser;
 use device::{DeviceModel, DeviceRow};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::host_bytes_peak;
+use gsscale::base::say::exit_code;
 use gsscale::base::text::read_text;
 use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
-use gsscale::config::values::ByteSize;
-use gsscale::config::values::Chosen;
+use gsscale::config::values::{ByteSize, Chosen};
 use gsscale::gpu::EmulatedBus;
 use gsscale::optim::method::Method;
 use gsscale::optim::moments::Moments;
@@ -176,16 +176,7 @@ fn main() -> ExitCode {
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
     gsscale::base::allocator::return_freed_blocks();
     gsscale::base::environment::quiet_wayland();
-    match start(&parse_arguments(&arguments)) {
-        Ok(text) => {
-            gsscale::say!("{text}");
-            ExitCode::SUCCESS
-        }
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(start(&parse_arguments(&arguments)).map(|text| gsscale::say!("{text}")))
 }
 
 fn start(args: &Args) -> InputResult<String> {

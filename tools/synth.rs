@@ -1,12 +1,12 @@
 //! `gsscale-synth`: writes a generated city as a COLMAP scene. Parses flags, calls the library, prints.
 
 use clap::Parser;
+use gsscale::base::count::new_bar;
 use gsscale::base::error::InputResult;
 use gsscale::base::say::exit_code;
 use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_plain;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
-use indicatif::{ProgressBar, ProgressStyle};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -95,8 +95,7 @@ fn main() -> ExitCode {
 
 /// The program, with the words of its command line; the first is its name.
 pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
-    let flags = parse_plain::<Flags>(&arguments);
-    exit_code(run(&flags))
+    exit_code(run(&parse_plain::<Flags>(&arguments)))
 }
 
 fn run(flags: &Flags) -> InputResult<()> {
@@ -122,10 +121,7 @@ fn run(flags: &Flags) -> InputResult<()> {
         overwrite: flags.overwrite,
     };
     let start = Instant::now();
-    let bar = ProgressBar::new(u64::from(options.photos()));
-    if let Ok(style) = ProgressStyle::with_template("{bar:32} {pos}/{len} photos  {per_sec}  {eta} left") {
-        bar.set_style(style);
-    }
+    let bar = new_bar(u64::from(options.photos()), "{bar:32} {pos}/{len} photos  {per_sec}  {eta} left");
     let summary = write_city(&flags.dir, &options, &|done, _| bar.set_position(u64::from(done)))?;
     bar.finish_and_clear();
     report(flags, &options, &summary, start.elapsed().as_secs_f64());

@@ -6,15 +6,11 @@
 //! updates to apply. (Views of a scene list neighbouring rows; the parts `gather` and `adam+statistics+bounds` of a
 //! whole step measure that case.)
 
-use super::{median, terrain, time};
+use super::{checked, median, paged, terrain, time};
 use gsscale::base::ids::PageNo;
 use gsscale::base::rng::{Purpose, Stream};
 use gsscale::base::simd::SimdPath;
-use gsscale::config::file::TrainConfig;
-use gsscale::config::limits::RunOptions;
-use gsscale::config::values::Chosen;
 use gsscale::optim::row_kernels::step_rows;
-use gsscale::paging::pager::{Pager, PagerConfig};
 use gsscale::paging::pinned::PinnedPage;
 use gsscale::scene::columns::{Column, Columns, row_width};
 use gsscale::train::step::catch_up::gather;
@@ -63,15 +59,9 @@ impl Touched {
 
 /// Medians of `rounds` rounds over `percent` of `rows` rows in pages.
 pub fn touched(rows: usize, percent: u32, rounds: usize, simd: SimdPath) -> Touched {
-    // All SH bands are in use from the first step.
-    let config = TrainConfig { simd: Chosen(Some(simd)), sh_every: 0, ..TrainConfig::default() };
-    let options = RunOptions::new(&config, 1.0);
-    let pager = Pager::in_memory(PagerConfig::in_memory(options.page_rows, options.sh_degree));
-    let made = PagedScene::new(&terrain(rows, 64, 64).0, pager, &options);
-    let Ok(mut scene) = made else { panic!("no pages: {:?}", made.err()) };
+    let (mut scene, options) = paged(&terrain(rows, 64, 64).0, 1.0, simd);
     let all: Vec<PageNo> = (0..scene.pager.index().len() as u32).map(PageNo).collect();
-    let acquired = scene.pager.acquire_pages(&all);
-    let Ok(mut pages) = acquired else { panic!("no pages: {:?}", acquired.err()) };
+    let mut pages = checked(scene.pager.acquire_pages(&all));
     let mut draws = Stream::new(1, Purpose::Test, 7, 7);
     let list: Vec<u32> = (0..rows as u32).filter(|_| draws.below(100) < u64::from(percent)).collect();
     let mut gradients = Columns::zeros(list.len(), options.sh_degree);

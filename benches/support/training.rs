@@ -1,5 +1,6 @@
 //! The command line of the benchmarks that train a scene. Measures nothing itself.
 
+use gsscale::base::say::exit_code;
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::ffi::OsString;
@@ -17,11 +18,5 @@ pub fn run_with_arguments(
         gsscale::tell!("SKIPPED {name}: it needs arguments; see cargo bench --bench {name} -- --help");
         return ExitCode::SUCCESS;
     }
-    match start(&arguments, &mut |line| gsscale::say!("{line}")) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            gsscale::tell!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    exit_code(start(&arguments, &mut |line| gsscale::say!("{line}")))
 }

@@ -104,6 +104,17 @@ fn is_hidden(char: char) -> bool {
     is_direction || (char.is_control() && !matches!(char, '\n' | '\t'))
 }
 
+/// The cells of a table, padded to the width of their column: the first column stands to the left, the others to the right.
+pub fn aligned(rows: &[Vec<String>]) -> Vec<Vec<String>> {
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..rows.first().map_or(0, Vec::len)).map(width).collect();
+    let pad = |(column, (cell, &width)): (usize, (&String, &usize))| match column {
+        0 => format!("{cell:<width$}"),
+        _ => format!("{cell:>width$}"),
+    };
+    rows.iter().map(|row| row.iter().zip(&widths).enumerate().map(pad).collect()).collect()
+}
+
 /// The exit code of a program that has ended so; an error is printed with its remedy.
 pub fn exit_code(done: Result<(), impl std::fmt::Display>) -> std::process::ExitCode {
     match done {

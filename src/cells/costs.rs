@@ -6,6 +6,7 @@
 
 use super::plan::{CellPlan, CityPlan};
 use super::prior::STEPS_SHARE;
+use super::work::COPY_EVERY;
 use crate::base::units::{parse_bytes, parse_count};
 use crate::config::file::TrainConfig;
 use crate::scene::state::row_bytes;
@@ -57,10 +58,9 @@ pub(crate) struct Basis<'a> {
     /// Steps of the whole scene.
     pub steps: f64,
     pub prior_degree: u8,
-    /// Bytes a second; machines that work on cells; seconds between copies.
+    /// Bytes a second; machines that work on cells.
     pub network: f64,
     pub machines: usize,
-    pub copy_every: f64,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -142,7 +142,7 @@ impl Basis<'_> {
         let mut longest: Vec<&CellPlan> = plan.cells.iter().collect();
         longest.sort_by(|a, b| b.seconds.total_cmp(&a.seconds));
         for cell in longest {
-            let legs = (cell.seconds / self.copy_every.max(1.0)).floor() + 1.0;
+            let legs = (cell.seconds / COPY_EVERY).floor() + 1.0;
             let rows = (cell.trained + cell.frozen) as f64;
             let copied = legs * 0.5 * (1.0 + rows / cell.max_gaussians.max(1) as f64) * cell.bytes as f64;
             let views = (cell.train_views + cell.test_views) as f64;

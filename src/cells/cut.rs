@@ -9,8 +9,7 @@ use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_d
 use super::prior::GAUSSIANS_SHARE;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
-use super::work::COPY_EVERY;
-use super::{City, check_machine_keys, check_range, config_of};
+use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
@@ -128,7 +127,6 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
         prior_degree: seen.sh_degree,
         network: request.network.max(1) as f64,
         machines: if request.machines == 0 { plan.cells.len() } else { request.machines },
-        copy_every: COPY_EVERY,
     };
     if let Some(larger) = request.as_if.filter(|_| request.dry_run) {
         basis.enlarge(&mut plan, larger);
@@ -347,7 +345,7 @@ fn write_cell(
     std::fs::create_dir_all(&folder).map_err(|e| InputError::io(&folder, "making the folder of the cell", &e))?;
     keys.insert("steps".into(), i64::from(planned.steps).into());
     keys.insert("max-gaussians".into(), (planned.max_gaussians as i64).into());
-    let text = toml::to_string(&keys).map_err(|e| InputError::new(&folder, e.to_string(), "report this as a bug"))?;
+    let text = toml_of(&folder, &keys)?;
     let mut views: Vec<usize> = draft.train.iter().chain(&draft.test).copied().collect();
     views.sort_unstable_by_key(|&view| &seen.views[view].name);
     let names: String = views.iter().map(|&view| format!("{}\n", seen.views[view].name)).collect();

@@ -136,7 +136,6 @@ fn machine_of(owner: &str) -> &str {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -13,7 +13,7 @@ use super::costs::POLISH_SHARE;
 use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
 use super::work::{copy_of, done_of};
-use super::{City, config_of};
+use super::{City, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::ids::{PageId, PageNo};
@@ -149,9 +149,7 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     write_config(&folder.path().join(CONFIG_FILE), &config, &facts)?;
     write_polish(&plan, &city, &request.out, &mut folder)?;
     let merged = Merged { gaussians: written.rows, ..merging.done };
-    let text = toml::to_string(&merged);
-    let text = text.map_err(|e| InputError::new(MERGED_FILE, e.to_string(), "report this as a bug"))?;
-    folder.write(Path::new(MERGED_FILE), text.as_bytes())?;
+    folder.write(Path::new(MERGED_FILE), toml_of(MERGED_FILE, &merged)?.as_bytes())?;
     folder.finish()?;
     Ok(merged)
 }
@@ -296,7 +294,5 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path, folder: &mut PartFolde
         keys.insert(key.into(), rate.into());
     }
     keys.insert("sh-every".into(), 0.into());
-    let text = toml::to_string(&keys);
-    let text = text.map_err(|e| InputError::new(POLISH_FILE, e.to_string(), "report this as a bug"))?;
-    folder.write(Path::new(POLISH_FILE), text.as_bytes())
+    folder.write(Path::new(POLISH_FILE), toml_of(POLISH_FILE, &keys)?.as_bytes())
 }

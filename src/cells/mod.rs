@@ -27,7 +27,6 @@ pub mod merge;
 pub mod plan;
 pub mod prior;
 mod ring;
-
 pub mod seam;
 mod views;
 pub mod work;
@@ -39,6 +38,7 @@ use crate::train::error::TrainError;
 use crate::train::run::begin::run;
 use crate::train::run::request::{Existing, RunOutcome, RunRequest};
 use crate::train::run::resume::{ResumeRequest, go_on, resume};
+use serde::Serialize;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -130,6 +130,11 @@ pub(crate) fn config_of(file: &Path, mut keys: toml::Table, machine: &TrainOverr
         .map_err(|problem| InputError::new(file, problem, "restore the file, or begin another city"))?;
     config.check()?;
     Ok(config)
+}
+
+/// The text of a TOML file.
+pub(crate) fn toml_of(file: impl AsRef<Path>, values: &impl Serialize) -> InputResult<String> {
+    toml::to_string(values).map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))
 }
 
 /// The folder of a city.

@@ -2,7 +2,7 @@
 //!
 //! Invariants: 1. every place of the ground lies in exactly one leaf; 2. a plan, a list or a prior that was changed after the cut is refused.
 
-use super::City;
+use super::{City, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
@@ -110,9 +110,7 @@ struct Signed {
 impl CityPlan {
     /// Digest of all of it. `file` is for errors.
     pub(crate) fn digest(&self, file: &Path) -> InputResult<String> {
-        let text = toml::to_string(self);
-        let text = text.map_err(|e| InputError::new(file, e.to_string(), "report this as a bug"))?;
-        Ok(hex(xxh3_64(text.as_bytes())))
+        Ok(hex(xxh3_64(toml_of(file, self)?.as_bytes())))
     }
 
     /// Writes plan.toml, which ends a cut.
@@ -120,8 +118,7 @@ impl CityPlan {
     pub fn write(&self, city: &City) -> InputResult<()> {
         let file = city.plan();
         let signed = Signed { digest: self.digest(&file)?, plan: self.clone() };
-        let text = toml::to_string(&signed);
-        write_whole(&file, text.map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?.as_bytes())
+        write_whole(&file, toml_of(&file, &signed)?.as_bytes())
     }
 
     /// Reads the plan of a city.

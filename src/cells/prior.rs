@@ -4,7 +4,7 @@
 //! Invariants: 1. the keys of the city are fixed here; 2. the store appears last, so a city that has it has a finished prior.
 
 use super::work::remove_store;
-use super::{AnyRun, City, begin_or_resume, config_of, is_of_machine, machine_keys};
+use super::{AnyRun, City, begin_or_resume, config_of, is_of_machine, machine_keys, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{KEYS, TrainConfig, TrainOverrides};
@@ -78,7 +78,7 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
 /// Errors: the city was begun with other keys.
 fn fix_keys(city: &City, keys: &toml::Table) -> InputResult<()> {
     let file = city.keys();
-    let text = toml::to_string(keys).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+    let text = toml_of(&file, keys)?;
     if !file.exists() || !city.prior_run().exists() {
         std::fs::create_dir_all(&city.0).map_err(|e| InputError::io(&city.0, "making the folder", &e))?;
         return write_whole(&file, text.as_bytes());

@@ -14,7 +14,7 @@
 
 use super::lock::{CellLock, owner_of};
 use super::plan::{CityPlan, prior_digest};
-use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, config_of};
+use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::machine::host_name;
 use crate::base::whole_file::write_whole;
@@ -117,7 +117,9 @@ pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
             }
             let psnr = summary.test.map(|test| test.psnr);
             let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
-            write_done(&folder, &Done { files: files.clone(), copy, steps, gaussians, seconds, psnr })?;
+            let (file, done) =
+                (folder.join("done.toml"), Done { files: files.clone(), copy, steps, gaussians, seconds, psnr });
+            write_whole(&file, toml_of(&file, &done)?.as_bytes())?;
             place.clear()?;
             return Ok(0);
         }
@@ -186,12 +188,6 @@ fn check_prior(plan: &CityPlan, city: &City, keys: &TrainOverrides) -> Result<()
 
 fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
     new_run::given_keys(Some(&folder.join("cell.toml")), &TrainOverrides::default())
-}
-
-fn write_done(folder: &Path, done: &Done) -> InputResult<()> {
-    let file = folder.join("done.toml");
-    let text = toml::to_string(done).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
-    write_whole(&file, text.as_bytes())
 }
 
 /// Where this machine works on a cell.

@@ -72,15 +72,13 @@ impl<'de> Deserialize<'de> for CommitEvery {
     fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]
-        enum CommitBytes {
-            Integer(i64),
-            Number(f64),
+        enum Written {
+            Seconds(f64),
             Text(String),
         }
-        match CommitBytes::deserialize(d)? {
-            CommitBytes::Integer(seconds) => Ok(CommitEvery::Seconds(seconds as f64)),
-            CommitBytes::Number(seconds) => Ok(CommitEvery::Seconds(seconds)),
-            CommitBytes::Text(text) => text.parse().map_err(serde::de::Error::custom),
+        match Written::deserialize(d)? {
+            Written::Seconds(seconds) => Ok(CommitEvery::Seconds(seconds)),
+            Written::Text(text) => text.parse().map_err(serde::de::Error::custom),
         }
     }
 }
@@ -192,7 +190,6 @@ fn automatic(cost: CommitCost, bytes_per_hour: f64) -> f64 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -232,7 +232,6 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
         allow_missing: config.allow_missing,
         near_plane: config.near_plane,
         views_file: (!config.views_file.is_empty()).then(|| PathBuf::from(&config.views_file)),
-        ..LoadOptions::default()
     }
 }
 

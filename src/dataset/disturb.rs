@@ -413,7 +413,6 @@ fn not_encoded(e: &image::ImageError) -> InputError {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -54,8 +54,6 @@ pub struct LoadOptions {
     /// Near plane in robust scene sizes, the local unit (see [`Extent::frame`]): gsplat uses 0.01 in a scene normalised
     /// to a median camera distance of 1.
     pub near_plane: f64,
-    /// Folder that the views' names are relative to; `None`: derived from the first view's name and path.
-    pub image_folder: Option<PathBuf>,
     /// A file that lists the names of the views to keep, one on each line; `None` keeps all.
     pub views_file: Option<PathBuf>,
 }
@@ -72,7 +70,6 @@ impl Default for LoadOptions {
             invert_masks: false,
             allow_missing: false,
             near_plane: 0.01,
-            image_folder: None,
             views_file: None,
         }
     }
@@ -189,7 +186,7 @@ fn load_views(
 ) -> InputResult<(Dataset, Extent)> {
     options.check()?;
     let mut warnings = raw.warnings;
-    let image_folder = options.image_folder.clone().unwrap_or_else(|| image_folder_of(&raw.views));
+    let image_folder = image_folder_of(&raw.views);
     let root = match raw.root.as_os_str().is_empty() {
         true => image_folder.parent().unwrap_or(&image_folder),
         false => &raw.root,

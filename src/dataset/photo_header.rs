@@ -355,7 +355,6 @@ impl HeaderReader<'_> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use std::io::Write;

@@ -112,14 +112,12 @@ impl CsvHeader {
         SEPARATORS.into_iter().find_map(|separator| {
             let names = cells_of(line, separator);
             let names = names.iter().map(|name| name.trim_matches(['#', ' ']).to_ascii_lowercase());
-            let mut names: Vec<String> = names.collect();
-            let place = |name: &str| names.iter().position(|other| other == name);
-            if let (Some(z), None, Some(_)) = (place("z"), place("alt"), place("heading")) {
-                names[z] = "alt".to_string();
+            let mut header = CsvHeader { names: names.collect(), separator };
+            if let (Some(z), None, Some(_)) = (header.place("z"), header.place("alt"), header.place("heading")) {
+                header.names[z] = "alt".to_string();
             }
-            let has = |name: &str| names.iter().any(|other| other == name);
-            let is_header = names.first().is_some_and(|name| name == "name") && has("x") && has("alt");
-            is_header.then_some(CsvHeader { names, separator })
+            let [name, x, alt] = ["name", "x", "alt"].map(|name| header.place(name));
+            (name == Some(0) && x.is_some() && alt.is_some()).then_some(header)
         })
     }
 
@@ -210,7 +208,6 @@ fn camera_to_world([heading, pitch, roll]: [f64; 3], centre: [f64; 3]) -> [[f64;
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -136,7 +136,6 @@ fn smallest_direction(matrix: DMat3) -> DVec3 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

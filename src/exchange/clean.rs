@@ -113,7 +113,6 @@ pub fn photos_required(is_on: Option<bool>, counts: &[u8]) -> u8 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};

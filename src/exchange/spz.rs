@@ -16,7 +16,7 @@
 //! range become its nearest end.
 
 use crate::base::error::{InputError, InputResult};
-use crate::base::math::exp32;
+use crate::base::math::sigmoid;
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::SceneMeta;
@@ -209,8 +209,7 @@ fn packed_position(position: [f32; 3], fraction_bits: u8) -> [u8; POSITION_BYTES
 
 /// The attributes that follow a position, in their order.
 fn push_attributes(row: &ExportRow, sh_degree: u8, out: &mut Vec<u8>) {
-    let alpha = 1.0 / (1.0 + exp32(-row.opacity));
-    out.push(byte(alpha * 255.0));
+    out.push(byte(sigmoid(row.opacity) * 255.0));
     out.extend(row.sh0.map(|c| byte(c * (COLOR_SCALE * 255.0) + 0.5 * 255.0)));
     out.extend(row.log_scales.map(|s| byte((s + 10.0) * 16.0)));
     out.extend(rotation(row.quat));

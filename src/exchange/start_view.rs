@@ -87,7 +87,6 @@ pub fn settings_path(ply: &Path) -> PathBuf {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::exchange::meta::{ExportFrame, SceneMeta};

@@ -179,7 +179,6 @@ fn masked(crc: u32) -> u32 {
 }
 
 #[cfg(test)]
-#[allow(clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

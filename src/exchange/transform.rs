@@ -131,7 +131,6 @@ fn affine(a: [[f64; 3]; 3], b: [f64; 3]) -> [[f64; 4]; 4] {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::scene::rotation::VIEWER_UP;

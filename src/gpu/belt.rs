@@ -15,6 +15,7 @@ use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 use super::submitter::{MapState, Mapping, SharedState, Ticket};
 use rayon::prelude::*;
+use wgpu::MAP_ALIGNMENT;
 
 /// Bytes of one staging buffer, at most: in the range where copies run fastest.
 const CHUNK_BYTES_MAX: u64 = 4 << 20;
@@ -49,9 +50,6 @@ fn fill(raw: &wgpu::Buffer, at: u64, bytes: &[u8]) -> GpuResult<()> {
         _ => bytes.par_chunks(COPY_PART).enumerate().try_for_each(|(i, part)| copy(at + (i * COPY_PART) as u64, part)),
     }
 }
-
-/// Alignment of mapped ranges.
-const MAP_ALIGNMENT: u64 = wgpu::MAP_ALIGNMENT;
 
 #[derive(Debug)]
 struct Chunk {

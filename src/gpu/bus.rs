@@ -8,8 +8,7 @@
 
 use super::error::{GpuError, GpuResult};
 use crate::base::units::parse_bytes;
-use std::time::Duration;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 /// Environment variable that emulates a bus for any program: `12GB/s,20us`.
 const VARIABLE: &str = "GSSCALE_EMULATE_BUS";
@@ -48,15 +47,9 @@ impl EmulatedBus {
     /// The bus that the environment requests.
     /// Errors: the variable is set to something else than a rate and a latency.
     pub(super) fn from_environment() -> GpuResult<Option<EmulatedBus>> {
-        match std::env::var_os(VARIABLE) {
-            None => Ok(None),
-            Some(text) => {
-                let text = text.to_string_lossy();
-                EmulatedBus::parse(&text)
-                    .map(Some)
-                    .ok_or_else(|| GpuError::EmulatedBus { variable: VARIABLE, text: text.into_owned() })
-            }
-        }
+        let Some(text) = std::env::var_os(VARIABLE) else { return Ok(None) };
+        let text = text.to_string_lossy().into_owned();
+        EmulatedBus::parse(&text).map(Some).ok_or(GpuError::EmulatedBus { variable: VARIABLE, text })
     }
 
     /// How long a copy takes.
@@ -78,7 +71,6 @@ impl EmulatedBus {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

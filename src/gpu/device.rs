@@ -306,7 +306,6 @@ mod tests {
     }
 
     #[test]
-    #[allow(clippy::unwrap_used)] // a panic is a failed test
     fn a_refused_optional_buffer_leaves_the_budget() {
         let Some(gpu) = open() else { return };
         let room = gpu.room();
@@ -321,7 +320,6 @@ mod tests {
     }
 
     #[test]
-    #[allow(clippy::unwrap_used)] // a panic is a failed test
     fn a_lost_device_is_reported_by_every_later_call() {
         let Some(gpu) = open() else { return };
         let mut recorder = gpu.begin("step 12");

@@ -77,9 +77,7 @@ impl GpuError {
     pub(super) fn bindings(stage: &str, problem: impl Into<String>) -> GpuError {
         GpuError::Bindings { stage: stage.into(), problem: problem.into() }
     }
-}
 
-impl GpuError {
     /// Whether a buffer or binding was refused for its size before any command that needs it was recorded. The same work in
     /// smaller parts may succeed.
     pub fn is_out_of_memory(&self) -> bool {

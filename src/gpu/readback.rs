@@ -44,7 +44,7 @@ impl Staging {
         let state = SharedState::new(MapState::Recorded);
         let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, size, &state);
         let ticket = ticket.clone();
-        Ok((Readback { buffer: to, stage, size, state, ticket, staging: Arc::clone(self) }, mapping))
+        Ok((Readback { buffer: to, stage, state, ticket, staging: Arc::clone(self) }, mapping))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
@@ -69,7 +69,6 @@ fn empty(mapped: &[u8], out: &mut [u8]) {
 pub struct Readback {
     buffer: Buffer,
     stage: &'static str,
-    size: u64,
     state: SharedState,
     ticket: Ticket,
     staging: Arc<Staging>,
@@ -79,7 +78,7 @@ impl Readback {
     /// Waits, then returns the elements.
     /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn to_vec<T: bytemuck::Pod>(self) -> GpuResult<Vec<T>> {
-        let mut out = vec![T::zeroed(); usize::try_from(self.size).unwrap_or(0) / size_of::<T>().max(1)];
+        let mut out = vec![T::zeroed(); usize::try_from(self.buffer.size()).unwrap_or(0) / size_of::<T>().max(1)];
         self.copy_to(&mut out)?;
         Ok(out)
     }
@@ -88,11 +87,11 @@ impl Readback {
     /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn copy_to<T: bytemuck::Pod>(mut self, out: &mut [T]) -> GpuResult<()> {
         self.wait()?;
-        let out = bytemuck::cast_slice_mut::<T, u8>(out);
-        let view = self.buffer.raw().get_mapped_range(..self.size).map_err(|e| GpuError::validation(self.stage, e))?;
+        let (out, size) = (bytemuck::cast_slice_mut::<T, u8>(out), self.buffer.size());
+        let view = self.buffer.raw().get_mapped_range(..size).map_err(|e| GpuError::validation(self.stage, e))?;
         let n = out.len().min(view.len());
-        let span = trace::span("read back").of("what", self.stage).with("bytes", self.size);
-        self.staging.driver.cross(self.size, || empty(&view[..n], &mut out[..n]));
+        let span = trace::span("read back").of("what", self.stage).with("bytes", size);
+        self.staging.driver.cross(size, || empty(&view[..n], &mut out[..n]));
         drop(span);
         drop(view);
         self.buffer.raw().unmap();

@@ -3,7 +3,6 @@
 //! Builds without debug assertions, which users run, have no mutants: [`active`] is `false` there at compile time.
 //! Invariant: a mutant is active only on the thread that chose it, and nowhere by default.
 
-/// One bug.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mutant {
     /// The map is committed before the segments are synced.

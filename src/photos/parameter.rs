@@ -327,8 +327,7 @@ mod tests {
 
     #[test]
     fn pictures_say_nothing_for_500_steps_after_a_reset() {
-        let viewmat = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        let camera = Camera::pinhole(viewmat, [20.0, 20.0, 2.0, 2.0], [4, 4]);
+        let camera = Camera::along_z(0.0, [20.0, 20.0, 2.0, 2.0], [4, 4]);
         let mut events = EventLog::default();
         let follows = |events: &EventLog, step: u32| {
             PhotoStep { view: 0, step, camera: &camera, events, is_left_out: false, is_rehearsal: false }

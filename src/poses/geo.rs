@@ -155,7 +155,6 @@ fn dominant_direction(mut matrix: DMat4) -> glam::DVec4 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -31,7 +31,7 @@ use geo::{Similarity, metres_from, robust_similarity};
 use glam::DVec3;
 use pairs::{ChosenBy, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos, modified_at};
-use program::{DATABASE, FeatureOptions, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
+use program::{CHUNK, DATABASE, FeatureOptions, LIST, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::fs::{File, Metadata, TryLockError};
@@ -260,8 +260,8 @@ impl PoseSearch {
             let mut done = 0;
             for chunk in pairs.chunks(size) {
                 watch("pairs compared", done as u32, pairs.len() as u32);
-                write_whole(&work.join("chunk.txt"), self.lines_of(chunk).as_bytes())?;
-                self.program.run(&Phase::Matches { pairs: "chunk.txt" }, &self.features, place, &mut |_| ())?;
+                write_whole(&work.join(CHUNK), self.lines_of(chunk).as_bytes())?;
+                self.program.run(Phase::Matches, &self.features, place, &mut |_| ())?;
                 done += chunk.len();
             }
             state.finish("matches", &work)?;
@@ -271,7 +271,7 @@ impl PoseSearch {
             make_folder(&work.join(SPARSE))?;
             let total = self.photos.len() as u32;
             let mut show = |line: &str| registered_in(line).into_iter().for_each(|n| watch("photos placed", n, total));
-            self.program.run(&Phase::Model, &self.features, place, &mut show)?;
+            self.program.run(Phase::Model, &self.features, place, &mut show)?;
             state.finish(SEARCH_END, &work)?;
         }
         self.write_scene(&work)
@@ -420,7 +420,7 @@ impl PoseSearch {
             let is_enough = one_camera && group.len() >= PHOTOS_FOR_OPENCV;
             let camera_model = if is_enough { "OPENCV" } else { "SIMPLE_RADIAL" };
             let names: String = group.iter().map(|&i| plain_name(i, &self.photos[i].name) + "\n").collect();
-            write_whole(&work.join("list.txt"), names.as_bytes())?;
+            write_whole(&work.join(LIST), names.as_bytes())?;
             let mut in_group = 0;
             let mut show = |line: &str| {
                 if line.contains("Processed file [") {
@@ -428,8 +428,8 @@ impl PoseSearch {
                     watch("photos searched for features", done + in_group, total);
                 }
             };
-            let phase = Phase::Features { list: "list.txt", camera_model, one_camera };
-            self.program.run(&phase, &self.features, (work, lock), &mut show)?;
+            let phase = Phase::Features { camera_model, one_camera };
+            self.program.run(phase, &self.features, (work, lock), &mut show)?;
             done += group.len() as u32;
         }
         state.finish("features", work)
@@ -451,14 +451,14 @@ impl PoseSearch {
         let registered = self.photos.len() - missing.len();
         let mut said: Vec<String> = raw.warnings.clone();
         let alignment = self.align(&raw, &index, &mut said);
-        let (origin, moved, rest) = alignment.unwrap_or((None, Similarity::IDENTITY, 0.0));
+        let moved = alignment.map_or(Similarity::IDENTITY, |(_, moved, _)| moved);
         let model = raw.points_path.as_deref().and_then(Path::parent).unwrap_or(work);
         let part = work.join("result");
         remove_ours(&part, is_of_model)?;
         make_folder(&part.join("0"))?;
         let name_of = |name: &str| index(name).map(|i| self.photos[i].name.clone());
         model::write_moved(model, &part.join("0"), &moved, &name_of)?;
-        if let Some(origin) = origin {
+        if let Some((origin, ..)) = alignment {
             let text = serde_json::json!({
                 "latitude": origin.latitude, "longitude": origin.longitude, "altitude": origin.altitude,
             });
@@ -468,7 +468,7 @@ impl PoseSearch {
         }
         let sparse = self.scene.join(SPARSE);
         std::fs::rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
-        let aligned = origin.map(|origin| (origin, rest));
+        let aligned = alignment.map(|(origin, _, rest)| (origin, rest));
         Ok(FoundPoses { scene: self.scene.clone(), photos: self.photos.len(), registered, missing, aligned, said })
     }
 
@@ -479,7 +479,7 @@ impl PoseSearch {
         raw: &RawScene,
         index: &dyn Fn(&str) -> Option<usize>,
         said: &mut Vec<String>,
-    ) -> Option<(Option<GpsPlace>, Similarity, f64)> {
+    ) -> Option<(GpsPlace, Similarity, f64)> {
         let place = |name: &str| self.photos[index(name)?].place.filter(|place| place.altitude.is_some());
         let with_place = || raw.views.iter().filter_map(|view| Some((view.pose.centre(), place(&view.name)?)));
         // Medians: a place that is far off moves neither.
@@ -498,22 +498,13 @@ impl PoseSearch {
         let origin = of_first.iter().zip(with_place().map(|(_, place)| place)).min_by(nearest)?.1;
         let (centres, metres): (Vec<_>, Vec<_>) =
             with_place().map(|(at, place)| (at, metres_from(&origin, &place))).unzip();
-        match robust_similarity(&centres, &metres) {
-            Some((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => Some((Some(origin), moved, rest)),
-            Some((_, rest)) => {
-                said.push(format!(
-                    "the photos' GPS disagrees with the model by {rest:.1} m, so the model has no metres and no north"
-                ));
-                None
-            }
-            None => {
-                said.push(
-                    "the photos' GPS places are too few, too coarse or on a line, so the model has no metres and no north"
-                        .to_string(),
-                );
-                None
-            }
-        }
+        let why = match robust_similarity(&centres, &metres) {
+            Some((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => return Some((origin, moved, rest)),
+            Some((_, rest)) => &format!("GPS disagrees with the model by {rest:.1} m"),
+            None => "GPS places are too few, too coarse or on a line",
+        };
+        said.push(format!("the photos' {why}, so the model has no metres and no north"));
+        None
     }
 }
 
@@ -684,7 +675,6 @@ fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -111,25 +111,12 @@ fn nearest(places: &[Option<GpsPlace>]) -> Vec<Vec<usize>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::photo_header::{PhotoFormat, PhotoHeader};
-    use std::path::PathBuf;
+    use crate::poses::photos::tests::photo;
 
     fn photos(places: impl Iterator<Item = Option<(f64, f64)>>) -> Vec<FoundPhoto> {
         let of_place = |place: Option<(f64, f64)>| FoundPhoto {
-            name: String::new(),
-            path: PathBuf::new(),
-            bytes: 0,
-            modified: 0,
-            header: PhotoHeader {
-                format: PhotoFormat::Png,
-                width: 4,
-                height: 3,
-                decode_bytes: 0,
-                has_alpha: false,
-                exif: None,
-            },
-            camera: String::new(),
             place: place.map(|(latitude, longitude)| GpsPlace { latitude, longitude, altitude: None }),
+            ..photo("")
         };
         places.map(of_place).collect()
     }

@@ -168,17 +168,21 @@ pub fn camera_groups(photos: &[FoundPhoto]) -> Vec<Vec<usize>> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 pub(super) mod tests {
     use super::*;
     use crate::dataset::photo_header::PhotoFormat;
 
+    /// A photo without a file.
+    pub(in crate::poses) fn photo(name: &str) -> FoundPhoto {
+        let (name, path, format) = (name.to_string(), PathBuf::new(), PhotoFormat::Jpeg);
+        let header = PhotoHeader { format, width: 4, height: 3, decode_bytes: 0, has_alpha: false, exif: None };
+        FoundPhoto { name, path, bytes: 0, modified: 0, header, camera: String::new(), place: None }
+    }
+
     /// A file that counts as a photo, whatever is in it.
     pub(in crate::poses) fn photo_at(folder: &Path, name: &str) -> FoundPhoto {
-        let (path, format) = (folder.join(name), PhotoFormat::Jpeg);
-        let bytes = std::fs::metadata(&path).unwrap().len();
-        let header = PhotoHeader { format, width: 4, height: 3, decode_bytes: 0, has_alpha: false, exif: None };
-        FoundPhoto { name: name.to_string(), path, bytes, modified: 0, header, camera: String::new(), place: None }
+        let path = folder.join(name);
+        FoundPhoto { bytes: std::fs::metadata(&path).unwrap().len(), path, ..photo(name) }
     }
 
     #[test]
@@ -222,16 +226,8 @@ pub(super) mod tests {
     #[test]
     fn photos_of_one_camera_one_zoom_and_one_size_are_a_group() {
         let photo_in = |folder: &str, camera: &str, width| {
-            let header = PhotoHeader {
-                format: PhotoFormat::Jpeg,
-                width,
-                height: 3,
-                decode_bytes: 0,
-                has_alpha: false,
-                exif: None,
-            };
-            let (name, path, camera) = (format!("{folder}/a.jpg"), PathBuf::new(), camera.to_string());
-            FoundPhoto { name, path, bytes: 0, modified: 0, header, camera, place: None }
+            let of = photo(&format!("{folder}/a.jpg"));
+            FoundPhoto { camera: camera.to_string(), header: PhotoHeader { width, ..of.header }, ..of }
         };
         let photo = |camera, width| photo_in("x", camera, width);
         let photos = [photo("A 24 mm", 4), photo("A 35 mm", 4), photo("A 24 mm", 4), photo("", 4), photo("A 24 mm", 5)];

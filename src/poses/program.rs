@@ -8,7 +8,7 @@
 use crate::base::error::{InputError, InputResult};
 use serde_json::json;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::Duration;
@@ -17,7 +17,7 @@ use std::time::Duration;
 const OLDEST: (u32, u32) = (3, 8);
 /// What pycolmap runs.
 const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
-/// GrowingLog of the log that an error shows.
+/// Lines of the log that an error shows.
 const LAST_LINES: usize = 6;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
@@ -27,14 +27,14 @@ const INSTALL: &str = "install one of them, and name this folder again:\n  \
     macOS:          brew install colmap\n  \
     Windows:        https://github.com/colmap/colmap/releases, then gsscale-poses PHOTOS --colmap PATH";
 
-/// One run of the program. Paths are below the folder it works in.
-#[derive(Debug, Clone)]
-pub enum Phase<'a> {
-    /// Finds features in the photos of `list`, which share one camera or have one each.
-    Features { list: &'a str, camera_model: &'static str, one_camera: bool },
-    /// Compares the pairs of a file of lines `NAME NAME`.
-    Matches { pairs: &'a str },
-    /// Reconstructs into the folder `sparse`, which exists.
+/// One run of the program.
+#[derive(Debug, Clone, Copy)]
+pub enum Phase {
+    /// Finds features in the photos of [`LIST`], which share one camera or have one each.
+    Features { camera_model: &'static str, one_camera: bool },
+    /// Compares the pairs of [`CHUNK`].
+    Matches,
+    /// Reconstructs into [`SPARSE`], which exists.
     Model,
 }
 
@@ -42,6 +42,9 @@ pub enum Phase<'a> {
 pub const DATABASE: &str = "database.db";
 pub const PHOTOS: &str = "photos";
 pub const SPARSE: &str = "sparse";
+pub const LIST: &str = "list.txt";
+/// Lines `NAME NAME`.
+pub const CHUNK: &str = "chunk.txt";
 const LOG: &str = "log.txt";
 
 /// What features are sought.
@@ -164,7 +167,7 @@ impl Program {
     /// Errors: the program cannot be started, or says that it failed: then the error shows its last lines.
     pub fn run(
         &self,
-        phase: &Phase<'_>,
+        phase: Phase,
         features: &FeatureOptions,
         (work, lock): (&Path, &File),
         watch: &mut dyn FnMut(&str),
@@ -180,7 +183,7 @@ impl Program {
         command.stdin(lock.try_clone().map_err(|e| io(&e))?).stdout(file).stderr(twin);
         end_with_this_process(&mut command);
         let mut child = command.spawn().map_err(|e| InputError::io(&self.path, "starting the program", &e))?;
-        let mut lines = GrowingLog::of(&log).map_err(|e| io(&e))?;
+        let mut lines = GrowingLog { file: File::open(&log).map_err(|e| io(&e))?, begun: Vec::new() };
         let status = loop {
             let ended = child.try_wait().map_err(|e| InputError::io(&self.path, "waiting for the program", &e))?;
             lines.new_ones(watch).map_err(|e| io(&e))?;
@@ -201,24 +204,24 @@ impl Program {
         Err(InputError::new(log, problem, remedy))
     }
 
-    fn arguments(&self, phase: &Phase<'_>, features: &FeatureOptions) -> Vec<String> {
+    fn arguments(&self, phase: Phase, features: &FeatureOptions) -> Vec<String> {
         match &self.called_as {
             CalledAs::Colmap { features_help, matches_help } => {
                 self.colmap_arguments(phase, features, features_help, matches_help)
             }
             CalledAs::Pycolmap => {
                 let (name, values) = match phase {
-                    Phase::Features { list, camera_model, one_camera } => {
+                    Phase::Features { camera_model, one_camera } => {
                         let values = json!({
-                            "database": DATABASE, "photos": PHOTOS, "list_file": list,
+                            "database": DATABASE, "photos": PHOTOS, "list_file": LIST,
                             "camera_model": camera_model, "one_camera": one_camera,
                             "max_image_size": features.max_image_size, "max_num_features": features.max_features,
                             "uses_gpu": self.uses_gpu,
                         });
                         ("features", values)
                     }
-                    Phase::Matches { pairs } => {
-                        ("matches", json!({ "database": DATABASE, "pairs": pairs, "uses_gpu": self.uses_gpu }))
+                    Phase::Matches => {
+                        ("matches", json!({ "database": DATABASE, "pairs": CHUNK, "uses_gpu": self.uses_gpu }))
                     }
                     Phase::Model => ("model", json!({ "database": DATABASE, "photos": PHOTOS, "model": SPARSE })),
                 };
@@ -229,7 +232,7 @@ impl Program {
 
     fn colmap_arguments(
         &self,
-        phase: &Phase<'_>,
+        phase: Phase,
         features: &FeatureOptions,
         features_help: &str,
         matches_help: &str,
@@ -238,29 +241,26 @@ impl Program {
         let mut arguments: Vec<String> = Vec::new();
         let mut add = |flag: &str, value: &str| arguments.extend([flag.to_string(), value.to_string()]);
         // An option that this version lacks is left at its default.
-        let named = |help: &str, name: &str| option_of(help, name);
         let command = match phase {
-            Phase::Features { list, camera_model, one_camera } => {
+            Phase::Features { camera_model, one_camera } => {
                 add("--image_path", PHOTOS);
-                add("--image_list_path", list);
+                add("--image_list_path", LIST);
                 add("--ImageReader.camera_model", camera_model);
-                add(
-                    if *one_camera { "--ImageReader.single_camera" } else { "--ImageReader.single_camera_per_image" },
-                    "1",
-                );
+                let cameras = if one_camera { "single_camera" } else { "single_camera_per_image" };
+                add(&format!("--ImageReader.{cameras}"), "1");
                 let sizes = [features.max_image_size, features.max_features].map(|n| n.to_string());
                 for (name, value) in [("use_gpu", &gpu), ("max_image_size", &sizes[0]), ("max_num_features", &sizes[1])]
                 {
-                    if let Some(flag) = named(features_help, name) {
+                    if let Some(flag) = option_of(features_help, name) {
                         add(&flag, value);
                     }
                 }
                 "feature_extractor"
             }
-            Phase::Matches { pairs } => {
-                add("--match_list_path", pairs);
+            Phase::Matches => {
+                add("--match_list_path", CHUNK);
                 add("--match_type", "pairs");
-                if let Some(flag) = named(matches_help, "use_gpu") {
+                if let Some(flag) = option_of(matches_help, "use_gpu") {
                     add(&flag, &gpu);
                 }
                 "matches_importer"
@@ -300,8 +300,8 @@ fn colmap_version(text: &str) -> Option<(u32, u32)> {
 
 /// The option with this name in COLMAP's help, in whatever group: `--SiftExtraction.use_gpu`, `--FeatureExtraction.use_gpu`.
 fn option_of(help: &str, name: &str) -> Option<String> {
-    let words = help.split_whitespace().filter(|word| word.starts_with("--"));
-    words.into_iter().find(|word| word.ends_with(&format!(".{name}"))).map(String::from)
+    let mut options = help.split_whitespace().filter(|word| word.starts_with("--"));
+    options.find(|word| word.ends_with(&format!(".{name}"))).map(String::from)
 }
 
 /// Asks the system to send the program SIGTERM when the thread that started it ends, also after a SIGKILL. On other systems than Linux
@@ -323,17 +323,11 @@ struct GrowingLog {
     file: File,
     /// The start of a line whose end is not written yet.
     begun: Vec<u8>,
-    at: u64,
 }
 
 impl GrowingLog {
-    fn of(path: &Path) -> std::io::Result<GrowingLog> {
-        Ok(GrowingLog { file: File::open(path)?, begun: Vec::new(), at: 0 })
-    }
-
     fn new_ones(&mut self, take: &mut dyn FnMut(&str)) -> std::io::Result<()> {
-        self.file.seek(SeekFrom::Start(self.at))?;
-        self.at += self.file.read_to_end(&mut self.begun)? as u64;
+        self.file.read_to_end(&mut self.begun)?;
         let Some(end) = self.begun.iter().rposition(|&byte| byte == b'\n') else { return Ok(()) };
         let whole: Vec<u8> = self.begun.drain(..=end).collect();
         String::from_utf8_lossy(&whole).lines().for_each(take);

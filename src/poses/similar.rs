@@ -274,10 +274,10 @@ fn agreeing(a: &[Corner], b: &[Corner]) -> u16 {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::dataset::photo_header::read_header;
+    use crate::poses::photos::tests::photo;
     use image::{GrayImage, Luma};
 
     /// A ground of blots of many sizes, the same for every view.
@@ -308,7 +308,7 @@ mod tests {
             .save(&path)
             .unwrap();
             let header = read_header(&path).unwrap();
-            FoundPhoto { name: k.to_string(), path, bytes: 0, modified: 0, header, camera: String::new(), place: None }
+            FoundPhoto { path, header, ..photo(&k.to_string()) }
         };
         let photos: Vec<FoundPhoto> = views.iter().enumerate().map(take).collect();
         let mut alike = look_alikes(&photos, 4, &mut |_| ());

@@ -163,8 +163,7 @@ impl Chart {
         let (x, y) = self.ranges();
         let of_series = |series: &Series| {
             let name = if series.mark == Mark::Faint { "one view" } else { &series.name };
-            let finite = series.points.iter().filter(|(x, y)| x.is_finite() && y.is_finite());
-            json!({ "name": name, "points": finite.collect::<Vec<_>>() })
+            json!({ "name": name, "points": series.points })
         };
         let series: Vec<serde_json::Value> = self.series.iter().map(of_series).collect();
         json!({ "plot": [left, top, right, bottom], "x": x, "y": y, "of": self.x, "series": series })
@@ -456,10 +455,9 @@ fn shortened(name: &str) -> String {
 fn draw_series(chart: &mut PlotArea<'_, '_>, series: &Series, in_legend: bool) -> Result<(), String> {
     let color = color(series.color);
     let is_named = in_legend && !series.name.is_empty();
-    if series.mark.is_line() || series.mark == Mark::LineAndDots {
+    if series.mark != Mark::Dots {
         let style = if series.mark == Mark::Faint { color.mix(0.35).stroke_width(1) } else { color.stroke_width(2) };
-        let line = LineSeries::new(series.points.iter().copied(), style);
-        let drawn = chart.draw_series(line).map_err(text)?;
+        let drawn = chart.draw_series(LineSeries::new(series.points.iter().copied(), style)).map_err(text)?;
         if is_named {
             drawn
                 .label(&series.name)
@@ -470,7 +468,7 @@ fn draw_series(chart: &mut PlotArea<'_, '_>, series: &Series, in_legend: bool) -
     if !series.mark.is_line() || series.points.len() == 1 {
         let dots = series.points.iter().map(|&p| Circle::new(p, 3, color.filled()));
         let drawn = chart.draw_series(dots).map_err(text)?;
-        if is_named && !series.mark.is_line() && series.mark != Mark::LineAndDots {
+        if is_named && series.mark == Mark::Dots {
             drawn.label(&series.name).legend(move |(x, y)| Circle::new((x + 6, y), 4, color.filled()));
         }
     }

@@ -247,7 +247,6 @@ fn add_table(page: &mut Page, runs: &[Compared]) {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use serde_json::json;

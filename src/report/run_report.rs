@@ -14,9 +14,8 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::say::as_called;
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
-use crate::photos::KINDS;
-use crate::photos::diagnosis;
 use crate::photos::parameter::Finding;
+use crate::photos::{KINDS, diagnosis};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -187,15 +186,14 @@ fn training_charts(metrics: &[Value]) -> Vec<(String, String)> {
     // A skipped step has the loss f64::MAX.
     let loss = |m: &Value| m["loss"].as_f64().filter(|l| *l < 1e30);
     let mut charts = Vec::new();
-    let (mut chart, mean) =
-        with_smooth(Chart::new("PSNR", "step", "dB"), "training view", curve(metrics, "step", train));
+    let (mut chart, mean) = with_smooth(Chart::new("PSNR", "step", "dB"), curve(metrics, "step", train));
     let (held_out, mut of) = (curve(metrics, "step", test), "");
     if !held_out.is_empty() {
         chart = chart.with_color("held-out views", held_out, Mark::LineAndDots, 1);
         of = ", and of the held-out views";
     }
     charts.push((chart.svg(), format!("PSNR of the view of each logged step{mean}{of}.")));
-    let (chart, mean) = with_smooth(Chart::new("Loss", "step", "loss"), "training view", curve(metrics, "step", loss));
+    let (chart, mean) = with_smooth(Chart::new("Loss", "step", "loss"), curve(metrics, "step", loss));
     charts.push((chart.zero_based().svg(), format!("Loss of the view of each logged step{mean}.")));
     let rows = over_steps(metrics, "Gaussians", "", |m| m["gaussians"].as_f64());
     charts.push((rows.svg(), "Gaussians in the scene.".to_string()));
@@ -210,10 +208,10 @@ fn over_steps(metrics: &[Value], title: &str, unit: &str, y: impl Fn(&Value) -> 
     Chart::new(title, "step", unit).with("", curve(metrics, "step", y), Mark::Line).zero_based()
 }
 
-/// Adds a noisy curve in a pale colour and, where it has enough points, its running mean in front. Also returns the words
-/// of the caption on the mean.
-fn with_smooth(chart: Chart, name: &str, points: Vec<(f64, f64)>) -> (Chart, &'static str) {
-    let mean = smoothed(&points);
+/// Adds the noisy curve of training views in a pale colour and, where it has enough points, its running mean in front. Also
+/// returns the words of the caption on the mean.
+fn with_smooth(chart: Chart, points: Vec<(f64, f64)>) -> (Chart, &'static str) {
+    let (name, mean) = ("training view", smoothed(&points));
     if mean.is_empty() {
         return (chart.with_color(name, points, Mark::Line, 0), "");
     }

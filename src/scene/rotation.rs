@@ -65,13 +65,7 @@ impl Rotation {
     /// This rotation after `first`.
     #[must_use]
     pub fn after(&self, first: &Rotation) -> Rotation {
-        let ([w, x, y, z], [a, b, c, d]) = (self.0, first.0);
-        Rotation([
-            w * a - x * b - y * c - z * d,
-            w * b + x * a + y * d - z * c,
-            w * c - x * d + y * a + z * b,
-            w * d + x * c - y * b + z * a,
-        ])
+        Rotation(quaternion_product(self.0, first.0))
     }
 
     /// The matrix, row-major.
@@ -87,6 +81,16 @@ impl Rotation {
     pub fn apply(&self, v: [f64; 3]) -> [f64; 3] {
         self.matrix().map(|row| dot(row, v))
     }
+}
+
+/// The product of two quaternions, w first.
+pub fn quaternion_product([w, x, y, z]: [f64; 4], [a, b, c, d]: [f64; 4]) -> [f64; 4] {
+    [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
 }
 
 fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {

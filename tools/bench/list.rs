@@ -317,7 +317,6 @@ fn times(value: &Value, factor: f64) -> Option<Value> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -3,6 +3,7 @@
 //! Invariant: a difference appears only between figures of the same measure (same SSIM padding, same LPIPS network and
 //! input range). Every output lists the differences between this run and the published run.
 
+use gsscale::base::say::aligned;
 use gsscale::base::units::format_bytes;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::PublishedRun;
@@ -191,14 +192,8 @@ impl Comparison<'_> {
     pub fn text(&self) -> String {
         let mut table = vec![self.head().into_iter().map(str::to_string).collect::<Vec<_>>()];
         table.extend(self.rows().iter().map(|row| row.cells(self.with_defaults.is_some())));
-        let width = |column: usize| table.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
-        let widths: Vec<usize> = (0..table[0].len()).map(width).collect();
-        let line = |row: &Vec<String>| {
-            let numbers = row.iter().zip(&widths).skip(1).map(|(cell, &width)| format!("  {cell:>width$}"));
-            format!("{:<width$}{}", row[0], numbers.collect::<String>(), width = widths[0])
-        };
         let mut lines = vec![format!("{}, tier {}", self.run.facts.title, self.tier.unwrap_or("none"))];
-        lines.extend(table.iter().map(line));
+        lines.extend(aligned(&table).iter().map(|row| row.join("  ")));
         lines.extend(self.facts());
         lines.extend(self.caveats.iter().map(|c| format!("not the published run: {c}")));
         lines.push(format!("report: {}", self.out.join("published.html").display()));

@@ -85,7 +85,6 @@ fn read(path: &Path, file: &mut File) -> InputResult<(Vec<RunRecord>, u64)> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

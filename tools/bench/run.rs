@@ -3,8 +3,7 @@
 
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::machine::host_bytes_peak;
-use gsscale::base::machine::{cpu_model, process_cpu_seconds};
+use gsscale::base::machine::{cpu_model, host_bytes_peak, process_cpu_seconds};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::{RunOptions, simd_path};
 use gsscale::config::values::Device;

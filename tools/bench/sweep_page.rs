@@ -4,6 +4,7 @@
 
 use super::front::{Setting, Spread, Verdict, against, pareto_front, settings};
 use super::record::{Figure, RunRecord};
+use gsscale::base::say::aligned;
 use gsscale::report::chart::{Bars, Chart, Mark};
 use gsscale::report::html::{Cell, Page};
 use serde::Deserialize;
@@ -66,22 +67,15 @@ pub fn sweep_page(view: &View, scene: &str, facts: &str, records: &[RunRecord]) 
 /// The table of the page as Markdown, and which runs ended with the same bits.
 pub fn sweep_table(view: &View, records: &[RunRecord]) -> String {
     let (names, rows) = cells(view, &settings(records, &view.reference));
-    let width = |i: usize| rows.iter().chain([&names]).map(|row| row[i].chars().count()).max().unwrap_or(0);
-    let widths: Vec<usize> = (0..names.len()).map(width).collect();
-    let line = |row: &Vec<String>| {
-        let cells = row.iter().zip(&widths).enumerate().map(|(i, (cell, &width))| match i {
-            0 => format!("{cell:<width$}"),
-            _ => format!("{cell:>width$}"),
-        });
-        format!("| {} |\n", cells.collect::<Vec<_>>().join(" | "))
-    };
-    let rule = widths.iter().enumerate().map(|(i, &width)| match i {
-        0 => "-".repeat(width + 2),
-        _ => format!("{}:", "-".repeat(width + 1)),
+    let table = aligned(&[vec![names], rows].concat());
+    let rule = table[0].iter().enumerate().map(|(i, cell)| match (i, cell.chars().count()) {
+        (0, width) => "-".repeat(width + 2),
+        (_, width) => format!("{}:", "-".repeat(width + 1)),
     });
-    let head = format!("{}|{}|\n", line(&names), rule.collect::<Vec<_>>().join("|"));
+    let mut lines: Vec<String> = table.iter().map(|row| format!("| {} |\n", row.join(" | "))).collect();
+    lines.insert(1, format!("|{}|\n", rule.collect::<Vec<_>>().join("|")));
     let said = equal_bits(records);
-    head + &rows.iter().map(line).collect::<String>() + if said.is_empty() { "" } else { "\n" } + &said
+    lines.concat() + if said.is_empty() { "" } else { "\n" } + &said
 }
 
 fn explanation(view: &View, settings: &[Setting]) -> String {
@@ -242,7 +236,6 @@ fn points(settings: &[Setting], figure: &Figure, cost: &Figure) -> Option<Chart>
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

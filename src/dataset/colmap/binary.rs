@@ -84,9 +84,8 @@ impl BinaryFile {
     /// Reads a count of records that must fit into the rest of the file.
     fn count(&mut self, what: &str, record_bytes: u64) -> InputResult<u64> {
         let at = self.offset;
-        let count = self.u64(what)?;
-        if count.checked_mul(record_bytes).is_none_or(|need| need > self.left()) {
-            let left = self.left();
+        let (count, left) = (self.u64(what)?, self.left());
+        if count.checked_mul(record_bytes).is_none_or(|need| need > left) {
             return Err(self.error(at, format!("{count} {what}, but only {left} bytes follow")));
         }
         Ok(count)
@@ -119,8 +118,8 @@ impl BinaryFile {
 
     /// Adds a warning if bytes follow the last record.
     fn finish(&self, warnings: &mut Vec<String>) {
-        if self.left() > 0 {
-            let left = self.left();
+        let left = self.left();
+        if left > 0 {
             warnings.push(format!("{}: {left} bytes after the last record are ignored", self.path.display()));
         }
     }
@@ -133,9 +132,6 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
     for _ in 0..count {
         let at = source.offset;
         let id = source.u32("a camera")?;
-        let wrong = |problem: String, remedy: &str| {
-            InputError::new(path, format!("camera {id} has {problem}"), remedy).at(format!("byte {at}"))
-        };
         let number = source.take("a camera").map(i32::from_le_bytes)?;
         let model = models::model_of(&format!("id {number}"), |m| m.id == number)
             .map_err(|p| InputError::new(path, p, models::UNDISTORT).at(format!("byte {at}, camera {id}")))?;
@@ -144,9 +140,10 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
         for value in params.iter_mut().take(model.params) {
             *value = source.take("camera parameters").map(f64::from_le_bytes)?;
         }
-        let intrinsics = models::intrinsics(model, size, &params[..model.params]).map_err(|p| wrong(p, DAMAGED))?;
+        let intrinsics = models::intrinsics(model, size, &params[..model.params])
+            .map_err(|p| source.error(at, format!("camera {id} has {p}")))?;
         if cameras.insert(id, intrinsics).is_some() {
-            return Err(wrong("a second definition".into(), DAMAGED));
+            return Err(source.error(at, format!("camera {id} has a second definition")));
         }
     }
     source.finish(warnings);

@@ -15,7 +15,7 @@ mod text;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::gathered::{Gathered, MAX_COORDINATE, PUT_THEM_THERE, RefusalWords};
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, RawView, TakePoint};
+use crate::dataset::model::{Intrinsics, PointCloud, Pose, RawScene, TakePoint};
 use crate::dataset::photo_files::PhotoFiles;
 use glam::{DMat3, DQuat, DVec3};
 use std::collections::BTreeMap;
@@ -56,11 +56,8 @@ struct ModelFolder {
 impl ModelFolder {
     fn of(folder: PathBuf) -> Option<ModelFolder> {
         let both = |ext: &str| ["cameras", "images"].iter().all(|n| folder.join(format!("{n}.{ext}")).is_file());
-        match (both("bin"), both("txt")) {
-            (true, _) => Some(ModelFolder { folder, is_binary: true }),
-            (false, true) => Some(ModelFolder { folder, is_binary: false }),
-            (false, false) => None,
-        }
+        let is_binary = both("bin");
+        (is_binary || both("txt")).then_some(ModelFolder { folder, is_binary })
     }
 
     fn file(&self, stem: &str) -> PathBuf {
@@ -85,31 +82,22 @@ pub fn looks_like_colmap(scene: &Path) -> bool {
 /// names that would leave the image folder or occur twice, unsupported cameras.
 pub fn read_colmap(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> {
     if !looks_like_colmap(scene) {
-        return Err(no_model(scene));
+        let problem = format!("no COLMAP model here; looked for {LOOKED_FOR}");
+        return Err(InputError::new(scene, problem, "give the folder that holds 'sparse' and 'images'"));
     }
-    let mut said = Vec::new();
-    let folders = parts::image_folders(scene, options, &mut said)?;
-    let model = read_model((scene, options), folders, Some(options.points_later))?;
-    let ReadModel { views, points, points_path, warnings } = model;
-    said.extend(warnings);
-    Ok(RawScene { views, points, points_path, warnings: said, ..RawScene::default() })
-}
-
-struct ReadModel {
-    views: Vec<RawView>,
-    points: PointCloud,
-    points_path: Option<PathBuf>,
-    warnings: Vec<String>,
+    let mut warnings = Vec::new();
+    let folders = parts::image_folders(scene, options, &mut warnings)?;
+    read_model((scene, options), folders, Some(options.points_later), warnings)
 }
 
 /// Reads the model of a folder whose photos are in `image_folders`. `points_later`: whether the caller reads the points
-/// later; `None` leaves them out.
+/// later; `None` leaves them out. The scene's warnings begin with these.
 fn read_model(
     (folder, options): (&Path, &ReadOptions),
     image_folders: Vec<PathBuf>,
     points_later: Option<bool>,
-) -> InputResult<ReadModel> {
-    let mut warnings = Vec::new();
+    mut warnings: Vec<String>,
+) -> InputResult<RawScene> {
     let model = choose_model(folder, &mut warnings)?;
     let cameras_path = model.file("cameras");
     let images_path = model.file("images");
@@ -142,7 +130,7 @@ fn read_model(
         None => (PointCloud::default(), None),
         Some(later) => read_points(&model, later, &mut warnings)?,
     };
-    Ok(ReadModel { views, points, points_path, warnings })
+    Ok(RawScene { views, points, points_path, warnings, ..RawScene::default() })
 }
 
 fn find_models(scene: &Path) -> Vec<ModelFolder> {
@@ -159,17 +147,9 @@ fn find_models(scene: &Path) -> Vec<ModelFolder> {
     folders.into_iter().filter_map(ModelFolder::of).collect()
 }
 
-fn no_model(scene: &Path) -> InputError {
-    let problem = format!("no COLMAP model here; looked for {LOOKED_FOR}");
-    InputError::new(scene, problem, "give the folder that holds 'sparse' and 'images'")
-}
-
 /// The model with the most images; the first among equals.
 fn choose_model(scene: &Path, warnings: &mut Vec<String>) -> InputResult<ModelFolder> {
     let mut models = find_models(scene);
-    if models.is_empty() {
-        return Err(no_model(scene));
-    }
     if models.len() == 1 {
         return Ok(models.remove(0));
     }

@@ -11,7 +11,7 @@
 //! Invariants: 1. a photo name that both folders have is resolved without guessing: with two models the folder's name
 //! distinguishes the views, with one model it is an error; 2. with two models the folders prescribe the split.
 
-use super::{ReadModel, read_model};
+use super::read_model;
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::gathered::sort_views;
 use crate::dataset::model::{RawScene, RawView, ReadOptions, Split};
@@ -53,9 +53,9 @@ pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> 
             let problem = format!("no photos here; looked for {}", PHOTOS.join(", "));
             InputError::new(folder, problem, "put them into rgbs or images, or name their folder with --images")
         })?;
-        let photos = vec![photos];
         let points = (split == Split::Train).then_some(options.points_later);
-        let ReadModel { views, points, points_path, warnings } = read_model((folder, options), photos, points)?;
+        let RawScene { views, points, points_path, warnings, .. } =
+            read_model((folder, options), vec![photos], points, Vec::new())?;
         all.warnings.extend(warnings);
         if split == Split::Train {
             (all.points, all.points_path) = (points, points_path);

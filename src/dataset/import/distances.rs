@@ -37,12 +37,7 @@ struct Answer {
 }
 
 /// The cloud in spatial order, and for each point the root mean square distance to its neighbours.
-pub(super) struct MeasuredPoints {
-    pub points: Spool<CloudPoint>,
-    pub distances: Spool<f64>,
-}
-
-pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<MeasuredPoints> {
+pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputResult<(Spool<CloudPoint>, Spool<f64>)> {
     let pages = Pages::of(points.len(), budget.records(SEARCH_BYTES));
     let blocks: Vec<Range<usize>> = (0..pages.pages).map(|b| pages.start(b)..pages.start(b + 1)).collect();
     let space = budget.space();
@@ -110,5 +105,5 @@ pub(super) fn measure(points: Spool<CloudPoint>, budget: &Budget<'_>) -> InputRe
         })?;
         dist2.iter().try_for_each(|d| distances.push(rms_distance(d)))?;
     }
-    Ok(MeasuredPoints { points, distances: distances.finish()? })
+    Ok((points, distances.finish()?))
 }

@@ -144,8 +144,8 @@ pub fn import_points(
     let budget = &options.budget;
     let (points, read) = spool_points(source, options)?;
     let rows = points.len();
-    let measured = distances::measure(points, budget)?;
-    let sized = size_points(measured, options)?;
+    let (points, distances) = distances::measure(points, budget)?;
+    let sized = size_points(points, distances, options)?;
     let space = PageSpace { list: budget.space(), records: budget.records(2 * size_of::<SizedPoint>()) };
     let pages = paginate(sized, options.fill, space, &mut |id, entries: &[SizedPoint]| {
         let point = |i: usize| {
@@ -209,8 +209,12 @@ fn first_excluded_key(source: &dyn PointSource, most: u64, seed: u64) -> InputRe
     Ok(search.key())
 }
 
-fn size_points(measured: distances::MeasuredPoints, options: &ImportOptions<'_>) -> InputResult<Spool<SizedPoint>> {
-    let distances::MeasuredPoints { points, distances } = measured;
+/// Gives the points their first scales. Takes both lists, which end here, before the pages need their space.
+fn size_points(
+    points: Spool<CloudPoint>,
+    distances: Spool<f64>,
+    options: &ImportOptions<'_>,
+) -> InputResult<Spool<SizedPoint>> {
     let mut positive = 0;
     distances.for_each(|&d| {
         positive += usize::from(d > 0.0);

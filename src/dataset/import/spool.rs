@@ -59,10 +59,6 @@ impl SpoolFile {
         std::fs::remove_file(&path).map_err(|e| InputError::io(&path, "unlinking a file for points", &e))?;
         Ok(SpoolFile { file, path })
     }
-
-    fn error(&self, doing: &str, e: &std::io::Error) -> InputError {
-        InputError::io(&self.path, doing, e)
-    }
 }
 
 impl Drop for SpoolFile {
@@ -105,7 +101,7 @@ impl<T: Pod> SpoolWriter<T> {
         }
         let Some(file) = &mut self.file else { return Ok(()) };
         let written = file.file.write_all(bytemuck::cast_slice(&self.waiting));
-        written.map_err(|e| file.error("writing points", &e))?;
+        written.map_err(|e| InputError::io(&file.path, "writing points", &e))?;
         self.in_file += self.waiting.len();
         self.waiting.clear();
         self.waiting.shrink_to(self.limit());
@@ -178,22 +174,20 @@ impl<T: Pod> Spool<T> {
     }
 
     fn read_into(&self, range: Range<usize>, out: &mut Vec<T>) -> InputResult<()> {
+        out.clear();
         let Some(file) = &self.file else {
-            out.clear();
             out.extend_from_slice(&self.records[range]);
             return Ok(());
         };
-        out.clear();
         out.resize(range.len(), T::zeroed());
         let mut reader = &file.file;
         let at = SeekFrom::Start((range.start * size_of::<T>()) as u64);
         let read = reader.seek(at).and_then(|_| reader.read_exact(bytemuck::cast_slice_mut(out)));
-        read.map_err(|e| file.error("reading points", &e))
+        read.map_err(|e| InputError::io(&file.path, "reading points", &e))
     }
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

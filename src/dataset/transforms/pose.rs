@@ -79,7 +79,6 @@ pub(in crate::dataset) fn make_pose(m: &[[f64; 4]; 4]) -> Option<Pose> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

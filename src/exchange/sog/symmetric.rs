@@ -2,7 +2,7 @@
 //!
 //! Invariant: all arithmetic is f64 in a fixed order.
 
-use crate::scene::rotation::Rotation;
+use crate::scene::rotation::{Rotation, quaternion_product};
 
 /// Sweeps of Jacobi's method; each squares the error.
 const SWEEPS: usize = 8;
@@ -87,14 +87,7 @@ fn about(q: [f64; 4], k: usize, cos: f64, sin: f64) -> [f64; 4] {
     let half_sin = -sin / (2.0 * half_cos);
     let mut turn = [half_cos, 0.0, 0.0, 0.0];
     turn[1 + k] = half_sin;
-    let [aw, ax, ay, az] = q;
-    let [bw, bx, by, bz] = turn;
-    let product = [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ];
+    let product = quaternion_product(q, turn);
     let length = libm::sqrt(product.iter().map(|v| v * v).sum());
     product.map(|v| v / length)
 }

@@ -95,7 +95,6 @@ impl PageBuffer {
         self.len
     }
 
-    /// All bytes.
     pub fn as_slice(&self) -> &[u8] {
         match &self.memory {
             Memory::Heap(bytes) => &bytes[self.start..self.start + self.len],
@@ -103,7 +102,6 @@ impl PageBuffer {
         }
     }
 
-    /// All bytes.
     pub fn as_mut_slice(&mut self) -> &mut [u8] {
         match &mut self.memory {
             Memory::Heap(bytes) => &mut bytes[self.start..self.start + self.len],

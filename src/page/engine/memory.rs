@@ -15,7 +15,6 @@ pub struct MemoryEngine {
 }
 
 impl MemoryEngine {
-    /// An engine without segments.
     pub fn new() -> MemoryEngine {
         MemoryEngine::default()
     }

@@ -55,10 +55,8 @@ impl FromStr for IoEngine {
     type Err = String;
     fn from_str(text: &str) -> Result<Self, String> {
         let names = || IoEngine::ALL.map(IoEngine::name).join(", ");
-        IoEngine::ALL
-            .into_iter()
-            .find(|e| e.name() == text)
-            .ok_or_else(|| format!("'{text}' is not an I/O engine; use one of: {}", names()))
+        let engine = IoEngine::ALL.into_iter().find(|e| e.name() == text);
+        engine.ok_or_else(|| format!("'{text}' is not an I/O engine; use one of: {}", names()))
     }
 }
 

@@ -61,18 +61,14 @@ impl SegmentFiles {
     pub fn new(folder: &Path, direct: bool) -> io::Result<SegmentFiles> {
         // Other systems cannot open folders; there a file's entry is durable with the file.
         let entries = if cfg!(unix) { Some(File::open(folder)?) } else { None };
-        Ok(SegmentFiles { direct: direct && direct_works(folder)?, entries, ..SegmentFiles::of(folder, false) })
+        let direct = direct && direct_works(folder)?;
+        Ok(SegmentFiles { direct, entries, read_only: false, ..SegmentFiles::read_only(folder) })
     }
 
     /// The segments in `folder`, read-only; the drive may be mounted read-only.
     pub fn read_only(folder: &Path) -> SegmentFiles {
-        SegmentFiles::of(folder, true)
-    }
-
-    fn of(folder: &Path, read_only: bool) -> SegmentFiles {
-        let (folder, open_max) = (folder.to_path_buf(), open_files_max());
-        let (direct, open) = (false, BTreeMap::new());
-        SegmentFiles { folder, entries: None, direct, read_only, open, open_max, clock: 0, lost: None }
+        let (folder, open, open_max) = (folder.to_path_buf(), BTreeMap::new(), open_files_max());
+        SegmentFiles { folder, entries: None, direct: false, read_only: true, open, open_max, clock: 0, lost: None }
     }
 
     /// Whether files bypass the page cache. If so, memory, offsets and lengths must be multiples of
@@ -362,7 +358,6 @@ impl WriteBehind {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

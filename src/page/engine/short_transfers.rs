@@ -110,7 +110,6 @@ fn move_parts(
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};

@@ -151,7 +151,7 @@ impl TransferPool {
             let run = move || {
                 loop {
                     // One idle worker waits in `recv`, the others wait for its lock.
-                    let next = waiting.lock().unwrap_or_else(PoisonError::into_inner).recv();
+                    let next = lock(&waiting).recv();
                     let Ok(mut transfer) = next else { return };
                     let result = catch_unwind(AssertUnwindSafe(|| work(&mut transfer)))
                         .unwrap_or_else(|_| Err(io::Error::other("an I/O thread panicked")));
@@ -203,7 +203,6 @@ impl Drop for TransferPool {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::page::engine::buffer::PageBuffer;

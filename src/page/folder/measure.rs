@@ -42,7 +42,6 @@ pub struct Limits {
 /// One combination of engine, transfer size and queue depth.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Case {
-    /// The I/O engine.
     pub engine: IoEngine,
     pub bytes: usize,
     /// Transfers in flight.
@@ -369,7 +368,6 @@ pub fn codec_for(bytes_per_second: f64) -> Codec {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

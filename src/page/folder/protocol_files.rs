@@ -156,7 +156,6 @@ impl StorageBackend for DriveFile {
 }
 
 #[cfg(all(test, unix))]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

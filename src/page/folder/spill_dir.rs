@@ -20,7 +20,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
-pub(in crate::page) const FORMAT: &str = "FORMAT";
+const FORMAT: &str = "FORMAT";
 /// The FORMAT file while it is written; renamed when complete.
 const FORMAT_NEW: &str = "FORMAT.new";
 pub(in crate::page) const LOCK: &str = "LOCK";
@@ -36,7 +36,6 @@ pub struct SpillDir {
     warnings: Vec<String>,
     /// Whether this run created the folder, and so may remove it.
     made_folder: bool,
-    /// Holds the lock.
     lock: File,
 }
 
@@ -415,13 +414,22 @@ fn is_same_file(_path: &Path, _file: &File) -> bool {
 }
 
 /// Content of the FORMAT file; `None` if there is none.
-fn read_format(folder: &Path) -> InputResult<Option<SpillFormat>> {
-    let read = |bytes: Vec<u8>| SpillFormat::from_bytes(&bytes).map_err(|error| bad_format(folder, &error));
-    format_bytes_of(folder)?.map(read).transpose()
+/// Errors: the file is damaged, or of another version.
+pub(in crate::page) fn read_format(folder: &Path) -> InputResult<Option<SpillFormat>> {
+    let Some(bytes) = format_bytes_of(folder)? else { return Ok(None) };
+    SpillFormat::from_bytes(&bytes).map(Some).map_err(|error| {
+        let remedy = match error {
+            FormatError::Version { .. } | FormatError::Features { .. } => {
+                "use the program version that created it, or name another folder"
+            }
+            _ => OTHER_FOLDER,
+        };
+        InputError::new(folder.join(FORMAT), error.to_string(), remedy)
+    })
 }
 
 /// Bytes of the FORMAT file, empty if it is not a regular file; `None` if there is none.
-pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
+fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<u8>>> {
     let path = folder.join(FORMAT);
     let failed = |e: io::Error| InputError::io(&path, "reading", &e);
     let file = match open_for_reading(&path) {
@@ -434,16 +442,6 @@ pub(in crate::page) fn format_bytes_of(folder: &Path) -> InputResult<Option<Vec<
     let mut bytes = Vec::new();
     file.take(FORMAT_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
     Ok(Some(bytes))
-}
-
-pub(in crate::page) fn bad_format(folder: &Path, error: &FormatError) -> InputError {
-    let remedy = match error {
-        FormatError::Version { .. } | FormatError::Features { .. } => {
-            "use the program version that created it, or name another folder"
-        }
-        _ => OTHER_FOLDER,
-    };
-    InputError::new(folder.join(FORMAT), error.to_string(), remedy)
 }
 
 /// Writes the FORMAT file atomically, durable before anything else is.
@@ -463,7 +461,6 @@ fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

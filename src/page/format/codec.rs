@@ -254,10 +254,9 @@ fn unhalve(stored: &[u8], payload: &mut [u8]) -> io::Result<()> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
-    use crate::base::rng::mix64;
+    use crate::base::rng::{Purpose, Stream, mix64};
 
     fn floats(n: usize) -> Vec<u8> {
         (0..n).flat_map(|i| ((i as f32 * 0.37).sin() * 3.0 + 10.0).to_le_bytes()).collect()
@@ -336,8 +335,6 @@ mod tests {
         assert_eq!(encode_as(Codec::Halves, &payload, &mut stored).unwrap(), None);
         assert_eq!(encode_as(Codec::Raw, &payload, &mut stored).unwrap(), None);
     }
-
-    use crate::base::rng::{Purpose, Stream};
 
     #[test]
     fn every_byte_round_trips_and_halved_lines_take_half() {

@@ -54,7 +54,6 @@ fn from_limited<T: DeserializeOwned, const LIMIT: usize>(bytes: &[u8]) -> Result
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

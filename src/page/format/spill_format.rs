@@ -184,7 +184,6 @@ fn seal(bytes: &mut [u8; FORMAT_BYTES]) {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used, clippy::expect_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -22,7 +22,7 @@ use crate::page::map::generations::Generations;
 use crate::page::map::manifest::Manifest;
 use crate::page::map::witness::Witness;
 use crate::page::mutants::{Mutant, active};
-use crate::page::versions::page_error::PageError;
+use crate::page::versions::page_error::{PageError, REMEDY_SPACE};
 use crate::page::versions::paged_store::{PageDone, PagedStore};
 use std::io;
 
@@ -73,7 +73,6 @@ pub struct Commits {
 }
 
 impl Commits {
-    /// The fixed settings.
     pub fn config(&self) -> CommitConfig {
         self.config
     }
@@ -347,9 +346,7 @@ pub enum CommitError {
     #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
     Map(#[from] MapError),
     /// No space. Nothing is lost; the commit may be repeated once there is space.
-    #[error(
-        "there is no space for a commit: {0}\n  remedy: free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
-    )]
+    #[error("there is no space for a commit: {0}\n  remedy: {REMEDY_SPACE}")]
     Full(io::Error),
     /// A file beside the map cannot be used.
     #[error("{name} cannot be used: {source}\n  remedy: {}", file_remedy(.source))]

@@ -70,8 +70,7 @@ impl NewStore {
         let part = refuse_existing(target)?;
         let spill = SpillDir::create(&part, layout, true)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
-            let opened: Opened =
-                Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
+            let opened = Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;
             let engine = open_engine(IoEngine::Auto, &part, IN_FLIGHT)?;
             let store = opened.paged_store(engine.store, layout, codec)?;
             Ok((opened.commits, store))
@@ -93,7 +92,7 @@ impl NewStore {
     /// Errors: the drive fails.
     pub fn put(&mut self, page: PageId, label: &[u8], payload: &[u8]) -> Result<(), ReadError> {
         while self.store.in_flight() >= IN_FLIGHT {
-            self.collect_completed(true)?;
+            self.await_write()?;
         }
         let mut buffer = self.free.pop().unwrap_or_else(|| self.store.new_buffer());
         let room = buffer.as_mut_slice().get_mut(HEADER_BYTES..).and_then(|b| b.get_mut(..payload.len()));
@@ -119,7 +118,7 @@ impl NewStore {
     /// Errors: the drive fails.
     pub fn commit(&mut self, run_state: &[u8], note: &[u8], names: &[String]) -> Result<u64, ReadError> {
         while self.store.in_flight() > 0 {
-            self.collect_completed(true)?;
+            self.await_write()?;
         }
         let changes = std::mem::take(&mut self.changes).into_iter();
         let changes: Vec<PageChange> = changes.map(|(page, version)| PageChange { page, version }).collect();
@@ -149,9 +148,10 @@ impl NewStore {
         Ok(())
     }
 
-    fn collect_completed(&mut self, wait: bool) -> Result<(), ReadError> {
+    /// Waits until at least one write has completed.
+    fn await_write(&mut self) -> Result<(), ReadError> {
         let mut done = Vec::new();
-        self.store.complete(wait, &mut done);
+        self.store.complete(true, &mut done);
         for PageDone { page, buffer, result, .. } in done {
             self.free.push(buffer);
             if let PageMoved::Written(slot) = result.map_err(|e| ReadError::Commit(e.into()))? {

@@ -13,7 +13,7 @@ use crate::page::engine::page_engine::Place;
 use crate::page::engine::segment_files::open_for_reading;
 use crate::page::engine::threaded::ThreadedEngine;
 use crate::page::folder::protocol_files::DriveFile;
-use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, bad_format, format_bytes_of, segments_in};
+use crate::page::folder::spill_dir::{LOCK, LOCK_MAGIC, read_format, segments_in};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::SlotRef;
 use crate::page::format::spill_format::SpillFormat;
@@ -236,8 +236,7 @@ pub fn format_at(folder: &Path) -> InputResult<SpillFormat> {
                       salvage can still find its pages";
         InputError::new(folder, "it is not a store: it has no FORMAT file", remedy)
     };
-    let bytes = format_bytes_of(folder)?.ok_or_else(no_store)?;
-    SpillFormat::from_bytes(&bytes).map_err(|error| bad_format(folder, &error))
+    read_format(folder)?.ok_or_else(no_store)
 }
 
 /// Refuses a folder that a process is using.

@@ -35,8 +35,8 @@ pub fn is_uncommitted(folder: &Path) -> InputResult<bool> {
 /// Checks whether a new run may put its store into `folder`, and changes nothing: the refusals of [`SpillDir::create`] after
 /// [`remove_uncommitted`].
 /// Errors: the folder is not empty or cannot be used, or the store in it holds commits, cannot be opened, or is in use.
-pub fn check_usable(folder: &Path, allow_remote: bool) -> InputResult<()> {
-    check_new(folder, allow_remote)?;
+pub fn check_usable(folder: &Path) -> InputResult<()> {
+    check_new(folder, false)?;
     if !SpillDir::exists_in(folder) {
         return Ok(());
     }

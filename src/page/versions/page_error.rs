@@ -29,6 +29,9 @@ impl std::fmt::Display for SlotName {
 /// What helps when the drive refuses a read, or a write.
 const REMEDY_READ: &str = "check the drive and cable; roll back to an earlier checkpoint";
 const REMEDY_WRITE: &str = "check the drive; committed generations are intact";
+/// What helps when there is no space.
+pub(in crate::page) const REMEDY_SPACE: &str =
+    "free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory";
 
 /// Why a page could not be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -43,17 +46,13 @@ pub enum PageError {
     #[error("{0} cannot be written: {1}\n  remedy: {remedy}", remedy = remedy_of(.1, REMEDY_WRITE))]
     Write(SlotName, #[source] io::Error),
     /// No space for the bytes. Nothing is lost, and the write may be repeated.
-    #[error(
-        "there is no space to write {0}: {1}\n  remedy: free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
-    )]
+    #[error("there is no space to write {0}: {1}\n  remedy: {REMEDY_SPACE}")]
     NoSpace(SlotName, #[source] io::Error),
     /// No space for another segment, or it cannot be created. Nothing is lost, and the attempt may be repeated.
     #[error("{} ({bytes} bytes) cannot be created: {source}\n  remedy: {}", segment_file_name(*.segment), grow_remedy(.source))]
     Grow { segment: u32, bytes: u64, source: io::Error },
     /// The drive failed to make writes durable. The store accepts no more writes.
-    #[error(
-        "the drive could not make writes durable: {0}\n  remedy: check the drive; committed generations are intact"
-    )]
+    #[error("the drive could not make writes durable: {0}\n  remedy: {REMEDY_WRITE}")]
     Sync(#[source] io::Error),
     /// A write or sync failed earlier, so the store accepts no writes.
     #[error("writing stopped after a drive error ({0})\n  remedy: check the drive, then start again")]
@@ -92,9 +91,7 @@ fn remedy_of(source: &io::Error, otherwise: &'static str) -> &'static str {
 fn grow_remedy(source: &io::Error) -> &'static str {
     match source.kind() {
         _ if is_too_many_files(source) => REMEDY_TOO_MANY_FILES,
-        _ if is_out_of_space(source.kind()) => {
-            "free space on the drive of the pages: of the spill directory, or of the output folder of a run in memory"
-        }
+        _ if is_out_of_space(source.kind()) => REMEDY_SPACE,
         io::ErrorKind::PermissionDenied | io::ErrorKind::ReadOnlyFilesystem => {
             "make the spill directory writable, or name another one"
         }

@@ -112,7 +112,6 @@ impl PagedStore {
         self.traffic
     }
 
-    /// The slots, read-only.
     pub fn slots(&self) -> &Slots {
         &self.slots
     }

@@ -220,7 +220,6 @@ impl FittedPair<'_> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use crate::base::rng::mix64;

@@ -23,9 +23,9 @@ pub mod state;
 use super::PhotoOptions;
 use super::outlier::spread;
 use super::parameter::{
-    Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
+    Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError, views_by_name,
+    write_values,
 };
-use super::parameter::{views_by_name, write_values};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::dataset::exif;

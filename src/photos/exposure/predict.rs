@@ -128,8 +128,7 @@ mod tests {
     use super::*;
 
     fn at(x: f32) -> Camera {
-        let viewmat = [[1.0, 0.0, 0.0, -x], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]];
-        Camera::pinhole(viewmat, [50.0, 50.0, 20.0, 15.0], [40, 30])
+        Camera::along_z(x, [50.0, 50.0, 20.0, 15.0], [40, 30])
     }
 
     fn exposure(stops: f64) -> [f64; IMAGE_VALUES] {

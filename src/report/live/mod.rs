@@ -237,7 +237,6 @@ pub fn parse_address(text: &str) -> Result<SocketAddr, String> {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 

@@ -270,7 +270,6 @@ impl AsyncWrite for Patient {
 }
 
 #[cfg(test)]
-#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
     use std::io::Write;

@@ -46,7 +46,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     // Before anything else is read, and without a change: dry runs refuse what runs refuse.
     out_folder::check_usable_out(&request.out, request.existing)?;
     out_folder::check_apart(&request.out, &request.scene)?;
-    config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
+    config.residence().spill_dir().map_or(Ok(()), check_usable)?;
     let _mark = Beginning::mark(request)?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;

@@ -127,7 +127,7 @@ fn saved_steps(folder: &Path) -> Vec<u32> {
 pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     let ShowRequest { scene, config, live, .. } = request;
     machine::set_up(config)?;
-    config.residence().spill_dir().map_or(Ok(()), |spill_dir| check_usable(spill_dir, false))?;
+    config.residence().spill_dir().map_or(Ok(()), check_usable)?;
     let first = ShownScene::open(request, 0, false)?;
     request.saved.iter().for_each(|folder| live.set_metrics(folder.join(METRICS_FILE)));
     let overview = overview(&first.trainer.scene, &first.dataset);
