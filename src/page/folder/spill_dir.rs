@@ -68,6 +68,21 @@ impl SpillDir {
         Ok(SpillDir { folder: folder.to_path_buf(), format, warnings, made_folder, lock })
     }
 
+    /// Makes a new, empty store in the place of this one. The FORMAT file is there at every moment, so that a folder whose process was
+    /// killed here is not taken for one whose drive is missing.
+    /// Errors: the folder holds files that are not of this store (nothing changes then), or cannot be written.
+    pub fn replace(mut self, layout: SlotLayout) -> InputResult<SpillDir> {
+        self.check_identity()?;
+        let (ours, foreign) = self.files()?;
+        if let Some(foreign) = foreign.first() {
+            return Err(has_foreign(&self.folder, foreign));
+        }
+        remove_files(&self.folder, ours.iter().filter(|name| ![FORMAT, LOCK].contains(&name.as_str())))?;
+        self.format = SpillFormat { store: draw_identity(), layout, compatible: KNOWN_COMPATIBLE };
+        write_format(&self.folder, &self.format)?;
+        Ok(self)
+    }
+
     /// Opens an existing spill directory.
     /// Errors: as for [`SpillDir::create`]; also if there is none, or it is damaged or of a newer version.
     pub fn open(folder: &Path, allow_remote: bool) -> InputResult<SpillDir> {
@@ -145,22 +160,8 @@ impl SpillDir {
     /// Errors: another store has replaced this one (then nothing is removed), or a file cannot be removed.
     pub fn remove(self) -> InputResult<Vec<String>> {
         self.check_identity()?;
-        let mut foreign = Vec::new();
-        let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
-            .map(str::to_string)
-            .to_vec();
-        for name in names(&self.folder)? {
-            if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
-                ours.insert(0, name);
-            } else if !ours.contains(&name) {
-                foreign.push(name);
-            }
-        }
-        for path in ours.iter().map(|name| self.folder.join(name)) {
-            if let Err(error) = std::fs::remove_file(&path).or_else(ignore_not_found) {
-                return Err(InputError::io(path, "removing", &error));
-            }
-        }
+        let (ours, foreign) = self.files()?;
+        remove_files(&self.folder, ours.iter())?;
         let SpillDir { folder, made_folder, lock, .. } = self;
         // A network drive keeps a removed file under another name for as long as it is open.
         drop(lock);
@@ -174,6 +175,22 @@ impl SpillDir {
             }
         }
         Ok(foreign)
+    }
+
+    /// The names of this store's files, in the order of their removal, and those of the other files in its folder.
+    fn files(&self) -> InputResult<(Vec<String>, Vec<String>)> {
+        let mut foreign = Vec::new();
+        let mut ours = [MAP_NAME, MAP_NEW_NAME, WITNESS_NAME, RESERVE_NAME, RESERVE_NEW_NAME, FORMAT_NEW, FORMAT, LOCK]
+            .map(str::to_string)
+            .to_vec();
+        for name in names(&self.folder)? {
+            if segment_from_file_name(&name).is_some() && self.is_our_segment(&self.folder.join(&name)) {
+                ours.insert(0, name);
+            } else if !ours.contains(&name) {
+                foreign.push(name);
+            }
+        }
+        Ok((ours, foreign))
     }
 
     /// Whether a segment's first slot belongs to this store or was never written (also after a crash during the
@@ -322,11 +339,20 @@ fn refuse_foreign_files(folder: &Path) -> InputResult<()> {
     // A run that was interrupted before it wrote its FORMAT file leaves these.
     match names.iter().find(|n| ![LOCK, FORMAT_NEW].contains(&n.as_str())) {
         None => Ok(()),
-        Some(foreign) => {
-            let problem = format!("it is neither empty nor a spill directory (it contains {foreign:?})");
-            Err(InputError::new(folder, problem, "name an empty folder, or one that does not exist"))
-        }
+        Some(foreign) => Err(has_foreign(folder, foreign)),
     }
+}
+
+fn has_foreign(folder: &Path, name: &str) -> InputError {
+    let problem = format!("it is neither empty nor a spill directory (it contains {name:?})");
+    InputError::new(folder, problem, "name an empty folder, or one that does not exist")
+}
+
+fn remove_files<'a>(folder: &Path, mut names: impl Iterator<Item = &'a String>) -> InputResult<()> {
+    names.try_for_each(|name| {
+        let path = folder.join(name);
+        std::fs::remove_file(&path).or_else(ignore_not_found).map_err(|e| InputError::io(path, "removing", &e))
+    })
 }
 
 /// Numbers and lengths of the segment files in `folder`, ascending.
@@ -400,15 +426,16 @@ fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
     write.map_err(|e| InputError::io(folder.join(LOCK), "locking the spill directory", &e))
 }
 
+/// Whether the open `file` is the one that `path` names.
 #[cfg(unix)]
-fn is_same_file(path: &Path, file: &File) -> bool {
+pub fn is_same_file(path: &Path, file: &File) -> bool {
     use std::os::unix::fs::MetadataExt;
     let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
     matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
 }
 
 #[cfg(not(unix))]
-fn is_same_file(_path: &Path, _file: &File) -> bool {
+pub fn is_same_file(_path: &Path, _file: &File) -> bool {
     // These systems do not let anyone remove an open file.
     true
 }

@@ -9,6 +9,7 @@
 use crate::base::error::InputResult;
 use crate::page::folder::protocol_files::MAP_NAME;
 use crate::page::folder::spill_dir::{SpillDir, check_new, of_another_run, segments_in};
+use crate::page::format::spill_format::SlotLayout;
 use crate::page::tool::reading::{format_at, latest_generation, refuse_if_in_use};
 use std::path::Path;
 
@@ -45,6 +46,18 @@ pub fn check_usable(folder: &Path) -> InputResult<()> {
         true => Ok(()),
         false => Err(of_another_run(folder)),
     }
+}
+
+/// Creates a store in `folder`, in the place of one that holds no commit. Returns whether there was one.
+/// Errors: as [`SpillDir::create`]; or the old store cannot be removed.
+pub fn create_or_replace(folder: &Path, layout: SlotLayout, allow_remote: bool) -> InputResult<(SpillDir, bool)> {
+    if let Ok(spill) = SpillDir::open(folder, allow_remote)
+        && holds_no_commit(&spill)?
+    {
+        return Ok((spill.replace(layout)?, true));
+    }
+    // This reports why a folder cannot be used.
+    Ok((SpillDir::create(folder, layout, allow_remote)?, false))
 }
 
 /// Removes the store in `folder` if it holds no commit, so that a run can create its own there. Returns whether it did.

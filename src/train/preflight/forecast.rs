@@ -24,6 +24,7 @@ use crate::densify::strategy::StrategyName;
 use crate::exchange::format::ExportFormat;
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::folder::measure::DriveRate;
+use crate::page::folder::spill_dir::segments_in;
 use crate::page::format::slot_header::transfer_bytes;
 use crate::page::format::spill_format::SlotLayout;
 use crate::paging::pager::PagerConfig;
@@ -496,12 +497,14 @@ pub(crate) fn first_pages(config: &TrainConfig, rows: u64) -> [u64; 2] {
     [rows.div_ceil(first_fill(config.page_rows as usize, config.strategy.grows()) as u64), frame_bytes]
 }
 
-/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. A drive that does not report its
-/// free space passes.
+/// Refuses a drive that cannot hold the `rows` first Gaussians, before the import. What a run left in the folder that was cut off before
+/// its first commit counts as free. A drive that does not report its free space passes.
 /// Errors: the drive has too little free space.
 pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
     let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
     let Some(free) = free_bytes(&drive_of(spill_dir)).ok().flatten() else { return Ok(()) };
+    let left = segments_in(spill_dir).unwrap_or_default().into_iter().map(|(_, bytes)| bytes);
+    let free = left.fold(free, u64::saturating_add);
     let [pages, frame_bytes] = first_pages(config, rows);
     refuse_small_drive(free, pages, frame_bytes)
 }

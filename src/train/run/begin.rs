@@ -14,7 +14,7 @@ use crate::base::units::format_grouped;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
 use crate::config::new_run;
-use crate::config::values::Up;
+use crate::config::values::{Up, checkpoint_folder};
 use crate::dataset::loader::Dataset;
 use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
@@ -47,7 +47,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     out_folder::check_usable_out(&request.out, request.existing)?;
     out_folder::check_apart(&request.out, &request.scene)?;
     config.residence().spill_dir().map_or(Ok(()), check_usable)?;
-    let _mark = Beginning::mark(request)?;
+    let mark = Beginning::mark(request)?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
     let (request, start, diagnosis) = adapt_to_photos(adapt_schedule(request, &start), start, host_mem)?;
@@ -58,7 +58,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
         return Ok(RunOutcome::of_nothing(request.out.clone()));
     }
     let FirstTrainer { dataset, trainer, tiers, begun } = first_trainer(request, start, host_mem)?;
-    plan_and_train(request, &dataset, tiers, trainer, Begun { diagnosis, ..begun })
+    let is_locked = mark.as_ref().is_some_and(Beginning::holds_lock);
+    plan_and_train(request, &dataset, tiers, trainer, Begun { diagnosis, is_locked, ..begun })
 }
 
 /// Prints a part of the plan, unless the run is quiet: to standard output where it is what was asked for.
@@ -167,7 +168,8 @@ pub(super) fn first_trainer(
     if !request.dry_run {
         tiers.commit_in(&request.out, config);
     }
-    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run: RunId::draw(), diagnosis: None };
+    let (run, diagnosis, is_locked) = (RunId::draw(), None, false);
+    let begun = Begun { print, sh_degree_start, past: None, host_mem, driver, run, diagnosis, is_locked };
     Ok(FirstTrainer { dataset, trainer, tiers, begun })
 }
 
@@ -189,11 +191,6 @@ pub(super) fn page_start(
     start: Start,
     host_mem: Option<u64>,
 ) -> Result<PagedStart, TrainError> {
-    if let Some(spill_dir) = config.residence().spill_dir().filter(|_| !dry_run)
-        && remove_uncommitted(spill_dir, false)?
-    {
-        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
-    }
     check_first_drive(config, start.rows)?;
     let (renderer, mut options, driver) = begin(quiet, config, &start)?;
     // A resumed run has them in its commit.
@@ -298,7 +295,7 @@ pub(super) fn plan_and_train(
     let stop = stop.with_deadline(request.leg.and_then(|leg| Instant::now().checked_add(leg)));
     out_folder::make_folder(&request.out)?;
     // Take the lock before removing files; hold it to the end.
-    let _lock = out_folder::lock(&request.out)?;
+    let _lock = if begun.is_locked { None } else { out_folder::lock(&request.out)? };
     if begun.past.is_none() {
         if request.out.join(CONFIG_FILE).is_file() && request.existing == Existing::Overwrite {
             out_folder::write_mark(request)?;
@@ -316,6 +313,11 @@ pub(super) fn plan_and_train(
         );
     }
     tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
+    // What a process left that was killed during its first commit to the output folder.
+    let folder = checkpoint_folder(&request.out);
+    if outcome.is_ok() && remove_uncommitted(&folder, true).is_ok_and(|is_removed| is_removed) {
+        let _ = std::fs::remove_dir(folder);
+    }
     outcome
 }
 

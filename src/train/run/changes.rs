@@ -152,7 +152,8 @@ impl Changes {
         // The scale may follow from points, which a run that goes on from Gaussians does not read.
         let origin = dataset.frame.origin.to_array();
         if then.origin.map(f64::to_bits) != origin.map(f64::to_bits) {
-            let line = format!("it is another scene: its cameras stood around {:?} and stand around {origin:?}", then.origin);
+            let line =
+                format!("it is another scene: its cameras stood around {:?} and stand around {origin:?}", then.origin);
             self.fixed.push(line);
         }
     }

@@ -86,10 +86,7 @@ impl FinishedRun {
 
 /// Trains the finished run in the output folder of `request` from its result to the steps of the config.
 /// Errors: as [`FinishedRun::start`]; else as [`super::begin::run`].
-pub(super) fn train_more_steps(
-    mut request: RunRequest,
-    mut finished: FinishedRun,
-) -> Result<RunOutcome, TrainError> {
+pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRun) -> Result<RunOutcome, TrainError> {
     let out = request.out.clone();
     machine::set_up(&request.config)?;
     let start = finished.start(&request)?;

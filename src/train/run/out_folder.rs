@@ -18,7 +18,7 @@ use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
-use crate::page::folder::spill_dir::SpillDir;
+use crate::page::folder::spill_dir::{SpillDir, is_same_file};
 use crate::photos;
 use crate::report::run_files::{
     BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, saved_step,
@@ -41,14 +41,18 @@ const PROBE: &str = ".gsscale-probe";
 /// Locks an existing output folder for as long as the file is open. On file systems without locks this does nothing.
 /// Errors: another process trains into the folder.
 pub(crate) fn lock(out: &Path) -> InputResult<Option<File>> {
-    let file = OpenOptions::new().write(true).create(true).truncate(false).open(out.join(LOCK));
-    let Ok(file) = file else { return Ok(None) };
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => {
+    let path = out.join(LOCK);
+    loop {
+        let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
+        let Ok(file) = file else { return Ok(None) };
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
             let remedy = "wait for it to end, stop it (Ctrl-C commits first), or choose another --out";
-            Err(InputError::new(out, "another process trains into this folder", remedy))
+            return Err(InputError::new(out, "another process trains into this folder", remedy));
         }
-        _ => Ok(Some(file)),
+        // A run that was refused may have removed the file between the two calls.
+        if is_same_file(&path, &file) {
+            return Ok(Some(file));
+        }
     }
 }
 
@@ -75,7 +79,7 @@ pub fn is_trace(name: &OsStr) -> bool {
 pub fn default_out(scene: Option<&Path>) -> (PathBuf, PathBuf) {
     let name = scene.map_or_else(|| "demo".to_string(), scene_name);
     let numbered = |n: u32| Path::new("runs").join(if n == 1 { name.clone() } else { format!("{name}-{n}") });
-    let is_free = |out: &PathBuf| !out.exists() || is_empty(out);
+    let is_free = |out: &PathBuf| !out.exists() || (is_empty(out) && refuse_in_use(out).is_ok());
     ((1..=u32::MAX).map(numbered).find(is_free).unwrap_or_else(|| numbered(1)), numbered(1))
 }
 
@@ -96,9 +100,7 @@ pub fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError
     }
     refuse_in_use(out)?;
     match existing {
-        Existing::Refuse if out.exists() && !is_empty(out) => {
-            Err(InputError::new(out, "exists already", remedy_of_existing(out)).into())
-        }
+        Existing::Refuse if out.exists() && !is_empty(out) => Err(exists_already(out).into()),
         Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
         Existing::Refuse | Existing::BeginAgain => Ok(()),
     }
@@ -113,6 +115,10 @@ pub fn check_apart(out: &Path, scene: &Path) -> InputResult<()> {
 /// Identity of the run whose config lies in `out`.
 fn run_in(out: &Path) -> RunId {
     read_resolved(&out.join(CONFIG_FILE)).map_or(RunId::UNKNOWN, |resolved| resolved.run)
+}
+
+fn exists_already(out: &Path) -> InputError {
+    InputError::new(out, "exists already", remedy_of_existing(out))
 }
 
 /// The remedy for an existing output folder: resume its run, or another folder. `--overwrite` is proposed only where there
@@ -274,9 +280,14 @@ pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
 
-/// A mark under way. Dropping it removes the mark and the folders that were made for it, if nothing else lies there.
+/// A mark under way, in a folder that is locked from here on: what it held when it was checked it holds at the first step. Dropping it
+/// removes the mark and the folders that were made for it, if nothing else lies there.
 pub(super) struct Beginning {
     out: PathBuf,
+    /// Held to the end of the run; `None` on file systems without locks.
+    lock: Option<File>,
+    /// The lock file was there before.
+    had_lock: bool,
     /// Folders that did not exist, the innermost first.
     folders: Vec<PathBuf>,
     /// An earlier process made the mark: it stays if this one is refused.
@@ -295,19 +306,33 @@ struct Facts {
 }
 
 impl Beginning {
-    /// Marks the output folder of a request, if it is new, empty, or marked already.
-    /// Errors: the folder cannot be written.
+    /// Locks and marks the output folder of a request, if it is new, empty, or marked already.
+    /// Errors: the folder cannot be written, another process trains into it, or has trained into it since it was checked.
     pub fn mark(request: &RunRequest) -> InputResult<Option<Beginning>> {
         let out = request.out.clone();
         if request.dry_run || (out.exists() && !is_empty(&out) && !is_marked(&out)) {
-            return Ok(None);
+            return if request.dry_run || request.existing != Existing::Refuse {
+                Ok(None)
+            } else {
+                Err(exists_already(&out))
+            };
         }
         let is_new = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
         let folders = out.ancestors().take_while(is_new).map(Path::to_path_buf).collect();
-        let beginning = Beginning { was_there: is_marked(&out), folders, out };
-        make_folder(&beginning.out)?;
+        make_folder(&out)?;
+        let had_lock = out.join(LOCK).exists();
+        let lock = lock(&out)?;
+        if !is_empty(&out) && !is_marked(&out) {
+            return Err(exists_already(&out));
+        }
+        let beginning = Beginning { was_there: is_marked(&out), lock, had_lock, folders, out };
         write_mark(request)?;
         Ok(Some(beginning))
+    }
+
+    /// Whether the folder is locked.
+    pub fn holds_lock(&self) -> bool {
+        self.lock.is_some()
     }
 }
 
@@ -316,6 +341,9 @@ impl Drop for Beginning {
         // Folders that hold something stay. Where nothing can be removed, the mark costs the next run nothing.
         if !self.was_there {
             remove_mark(&self.out);
+            if !self.had_lock && !self.out.join(CONFIG_FILE).exists() {
+                let _ = std::fs::remove_file(self.out.join(LOCK));
+            }
             self.folders.iter().take_while(|folder| std::fs::remove_dir(folder).is_ok()).for_each(drop);
         }
     }
@@ -435,5 +463,33 @@ mod tests {
             assert_eq!(check_results(out, ExportFormat::Ply).is_err(), name == PLY_FILE);
             assert!(check_results(out, ExportFormat::Spz).is_err());
         }
+    }
+
+    /// Another run may have begun and ended since the folder was checked.
+    #[test]
+    fn a_run_does_not_begin_in_a_folder_that_is_used_meanwhile() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("new/out");
+        let request = RunRequest {
+            scene: folder.path().to_path_buf(),
+            out: out.clone(),
+            config: TrainConfig::default(),
+            dry_run: false,
+            existing: Existing::Refuse,
+            quiet: true,
+            live: None,
+            leg: None,
+        };
+        let first = Beginning::mark(&request).unwrap().unwrap();
+        let refused = Beginning::mark(&request).err().unwrap().to_string();
+        assert!(refused.contains("another process trains"), "{refused}");
+        assert!(refuse_in_use(&out).is_err());
+        drop(first);
+        assert!(!out.exists() && !folder.path().join("new").exists(), "a refused run leaves nothing");
+        make_folder(&out).unwrap();
+        std::fs::write(out.join(CONFIG_FILE), "").unwrap();
+        let refused = Beginning::mark(&request).err().unwrap().to_string();
+        assert!(refused.contains("exists already"), "{refused}");
+        assert!(out.join(CONFIG_FILE).exists());
     }
 }

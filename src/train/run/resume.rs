@@ -299,7 +299,8 @@ fn resume_from(
     // Its own, that of its checkpoint, or a new one.
     let run = [earlier.run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw);
     let sh_degree_start = state.origin.sh_degree_start;
-    let begun = Begun { print, sh_degree_start, past: Some(past), host_mem, driver, run, diagnosis: None };
+    let begun =
+        Begun { print, sh_degree_start, past: Some(past), host_mem, driver, run, diagnosis: None, is_locked: false };
     let request = request.to_run(&earlier.scene, config, Existing::BeginAgain);
     plan_and_train(&request, &dataset, tiers, trainer, begun)
 }

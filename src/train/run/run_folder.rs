@@ -75,6 +75,8 @@ pub(super) struct Begun {
     pub run: RunId,
     /// What the photos of a new run said before training, if anything.
     pub diagnosis: Option<Diagnosis>,
+    /// The caller holds the lock of the output folder.
+    pub is_locked: bool,
 }
 
 /// Costs of the steps since the pager had counted `before`.

@@ -16,6 +16,7 @@ use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
 use crate::page::map::opening::Opened;
+use crate::page::tool::uncommitted::create_or_replace;
 use crate::page::versions::paged_store::{PagedStore, PagedStoreConfig};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -48,6 +49,9 @@ pub struct Tiers {
     is_in_output: bool,
     /// The run resumed from this store.
     has_resumed: bool,
+    /// An earlier process left a store without a commit here. A run that is refused leaves one, too: without it a resume would take the
+    /// drive for one that is not mounted.
+    was_there: bool,
     /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,
     /// I/O engine, for reports; empty if all pages stay in memory.
@@ -137,9 +141,14 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         let of_store = PagedStoreConfig { store: 0, layout, codec: tiers.codec, generation: 1, serial: 1 };
         return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     };
-    let spill = SpillDir::create(spill_dir, layout, false)?;
+    // Only here, after everything that can refuse the run: a resume that is refused changes nothing.
+    let (spill, is_again) = create_or_replace(spill_dir, layout, false)?;
+    if is_again {
+        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+    }
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
-    // From here on, an error removes the directory.
+    // From here on, an error removes the directory, unless an earlier process left one.
+    tiers.was_there = is_again;
     let engine = tiers.take_spill(spill, config)?;
     let opened = Opened::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, tiers.codec)?;
@@ -249,7 +258,7 @@ impl Tiers {
     /// Closes the checkpoint and removes it, unless a run can resume from it or it is to be kept. The pager must be
     /// dropped before. Returns messages for the user.
     pub fn close(&mut self) -> Vec<String> {
-        let is_kept = self.has_checkpoint() && (self.keeps || !self.is_done);
+        let is_kept = (self.has_checkpoint() || self.was_there) && (self.keeps || !self.is_done);
         let made = self.checkpoint.take().and_then(|checkpoint| checkpoint.spill);
         let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();

@@ -90,6 +90,18 @@ fn a_run_that_is_killed_while_it_replaces_another_begins_again() {
     assert!(work.results("out") == work.results("alone"), "{:?}", work.results("out").keys());
 }
 
+/// The folder is a run's from its mark on, also while its photos are read.
+#[test]
+fn a_run_that_begins_elsewhere_meanwhile_is_refused() {
+    let work = scene();
+    let first = work.begin(&format!("{FLAGS} --out out")).once_quickly(|| work.exists("out/.gsscale-begun.toml"));
+    let said = work.refuses(&format!("{FLAGS} --out out --seed 9"), &["out"]);
+    assert!(said.contains("another process") || said.contains("exists already"), "{said}");
+    first.ends(0);
+    work.train(&format!("{FLAGS} --out alone"));
+    assert!(work.results("out") == work.results("alone"), "the second run touched the first one's results");
+}
+
 /// A run that is refused leaves nothing, not even the folders of its path.
 #[test]
 fn a_run_that_is_refused_leaves_no_mark() {

@@ -1,7 +1,7 @@
 //! Kept checkpoints: named checkpoints, and finished runs continued to more steps.
 
 use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
-use crate::support::workdir::open_store;
+use crate::support::workdir::{Workdir, copy_folder, open_store};
 use gsscale::checkpoint::run_state::RunState;
 
 /// Named checkpoints keep their steps and evaluations; a run returns to one of them.
@@ -93,4 +93,47 @@ fn more_steps_keep_the_schedule() {
         assert!(bench.psnr("out") > before - 1.5, "{} after {before}", bench.psnr("out"));
         bench.clear();
     }
+}
+
+/// The result of an attempt may have replaced the earlier one when it is cut off before its summary. The next attempt goes on from the
+/// earlier one all the same.
+#[test]
+fn a_kill_before_the_summary_of_more_steps_costs_no_result() {
+    let work = Workdir::city(12, 64, 48, 600);
+    work.train("scene --out out --steps 20 --device cpu --quiet");
+    let first = work.ply("out");
+    let summary = work.bytes("out/summary.json");
+    work.train("--resume out --steps 40 --commit-every 0 --quiet");
+    let want = work.ply("out");
+    work.write("out/summary.json", summary);
+    work.train("--resume out --commit-every 0 --quiet");
+    assert!(work.bytes("out/point_cloud_000020.ply") == first, "the earlier result is gone");
+    assert!(work.ply("out") == want && work.summary("out")["steps"] == 40);
+}
+
+/// As with a checkpoint. What is refused changes no file.
+#[test]
+fn more_steps_with_other_settings_are_refused_unless_accepted() {
+    let work = Workdir::city(12, 64, 48, 600);
+    work.train("scene --out out --steps 20 --device cpu --quiet");
+    let before = work.files("out");
+    copy_folder(&work.scene(), &work.path("copy"));
+    let other = Workdir::city(14, 64, 48, 600);
+    copy_folder(&other.scene(), &work.path("other"));
+    for (flags, words) in [
+        ("--seed 7", &["seed was", "--accept-changes"][..]),
+        ("--sh-degree 1", &["sh-degree was 3 and is 1", "do not fit"]),
+        ("--page-rows 64 --accept-changes", &["page-rows was", "do not fit"]),
+        ("other --test-every 8", &["another scene"]),
+        ("--host-mem 1MiB", &["--host-mem"]),
+    ] {
+        let (scene, flags) = flags.split_once("other ").map_or(("", flags), |(_, flags)| ("other", flags));
+        work.refuses(&format!("--resume out {scene} --steps 40 --quiet {flags}"), words);
+        assert!(work.files("out") == before, "{flags}: a refused resume changed something");
+    }
+    work.refuses("--resume out --steps 40 --seed 7 --dry-run", &["seed was"]);
+    // A scene that was moved, and settings that change no number.
+    let said = work.train("--resume out copy --steps 30 --seed 7 --accept-changes --threads 1");
+    assert!(said.contains("accepted from step 20 on: seed was"), "{said}");
+    assert_eq!(work.count("out", "steps"), 30);
 }

@@ -3,6 +3,8 @@
 use super::bench::{BUSY, Bench, Place, SELDOM, STEPS};
 use crate::support::scenes::text;
 use crate::support::workdir::{CKPT, TRAIN, copy_folder, succeeded};
+use gsscale::page::folder::spill_dir::SpillDir;
+use gsscale::page::format::spill_format::SlotLayout;
 use std::path::Path;
 use std::process::Command;
 
@@ -129,10 +131,19 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
     let alone = bench.alone("");
     for place in [Place::Spill(alone.fewest), Place::Memory] {
         bench.start(place, SELDOM).after_lines("out", 1).kill();
-        let said = bench.go_on("");
+        // A refusal changes nothing, before and after the first pages are made.
+        bench.does_not_go_on("--device no-such-card", &["no-such-card"]);
+        bench.does_not_go_on("--host-mem 1MiB", &["--host-mem"]);
+        if place == Place::Memory {
+            // A process that is killed during its first commit leaves a store, which the end of the run removes.
+            let layout = SlotLayout::new(4096, 1);
+            SpillDir::create(&bench.checkpoint(place), layout, true).unwrap();
+        }
+        let said = bench.go_on("--commit-every 0");
         assert!(said.contains("begins again"), "{said}");
         assert!(bench.ply("out") == alone.ply, "{place:?}: the scene is another");
         assert_eq!(bench.logged("out", "step"), alone.logged, "{place:?}");
+        assert!(!bench.checkpoint(place).join("FORMAT").exists(), "{place:?}: a store is left");
         bench.clear();
     }
     // An unmounted drive of pages is no reason to start over, nor is its mount point.
