@@ -65,7 +65,7 @@ pub struct Cut<'a> {
 pub struct Commits {
     pub(super) folder: Box<dyn Folder>,
     pub(super) config: CommitConfig,
-    /// `None` after the drive was full: the map must be reopened.
+    /// `None` after the drive was full: the map must be reopened. Its last transaction may be durable and not in the witness.
     pub(super) manifest: Option<Manifest>,
     pub(super) witness: Witness,
     pub(super) generations: Generations,
@@ -252,7 +252,14 @@ impl Commits {
             other => other?,
         }
         let sequence = self.manifest.as_ref().map_or(0, |m| m.counters().sequence);
-        self.witness.record(sequence).map_err(CommitError::file(WITNESS_NAME))?;
+        match self.witness.record(sequence) {
+            Err(error) if is_out_of_space(error.kind()) => {
+                // The transaction is durable: reopening the map tells, and records it again.
+                self.manifest = None;
+                return Err(CommitError::Full(error));
+            }
+            recorded => recorded.map_err(CommitError::file(WITNESS_NAME))?,
+        }
         self.generations.adopt(batch);
         Ok(())
     }
@@ -277,12 +284,12 @@ impl Commits {
         let file = file.ok_or_else(|| MapError::Damaged("the file no longer exists".to_string()))?;
         let acknowledged = self.witness.sequence();
         let (manifest, content) = Manifest::open(file, self.config.store, acknowledged, self.config.cache_bytes)?;
-        self.manifest = Some(manifest);
-        self.generations = Generations::of(&content);
         let was_durable = content.counters.sequence > acknowledged;
         if was_durable {
             self.witness.record(content.counters.sequence)?;
         }
+        self.manifest = Some(manifest);
+        self.generations = Generations::of(&content);
         Ok(was_durable)
     }
 
@@ -381,6 +388,7 @@ pub enum CommitError {
 fn file_remedy(source: &io::Error) -> &'static str {
     match is_too_many_files(source) {
         true => REMEDY_TOO_MANY_FILES,
+        false if is_out_of_space(source.kind()) => "free space on the drive of this folder",
         false => "check the drive; `gsscale-ckpt salvage` can rebuild the map",
     }
 }
