@@ -7,8 +7,8 @@
 //!
 //! Invariants: 1. a store opens at the last acknowledged generation or at one whose commit was in progress, never at
 //! another and never at a mixture; 2. after a failed write, sync or transaction this process commits nothing more,
-//! except after a lack of space: then the map is reopened, the reserve is given up, and the commit may be repeated; 3.
-//! nothing durable names a file whose folder entry is not durable.
+//! except after a lack of space (never that of a sync): then the map is reopened, the reserve is given up, and the commit may be repeated;
+//! 3. nothing durable names a file whose folder entry is not durable.
 //!
 //! One process at a time owns the store; the caller holds the lock on its folder.
 

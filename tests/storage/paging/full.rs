@@ -1,5 +1,5 @@
 //! Commits on a full drive: a transaction is durable although its witness found no space, and the drive may still be
-//! full when the map is reopened. Neither case loses a page, and no deleted page comes back.
+//! full when the map is reopened. Neither case loses a page, and no deleted page comes back. A sync never counts as a lack of space.
 
 use super::beside::{COMMITS, opens_with, paged_store};
 use super::run_in_memory;
@@ -174,5 +174,32 @@ fn a_drive_that_stays_full_costs_commits_and_not_the_run() {
         run.pager.commit(&mut commits, b"state", b"", None).unwrap().unwrap();
         drop(commits);
         opens_with(at, &run.model);
+    }
+}
+
+/// After a failed sync the system takes lost bytes for written, so a commit that went on after one could acknowledge what never reached the
+/// drive.
+#[test]
+fn a_sync_without_space_ends_all_commits() {
+    for name in [&[MAP_NAME], &[WITNESS_NAME]] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let fails = Arc::new(AtomicBool::new(false));
+        let fails_now = Arc::clone(&fails);
+        let guard = move |change: Change| match change == Change::Sync && fails_now.load(Ordering::Relaxed) {
+            true => Err(ErrorKind::StorageFull.into()),
+            false => Ok(()),
+        };
+        let opened = Opened::create(Box::new(GuardedFolder::new(at, name, Arc::new(guard))), COMMITS).unwrap();
+        let pager = Pager::new(config(1000), paged_store(&opened, at, Codec::Raw, &Faults::new()));
+        let mut commits = opened.commits;
+        let mut run = Run::new(pager, 1, PAGES, STEPS).unwrap();
+        run.pager.flush().unwrap();
+        fails.store(true, Ordering::Relaxed);
+        let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+        assert!(!error.is_out_of_space() && !error.to_string().contains("free space"), "{name:?}: {error}");
+        fails.store(false, Ordering::Relaxed);
+        let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+        assert!(matches!(error, CommitError::Poisoned(_)), "{name:?}: {error}");
     }
 }
