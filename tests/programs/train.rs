@@ -5,11 +5,15 @@ use crate::support::workdir::{TRAIN, Workdir};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
-use gsscale::densify::strategy::StrategyName;
+use gsscale::densify::stats::GradHistogram;
+use gsscale::densify::strategy::{RoundSteps, RowCount, Strategy, StrategyName, ViewGradients};
+use gsscale::optim::bounds::SplitLimits;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::scene::events::EventKind;
+use gsscale::train::error::TrainError;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
+use std::sync::Arc;
 
 fn run(work: &Workdir, out: &str, more: &str) {
     work.train(&format!("scene --out {out} --quiet {more}"));
@@ -69,6 +73,49 @@ fn letter(kind: EventKind) -> char {
         EventKind::ResetOpacity { .. } => 'r',
         EventKind::RaiseShDegree { .. } => 's',
     }
+}
+
+/// Spoils the gradient of one row of each view.
+#[derive(Debug)]
+struct SpoilOneRow;
+
+impl Strategy for SpoilOneRow {
+    fn rounds(&self) -> Option<&RoundSteps> {
+        None
+    }
+
+    fn add_gradients(&self, view: &mut ViewGradients<'_>) {
+        if let Some(drawn) = view.gradients.radii.iter().position(|radii| !radii.contains(&0)) {
+            view.gradients.columns.opacities[drawn] = f32::INFINITY;
+        }
+    }
+
+    fn events_after(&self, _: u32, _: f32, _: RowCount, _: &GradHistogram) -> Vec<EventKind> {
+        Vec::new()
+    }
+
+    fn split_limits(&self, _: f32) -> SplitLimits {
+        SplitLimits::NEVER
+    }
+}
+
+/// Otherwise the rows that it changed would be written as those of the step before.
+#[test]
+fn a_step_that_ends_a_diverged_run_counts_if_it_changed_rows() {
+    let scene = Workdir::city(12, 96, 64, 400);
+    let config = TrainConfig { steps: 60, ..TrainConfig::default() };
+    let Prepared { dataset, columns, sh_degree_start, .. } = prepare(&scene.scene(), &config).unwrap();
+    let strategy = Arc::new(SpoilOneRow);
+    let options = RunOptions { sh_degree_start, strategy, ..RunOptions::new(&config, dataset.scene_scale) };
+    let targets = TargetCache::new(&dataset.views, 1 << 24, 1).unwrap();
+    let mut trainer = Trainer::new(columns, &dataset, Box::new(CpuRenderer::new()), options).unwrap();
+    for _ in 0..2 {
+        let outcome = trainer.step(&dataset, &targets).unwrap();
+        assert!(outcome.updated > 0 && outcome.rows_skipped == 1, "{outcome:?}");
+    }
+    let error = trainer.step(&dataset, &targets).unwrap_err();
+    assert!(matches!(error, TrainError::NonFinite { step: 2, .. }), "{error}");
+    assert_eq!((trainer.steps_done(), trainer.skipped()), (3, (3, 0)));
 }
 
 #[test]

@@ -297,7 +297,7 @@ fn the_reserve_is_filled_whole_and_exists_until_it_is_given_up() {
     let config = CommitConfig { reserve_bytes: 3 << 20, ..CONFIG };
     // As if the process were killed after the first piece.
     let stops = |change| if matches!(change, Change::WriteAt(1..)) { Err(ErrorKind::Other.into()) } else { Ok(()) };
-    let killed = GuardedFolder::new(at, RESERVE_NEW_NAME, Arc::new(stops));
+    let killed = GuardedFolder::new(at, &[RESERVE_NEW_NAME], Arc::new(stops));
     let mut killed = Opened::open(Box::new(killed), config).unwrap().commits;
     assert!(killed.fill_reserve().is_err());
     drop(killed);

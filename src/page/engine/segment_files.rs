@@ -96,8 +96,9 @@ impl SegmentFiles {
             let what = if there.is_file() { "exists with another length" } else { "is not a file" };
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, format!("{} {what}", path.display())));
         }
+        // Synced here as well: space may run out then, and a second sync of the same bytes would not tell.
         if there.len() < bytes
-            && let Err(error) = allocate(&file, there.len(), bytes)
+            && let Err(error) = allocate(&file, there.len(), bytes).and_then(|()| file.sync_all())
         {
             // Space ran out: the new space is freed, and a file that existed keeps its old length.
             let _ = if there.len() == 0 { std::fs::remove_file(&path) } else { file.set_len(there.len()) };

@@ -7,8 +7,8 @@
 //!
 //! Invariants: 1. a store opens at the last acknowledged generation or at one whose commit was in progress, never at
 //! another and never at a mixture; 2. after a failed write, sync or transaction this process commits nothing more,
-//! except after a lack of space: then the map is reopened, the reserve is given up, and the commit may be repeated; 3.
-//! nothing durable names a file whose folder entry is not durable.
+//! except after a lack of space (never that of a sync): then the map is reopened, the reserve is given up, and the commit may be repeated;
+//! 3. nothing durable names a file whose folder entry is not durable.
 //!
 //! One process at a time owns the store; the caller holds the lock on its folder.
 
@@ -65,7 +65,7 @@ pub struct Cut<'a> {
 pub struct Commits {
     pub(super) folder: Box<dyn Folder>,
     pub(super) config: CommitConfig,
-    /// `None` after the drive was full: the map must be reopened.
+    /// `None` after the drive was full: the map must be reopened. Its last transaction may be durable and not in the witness.
     pub(super) manifest: Option<Manifest>,
     pub(super) witness: Witness,
     pub(super) generations: Generations,
@@ -251,7 +251,14 @@ impl Commits {
             other => other?,
         }
         let sequence = self.manifest.as_ref().map_or(0, |m| m.counters().sequence);
-        self.witness.record(sequence).map_err(CommitError::file(WITNESS_NAME))?;
+        match self.witness.record(sequence) {
+            Err(error) if is_out_of_space(error.kind()) => {
+                // The transaction is durable: reopening the map tells, and records it again.
+                self.manifest = None;
+                return Err(CommitError::Full(error));
+            }
+            recorded => recorded.map_err(CommitError::file(WITNESS_NAME))?,
+        }
         self.generations.adopt(batch);
         Ok(())
     }
@@ -276,12 +283,12 @@ impl Commits {
         let file = file.ok_or_else(|| MapError::Damaged("the file no longer exists".to_string()))?;
         let acknowledged = self.witness.sequence();
         let (manifest, content) = Manifest::open(file, self.config.store, acknowledged, self.config.cache_bytes)?;
-        self.manifest = Some(manifest);
-        self.generations = Generations::of(&content);
         let was_durable = content.counters.sequence > acknowledged;
         if was_durable {
             self.witness.record(content.counters.sequence)?;
         }
+        self.manifest = Some(manifest);
+        self.generations = Generations::of(&content);
         Ok(was_durable)
     }
 
@@ -378,6 +385,7 @@ pub enum CommitError {
 fn file_remedy(source: &io::Error) -> &'static str {
     match is_too_many_files(source) {
         true => REMEDY_TOO_MANY_FILES,
+        false if is_out_of_space(source.kind()) => "free space on the drive of this folder",
         false => "check the drive; `gsscale-ckpt salvage` can rebuild the map",
     }
 }

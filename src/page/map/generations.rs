@@ -95,7 +95,7 @@ impl Generations {
         };
     }
 
-    /// Plans the transaction that makes `generation` the latest. `put` holds the pages changed since the last
+    /// Plans the transaction that makes `generation`, which is later than all, the latest. `put` holds the pages changed since the last
     /// generation, in any order, each once.
     pub fn plan_commit(
         &self,
@@ -104,6 +104,8 @@ impl Generations {
         texts: (Vec<u8>, Vec<u8>),
         pin: Option<&str>,
     ) -> MapBatch {
+        // Entries of a generation that is there already would be superseded by themselves, and a removal among them lost.
+        debug_assert!(generation > self.latest, "generation {generation} is planned after {}", self.latest);
         let mut pins = self.pins.clone();
         pins.extend(pin.map(|name| (name.to_string(), generation)));
         let mut versions: Vec<MapVersion> =
@@ -219,5 +221,20 @@ impl Generations {
         batch.drop_versions.extend(gone.map(|(page, from)| (*page, *from)));
         batch.drop_versions.sort_unstable();
         batch
+    }
+}
+
+#[cfg(all(test, debug_assertions))]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[should_panic(expected = "generation 1 is planned after 1")]
+    fn no_generation_is_planned_twice() {
+        let mut generations = Generations::default();
+        let plan = |generations: &Generations| generations.plan_commit(1, Vec::new(), Default::default(), None);
+        let batch = plan(&generations);
+        generations.adopt(&batch);
+        plan(&generations);
     }
 }

@@ -6,7 +6,7 @@
 //! last write, so every opening takes the path of an opening after a crash, which is the tested path.
 //!
 //! Invariants: 1. held-back operations are carried out in order, syncs included; 2. once shut, the file is neither read
-//! nor written.
+//! nor written; 3. a failed sync never counts as a lack of space.
 
 use crate::page::mutants::{Mutant, active};
 use redb::{BackendError, StorageBackend};
@@ -66,7 +66,7 @@ impl MapFile {
             let done = match operation {
                 Held::Write(offset, bytes) => self.0.file.write(offset, &bytes),
                 Held::Length(len) => self.0.file.set_len(len),
-                Held::Sync => self.0.file.sync_data(),
+                Held::Sync => sync(&*self.0.file),
             };
             if let Err(error) = done {
                 self.shut();
@@ -103,6 +103,13 @@ impl MapFile {
         }
         result
     }
+}
+
+/// Makes the writes to a file durable.
+/// Errors: some of them may be lost. The error is never one of space, after which the caller would go on: the system reports lost bytes once and
+/// counts them as written from then on, so neither a second sync nor reading the file shows the loss.
+pub(super) fn sync(file: &dyn StorageBackend) -> io::Result<()> {
+    file.sync_data().map_err(io::Error::other)
 }
 
 /// Applies `operations` to `out`, which was read from `offset`.
@@ -168,7 +175,7 @@ impl StorageBackend for MapFile {
         if active(Mutant::MapNotDurable) {
             return Ok(());
         }
-        self.noted(self.0.file.sync_data())
+        self.noted(sync(&*self.0.file))
     }
 
     fn write(&self, offset: u64, data: &[u8]) -> io::Result<()> {

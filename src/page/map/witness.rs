@@ -8,6 +8,7 @@
 //! least one is valid, and it is at most one transaction behind. A witness behind its map is an ordinary crash.
 
 use crate::page::map::entries::{SEAL_BYTES, SealScope};
+use crate::page::map::map_file::sync;
 use crate::page::mutants::{Mutant, active};
 use redb::StorageBackend;
 use std::io;
@@ -71,7 +72,7 @@ impl Witness {
         let mut bytes = scope(self.store).seal(&slot.to_le_bytes(), &body);
         bytes.resize(SLOT_BYTES, 0);
         self.file.write(slot * SLOT_BYTES as u64, &bytes)?;
-        self.file.sync_data()?;
+        sync(&*self.file)?;
         self.sequence = sequence;
         Ok(())
     }

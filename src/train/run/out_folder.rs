@@ -197,6 +197,8 @@ pub(super) fn remove_evaluation(out: &Path) -> InputResult<()> {
 fn remove_files(out: &Path, which: impl Fn(Tells) -> bool) -> InputResult<()> {
     let files = RUN_FILES.iter().filter(|(_, tells)| which(*tells));
     files.map(|(file, _)| file).try_for_each(|file| match file {
+        RunFile::File(name) if is_behind_link(out, folder_of(&out.join(name))) => Ok(()),
+        RunFile::Events(folder) | RunFile::Pictures(folder) if is_behind_link(out, &out.join(folder)) => Ok(()),
         RunFile::File(name) => remove_file(&out.join(name)),
         RunFile::SavedPlys => saved(out)?.iter().try_for_each(|path| remove_file(path)),
         RunFile::Events(folder) => remove_in(&out.join(folder), is_event_file, false),
@@ -223,6 +225,11 @@ fn remove_file(path: &Path) -> InputResult<()> {
         Err(e) if path.is_file() => Err(failed(path, "removing the earlier run's file")(e)),
         _ => Ok(()),
     }
+}
+
+/// Whether a symbolic link below `out` leads to `folder`: a run makes none, so the files behind it are somebody's.
+fn is_behind_link(out: &Path, folder: &Path) -> bool {
+    folder.ancestors().take_while(|part| *part != out).any(Path::is_symlink)
 }
 
 /// Removes the files that are ours from `folder`, and from its subfolders if `is_deep`; then folders that are empty.
@@ -420,6 +427,32 @@ mod tests {
         make(out, Existing::Overwrite).unwrap();
         assert!(!events.exists());
         assert!(!out.join("evaluated.json").exists() && !out.join("evaluated-as.toml").exists());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn files_behind_links_stay() {
+        for link in ["renders", "renders/test", "renders/test/deep", "tensorboard"] {
+            let (folder, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+            let (out, link) = (folder.path(), folder.path().join(link));
+            let deep = elsewhere.path().join("test/deep");
+            std::fs::create_dir_all(&deep).unwrap();
+            EventFile::create(elsewhere.path(), None).unwrap().write(1, &[("loss/train", 0.5)]).unwrap();
+            for name in ["a.png", "test/a.png", "test/views.json", "views.json", "test/deep/a.png"] {
+                std::fs::write(elsewhere.path().join(name), "somebody's").unwrap();
+            }
+            let count = || {
+                [elsewhere.path(), &elsewhere.path().join("test"), &deep]
+                    .map(|at| std::fs::read_dir(at).unwrap().count())
+            };
+            let before = count();
+            std::fs::create_dir_all(folder_of(&link)).unwrap();
+            std::os::unix::fs::symlink(elsewhere.path(), &link).unwrap();
+            std::fs::write(out.join(CONFIG_FILE), "").unwrap();
+            make(out, Existing::Overwrite).unwrap();
+            assert!(link.is_symlink() && count() == before, "{}: {before:?}, now {:?}", link.display(), count());
+            assert!(!out.join(CONFIG_FILE).exists(), "the run's own files go");
+        }
     }
 
     #[test]

@@ -300,7 +300,11 @@ impl Trainer {
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
         self.memory.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.ahead.note_rows_of(view, outcome.rows);
-        note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply)?;
+        let sound = note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply);
+        // A step that was taken counts, also as the last one: rows of its view belong to the step after it.
+        if sound.is_err() && outcome.skipped.is_some() {
+            return sound.map(|()| outcome);
+        }
         self.idle.note(&outcome, self.state.step, self.scene.rows(), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
@@ -311,7 +315,7 @@ impl Trainer {
         self.end_step_of_photo(view, &outcome, &target, dataset);
         self.state.step += 1;
         self.state.train_seconds += started.elapsed().as_secs_f64();
-        Ok(outcome)
+        sound.map(|()| outcome)
     }
 
     /// Attempts a step on a view.

@@ -3,7 +3,8 @@
 //! lists have no room, or whose gate closes as for a loss that is not finite; `GSSCALE_STEPS_IN_FLIGHT` limits the steps in flight.
 //!
 //! Invariants: 1. nothing here changes a number of the result: a run is stopped or goes on, and no fault and no number of steps in flight
-//! changes a bit; 2. a run that stops here keeps its last commit and writes its last good step.
+//! changes a bit; 2. a run that stops here keeps its last commit and writes the last step that it took, which
+//! is the unsound one unless that was skipped.
 
 use super::train_step::{Skipped, StepOutcome};
 use crate::base::error::InputError;

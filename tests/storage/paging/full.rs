@@ -1,5 +1,5 @@
-//! Commits on a full drive: a transaction that found no space may be durable all the same, and the drive may still be
-//! full when the map is reopened. Neither case loses a page, and no deleted page comes back.
+//! Commits on a full drive: a transaction is durable although its witness found no space, and the drive may still be
+//! full when the map is reopened. Neither case loses a page, and no deleted page comes back. A sync never counts as a lack of space.
 
 use super::beside::{COMMITS, opens_with, paged_store};
 use super::run_in_memory;
@@ -9,7 +9,7 @@ use crate::support::faulty_engine::Faults;
 use crate::support::guarded::{Change, GuardedFolder};
 use gsscale::base::ids::PageId;
 use gsscale::page::format::codec::Codec;
-use gsscale::page::map::commit::{CommitError, Commits, MAP_NAME};
+use gsscale::page::map::commit::{CommitError, Commits, MAP_NAME, WITNESS_NAME};
 use gsscale::page::map::opening::Opened;
 use gsscale::paging::pager::Pager;
 use std::io::{self, ErrorKind};
@@ -17,34 +17,36 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
-/// Decides when the page map finds no space.
+/// Decides when the page map and its witness find no space.
 #[derive(Debug, Default)]
 struct Shortage {
     syncs: AtomicU64,
-    /// Number of the map's sync that reports no space after all earlier data reached the drive.
-    at_sync: Mutex<Option<u64>>,
-    /// Every later call that needs space fails.
+    /// Number of the sync after which there is no space.
+    after_sync: Mutex<Option<u64>>,
+    /// Every later call that needs space fails, not only the next one.
     lasts: AtomicBool,
-    began: AtomicBool,
+    is_full: AtomicBool,
 }
 
 impl Shortage {
     fn begin_after(&self, syncs: u64, lasts: bool) {
-        *self.at_sync.lock().unwrap() = Some(self.syncs.load(Ordering::Relaxed) + syncs);
+        *self.after_sync.lock().unwrap() = Some(self.syncs.load(Ordering::Relaxed) + syncs);
         self.lasts.store(lasts, Ordering::Relaxed);
-        self.began.store(false, Ordering::Relaxed);
     }
 
     fn end(&self) {
-        *self.at_sync.lock().unwrap() = None;
-        self.began.store(false, Ordering::Relaxed);
+        *self.after_sync.lock().unwrap() = None;
+        self.is_full.store(false, Ordering::Relaxed);
     }
 
     fn check(&self, change: Change) -> io::Result<()> {
-        let number = if change == Change::Synced { Some(self.syncs.fetch_add(1, Ordering::Relaxed)) } else { None };
-        let begins = number.is_some() && *self.at_sync.lock().unwrap() == number;
-        let began = self.began.fetch_or(begins, Ordering::Relaxed);
-        match begins || (change != Change::Synced && began && self.lasts.load(Ordering::Relaxed)) {
+        if change == Change::Synced {
+            let number = self.syncs.fetch_add(1, Ordering::Relaxed);
+            let begins = *self.after_sync.lock().unwrap() == Some(number);
+            self.is_full.fetch_or(begins, Ordering::Relaxed);
+        }
+        let needs_space = matches!(change, Change::SetLen | Change::WriteAt(_));
+        match needs_space && self.is_full.fetch_and(self.lasts.load(Ordering::Relaxed), Ordering::Relaxed) {
             true => Err(ErrorKind::StorageFull.into()),
             false => Ok(()),
         }
@@ -55,7 +57,7 @@ impl Shortage {
 fn begun(at: &Path, seed: u64, shortage: &Arc<Shortage>) -> (Run, Commits, Model) {
     let frames = run_in_memory(seed).1 + 5;
     let shortage = Arc::clone(shortage);
-    let folder = GuardedFolder::new(at, MAP_NAME, Arc::new(move |change| shortage.check(change)));
+    let folder = GuardedFolder::new(at, &[MAP_NAME, WITNESS_NAME], Arc::new(move |change| shortage.check(change)));
     let opened = Opened::create(Box::new(folder), COMMITS).unwrap();
     let pager = Pager::new(config(frames), paged_store(&opened, at, Codec::Raw, &Faults::new()));
     let mut commits = opened.commits;
@@ -81,8 +83,7 @@ struct Left {
     short_lived: usize,
 }
 
-/// A commit that finds no space at its sync number `nth`, then steps, then a commit; `None` if the commit has fewer
-/// syncs.
+/// A commit that finds no space after its sync number `nth`, then steps, then a commit; `None` if nothing follows that sync.
 fn full_once(seed: u64, nth: u64, beside: bool) -> Option<Left> {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
@@ -173,5 +174,32 @@ fn a_drive_that_stays_full_costs_commits_and_not_the_run() {
         run.pager.commit(&mut commits, b"state", b"", None).unwrap().unwrap();
         drop(commits);
         opens_with(at, &run.model);
+    }
+}
+
+/// After a failed sync the system takes lost bytes for written, so a commit that went on after one could acknowledge what never reached the
+/// drive.
+#[test]
+fn a_sync_without_space_ends_all_commits() {
+    for name in [&[MAP_NAME], &[WITNESS_NAME]] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = folder.path();
+        let fails = Arc::new(AtomicBool::new(false));
+        let fails_now = Arc::clone(&fails);
+        let guard = move |change: Change| match change == Change::Sync && fails_now.load(Ordering::Relaxed) {
+            true => Err(ErrorKind::StorageFull.into()),
+            false => Ok(()),
+        };
+        let opened = Opened::create(Box::new(GuardedFolder::new(at, name, Arc::new(guard))), COMMITS).unwrap();
+        let pager = Pager::new(config(1000), paged_store(&opened, at, Codec::Raw, &Faults::new()));
+        let mut commits = opened.commits;
+        let mut run = Run::new(pager, 1, PAGES, STEPS).unwrap();
+        run.pager.flush().unwrap();
+        fails.store(true, Ordering::Relaxed);
+        let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+        assert!(!error.is_out_of_space() && !error.to_string().contains("free space"), "{name:?}: {error}");
+        fails.store(false, Ordering::Relaxed);
+        let error = run.pager.commit(&mut commits, b"state", b"", None).unwrap_err();
+        assert!(matches!(error, CommitError::Poisoned(_)), "{name:?}: {error}");
     }
 }

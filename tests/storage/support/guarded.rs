@@ -49,20 +49,20 @@ impl StorageBackend for Guarded {
     }
 }
 
-/// A folder that guards the file `name`.
+/// A folder that guards the files `names`.
 pub struct GuardedFolder {
     folder: DriveFolder,
-    name: &'static str,
+    names: &'static [&'static str],
     guard: Guard,
 }
 
 impl GuardedFolder {
-    pub fn new(at: &Path, name: &'static str, guard: Guard) -> GuardedFolder {
-        GuardedFolder { folder: DriveFolder::new(at), name, guard }
+    pub fn new(at: &Path, names: &'static [&'static str], guard: Guard) -> GuardedFolder {
+        GuardedFolder { folder: DriveFolder::new(at), names, guard }
     }
 
     fn guarded(&self, name: &str, file: Arc<dyn StorageBackend>) -> Arc<dyn StorageBackend> {
-        if name == self.name { Arc::new(Guarded(file, Arc::clone(&self.guard))) } else { file }
+        if self.names.contains(&name) { Arc::new(Guarded(file, Arc::clone(&self.guard))) } else { file }
     }
 }
 
