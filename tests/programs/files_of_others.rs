@@ -1,6 +1,6 @@
 //! No command replaces or removes files of the user: photos, poses, models, results of another kind.
 
-use crate::support::workdir::Workdir;
+use crate::support::workdir::{BENCH, CKPT, EVAL, Workdir};
 
 /// A folder of photos and poses may have the name and the file names of the city of a demo.
 #[test]
@@ -14,4 +14,42 @@ fn a_demo_takes_a_scene_for_its_own_only_by_the_mark() {
     let words = ["mine/scene/sparse", ".gsscale-city", "nothing was overwritten"];
     work.refuses("--demo --out mine --steps 2 --device cpu --overwrite", &words);
     assert!(work.files("mine") == before);
+}
+
+#[test]
+fn an_output_replaces_only_what_its_flag_writes() {
+    let work = Workdir::city(4, 48, 32, 100);
+    work.run("run", "--steps 2 --test-every 2 --keep-checkpoint");
+    std::fs::create_dir(work.path("pictures")).unwrap();
+    work.write("pictures/a.PNG", "a picture");
+    std::fs::create_dir(work.path("levels")).unwrap();
+    work.write("levels/lod-meta.json", "{}");
+    let header =
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n";
+    work.write("scan.ply", format!("{header}1 2 3\n"));
+    let before = work.files("");
+    for (program, flags, words) in [
+        (EVAL, "run --renders scene/images", ["among the photos", "scene/images"]),
+        (EVAL, "run --renders scene/images/new", ["among the photos", "scene/images"]),
+        (EVAL, "run --renders pictures", ["no evaluation wrote", "a.PNG"]),
+        (EVAL, "run --json run/point_cloud.ply", ["--json would replace", "run/point_cloud.ply"]),
+        (EVAL, "run --json scene/sparse/0/cameras.bin", ["--json would replace", "cameras.bin"]),
+        (EVAL, "run --json run/summary.json", ["--json would replace", "summary.json"]),
+        (EVAL, "levels/lod-meta.json scene --page scan.ply", ["--page would replace", "scan.ply"]),
+        (BENCH, "compare run run --out run/config.toml", ["--out would replace", "config.toml"]),
+        (CKPT, "export run --out scan.ply", ["--out would replace", "scan.ply"]),
+    ] {
+        work.refuses_with(program, flags, &words);
+        assert!(work.files("") == before, "{flags}");
+    }
+    // What the same flag wrote before is replaced.
+    for _ in 0..2 {
+        work.succeeds(EVAL, "run --json figures.json --renders renders");
+        work.succeeds(BENCH, "compare run run --out page.html");
+        work.succeeds(CKPT, "export run --out exported.ply");
+    }
+    // An evaluation that was stopped left pictures, but only an empty list of them.
+    work.write("renders/views.json", "[]");
+    work.succeeds(EVAL, "run --renders renders");
+    assert_eq!(work.json("renders/views.json").as_array().map(Vec::len), Some(2));
 }
