@@ -1,6 +1,7 @@
 //! No command replaces or removes files of the user: photos, poses, models, results of another kind.
 
-use crate::support::workdir::{BENCH, CKPT, EVAL, Workdir};
+use crate::support::scenes::stderr;
+use crate::support::workdir::{BENCH, CKPT, EVAL, Workdir, says};
 
 /// A folder of photos and poses may have the name and the file names of the city of a demo.
 #[test]
@@ -11,7 +12,7 @@ fn a_demo_takes_a_scene_for_its_own_only_by_the_mark() {
     std::fs::remove_file(work.path("mine/scene/.gsscale-city")).unwrap();
     let before = work.files("mine");
     work.refuses("--demo --out mine --steps 2 --device cpu", &["mine", "exists already"]);
-    let words = ["mine/scene/sparse", ".gsscale-city", "nothing was overwritten"];
+    let words = ["sparse", ".gsscale-city", "nothing was overwritten"];
     work.refuses("--demo --out mine --steps 2 --device cpu --overwrite", &words);
     assert!(work.files("mine") == before);
 }
@@ -52,4 +53,19 @@ fn an_output_replaces_only_what_its_flag_writes() {
     work.write("renders/views.json", "[]");
     work.succeeds(EVAL, "run --renders renders");
     assert_eq!(work.json("renders/views.json").as_array().map(Vec::len), Some(2));
+}
+
+/// As macOS leaves them on drives that others share.
+#[test]
+fn a_file_among_the_pictures_costs_no_report() {
+    let work = Workdir::city(4, 48, 32, 100);
+    std::fs::create_dir_all(work.path("run/renders/test")).unwrap();
+    work.write("run/renders/test/._view_0000.png", "no picture");
+    work.run("run", "--steps 2 --test-every 2 --log tensorboard --overwrite");
+    assert_eq!(work.text("run/report.html").matches("class=\"slider\"").count(), 2);
+    // Nor does a picture that was damaged.
+    work.write("run/renders/test/view_0000.png", "no picture");
+    let said = stderr(&work.succeeds(BENCH, "compare run run --out both.html"));
+    says(&said, &["warning: ", "view_0000.png"]);
+    assert_eq!(work.text("both.html").matches("class=\"slider\"").count(), 1);
 }
