@@ -69,3 +69,20 @@ fn a_file_among_the_pictures_costs_no_report() {
     says(&said, &["warning: ", "view_0000.png"]);
     assert_eq!(work.text("both.html").matches("class=\"slider\"").count(), 1);
 }
+
+#[test]
+fn results_do_not_go_among_the_photos() {
+    let work = Workdir::city(4, 48, 32, 100);
+    let before = work.files("scene");
+    for flags in [
+        "scene --out scene/images --overwrite",
+        "scene --out scene/images/x",
+        "scene --out scene/images/x --dry-run",
+        "scene/images --out scene/images/x",
+    ] {
+        work.refuses(&format!("{flags} --steps 2 --device cpu"), &["among the photos of the scene", "--out"]);
+        assert!(work.files("scene") == before && !work.exists("scene/images/x"), "{flags}");
+    }
+    // Beside them is room.
+    work.run("scene/runs/a", "--steps 2");
+}
