@@ -6,14 +6,14 @@ use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::InputError;
 use gsscale::base::say::exit_code;
-use gsscale::base::whole_file::{folder_of, write_whole};
+use gsscale::base::whole_file::{check_replaceable, folder_of, write_whole};
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::exchange::sog::is_tree;
 use gsscale::photos::exposure::FILE as APPEARANCE_FILE;
 use gsscale::render::lpips::InputRange;
 use gsscale::report::chart::{Chart, Mark};
-use gsscale::report::html::{Cell, Page};
+use gsscale::report::html::{Cell, Page, is_page};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
 use gsscale::train::run::model_of_run::ModelOfRun;
@@ -77,6 +77,8 @@ fn start(args: Args) -> Result<(), TrainError> {
         let remedy = "give the lod-meta.json of a folder of SOGs (--export sog), or leave --page out";
         return Err(InputError::new("--page", format!("{} has no levels of detail", ply.display()), remedy).into());
     }
+    args.json.as_deref().map_or(Ok(()), |file| check_replaceable("--json", file, EvalReport::is_in))?;
+    args.page.as_deref().map_or(Ok(()), |file| check_replaceable("--page", file, is_page))?;
     let values = run_config.as_deref().map(|config| folder_of(config).join(APPEARANCE_FILE));
     let file = args.config.as_deref().or(run_config.as_deref());
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;

@@ -11,7 +11,7 @@ use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
 use gsscale::dataset::read::{MORE_OVERLAP, lacks_poses};
-use gsscale::dataset::synthetic::{CityOptions, write_city};
+use gsscale::dataset::synthetic::{CityOptions, is_generated, write_city};
 use gsscale::poses::{PoseSearch, PosesRequest};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE, SETTINGS_FILE};
@@ -231,7 +231,8 @@ fn demo_config(keys: &TrainOverrides) -> InputResult<TrainConfig> {
 /// Refuses an output folder of a demo that holds more than the city of an earlier demo.
 fn check_demo_out(out: &Path, overwrite: bool) -> InputResult<()> {
     // A demo that was stopped before its first step left only its city.
-    let is_foreign = |entry: std::fs::DirEntry| entry.file_name() != "scene" && !is_trace(&entry.file_name());
+    let is_city = |entry: &std::fs::DirEntry| entry.file_name() == "scene" && is_generated(&entry.path());
+    let is_foreign = |entry: std::fs::DirEntry| !is_city(&entry) && !is_trace(&entry.file_name());
     let is_taken = std::fs::read_dir(out).is_ok_and(|entries| entries.flatten().any(is_foreign));
     if !overwrite && (is_taken || out.is_file()) {
         return Err(InputError::new(out, "exists already", remedy_of_existing(out)));

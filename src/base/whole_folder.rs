@@ -113,7 +113,7 @@ pub fn check_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
         Ok(None) => Ok(()),
         Ok(Some(other)) => {
             let problem =
-                format!("this folder would be replaced, but it holds {}, which no export wrote", other.display());
+                format!("this folder would be replaced, but it holds {}, which gsscale did not write", other.display());
             Err(InputError::new(folder, problem, "name a new folder, or move the file away"))
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(()),

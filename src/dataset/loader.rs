@@ -107,6 +107,8 @@ pub struct Dataset {
     pub warnings: Vec<String>,
     /// Folder that the views' names are relative to.
     pub image_folder: PathBuf,
+    /// Folder of the scene.
+    pub root: PathBuf,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -131,6 +133,15 @@ impl Dataset {
     /// The cameras of the training views, in their order.
     pub fn train_cameras(&self) -> Vec<Camera> {
         self.train_views().into_iter().map(|view| self.views[view].camera).collect()
+    }
+
+    /// The folder of photos that `path`, which need not exist, is or lies in. Folders inside of a scene whose photos lie around them, or
+    /// beside them, are apart from the photos.
+    pub fn photo_folder_around(&self, path: &Path) -> Option<PathBuf> {
+        let (path, root) = (resolved(path), resolved(&self.root));
+        let folders: BTreeSet<&Path> = self.views.iter().filter_map(|view| view.photo.image_path.parent()).collect();
+        let mut folders = folders.into_iter().chain([self.image_folder.as_path()]).map(resolved);
+        folders.find(|folder| path == *folder || path.starts_with(folder) && !root.starts_with(folder))
     }
 
     fn views_of(&self, split: Split) -> Vec<usize> {
@@ -230,7 +241,16 @@ fn load_views(
     }
     let scene_scale = (scene_scale / frame.scale) as f32;
     let (points, colors) = (Vec::new(), Vec::new());
-    Ok((Dataset { views, points, colors, frame, scene_scale, warnings, image_folder }, extent))
+    let root = root.to_path_buf();
+    Ok((Dataset { views, points, colors, frame, scene_scale, warnings, image_folder, root }, extent))
+}
+
+/// The path without links, as far as it exists.
+fn resolved(path: &Path) -> PathBuf {
+    let path = if path.as_os_str().is_empty() { Path::new(".") } else { path };
+    let whole = std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf());
+    let of = |above: &Path| Some(above.canonicalize().ok()?.join(whole.strip_prefix(above).ok()?));
+    whole.ancestors().find_map(of).unwrap_or_else(|| whole.clone())
 }
 
 /// The folder such that folder / name is the first view's path; that path's parent if there is none.
@@ -501,6 +521,7 @@ fn check_shape(view: &RawView, size: Size) -> InputResult<()> {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
 
@@ -514,5 +535,30 @@ mod tests {
         assert_eq!(with(1.0, Some(1600)), (1600, 1200));
         assert_eq!(with(4.0, Some(1600)), (1152, 864));
         assert_eq!(with(2.0, Some(1000)), (1000, 750));
+    }
+
+    #[test]
+    fn folders_beside_the_photos_are_apart_from_them() {
+        let folder = tempfile::tempdir().unwrap();
+        let (root, images) = (folder.path().to_path_buf(), folder.path().join("images"));
+        std::fs::create_dir(&images).unwrap();
+        let is_among = |image_folder: &Path, path: &str| {
+            let dataset = Dataset {
+                views: Vec::new(),
+                points: Vec::new(),
+                colors: Vec::new(),
+                frame: Frame { origin: DVec3::ZERO, scale: 1.0 },
+                scene_scale: 1.0,
+                warnings: Vec::new(),
+                image_folder: image_folder.to_path_buf(),
+                root: root.clone(),
+            };
+            dataset.photo_folder_around(&root.join(path)).is_some()
+        };
+        let of = |image_folder: &Path| {
+            ["images", "images/a/b", "images2", "runs/a", ""].map(|path| is_among(image_folder, path))
+        };
+        assert_eq!(of(&images), [true, true, false, false, false]);
+        assert_eq!(of(&root), [false, false, false, false, true], "photos lie beside the model");
     }
 }

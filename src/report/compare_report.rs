@@ -6,9 +6,8 @@
 
 use super::chart::{Chart, Mark};
 use super::html::{Cell, Page, slider};
-use super::picture::view_pictures;
 use super::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PICTURES_FOLDER, SUMMARY_FILE};
-use super::run_report::{curve, read_json, read_metrics, read_text};
+use super::run_report::{curve, listed_pictures, read_json, read_metrics, read_text, readable_picture};
 use crate::base::error::InputResult;
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -95,7 +94,7 @@ fn photos(config: &Path) -> [Option<f64>; 2] {
     PHOTO_KEYS.map(|key| table.as_ref().and_then(|table| table.get(key)).and_then(number))
 }
 
-/// The page that compares the runs in `folders`. Errors: a folder holds no metrics, or a picture cannot be decoded.
+/// The page that compares the runs in `folders`. Errors: a folder holds no metrics.
 pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     let mut runs = Vec::new();
     for (folder, name) in folders.iter().zip(names(folders)) {
@@ -112,7 +111,7 @@ pub fn compare_report(folders: &[PathBuf]) -> InputResult<String> {
     for chart in charts(&runs) {
         page.wide_chart(&chart.svg(), caption);
     }
-    add_views(&mut page, &runs)?;
+    add_views(&mut page, &runs);
     Ok(page.finish())
 }
 
@@ -168,20 +167,15 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
 }
 
 /// Renders of the views that all runs have: each run against the first run.
-fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
-    let Some((first, others)) = runs.split_first().filter(|(_, others)| !others.is_empty()) else { return Ok(()) };
-    let pictures = |folder: &Path| -> BTreeSet<String> {
-        let entries = std::fs::read_dir(folder.join(PICTURES_FOLDER)).into_iter().flatten().flatten();
-        let names = entries.map(|e| e.file_name().to_string_lossy().into_owned());
-        names.filter(|name| name.ends_with(".png")).collect()
-    };
-    let mut common = pictures(&first.folder);
+fn add_views(page: &mut Page, runs: &[Compared]) {
+    let Some((first, others)) = runs.split_first().filter(|(_, others)| !others.is_empty()) else { return };
+    let mut common = listed_pictures(&first.folder.join(PICTURES_FOLDER));
     for run in others {
-        let own = pictures(&run.folder);
-        common.retain(|name| own.contains(name));
+        let own = listed_pictures(&run.folder.join(PICTURES_FOLDER));
+        common.retain(|name, _| own.contains_key(name));
     }
     if common.is_empty() {
-        return Ok(());
+        return;
     }
     page.heading("Held-out views of all runs");
     let shown = others.len().min(SLIDERS_MAX);
@@ -194,18 +188,17 @@ fn add_views(page: &mut Page, runs: &[Compared]) -> InputResult<()> {
             all - sliders
         ));
     }
-    let common: Vec<&String> = common.iter().collect();
+    let common: Vec<&String> = common.keys().collect();
     let mut sliders = Vec::new();
     for name in views.iter().map(|&view| common[view]) {
-        let left = view_pictures(&first.folder.join(PICTURES_FOLDER).join(name))?;
+        let Some(left) = readable_picture(&first.folder, name) else { continue };
         for run in runs.iter().map(|&run| &others[run]) {
-            let right = view_pictures(&run.folder.join(PICTURES_FOLDER).join(name))?;
+            let Some(right) = readable_picture(&run.folder, name) else { continue };
             let sides = [(first.name.as_str(), left.render.as_str()), (run.name.as_str(), right.render.as_str())];
             sliders.push(slider(name.trim_end_matches(".png"), "", sides, ("photo", &left.photo)));
         }
     }
     page.views(&sliders);
-    Ok(())
 }
 
 /// At most `max` of the numbers below `count`, evenly spaced.
@@ -248,6 +241,7 @@ fn add_table(page: &mut Page, runs: &[Compared]) {
 
 #[cfg(test)]
 mod tests {
+    use super::super::run_files::VIEWS_FILE;
     use super::*;
     use serde_json::json;
     use tempfile::TempDir;
@@ -266,6 +260,8 @@ mod tests {
             let picture = image::RgbImage::from_pixel(4, 2, image::Rgb([view as u8, 20, 30]));
             picture.save(folder.join(format!("renders/test/view{view:02}.png"))).unwrap();
         }
+        let list: Vec<Value> = (0..views).map(|view| json!({"picture": format!("view{view:02}.png")})).collect();
+        std::fs::write(folder.join(VIEWS_FILE), json!(list).to_string()).unwrap();
         folder
     }
 

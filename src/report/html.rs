@@ -3,7 +3,9 @@
 //! Invariants: 1. the page fetches nothing: styles, scripts and pictures are inside the file; 2. this module escapes
 //! every text, so callers pass plain text.
 
+use crate::base::text::head_of;
 use crate::base::units::format_bytes;
+use std::path::Path;
 
 const STYLE: &str = "\
 :root{color-scheme:light dark;--ink:#1d2228;--dim:#5d6773;--line:#dfe3e8;--paper:#fff;--back:#f5f6f8;--accent:#2463b4;--grid:#e5e5e5}
@@ -182,6 +184,11 @@ impl Page {
             self.body
         )
     }
+}
+
+/// Whether a file is an HTML page, as [`Page::finish`] makes one.
+pub fn is_page(file: &Path) -> bool {
+    head_of(file, 64).trim_start().to_ascii_lowercase().starts_with("<!doctype html>")
 }
 
 /// HTML of two pictures of a view, one over the other with a movable edge, a caption with the name and `figures` of the

@@ -6,7 +6,7 @@
 use super::chart::{Chart, Mark, short, smoothed};
 use super::html::{Cell, Page, slider};
 use super::page_map::{PageTile, page_map_legend, page_map_svg};
-use super::picture::view_pictures;
+use super::picture::{ViewPictures, view_pictures};
 use super::run_files::{
     CONFIG_FILE, DIAGNOSIS_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
 };
@@ -17,6 +17,7 @@ use crate::base::whole_file::write_whole;
 use crate::photos::parameter::Finding;
 use crate::photos::{KINDS, diagnosis};
 use serde_json::Value;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Most views: a file with more opens slowly.
@@ -27,7 +28,7 @@ const TEXT_BYTES_MAX: u64 = 256 << 20;
 const MIB: f64 = (1 << 20) as f64;
 
 /// The report of the run in `folder` as HTML. `progress(done, all)` is called after each of its pictures.
-/// Errors: the folder holds no metrics, or a picture cannot be decoded.
+/// Errors: the folder holds no metrics.
 pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<String> {
     let metrics = read_metrics(folder)?;
     let summary = read_json(&folder.join(SUMMARY_FILE)).unwrap_or(Value::Null);
@@ -38,7 +39,7 @@ pub fn run_report(folder: &Path, progress: &dyn Fn(usize, usize)) -> InputResult
     if let Some(text) = unfinished_text(folder, &summary) {
         page.paragraph(&text);
     }
-    add_views(&mut page, folder, progress)?;
+    add_views(&mut page, folder, progress);
     page.heading("Training");
     page.charts(&training_charts(&metrics));
     add_growth(&mut page, &summary);
@@ -312,38 +313,47 @@ fn add_page_map(page: &mut Page, path: &Path) {
     page.charts(&[(svg + &page_map_legend(&tiles), caption.to_string())]);
 }
 
-/// PSNR and SSIM of a view for its caption; empty where they are not known.
-fn figures_of(views: &Value, picture: &str) -> String {
-    let views = views.as_array().map_or(&[][..], Vec::as_slice);
-    let Some(view) = views.iter().find(|view| view["picture"] == picture) else { return String::new() };
+/// The pictures in a folder that the list of the evaluation names, with the figures of each. Systems leave files of their own beside them,
+/// which look like pictures.
+pub fn listed_pictures(folder: &Path) -> BTreeMap<String, Value> {
+    let list = folder.join(Path::new(VIEWS_FILE).file_name().unwrap_or_default());
+    let views = read_json(&list).unwrap_or(Value::Null);
+    let views = views.as_array().cloned().unwrap_or_default().into_iter();
+    let named = views.filter_map(|view| Some((view["picture"].as_str()?.to_string(), view)));
+    named.filter(|(name, _)| folder.join(name).is_file()).collect()
+}
+
+/// A picture of a run; `None`, with a warning, if it cannot be read: that must not cost the page.
+pub(super) fn readable_picture(run: &Path, name: &str) -> Option<ViewPictures> {
+    let picture = view_pictures(&run.join(PICTURES_FOLDER).join(name));
+    picture.map_err(|error| crate::tell!("warning: {error}")).ok()
+}
+
+/// PSNR and SSIM of a view for its caption.
+fn figures_of(view: &Value) -> String {
     let [psnr, ssim] = ["psnr", "ssim"].map(|name| view[name].as_f64());
     let psnr = psnr.map_or(String::from("all masked"), |psnr| format!("{psnr:.2} dB"));
     psnr + &ssim.map_or(String::new(), |ssim| format!(", SSIM {ssim:.3}"))
 }
 
-fn add_views(page: &mut Page, run: &Path, progress: &dyn Fn(usize, usize)) -> InputResult<()> {
-    let views = read_json(&run.join(VIEWS_FILE)).unwrap_or(Value::Null);
-    let Ok(entries) = std::fs::read_dir(run.join(PICTURES_FOLDER)) else { return Ok(()) };
-    let mut files: Vec<PathBuf> =
-        entries.flatten().map(|e| e.path()).filter(|p| p.extension().is_some_and(|e| e == "png")).collect();
-    if files.is_empty() {
-        return Ok(());
+fn add_views(page: &mut Page, run: &Path, progress: &dyn Fn(usize, usize)) {
+    let views = listed_pictures(&run.join(PICTURES_FOLDER));
+    if views.is_empty() {
+        return;
     }
-    files.sort();
     page.heading("Held-out views");
-    let stride = files.len().div_ceil(VIEWS_MAX);
+    let stride = views.len().div_ceil(VIEWS_MAX);
     if stride > 1 {
-        page.paragraph(&format!("One in {stride} of {} views; renders/test has all.", files.len()));
+        page.paragraph(&format!("One in {stride} of {} views; renders/test has all.", views.len()));
     }
     let mut sliders = Vec::new();
-    for file in files.iter().step_by(stride) {
-        let pictures = view_pictures(file)?;
-        let name = file.file_stem().unwrap_or_default().to_string_lossy();
-        let figures = figures_of(&views, &file.file_name().unwrap_or_default().to_string_lossy());
-        let sides = [("render", pictures.render.as_str()), ("photo", &pictures.photo)];
-        sliders.push(slider(&name, &figures, sides, ("difference", &pictures.difference)));
-        progress(sliders.len(), files.len().div_ceil(stride));
+    for (i, (file, view)) in views.iter().step_by(stride).enumerate() {
+        if let Some(pictures) = readable_picture(run, file) {
+            let sides = [("render", pictures.render.as_str()), ("photo", &pictures.photo)];
+            let name = file.trim_end_matches(".png");
+            sliders.push(slider(name, &figures_of(view), sides, ("difference", &pictures.difference)));
+        }
+        progress(i + 1, views.len().div_ceil(stride));
     }
     page.views(&sliders);
-    Ok(())
 }

@@ -304,7 +304,7 @@ fn a_folder_with_something_in_it_is_refused_unless_told_otherwise() {
     write(folder.path(), &CityOptions { overwrite: true, ..small() });
     write(folder.path(), &CityOptions { overwrite: true, views: 4, ..small() });
     let found = files(folder.path());
-    assert_eq!(found.len(), 1 + 4 + 3, "{:?}", found.keys());
+    assert_eq!(found.len(), 1 + 1 + 4 + 3, "the notes, the mark, photos and model: {:?}", found.keys());
     assert_eq!(std::fs::read_to_string(notes).unwrap(), "mine", "overwriting touched a foreign file");
     // Real photos are worth more than a flag.
     std::fs::write(folder.path().join("images/DSC_0001.jpg"), "a photo").unwrap();
@@ -312,12 +312,30 @@ fn a_folder_with_something_in_it_is_refused_unless_told_otherwise() {
     let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
     assert!(error.to_string().contains("DSC_0001.jpg"), "{error}");
     assert!(files(folder.path()) == before);
-    // So is a model that no generated photo lies beside.
-    std::fs::remove_dir_all(folder.path().join("images")).unwrap();
+    std::fs::remove_file(folder.path().join("images/DSC_0001.jpg")).unwrap();
+    // So is another reconstruction, beside the generated photos.
+    std::fs::write(folder.path().join("sparse/0/project.ini"), "").unwrap();
     let before = files(folder.path());
     let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
-    assert!(error.to_string().contains("model without photos"), "{error}");
+    assert!(error.to_string().contains("project.ini"), "{error}");
     assert!(files(folder.path()) == before);
+}
+
+/// Photos and poses of a user may have the very names of generated ones.
+#[test]
+fn a_scene_that_is_not_marked_as_generated_is_never_removed() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &CityOptions { views: 2, ..small() });
+    std::fs::remove_file(folder.path().join(".gsscale-city")).unwrap();
+    // Of a whole scene, then of the photos that are left.
+    for part in ["sparse", "images"] {
+        let before = files(folder.path());
+        let error = write_city(folder.path(), &CityOptions { overwrite: true, ..small() }, &|_, _| {}).unwrap_err();
+        let said = error.to_string();
+        assert!(said.contains(part) && said.contains(".gsscale-city"), "{said}");
+        assert!(files(folder.path()) == before);
+        std::fs::remove_dir_all(folder.path().join(part)).unwrap();
+    }
 }
 
 #[test]

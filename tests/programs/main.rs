@@ -21,6 +21,7 @@ mod dry_runs;
 mod examples;
 mod exports;
 mod extremes;
+mod files_of_others;
 mod find_poses;
 mod first_hour;
 mod forecast;

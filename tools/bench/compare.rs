@@ -1,8 +1,9 @@
 //! `gsscale-bench compare`: compares finished runs on one page.
 
 use clap::Parser;
-use gsscale::base::whole_file::write_whole;
+use gsscale::base::whole_file::{check_replaceable, write_whole};
 use gsscale::report::compare_report::compare_report;
+use gsscale::report::html::is_page;
 use gsscale::train::error::TrainError;
 use std::path::PathBuf;
 
@@ -26,8 +27,9 @@ pub struct Args {
     out: PathBuf,
 }
 
-/// Writes the page. Errors: a folder holds no run, or the page cannot be written.
+/// Writes the page. Errors: a folder holds no run, or the page cannot be written, or would replace something else.
 pub fn start(args: &Args) -> Result<(), TrainError> {
+    check_replaceable("--out", &args.out, is_page)?;
     write_whole(&args.out, compare_report(&args.runs)?.as_bytes())?;
     gsscale::tell!("{}", args.out.display());
     Ok(())

@@ -6,7 +6,8 @@
 //!
 //! Invariants: 1. the same options give the same bytes for any number of threads and on every platform: all random draws
 //! are keyed, all arithmetic is + - * / sqrt and `libm`; 2. `sparse/` appears last, complete, in one rename: the folder
-//! of an interrupted run cannot be read as a scene.
+//! of an interrupted run cannot be read as a scene; 3. photos and models are removed only beside the mark, which is written
+//! before them where there were none, and only files with the names that are written here.
 
 mod build;
 mod flight;
@@ -20,6 +21,7 @@ mod world;
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
+use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::dataset::colmap_write::{ColmapModel, ModelImage, make_folder, write_model};
 use build::build_city;
 use flight::CityFlight;
@@ -30,6 +32,9 @@ use shade::Scene;
 use std::path::{Path, PathBuf};
 
 const JPEG_QUALITY: u8 = 95;
+
+/// File that shows that photos and model of a folder are generated: others may have the same names.
+const MARK: &str = ".gsscale-city";
 
 #[derive(Debug, Clone, PartialEq)]
 pub struct CityOptions {
@@ -134,7 +139,8 @@ fn check(options: &CityOptions) -> InputResult<()> {
 }
 
 /// Generates a city and writes it to `folder` as a COLMAP scene. `progress(done, views)` is called after each photo.
-/// Errors: an option is out of range, the folder is not empty and `overwrite` is off, or a file cannot be written.
+/// Errors: an option is out of range, the folder is not empty and `overwrite` is off, it holds photos or a model of others, or a file
+/// cannot be written.
 pub fn write_city(
     folder: &Path,
     options: &CityOptions,
@@ -176,54 +182,47 @@ fn photo_name(k: usize, views: u32) -> String {
     format!("view_{k:0digits$}.jpg")
 }
 
-/// Creates the folders. With `overwrite`, removes the generated scene in them, but never other photos or models.
+/// Whether the folder holds a generated scene, perhaps an unfinished one.
+pub fn is_generated(folder: &Path) -> bool {
+    folder.join(MARK).is_file()
+}
+
+/// Creates the folders, and marks them. With `overwrite`, removes the generated scene in them, but never other photos or models.
 fn prepare(folder: &Path, overwrite: bool) -> InputResult<()> {
     make_folder(folder)?;
-    let images = folder.join("images");
-    if !list(folder)?.is_empty() {
-        if !overwrite {
-            return Err(InputError::new(
-                folder,
-                "the folder is not empty",
-                "choose another folder, or --overwrite to replace the generated scene in it",
-            ));
-        }
-        let photos = if images.is_dir() { list(&images)? } else { Vec::new() };
-        if let Some(foreign) = photos.iter().find(|name| !is_photo_name(name)) {
-            return Err(InputError::new(
-                &images,
-                format!("'{foreign}' is not a photo of a generated city; nothing was overwritten"),
-                "choose another folder",
-            ));
-        }
-        // A generated model always has photos beside it: photos are written before it, and removed after it.
-        let model = folder.join("sparse");
-        if photos.is_empty() && model.symlink_metadata().is_ok() {
-            let problem = "this is a model without photos of a generated city; nothing was overwritten";
-            return Err(InputError::new(&model, problem, "choose another folder"));
-        }
-        // The model is removed first: without it the folder cannot be read as a scene.
-        for name in ["sparse", "sparse.partial", "images"] {
-            let path = folder.join(name);
-            if path.symlink_metadata().is_ok_and(|m| m.is_dir()) {
-                std::fs::remove_dir_all(&path).map_err(|e| InputError::io(&path, "removing the old scene", &e))?;
-            }
-        }
+    let listed = std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "listing the folder", &e))?;
+    if !overwrite && listed.count() > 0 {
+        return Err(InputError::new(
+            folder,
+            "the folder is not empty",
+            "choose another folder, or --overwrite to replace the generated scene in it",
+        ));
     }
-    make_folder(&images)
+    // The model is removed first: without it the folder cannot be read as a scene.
+    let parts = ["sparse", "sparse.partial", "images"].map(|name| folder.join(name));
+    if is_generated(folder) {
+        parts.iter().try_for_each(|part| check_ours(part, is_generated_file))?;
+        parts.iter().try_for_each(|part| remove_ours(part, is_generated_file))?;
+    } else if let Some(other) = parts.iter().find(|part| part.symlink_metadata().is_ok()) {
+        let problem = format!("no {MARK} beside it says that it is generated; nothing was overwritten");
+        return Err(InputError::new(other, problem, "choose another folder, or move it away"));
+    } else {
+        write_whole(
+            &folder.join(MARK),
+            b"gsscale made the photos and the model in this folder, and may replace them.\n",
+        )?;
+    }
+    make_folder(&folder.join("images"))
 }
 
-fn list(folder: &Path) -> InputResult<Vec<String>> {
-    let names = std::fs::read_dir(folder)
-        .and_then(|entries| entries.map(|e| Ok(e?.file_name().to_string_lossy().into_owned())).collect());
-    names.map_err(|e: std::io::Error| InputError::io(folder, "listing the folder", &e))
-}
-
-/// Whether [`photo_name`] makes this name, or an interrupted run left it.
-fn is_photo_name(name: &str) -> bool {
-    let name = name.strip_prefix('.').and_then(|name| name.strip_suffix(".part")).unwrap_or(name);
+/// Whether [`write_city`] makes a file of this path inside of one of its folders, or an interrupted run left it.
+fn is_generated_file(inside: &Path) -> bool {
+    let name = inside.file_name().unwrap_or_default().to_string_lossy();
+    let name = name.strip_prefix('.').and_then(|name| name.strip_suffix(".part")).unwrap_or(&name);
     let number = name.strip_prefix("view_").and_then(|n| n.strip_suffix(".jpg"));
-    number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()))
+    let is_photo = number.is_some_and(|n| n.len() >= 4 && n.bytes().all(|b| b.is_ascii_digit()));
+    let is_of_model = ["cameras.bin", "images.bin", "points3D.bin"].contains(&name);
+    is_photo && inside.components().count() == 1 || is_of_model && inside.parent() == Some(Path::new("0"))
 }
 
 /// Takes and writes all photos; returns the number of rays.

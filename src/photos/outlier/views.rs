@@ -569,6 +569,7 @@ mod tests {
             scene_scale: 1.0,
             warnings: Vec::new(),
             image_folder: PathBuf::new(),
+            root: PathBuf::new(),
         };
         let (view, photo, dataset) = (step as usize % 10, &photo, &dataset);
         let [is_skipped, is_left_out] = [false; 2];

@@ -15,6 +15,7 @@ use crate::paging::pager::Pager;
 use crate::paging::stats::PagerStats;
 use crate::photos::exposure::AppearanceMode;
 use crate::render::color_correct::ColorCorrect;
+use crate::report::run_report::listed_pictures;
 use crate::train::step::device_slots::SlotTraffic;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -388,10 +389,9 @@ impl MetricsLog {
 
 /// Writes up to [`PICTURES_MAX`] of the pictures in `folder`, spread over their names.
 fn write_pictures(events: &mut EventFile, step: u32, folder: &Path) -> InputResult<()> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
-    let mut files: Vec<PathBuf> = entries.filter(|path| path.extension().is_some_and(|e| e == "png")).collect();
-    files.sort();
-    for file in files.iter().step_by(files.len().div_ceil(PICTURES_MAX).max(1)) {
+    let names = listed_pictures(folder);
+    for name in names.keys().step_by(names.len().div_ceil(PICTURES_MAX).max(1)) {
+        let file = &folder.join(name);
         let header = read_header(file)?;
         let png = std::fs::read(file).map_err(|e| InputError::io(file, "reading the picture", &e))?;
         let tag = format!("held-out/{}", file.file_stem().unwrap_or_default().to_string_lossy());

@@ -50,6 +50,7 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let mark = Beginning::mark(request)?;
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
+    out_folder::check_apart_from_photos(&request.out, &start.dataset)?;
     let (request, start, diagnosis) = adapt_to_photos(adapt_schedule(request, &start), start, host_mem)?;
     let (request, config) = (&request, &request.config);
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {

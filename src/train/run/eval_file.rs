@@ -4,6 +4,8 @@
 
 use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::read_text;
+use crate::base::whole_file::write_whole;
 use crate::config::file::TrainConfig;
 use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
@@ -19,6 +21,7 @@ use crate::photos::{PhotoOptions, PhotoParameters, first_parameters};
 use crate::render::lpips::weights::read_lpips;
 use crate::render::lpips::{InputRange, Lpips};
 use crate::render::{RenderOptions, Renderer};
+use crate::report::run_files::VIEWS_FILE;
 use crate::scene::columns::Columns;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{PositionSample, file_warnings};
@@ -28,6 +31,7 @@ use crate::train::memory::{check_evaluation_fits, check_photos_fit, host_budget}
 use crate::train::state::eval::{EvalRequest, evaluate};
 use crate::train::step::pages::{PagedScene, WorkingSet};
 use crate::train::step::view::SceneNow;
+use serde_json::Value;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
@@ -47,6 +51,23 @@ pub struct EvalReport {
     /// Each level of detail, the finest first; none of a PLY.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub levels: Vec<LevelReport>,
+}
+
+/// Size limit of a file of figures, bytes.
+const FIGURES_BYTES_MAX: u64 = 64 << 20;
+
+/// The JSON in a file of figures; null of every other file.
+fn figures_in(file: &Path) -> Value {
+    let text = read_text(file, FIGURES_BYTES_MAX, "").unwrap_or_default();
+    serde_json::from_str(&text).unwrap_or_default()
+}
+
+impl EvalReport {
+    /// Whether a file holds such a report, perhaps that of another version.
+    pub fn is_in(file: &Path) -> bool {
+        let report = figures_in(file);
+        report["ply"].is_string() && report["scene"].is_string() && report["gaussians"].is_u64()
+    }
 }
 
 /// The figures of some Gaussians.
@@ -185,6 +206,26 @@ impl<'a> Evaluator<'a> {
         Ok(())
     }
 
+    /// Takes a folder for pictures. Its list of views, empty at first, shows a later evaluation that its pictures may be replaced.
+    /// Errors: photos of the scene lie in the folder or around it, or it holds pictures that no evaluation wrote.
+    fn claim(&self, folder: &Path) -> InputResult<()> {
+        let refused = |problem: String| Err(InputError::new(folder, problem, "name a new folder with --renders"));
+        if let Some(photos) = self.dataset.photo_folder_around(folder) {
+            return refused(format!("--renders would write among the photos of the scene, in {}", photos.display()));
+        }
+        let list = folder.join(Path::new(VIEWS_FILE).file_name().unwrap_or_default());
+        if figures_in(&list).as_array().is_some_and(|views| views.iter().all(|view| view["picture"].is_string())) {
+            return Ok(());
+        }
+        let is_png = |path: &Path| path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("png"));
+        let mut files = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+        if let Some(other) = files.find(|path| is_png(path) || *path == list) {
+            return refused(format!("--renders would write beside {}, which no evaluation wrote", other.display()));
+        }
+        std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder for pictures", &e))?;
+        write_whole(&list, b"[]")
+    }
+
     /// Evaluates every level of a folder of SOGs, the finest first. Pictures go to a folder for each level.
     fn evaluate_levels(
         &mut self,
@@ -243,6 +284,7 @@ impl<'a> Evaluator<'a> {
         pictures: Option<&Path>,
     ) -> Result<EvalFigures, TrainError> {
         let columns = self.placed(file, columns, meta)?;
+        pictures.map_or(Ok(()), |folder| self.claim(folder))?;
         let (mut pages, run) = self.pages(&columns)?;
         let gaussians = columns.rows() as u64;
         drop(columns);

@@ -16,6 +16,7 @@ use crate::base::identity::RunId;
 use crate::base::whole_file::{folder_of, part_path, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
+use crate::dataset::loader::Dataset;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::{SpillDir, is_same_file};
@@ -110,6 +111,14 @@ pub fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError
 pub fn check_apart(out: &Path, scene: &Path) -> InputResult<()> {
     let is_one = out.canonicalize().is_ok_and(|out| scene.canonicalize().is_ok_and(|scene| out == scene));
     if is_one { Err(InputError::new(out, "is the scene itself", "name another folder with --out")) } else { Ok(()) }
+}
+
+/// Refuses a folder of photos, and a folder in one, as that of the results. Only the dataset says where the photos are.
+pub(super) fn check_apart_from_photos(out: &Path, dataset: &Dataset) -> InputResult<()> {
+    dataset.photo_folder_around(out).map_or(Ok(()), |photos| {
+        let problem = format!("lies among the photos of the scene, in {}", photos.display());
+        Err(InputError::new(out, problem, "name another folder with --out"))
+    })
 }
 
 /// Identity of the run whose config lies in `out`.

@@ -13,11 +13,13 @@ use crate::base::machine::host_bytes_peak;
 use crate::base::math::exp32;
 use crate::base::text::read_text;
 use crate::base::units::format_bytes;
+use crate::base::whole_file::check_replaceable;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::ply::holds_gaussians;
 use crate::exchange::sink::LEVELS_MAX;
 use crate::optim::drift::STEP_BYTES;
 use crate::page::tool::reading::{Access, StoreReader};
@@ -90,6 +92,10 @@ pub struct Exported {
 /// be written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
     let format = ExportFormat::of_path(&request.out)?;
+    if format == ExportFormat::Ply {
+        // Points that somebody has scanned are PLY files, too.
+        check_replaceable("--out", &request.out, |file| holds_gaussians(file).unwrap_or(false))?;
+    }
     let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
