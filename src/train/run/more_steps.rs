@@ -52,7 +52,8 @@ pub(super) fn train_more_steps(
     let (scene, out) = (request.scene.clone(), request.out.clone());
     machine::set_up(&request.config)?;
     if !scene.exists() {
-        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
+        let remedy =
+            format!("if it was moved: gsscale-train --resume {} SCENE --steps N", crate::base::say::shell_word(&out));
         return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
     let kept = keep_result(&out, summary.steps)?;
