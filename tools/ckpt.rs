@@ -4,7 +4,7 @@
 use clap::{Parser, Subcommand};
 use gsscale::base::error::InputError;
 use gsscale::base::ids::PageId;
-use gsscale::base::say::aligned;
+use gsscale::base::say::{aligned, shell_word};
 use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_plain;
 use gsscale::config::values::ByteSize;
@@ -321,7 +321,7 @@ fn verify_text(verdict: &Verdict, args: &Verify) -> String {
         0 if verdict.deep => format!("intact: {what}"),
         0 => format!("intact according to all headers: {what}; --deep reads the pages"),
         n => {
-            let dir = args.dir.display();
+            let dir = shell_word(&args.dir);
             format!(
                 "{n} faults: {what}\n\
                  remedy: roll back to a generation without them (gsscale-ckpt rollback {dir} GEN), or recover the intact pages\n\
@@ -615,7 +615,7 @@ fn run_clone(args: &Clone) -> Result<ExitCode, TrainError> {
             done.generations.len(),
             done.versions,
             format_bytes(done.bytes_read),
-            done.to.display(),
+            shell_word(&done.to),
         )
     })
 }

@@ -19,7 +19,7 @@ use clap::builder::Resettable::Reset;
 use clap::{Arg, Command, CommandFactory, value_parser};
 use clap_complete::Shell;
 use gsscale::base::error::{InputError, InputResult};
-use gsscale::base::say::{exit_code, set_commands};
+use gsscale::base::say::{exit_code, set_commands, shell_word};
 use gsscale::config::command_line::{in_words_of_caller, with_help_of_keys};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -84,7 +84,7 @@ fn own_command(arguments: &[OsString]) -> InputResult<()> {
     };
     let is_for_train = |given: &&OsString| Path::new(given).exists() || given.to_string_lossy().starts_with("--");
     if let Some(given) = arguments.get(1).filter(|given| !is_own(given) && is_for_train(given)) {
-        let remedy = format!("to train: gsscale train {}", given.display());
+        let remedy = format!("to train: gsscale train {}", shell_word(given));
         return Err(InputError::new(given, "is not a command of gsscale", remedy));
     }
     match commands.clone().get_matches_from(arguments).subcommand() {

@@ -70,11 +70,15 @@ pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
 
 fn run(flags: &Flags) -> InputResult<()> {
     if !(1.0..=3600.0).contains(&flags.seconds) {
-        return Err(InputError::new("--seconds", "the value is out of range", "use 1 to 3600"));
+        return Err(InputError::new("--seconds", format!("{} is out of range", flags.seconds), "use 1 to 3600"));
     }
     // The file must be large enough to keep the drive busy with the largest transfers.
     if !((64 << 20)..=(1 << 40)).contains(&flags.file) {
-        return Err(InputError::new("--file", "the value is out of range", "use 64MiB to 1TiB"));
+        return Err(InputError::new(
+            "--file",
+            format!("{} is out of range", format_bytes(flags.file)),
+            "use 64MiB to 1TiB",
+        ));
     }
     warn_about(&flags.dir);
     let cases = cases();

@@ -218,16 +218,19 @@ fn load(args: &Args) -> InputResult<Scene> {
         let problem = "dense reads and writes every page at every step, which this tool does not plan";
         return Err(InputError::new("--optimizer", problem, "plan for deferred, which gives the same result"));
     }
-    if !(1.0..=1e6).contains(&args.growth) || args.step_seconds.is_some_and(|s| !(0.0..=1e6).contains(&s)) {
-        let problem = "--growth must be at least 1, --step-seconds at least 0";
-        return Err(InputError::new("--growth, --step-seconds", problem, "leave them out"));
+    for (flag, value, least) in
+        [("--growth", args.growth, 1.0), ("--step-seconds", args.step_seconds.unwrap_or(0.0), 0.0)]
+    {
+        if !(least..=1e6).contains(&value) {
+            return Err(InputError::new(flag, format!("{value} is out of range"), format!("use {least} to 1000000")));
+        }
     }
-    if [args.drive_read, args.drive_write].iter().flatten().any(|rate| rate.0 == 0) {
-        return Err(InputError::new(
-            "--drive-read, --drive-write",
-            "a rate of 0",
-            "give bytes per second, such as 3GB",
-        ));
+    for (flag, bytes) in
+        [("--drive-read", args.drive_read), ("--drive-write", args.drive_write), ("--endurance", Some(args.endurance))]
+    {
+        if bytes.is_some_and(|bytes| bytes.0 == 0) {
+            return Err(InputError::new(flag, "0 bytes", "give a size above 0, such as 3GB"));
+        }
     }
     let path = if is_run { scene_of_run(&run_config)? } else { args.scene.clone() };
     let drive_rate = drive_rates(args, &config)?;

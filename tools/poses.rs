@@ -2,7 +2,7 @@
 
 use clap::Parser;
 use gsscale::base::error::InputResult;
-use gsscale::base::say::exit_code;
+use gsscale::base::say::{exit_code, shell_word};
 use gsscale::config::command_line::parse_plain;
 use gsscale::poses::program::{FeatureOptions, ProgramPaths};
 use gsscale::poses::{PoseSearch, PosesRequest};
@@ -72,7 +72,7 @@ fn start(flags: &Flags) -> InputResult<()> {
     }
     let found = search.run_shown(flags.quiet)?;
     if !flags.quiet {
-        gsscale::tell!("next: gsscale-train {}", found.scene.display());
+        gsscale::tell!("next: gsscale-train {}", shell_word(&found.scene));
     }
     Ok(())
 }

@@ -3,8 +3,8 @@
 use clap::Parser;
 use gsscale::base::count::new_bar;
 use gsscale::base::error::InputResult;
-use gsscale::base::say::exit_code;
-use gsscale::base::units::format_bytes;
+use gsscale::base::say::{exit_code, shell_word};
+use gsscale::base::units::{counted, format_bytes};
 use gsscale::config::command_line::parse_plain;
 use gsscale::dataset::synthetic::{CityOptions, CitySummary, write_city};
 use std::ffi::OsString;
@@ -143,7 +143,13 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
         gsscale::say!("in {}x{} copies side by side", options.tiles[0], options.tiles[1]);
     }
     gsscale::say!("{}/", dir.display());
-    gsscale::say!("  images/    {} photos of {}x{}, {}", s.views, options.width, options.height, size("images"));
+    gsscale::say!(
+        "  images/    {} of {}x{}, {}",
+        counted(s.views.into(), "photo"),
+        options.width,
+        options.height,
+        size("images")
+    );
     let sparse = size("sparse/0");
     gsscale::say!(
         "  sparse/0/  1 camera, {} poses, {} points in {} observations, {sparse}",
@@ -152,7 +158,7 @@ fn report(flags: &Flags, options: &CityOptions, s: &CitySummary, seconds: f64) {
         s.observations
     );
     gsscale::say!("{seconds:.1} s, {rate:.1} million camera rays per second");
-    gsscale::say!("next: gsscale-train {} --out <run>", dir.display());
+    gsscale::say!("next: gsscale-train {} --out RUN", shell_word(dir));
 }
 
 fn folder_bytes(folder: &Path) -> u64 {

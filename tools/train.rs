@@ -5,8 +5,9 @@ use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::count::Count;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::{InputError, InputResult};
+use gsscale::base::say::shell_word;
 use gsscale::base::trace;
-use gsscale::base::units::{format_grouped, format_seconds};
+use gsscale::base::units::{counted, format_grouped, format_seconds};
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
@@ -173,10 +174,11 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
     let out = args.out.unwrap_or_else(|| {
         let (out, first) = default_out(args.scene.as_deref());
         if out != first && !args.quiet {
-            let first = first.display();
             gsscale::tell!(
-                "{first} is taken: results go to {}; to resume the run there: gsscale-train --resume {first}",
-                out.display()
+                "{} is taken: results go to {}; to resume the run there: gsscale-train --resume {}",
+                first.display(),
+                out.display(),
+                shell_word(&first)
             );
         }
         out
@@ -198,7 +200,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
             let found = search.run_shown(args.quiet)?;
             if 2 * found.registered < found.photos {
                 let problem = format!("only {} of {} photos have poses", found.registered, found.photos);
-                let remedy = format!("{MORE_OVERLAP}; to train with these: gsscale-train {}", found.scene.display());
+                let remedy = format!("{MORE_OVERLAP}; to train with these: gsscale-train {}", shell_word(&found.scene));
                 return Err(InputError::new(&photos, problem, remedy).into());
             }
             found.scene
@@ -286,16 +288,17 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
         let test = match &summary.test {
             Some(t) => {
                 let corrected = t.corrected_text();
-                format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {} held-out views", t.psnr, t.ssim, t.views)
+                let views = counted(t.views.into(), "held-out view");
+                format!("test PSNR {:.2} dB, SSIM {:.4}{corrected} on {views}", t.psnr, t.ssim)
             }
             None if summary.finished => String::from("not measured: there is no held-out photo that counts"),
             None => String::from("not evaluated"),
         };
         gsscale::tell!(
-            "{} {} steps, {} Gaussians, {} of training",
+            "{} {}, {}, {} of training",
             if summary.finished { "done:" } else { "stopped after" },
-            format_grouped(summary.steps.into()),
-            format_grouped(summary.gaussians),
+            counted(summary.steps.into(), "step"),
+            counted(summary.gaussians, "Gaussian"),
             format_seconds(summary.train_seconds),
         );
         let out = &outcome.out;
@@ -309,10 +312,10 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             gsscale::tell!("  start view  {} (for viewers)", out.join(SETTINGS_FILE).display());
         }
         gsscale::tell!("  report      {}", out.join(REPORT_FILE).display());
-        gsscale::tell!("  look        gsscale-view {}", out.display());
+        gsscale::tell!("  look        gsscale-view {}", shell_word(out));
         if summary.finished {
             let more = summary.steps.saturating_mul(2);
-            gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", out.display());
+            gsscale::tell!("  more steps  gsscale-train --resume {} --steps {more}", shell_word(out));
             if !outcome.keeps_checkpoint {
                 gsscale::tell!(
                     "              (a little worse than in one go; a run with --keep-checkpoint goes on exactly)"

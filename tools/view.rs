@@ -64,6 +64,5 @@ fn start(args: Args) -> Result<(), TrainError> {
     config.check()?;
     let on_port = |port| Live::begin(SocketAddr::from(([127, 0, 0, 1], port)));
     let live = args.serve.map_or_else(|| on_port(8080).or_else(|_| on_port(0)), Live::begin)?;
-    gsscale::tell!("live page: http://{}/", live.address());
     show(&ShowRequest { gaussians: file, scene, config, saved, live })
 }

@@ -4,11 +4,13 @@
 //! Invariants: 1. a terminal that is gone, a closed pipe or a full drive behind standard error ends no program: such lines
 //! are lost; 2. nothing that a file's name holds can move the cursor or turn the direction of a line: control characters
 //! and direction marks are printed as escapes (`\u202e`, as in JSON); 3. a line names the programs as the user called this one:
-//! texts say `gsscale-train`, and after `gsscale ...` the lines say `gsscale train` ([`as_called`]).
+//! texts say `gsscale-train`, and after `gsscale ...` the lines say `gsscale train` ([`as_called`]); 4. a path in a printed
+//! command is one word for a shell ([`shell_word`]).
 
 use std::borrow::Cow;
 use std::fmt::{Arguments, Write as _};
 use std::io::{ErrorKind, Write};
+use std::path::Path;
 use std::sync::OnceLock;
 
 /// The commands of `gsscale`, once a user has called it by that name.
@@ -81,6 +83,19 @@ fn with_commands<'a>(text: &'a str, commands: &[&str]) -> Cow<'a, str> {
     if named.is_empty() { Cow::Borrowed(text) } else { Cow::Owned(named + rest) }
 }
 
+/// The path as one word of a command that a user can paste into a shell: in quotes where it needs them.
+pub fn shell_word(path: impl AsRef<Path>) -> String {
+    let text = path.as_ref().to_string_lossy();
+    let is_plain = |char: char| {
+        char.is_alphanumeric() || "/._-+,:@%=".contains(char) || (cfg!(windows) && matches!(char, '\\' | '~'))
+    };
+    if !text.is_empty() && text.chars().all(is_plain) {
+        text.into_owned()
+    } else {
+        format!("'{}'", text.replace('\'', r"'\''"))
+    }
+}
+
 /// The text with its control characters (but for line breaks and tabs) and direction marks as escapes.
 pub fn visible(text: &str) -> Cow<'_, str> {
     if !text.chars().any(is_hidden) {
@@ -141,6 +156,20 @@ mod tests {
         }
         assert_eq!(named("gsscale-train"), "gsscale train");
         assert_eq!(as_called("gsscale-train"), "gsscale-train", "tests are not called gsscale");
+    }
+
+    #[test]
+    fn paths_in_commands_are_one_word() {
+        for (path, word) in [
+            ("runs/a-1.5", "runs/a-1.5"),
+            ("scans/straße", "scans/straße"),
+            ("my runs/a", "'my runs/a'"),
+            ("it's", r"'it'\''s'"),
+            ("~/a;$b", "'~/a;$b'"),
+            ("", "''"),
+        ] {
+            assert_eq!(shell_word(path), word);
+        }
     }
 
     #[test]

@@ -110,6 +110,16 @@ pub fn format_grouped(n: u64) -> String {
     out
 }
 
+/// A count with its noun: `1 photo`, `1,234 photos`.
+pub fn counted(count: u64, noun: &str) -> String {
+    format!("{} {noun}{}", format_grouped(count), if count == 1 { "" } else { "s" })
+}
+
+/// As [`counted`], with the verb: `1 photo is`.
+pub fn counted_are(count: u64, noun: &str) -> String {
+    format!("{} {}", counted(count, noun), if count == 1 { "is" } else { "are" })
+}
+
 /// Formats a time with two or three digits and a unit.
 pub fn format_seconds(seconds: f64) -> String {
     const UNITS: [(f64, &str); 4] = [(1.0, "s"), (60.0, "min"), (3600.0, "h"), (86400.0, "d")];
@@ -136,6 +146,7 @@ mod tests {
         let counts = [7, 999, 1000, 15_950, 792_000, 999_600, 1_250_000, 4_294_967_294];
         assert_eq!(counts.map(format_count), ["7", "999", "1.00k", "15.9k", "792k", "1.00M", "1.25M", "4295M"]);
         assert_eq!([5, 1234, 1_234_567].map(format_grouped), ["5", "1,234", "1,234,567"]);
+        assert_eq!([0, 1, 1234].map(|n| counted_are(n, "photo")), ["0 photos are", "1 photo is", "1,234 photos are"]);
     }
 
     #[test]

@@ -13,7 +13,6 @@ use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
-use crate::config::new_run;
 use crate::photos::outlier::blocks::MASKED_SHARE;
 use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use crate::scene::state::row_bytes;
@@ -71,6 +70,9 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
         let problem = "a city has one cell at least, with one Gaussian at least";
         return Err(InputError::new("--cells", problem, "give a number from 1 on").into());
     }
+    if request.network == 0 {
+        return Err(InputError::new("--network", "0 bytes a second", "give its rate, such as 125MB").into());
+    }
     if !request.dry_run && city.plan().exists() {
         let plan = CityPlan::read(&city)?;
         if (plan.asked, plan.view_share, plan.margin) == (request.cells, request.view_share, request.margin) {
@@ -80,7 +82,7 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
         let problem = "the city is cut already, in another way";
         return Err(InputError::new(city.plan(), problem, "go on with gsscale-cells run, or begin another city").into());
     }
-    let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
+    let mut keys = city.given_keys()?;
     keys.extend(remedies_of_prior(&city)?);
     // The rows of the prior are no poor points.
     keys.entry("poor-points").or_insert_with(|| "off".into());
@@ -125,7 +127,7 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
         step_seconds: past,
         steps: whole.steps.into(),
         prior_degree: seen.sh_degree,
-        network: request.network.max(1) as f64,
+        network: request.network as f64,
         machines: if request.machines == 0 { plan.cells.len() } else { request.machines },
     };
     if let Some(larger) = request.as_if.filter(|_| request.dry_run) {

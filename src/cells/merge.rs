@@ -116,10 +116,13 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
         }
     }
     if !open.is_empty() {
-        let problem = format!("cells {} are not done", open.join(", "));
+        let problem = match open.as_slice() {
+            [cell] => format!("cell {cell} is not done"),
+            _ => format!("cells {} are not done", open.join(", ")),
+        };
         return Err(InputError::new(&city.0, problem, "run them: gsscale-cells run CITY --cell K").into());
     }
-    let keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
+    let keys = city.given_keys()?;
     let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
     let facts = read_resolved(&city.prior_run().join(CONFIG_FILE))?;
     let above = folder_of(&request.out);
@@ -263,7 +266,7 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path, folder: &mut PartFolde
     let crossing = cells_of.iter().filter(|(_, cells)| **cells > 1 || most == 1);
     let names: String = crossing.map(|(name, _)| format!("{name}\n")).collect();
     folder.write(Path::new(POLISH_VIEWS_FILE), names.as_bytes())?;
-    let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
+    let mut keys = city.given_keys()?;
     let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
     let of_cell = new_run::given_keys(Some(&city.cell(0).join("cell.toml")), &TrainOverrides::default())?;
     let ended = config_of(&city.cell(0), of_cell, &TrainOverrides::default())?;

@@ -106,7 +106,7 @@ pub(crate) fn check_range(flag: &str, value: f64, range: RangeInclusive<f64>) ->
         return Ok(());
     }
     let remedy = format!("use a number from {} to {}", range.start(), range.end());
-    Err(InputError::new(flag, "the value is out of range", remedy))
+    Err(InputError::new(flag, format!("{value} is out of range"), remedy))
 }
 
 /// Refuses flags that decide the bytes of a city.
@@ -145,6 +145,15 @@ impl City {
     /// The keys that the user gave, which decide the bytes of the whole scene; usable as `--config`.
     pub fn keys(&self) -> PathBuf {
         self.0.join("keys.toml")
+    }
+
+    /// The keys in that file.
+    /// Errors: there is no prior, or the file is none of keys.
+    pub fn given_keys(&self) -> InputResult<toml::Table> {
+        new_run::given_keys(Some(&self.keys()), &TrainOverrides::default()).map_err(|error| match error.kind {
+            Some(std::io::ErrorKind::NotFound) => InputError { remedy: NO_PRIOR.to_string(), ..error },
+            _ => error,
+        })
     }
 
     /// The output folder of the prior's run.

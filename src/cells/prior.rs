@@ -13,7 +13,7 @@ use crate::page::format::codec::Codec;
 use crate::page::tool::new_store::part_of;
 use crate::train::error::TrainError;
 use crate::train::memory::host_budget;
-use crate::train::run::out_folder::is_empty;
+use crate::train::run::out_folder::{check_apart, is_empty};
 use crate::train::state::trainer::Trainer;
 use crate::train::stores::{ImportRequest, import};
 use std::path::PathBuf;
@@ -40,6 +40,7 @@ pub struct PriorRequest {
 /// Errors: those of a run; the city was begun with other keys.
 pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     let city = City(request.city.clone());
+    check_apart(&city.0, &request.scene)?;
     let mut keys = new_run::given_keys(request.config.as_deref(), &request.keys)?;
     let of_machine = |name: &str| KEYS.iter().any(|key| key.name() == name && is_of_machine(key));
     let machine: toml::Table = keys.clone().into_iter().filter(|(name, _)| of_machine(name)).collect();

@@ -12,7 +12,6 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::ids::{PageId, PageNo};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::RunOptions;
-use crate::config::new_run;
 use crate::config::values::Up;
 use crate::dataset::loader::View;
 use crate::dataset::model::Split;
@@ -117,7 +116,7 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
 
 /// The config of the prior's run with the keys of this machine, and what the user says of up.
 fn prior_config(city: &City, machine: &TrainOverrides) -> InputResult<(TrainConfig, Up)> {
-    let mut keys = new_run::given_keys(Some(&city.keys()), &TrainOverrides::default())?;
+    let mut keys = city.given_keys()?;
     let whole = config_of(&city.keys(), keys.clone(), machine)?;
     keys.extend(keys_of_prior(&whole));
     Ok((config_of(&city.keys(), keys, machine)?, whole.up))

@@ -159,7 +159,7 @@ config_keys! {
         /// resumed run keeps its values
         schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
-        seed: u64 = 42 => Numbers;
+        [value_parser = parse_count] seed: u64 = 42 => Numbers;
         /// Highest degree of spherical harmonics (SH), 0 to 3
         sh_degree: u8 = 3 => Layout;
         /// Raise the SH degree every N steps; 0 = full degree from the start
@@ -322,7 +322,7 @@ config_keys! {
         /// only if the run stops early
         [num_args = 0..=1, default_missing_value = "true", require_equals = true] keep_checkpoint: bool = false => Lasting;
         /// Most pages in memory; 0 = as many as --host-mem allows
-        frames: u32 = 0 => Free hidden;
+        [value_parser = parse_count32] frames: u32 = 0 => Free hidden;
         /// I/O engine for pages: auto, uring, mmap or pread. Never changes results. mmap reads through memory maps: if another
         /// program makes a page file shorter during a read, the system ends the run (SIGBUS), and --resume continues it
         io: IoEngine = IoEngine::Auto => Free hidden;
@@ -404,6 +404,7 @@ impl TrainConfig {
         let (from_0, to_1e6, to_1) = ("a number from 0 on", "a number from 0 to 1e6", "a number above 0 and up to 1");
         let checks = [
             ("data-factor", self.data_factor.is_finite() && self.data_factor >= 1.0, "1 or more"),
+            ("test-after", self.test_after >= -1, "an index from 0 on, or -1 to hold out by --test-every"),
             ("near-plane", positive(self.near_plane), "a positive number"),
             ("sh-degree", self.sh_degree <= 3, "0, 1, 2 or 3"),
             ("sh-start", self.sh_start <= self.sh_degree, "0 to --sh-degree"),
@@ -443,7 +444,13 @@ impl TrainConfig {
             ("others-lr-final", fraction(self.others_lr_final), to_1),
         ];
         if let Some((key, _, allowed)) = checks.iter().find(|(_, is_allowed, _)| !is_allowed) {
-            return Err(InputError::new(format!("--{key}"), "the value is out of range", format!("use {allowed}")));
+            let table = toml::Table::try_from(self).unwrap_or_default();
+            let value = table.get(*key).map_or("the value".to_string(), ToString::to_string);
+            return Err(InputError::new(
+                format!("--{key}"),
+                format!("{value} is out of range"),
+                format!("use {allowed}"),
+            ));
         }
         if self.strategy == StrategyName::Mcmc && self.max_gaussians == 0 {
             let problem = "it grows up to a cap, and there is none";

@@ -6,6 +6,7 @@
 use super::model::{Intrinsics, Lens, Pose, RawView, ReadOptions, Split};
 use super::photo_files::{Photo, PhotoFiles};
 use crate::base::error::{InputError, InputResult};
+use crate::base::units::{counted, counted_are};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -72,7 +73,8 @@ pub(super) fn sort_views(file: &Path, views: &mut [RawView]) -> InputResult<()> 
 
 /// The warning about views that a reader leaves out.
 pub(super) fn left_out(file: &Path, names: &[String], why: &str) -> String {
-    format!("{}: {} view(s) left out, {why}: {}", file.display(), names.len(), listed(names))
+    let views = counted(names.len() as u64, "view");
+    format!("{}: {views} left out, {why}: {}", file.display(), listed(names))
 }
 
 /// The first names of a list, and the number of further ones.
@@ -134,7 +136,8 @@ impl<'a> Gathered<'a> {
         self.photos.finish(&mut self.views, warnings);
         if !self.missing.is_empty() && !self.options.allow_missing {
             let near = self.photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
-            let problem = format!("{} photo(s) are missing: {}{near}", self.missing.len(), listed(&self.missing));
+            let are = counted_are(self.missing.len() as u64, "photo");
+            let problem = format!("{are} missing: {}{near}", listed(&self.missing));
             return Err(InputError::new(file, problem, words.photo_is_missing).at(words.photos));
         }
         let why = "their pose is not finite or not a rotation";

@@ -17,8 +17,10 @@ use super::photo::{Alpha, PhotoSource, holds_0_and_1, intrinsics_at};
 use super::photo_files::PhotoFiles;
 use super::photo_header::read_header;
 use super::resize::{Size, divided_size, same_shape};
+use super::undistort::Undistorter;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
+use crate::base::units::counted_are;
 use crate::scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -80,7 +82,7 @@ impl LoadOptions {
     fn check(&self) -> InputResult<()> {
         let (factor, near) = (self.data_factor, self.near_plane);
         let (flag, problem, remedy) = if !(1.0..=1e4).contains(&factor) {
-            ("--data-factor", format!("{factor} is not between 1 and 10000"), "give 1 or more")
+            ("--data-factor", format!("{factor} is not between 1 and 10000"), "give 1 to 10000, such as 2")
         } else if self.max_resolution == Some(0) {
             ("--max-resolution", "0 leaves no pixel".to_string(), "give the longer side in pixels")
         } else if !(near > 0.0 && near <= 1e3) {
@@ -239,6 +241,13 @@ fn load_views(
         let remedy = "check the split of the dataset, --test-every and --test-after";
         return Err(InputError::new(image_folder, "no view is left for training", remedy));
     }
+    let shows_any = |View { photo: PhotoSource { intrinsics, .. }, .. }: &View| {
+        !intrinsics.lens.distorts() || Undistorter::new(*intrinsics).shows_any()
+    };
+    if !views.iter().any(shows_any) {
+        let problem = "no photo has a pixel left without its lens distortion";
+        return Err(InputError::new(image_folder, problem, "correct the distortion of the cameras (k1, k2 and so on)"));
+    }
     let scene_scale = (scene_scale / frame.scale) as f32;
     let (points, colors) = (Vec::new(), Vec::new());
     let root = root.to_path_buf();
@@ -346,8 +355,9 @@ fn warn_about_extra_photos(photos: &[PhotoSource], warnings: &mut Vec<String>) {
     if !extra.is_empty() {
         extra.sort();
         let names: Vec<_> = extra.iter().filter_map(|p| p.file_name()).take(3).map(|n| n.to_string_lossy()).collect();
-        let (count, names, more) = (extra.len(), names.join(", "), if extra.len() > 3 { ", ..." } else { "" });
-        warnings.push(format!("{count} photos are not in the model and are not used: {names}{more}"));
+        let (are, names) = (counted_are(extra.len() as u64, "photo"), names.join(", "));
+        let more = if extra.len() > 3 { ", ..." } else { "" };
+        warnings.push(format!("{are} not in the model and not used: {names}{more}"));
     }
 }
 
@@ -364,8 +374,15 @@ fn drop_missing(
     if missing.is_empty() {
         return Ok(present);
     }
+    let refused = |((view, _), _): &((RawView, Split), bool)| {
+        std::fs::metadata(&view.image_path).err().filter(|e| e.kind() == std::io::ErrorKind::PermissionDenied)
+    };
+    if let Some(error) = missing.iter().find_map(refused).filter(|_| !options.allow_missing) {
+        return Err(InputError::io(image_folder, "looking for the photos", &error));
+    }
     let names: Vec<&str> = missing.iter().map(|((view, _), _)| view.name.as_str()).collect();
-    let mut problem = format!("{} of {total} photos are missing: {}", missing.len(), list_names(names.iter().copied()));
+    let are = if names.len() == 1 { "is" } else { "are" };
+    let mut problem = format!("{} of {total} photos {are} missing: {}", names.len(), list_names(names.iter().copied()));
     if !options.allow_missing || present.is_empty() {
         let photos = PhotoFiles::in_folders(root, vec![image_folder.to_path_buf()], true);
         problem.push_str(&photos.near_misses(&names));
@@ -431,8 +448,9 @@ fn check_photos(
     }
     let transparent = photos.iter().filter(|p| p.is_masked_by_alpha()).count();
     if transparent > 0 {
+        let have = if transparent == 1 { "photo has" } else { "photos have" };
         warnings.push(format!(
-            "{transparent} photos have an alpha channel: pixels that are less than half opaque do not count, as under a mask \
+            "{transparent} {have} an alpha channel: pixels that are less than half opaque do not count, as under a mask \
              (--masks=false shows --background there)"
         ));
     }
@@ -468,7 +486,7 @@ fn check_photo(view: &RawView, found: Option<FoundMask>, options: &LoadOptions) 
     let stated = view.mask_path.clone().filter(|_| options.masks).map(|path| FoundMask { path, inverted: false });
     let mask = stated.or(found);
     let checked_mask = |FoundMask { path, inverted }: FoundMask| {
-        let header = read_header(&path)?;
+        let header = read_header(&path).map_err(|error| of_mask(error, view))?;
         if same_shape((header.width, header.height), size) {
             return Ok(MaskSource { path, header, invert: inverted != options.invert_masks });
         }
@@ -488,6 +506,24 @@ fn check_photo(view: &RawView, found: Option<FoundMask>, options: &LoadOptions) 
         mask,
         alpha: if options.masks { Alpha::Mask } else { Alpha::Over(options.background) },
     })
+}
+
+/// The error for a mask instead of a photo.
+fn of_mask(error: InputError, view: &RawView) -> InputError {
+    let is_stated = view.mask_path.as_ref() == Some(&error.file);
+    if is_stated && error.kind == Some(std::io::ErrorKind::NotFound) {
+        let remedy = "put it there, remove the key, or use --masks=false";
+        return InputError::new(error.file, "there is no such mask", remedy)
+            .at(format!("mask_path of view '{}'", view.name));
+    }
+    let problem = error.problem.replace("photo", "mask");
+    match error.kind {
+        Some(_) => InputError { problem, ..error },
+        None => {
+            let remedy = "make the mask again for this photo, or remove it".to_string();
+            InputError { problem, remedy, ..error }
+        }
+    }
 }
 
 /// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the

@@ -209,12 +209,18 @@ impl PhotoFiles {
     /// What may help to find photos with these names of views: files with nearly the same name, and links that lead nowhere.
     /// Empty, or begins with a separator.
     pub fn near_misses(&self, missing: &[&str]) -> String {
-        let leads_nowhere = |name: &&&str| self.bases.iter().any(|base| base.join(name).symlink_metadata().is_ok());
-        let links = missing.iter().filter(leads_nowhere).count();
+        let places = || missing.iter().flat_map(|name| self.bases.iter().map(move |base| base.join(name)));
+        let leads_nowhere = |path: &PathBuf| {
+            path.is_symlink() && path.metadata().is_err_and(|error| error.kind() == std::io::ErrorKind::NotFound)
+        };
+        let links = places().filter(leads_nowhere).count();
         if links > 0 {
-            return format!(
-                "; {links} of them are links whose target is not on this machine: fetch it first (git annex get, dvc pull)"
-            );
+            let links = if links == 1 { "1 of them is a link".into() } else { format!("{links} of them are links") };
+            return format!("; {links} whose target is not on this machine: fetch it first (git annex get, dvc pull)");
+        }
+        // A folder, a pipe, or a link to itself.
+        if let Some(other) = places().find(|path| path.symlink_metadata().is_ok()) {
+            return format!("; {} is there, but is no file that can be read", other.display());
         }
         let mut shown = Vec::new();
         for name in missing {

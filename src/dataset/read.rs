@@ -1,7 +1,9 @@
 //! Chooses the reader for a path.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::say::shell_word;
 use crate::base::text::{as_windows_1252, has_raw_bytes, head_of, shown};
+use crate::base::units::{counted, counted_are};
 use crate::dataset::gathered::{listed, sort_views};
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
@@ -71,7 +73,7 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
     }
     let has = |name: &str| path.join(name).is_file();
     if has("config.toml") && ["metrics.jsonl", "summary.json", "point_cloud.ply"].into_iter().any(has) {
-        let folder = path.display();
+        let folder = shell_word(path);
         let remedy = format!(
             "to continue the run: gsscale-train --resume {folder}; to measure its result: gsscale-eval {folder}; its config.toml \
              names the scene that it trained on"
@@ -111,7 +113,7 @@ fn file_of_results(path: &Path) -> Option<InputError> {
     if !is_tree && !is_rows {
         return None;
     }
-    let file = path.display();
+    let file = shell_word(path);
     let remedy = match name.ends_with(".ply") {
         true => {
             format!("to measure it: gsscale-eval {file} SCENE; to start from it: gsscale-train SCENE --init-ply {file}")
@@ -176,7 +178,7 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     let of_search = if search.join(SEARCH_STATE).is_file() { photos_below(&search, FOLDERS_DEEP - 1) } else { 0 };
     let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
     let count = counts.into_iter().find(|n| *n > 0)?;
-    let place = folder.display();
+    let place = shell_word(folder);
     // What would only send the user back.
     if is_searched(folder) {
         let problem = format!("gsscale-poses has found no poses: the {count} photos show too little in common");
@@ -184,7 +186,7 @@ fn without_poses(folder: &Path) -> Option<InputError> {
         return Some(InputError::new(folder, problem, remedy));
     }
     if count < PHOTOS_LEAST {
-        let problem = format!("{count} photo(s), but no camera poses");
+        let problem = format!("{}, but no camera poses", counted(count as u64, "photo"));
         let remedy =
             "take some dozens of photos from places around, of which neighbours share two thirds of their content";
         return Some(InputError::new(folder, problem, remedy));
@@ -224,8 +226,8 @@ fn make_readable(file: &Path, scene: &mut RawScene) -> InputResult<()> {
     }
     for (names, what) in [(&found, "matched with the photos"), (&lost, "no photo, or more than one, fits them")] {
         if !names.is_empty() {
-            let (file, count, names) = (file.display(), names.len(), listed(names));
-            scene.warnings.push(format!("{file}: {count} name(s) are not UTF-8 but of a code page; {what}: {names}"));
+            let (file, are, names) = (file.display(), counted_are(names.len() as u64, "name"), listed(names));
+            scene.warnings.push(format!("{file}: {are} not UTF-8 but of a code page; {what}: {names}"));
         }
     }
     sort_views(file, &mut scene.views)

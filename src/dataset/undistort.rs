@@ -41,6 +41,20 @@ impl Undistorter {
         Some([k.fx * x + k.cx, k.fy * y + k.cy])
     }
 
+    /// Whether some pixel of the ideal photo lies inside the real one: of a grid, and of the middle of the lens, which
+    /// moves least. All-out distortion leaves none.
+    pub fn shows_any(&self) -> bool {
+        const GRID: u32 = 32;
+        let k = &self.intrinsics;
+        let [width, height] = [k.width, k.height].map(f64::from);
+        let at = |i: u32, side: f64| (f64::from(i) + 0.5) / f64::from(GRID) * side;
+        let pixel = |c: f64, side: f64| c.clamp(0.0, side - 1.0).floor() + 0.5;
+        let grid = (0..GRID * GRID).map(|i| [at(i % GRID, width), at(i / GRID, height)]);
+        let is_inside = |[x, y]: [f64; 2]| (0.0..=width).contains(&x) && (0.0..=height).contains(&y);
+        grid.chain([[pixel(k.cx, width), pixel(k.cy, height)]])
+            .any(|[u, v]| self.source_of(u, v).is_some_and(is_inside))
+    }
+
     /// Samples one row of the ideal photo from `photo` (interleaved 8-bit, `C` channels, the intrinsics' size) into
     /// `out` with 8 fractional bits, and writes 255 (inside the photo) or 0 into `valid`.
     pub fn sample_row<const C: usize>(&self, photo: &[u8], row: u32, out: &mut [u16], valid: &mut [u8]) {
@@ -163,5 +177,7 @@ mod tests {
         assert!((undistorter.fold_radius - 1.0 / 3f64.sqrt()).abs() < 4e-4, "{}", undistorter.fold_radius);
         assert!(undistorter.source_of(0.5, 0.5).is_none());
         assert!(undistorter.source_of(80.0, 60.0).is_some());
+        assert!(undistorter.shows_any());
+        assert!(!Undistorter::new(camera(Lens::Radial([1e10, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))).shows_any());
     }
 }

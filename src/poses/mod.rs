@@ -20,6 +20,7 @@ pub mod similar;
 
 use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
+use crate::base::say::shell_word;
 use crate::base::units::{format_grouped, format_seconds};
 use crate::base::whole_file::write_whole;
 use crate::base::whole_folder::remove_ours;
@@ -148,8 +149,8 @@ impl PoseSearch {
         if sparse.exists() && !is_empty(&sparse) {
             let remedy = format!(
                 "to train with it: gsscale-train {}; for new poses: gsscale-poses {} --out FOLDER",
-                scene.display(),
-                request.photos.display()
+                shell_word(&scene),
+                shell_word(&request.photos)
             );
             return Err(InputError::new(sparse, "a model is here already", remedy));
         }

@@ -4,6 +4,7 @@
 //! folders are not followed, and nothing outside of the folder is listed.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::units::{counted, counted_are};
 use crate::dataset::exif::{GpsPlace, camera_and_place};
 use crate::dataset::masks::FOLDERS as MASK_FOLDERS;
 use crate::dataset::photo_header::{PhotoHeader, read_header};
@@ -69,8 +70,8 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
     }
     if photos.len() < 3 {
         let problem = match said.first() {
-            Some(first) => format!("{} photos can be read ({first})", photos.len()),
-            None => format!("{} photos (JPEG or PNG) are here", photos.len()),
+            Some(first) => format!("{} can be read ({first})", counted(photos.len() as u64, "photo")),
+            None => format!("{} here (JPEG or PNG)", counted_are(photos.len() as u64, "photo")),
         };
         return Err(InputError::new(folder, problem, "name a folder with at least three photos that overlap"));
     }

@@ -97,11 +97,20 @@ impl Program {
             1 => path.clone(),
             _ => std::path::absolute(path).unwrap_or_else(|_| path.clone()),
         };
+        let of_user = |found: InputResult<Program>, flag: &str| {
+            found.map_err(|error| match error.kind {
+                Some(std::io::ErrorKind::NotFound) => {
+                    let remedy = format!("correct the path, or leave {flag} out: programs of the PATH are found");
+                    InputError { problem: format!("{flag}: there is no such program"), remedy, ..error }
+                }
+                _ => error,
+            })
+        };
         if let Some(path) = &places.colmap {
-            return Program::colmap(&whole(path));
+            return of_user(Program::colmap(&whole(path)), "--colmap");
         }
         if let Some(path) = &places.python {
-            return Program::pycolmap(&whole(path));
+            return of_user(Program::pycolmap(&whole(path)), "--python");
         }
         let colmap = Program::colmap(Path::new("colmap"));
         if colmap.as_ref().is_ok_and(|program| program.uses_gpu) {

@@ -11,7 +11,7 @@ use super::run_files::{
     CONFIG_FILE, DIAGNOSIS_FILE, METRICS_FILE, PAGES_FILE, PICTURES_FOLDER, REPORT_FILE, SUMMARY_FILE, VIEWS_FILE,
 };
 use crate::base::error::{InputError, InputResult};
-use crate::base::say::as_called;
+use crate::base::say::{as_called, shell_word};
 use crate::base::units::{format_bytes, format_grouped};
 use crate::base::whole_file::write_whole;
 use crate::photos::parameter::Finding;
@@ -85,7 +85,7 @@ fn unfinished_text(folder: &Path, summary: &Value) -> Option<String> {
     let planned = config.get("steps").and_then(toml::Value::as_integer).and_then(|steps| u64::try_from(steps).ok())?;
     let done = summary["steps"].as_u64()?;
     let [done, planned] = [done, planned].map(format_grouped);
-    let folder = folder.display();
+    let folder = shell_word(folder);
     let text = format!("Stopped after {done} of {planned} steps. To go on: gsscale-train --resume {folder}");
     Some(as_called(&text).into_owned())
 }

@@ -154,7 +154,7 @@ fn extra_photos_are_counted() {
         std::fs::write(folder.path().join("images").join(name), b"x").unwrap();
     }
     let dataset = load(&raw);
-    assert!(has_warning(&dataset, "4 photos are not in the model and are not used: q0.png, q1.JPG, q2.jpeg, ..."));
+    assert!(has_warning(&dataset, "4 photos are not in the model and not used: q0.png, q1.JPG, q2.jpeg, ..."));
 }
 
 #[test]
@@ -271,7 +271,7 @@ fn every_pixel_format_becomes_rgb8() {
     let opaque: Vec<u8> = (0..64 * 48).map(|i| if i % 64 < 32 { 255 } else { 0 }).collect();
     assert_eq!(targets[1].mask.as_ref(), Some(&opaque));
     assert!([0, 2, 3, 4].into_iter().all(|i| targets[i].mask.is_none()));
-    assert!(has_warning(&dataset, "1 photos have an alpha channel"));
+    assert!(has_warning(&dataset, "1 photo has an alpha channel"));
     let over = LoadOptions { masks: false, background: [0, 128, 255], ..LoadOptions::default() };
     let target = decode(&load_dataset(raw, &over).unwrap().views[1].photo).unwrap();
     assert_eq!((&target.rgb[..3], &target.rgb[3 * 40..][..3]), (&[200, 100, 50][..], &[0, 128, 255][..]));
@@ -366,6 +366,13 @@ fn masks_keep_white_and_can_be_inverted() {
     GrayImage::new(50, 48).save(masks.join("p02.png")).unwrap();
     std::fs::remove_file(masks.join("p02.PNG")).unwrap();
     assert!(refusal(&raw, &LoadOptions::default()).problem.contains("mask"));
+    std::fs::write(masks.join("p02.png"), b"\x89PNG\r\n\x1a\n").unwrap();
+    let error = refusal(&raw, &LoadOptions::default());
+    assert!(error.problem.contains("the mask is cut short") && !error.remedy.contains("--allow-missing"), "{error}");
+    let mut stated = raw.clone();
+    stated.views[0].mask_path = Some(masks.join("none.png"));
+    let error = refusal(&stated, &LoadOptions::default());
+    assert!(error.place.contains("mask_path") && error.problem.contains("no such mask"), "{error}");
 }
 
 /// A soft checker on the plane at depth 1, 0 to 255.

@@ -251,7 +251,7 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     {
         cells.refuses(flags, &["out of range"]);
     }
-    for flags in ["--margin nan", "--view-share nan", "--cells 0"] {
+    for flags in ["--margin nan", "--view-share nan", "--cells 0", "--network 0"] {
         cells.refuses(&format!("cut scene --out city --cells 2 {flags}"), &[&flags[..flags.find(' ').unwrap()]]);
     }
     // A dry run plans for a larger scene, and writes nothing.
@@ -262,6 +262,8 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     let machines = said.lines().find_map(|line| line.strip_prefix("cells ")).unwrap().split_whitespace().next();
     assert!(machines == Some("3") && cells.0.text("city/plan.toml") == plan, "{said}");
     cells.refuses("prior scene --out other --ssim-lambda 7", &["--ssim-lambda"]);
+    cells.refuses("prior scene --out scene", &["is the scene itself"]);
+    cells.refuses("cut scene --out other --cells 2", &["keys.toml", "gsscale-cells prior"]);
     assert!(!cells.0.exists("other"));
     // Legs of one step: most of the time the worker is between two of them.
     let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > Some(0));

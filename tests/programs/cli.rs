@@ -203,9 +203,14 @@ fn numbers_that_no_machine_can_hold_are_refused() {
         ["--adam-eps", "9.9e-17"],
         ["--adam-eps", "1.5"],
         ["--adam-eps", "nan"],
+        ["--test-after=-2", ""],
     ] {
-        refuses(&work, &format!("{flag} {value}"), &[flag, "out of range"]);
+        let named = flag.split('=').next().unwrap();
+        refuses(&work, &format!("{flag} {value}"), &[named, "out of range"]);
     }
+    work.write("pages.txt", "0\n");
+    refuses(&work, "--pages-file pages.txt", &["--pages-file", "--init-ply names none"]);
+    refuses(&work, "--out new --spill-dir new/pages", &["new does not exist (yet)"]);
     // A file and the command line behave alike; the message names the limit, and the limit itself is allowed.
     work.write("eps.toml", "adam-eps = 1e-30\n");
     refuses(&work, "--config eps.toml", &["--adam-eps", "1e-30", "f32 rounds to zero", "1e-16 to 1"]);

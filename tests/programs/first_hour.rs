@@ -53,6 +53,34 @@ fn a_run_needs_no_folder_and_says_where_everything_is() {
     assert!(said.contains("runs/scene is taken: results go to runs/scene-3; "), "{said}");
 }
 
+/// A command that is said for a folder with a space and a quote in its name works in a shell.
+#[cfg(unix)]
+#[test]
+fn commands_that_are_said_can_be_pasted_into_a_shell() {
+    use crate::support::workdir::{CKPT, VIEW, says, succeeded};
+    let work = Workdir::city(12, 48, 32, 200);
+    let out = "my runs/it's";
+    let mut train = work.command(TRAIN, "scene --steps 4 --strategy none --device cpu");
+    let said = stderr(&succeeded(train.args(["--out", out]).output().unwrap()));
+    let command = said.lines().find_map(|line| line.strip_prefix("  more steps  ")).unwrap();
+    assert_eq!(command, r"gsscale-train --resume 'my runs/it'\''s' --steps 8");
+    let programs = std::path::Path::new(TRAIN).parent().unwrap();
+    let mut shell = std::process::Command::new("/bin/sh");
+    succeeded(shell.args(["-c", command]).env("PATH", programs).current_dir(work.path("")).output().unwrap());
+    assert_eq!(work.count(out, "steps"), 8);
+
+    // A run that was stopped has no result, and what to do about it is said.
+    std::fs::remove_file(work.path(out).join("point_cloud.ply")).unwrap();
+    let told = |program: &str, flags: &str| stderr(&work.command(program, flags).arg(out).output().unwrap());
+    let resume = r"gsscale-train --resume 'my runs/it'\''s'";
+    for program in [EVAL, VIEW] {
+        let told = told(program, "");
+        says(&told, &["still trains or was stopped", resume]);
+        assert!(!told.contains("live page"), "{told}");
+    }
+    says(&told(CKPT, "ls"), &["has not made a commit", resume]);
+}
+
 /// In a quiet environment, as of a container.
 #[test]
 fn drivers_do_not_speak_for_gsscale() {

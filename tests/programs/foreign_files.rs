@@ -2,7 +2,7 @@
 //! config files in other encodings, and results where a scene is expected.
 
 use crate::support::scenes::TextModel;
-use crate::support::workdir::{CKPT, EVAL, TRAIN, Workdir, sorted_rows, split_ply};
+use crate::support::workdir::{CKPT, EVAL, TRAIN, VIEW, Workdir, sorted_rows, split_ply};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
 use gsscale::scene::columns::Columns;
@@ -89,12 +89,23 @@ fn a_saved_ply_is_read_in_the_frame_of_the_file_beside_it() {
     for ending in ["splat", "ksplat", "spz", "sog", "SPLAT"] {
         let file = format!("run/x.{ending}");
         work.write(&file, [7; 64]);
-        let words = &["splat-transform", "x.ply", "remedy"];
+        // The frame of an SPZ is upside down for other programs.
+        let turned = if ending == "spz" { " -r 180,0,0 run/x.ply" } else { "x.ply" };
+        let words = &["splat-transform", turned, "remedy"];
         work.refuses_with(EVAL, &format!("{file} scene"), words);
         work.refuses_with(TRAIN, &format!("scene --init-ply {file}"), words);
         work.refuses_with(CKPT, &format!("import {file} --out run/store"), words);
         work.refuses_with(TRAIN, &file, &["not a scene", "splat-transform"]);
     }
+    // The original beside it is better.
+    let beside = "give the PLY beside it: run/point_cloud.ply";
+    work.refuses_with(EVAL, "run/point_cloud.spz scene", &[beside]);
+    work.refuses_with(CKPT, "import run/point_cloud_sog/lod-meta.json --out run/store", &[beside, "--init-ply"]);
+    let tree = "run/point_cloud_sog/lod-meta.json";
+    work.refuses_with(TRAIN, "scene --init-ply run/point_cloud_sog", &[tree]);
+    work.refuses_with(EVAL, "run/point_cloud_sog", &[tree]);
+    let said = work.refuses_with(VIEW, "run/point_cloud_sog scene", &[tree]);
+    assert!(!said.contains("live page"), "{said}");
     // The finest level of SOGs is a start like a PLY, and as good but for its rounding.
     run(&work, "from_sog", &format!("{one} run/point_cloud_sog/lod-meta.json"));
     assert!((work.psnr("from_sog") - want).abs() < 0.3, "{} instead of {want}", work.psnr("from_sog"));
@@ -143,7 +154,7 @@ fn config_files_and_models_in_other_encodings_train() {
     ] {
         work.write("run.toml", bytes);
         let said = run(&work, "out", "--config run.toml --overwrite");
-        assert!(said.contains("1 name(s) are not UTF-8") && said.contains("Gem\\xE4uer.jpg is Gemäuer.jpg"), "{said}");
+        assert!(said.contains("1 name is not UTF-8") && said.contains("Gem\\xE4uer.jpg is Gemäuer.jpg"), "{said}");
         assert_eq!(work.count("out", "steps"), 3);
         assert!(work.exists("out/point_cloud.spz") && work.path("out/point_cloud_sog").is_dir());
     }

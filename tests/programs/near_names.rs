@@ -124,7 +124,7 @@ fn what_fits_several_is_named_and_not_guessed() {
     // Two files fit.
     fs::copy(images.join(first), images.join(first.replace(".jpg", ".Jpg"))).unwrap();
     fs::rename(images.join(first), images.join(first.replace(".jpg", ".JPG"))).unwrap();
-    refused(&["1 of 12 photos are missing", ".JPG or", ".Jpg"]);
+    refused(&["1 of 12 photos is missing", ".JPG or", ".Jpg"]);
     fs::remove_file(images.join(first.replace(".jpg", ".Jpg"))).unwrap();
     run(&work);
     // The only file that fits belongs to another view.
@@ -138,7 +138,15 @@ fn what_fits_several_is_named_and_not_guessed() {
     {
         fs::remove_file(images.join(first.replace(".jpg", ".JPG"))).unwrap();
         std::os::unix::fs::symlink("../.git/annex/objects/none", images.join(first)).unwrap();
-        refused(&["1 of 12 photos are missing", "git annex get"]);
+        refused(&["1 of 12 photos is missing", "git annex get"]);
+        // What is there, and is no file.
+        fs::remove_file(images.join(first)).unwrap();
+        std::os::unix::fs::symlink(first, images.join(first)).unwrap();
+        let said = refused(&["1 of 12 photos is missing", "is there, but is no file"]);
+        assert!(!said.contains("git annex"), "{said}");
+        fs::remove_file(images.join(first)).unwrap();
+        fs::create_dir(images.join(first)).unwrap();
+        refused(&["is there, but is no file"]);
     }
 }
 

@@ -118,9 +118,11 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     for (flags, words) in [
         ("--compare-frames many", ["'many'", "25%"]),
         ("--compare-orders random", ["'random'", "groups:N"]),
-        ("--drive-read 0", ["--drive-read", "bytes per second"]),
+        ("--drive-read 0", ["--drive-read", "above 0"]),
+        ("--endurance 0", ["--endurance", "above 0"]),
+        ("--growth 1e30", ["--growth: 1", "use 1 to 1000000"]),
         ("--lists 5..5", ["5..5", "100..110"]),
-        ("--step-seconds nan", ["--step-seconds", "leave them out"]),
+        ("--step-seconds nan", ["--step-seconds", "use 0 to 1000000"]),
         ("--optimizer dense", ["every page at every step", "deferred"]),
     ] {
         refuses(&work, &format!("run {flags}"), &words);

@@ -268,7 +268,7 @@ fn an_incomplete_folder_is_told_from_a_complete_one() {
         assert!(!work.exists("out"), "nothing is left behind");
     };
     fs::remove_file(data.join("val/rgbs/000006.jpg")).unwrap();
-    refuses(&["1 of 24 photos are missing: 000006.jpg"]);
+    refuses(&["1 of 24 photos is missing: 000006.jpg"]);
     fs::remove_dir_all(data.join("val/sparse")).unwrap();
     fs::remove_file(data.join("coordinates.pt")).unwrap();
     refuses(&[

@@ -18,9 +18,9 @@ fn begin<'a>(work: &'a Workdir, flags: &str) -> Served<'a> {
 /// Starts a program with a page and reads its address.
 fn serve<'a>(work: &'a Workdir, program: &str, flags: &str) -> Served<'a> {
     let mut run = Running::spawn(work, &mut work.command(program, &format!("{flags} --serve 127.0.0.1:0")));
-    let line = run.says("\n");
-    let address = line.strip_prefix("live page: http://").and_then(|rest| rest.split('/').next());
-    let address = address.unwrap_or_else(|| panic!("no address: {line}")).parse().unwrap();
+    let said = run.says("/\n");
+    let address = said.split("live page: http://").nth(1).and_then(|rest| rest.split('/').next());
+    let address = address.unwrap_or_else(|| panic!("no address: {said}")).parse().unwrap();
     Served { run, address }
 }
 

@@ -8,6 +8,7 @@ use super::read_json;
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::reset_host_bytes_peak;
+use gsscale::base::say::shell_word;
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::read_options;
@@ -242,8 +243,8 @@ fn train(
     if outcome.exit_code == 0 {
         return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));
     }
-    let (name, data, all) = (args.run.display(), args.data.display(), setting.out.display());
-    let resume = format!("gsscale-train --resume {}", out.display());
+    let [name, data, all] = [&args.run, &args.data, &setting.out].map(shell_word);
+    let resume = format!("gsscale-train --resume {}", shell_word(&out));
     let more = if args.with_defaults { " --with-defaults" } else { "" };
     gsscale::tell!(
         "stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train"

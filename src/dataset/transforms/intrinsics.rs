@@ -112,7 +112,15 @@ impl<'a> Levels<'a> {
         let centre =
             [self.number("cx")?.unwrap_or(0.5 * size.0 as f64), self.number("cy")?.unwrap_or(0.5 * size.1 as f64)];
         let lens = self.lens()?;
-        checked_intrinsics(size, focal, centre, lens)
-            .map_err(|problem| self.error("fl_x", format!("the camera has {problem}"), FIX_KEY))
+        checked_intrinsics(size, focal, centre, lens).map_err(|problem| {
+            let is_bad = |centre| checked_intrinsics(size, focal, centre, Lens::Pinhole).is_err();
+            let key = match () {
+                () if is_bad([0.0; 2]) => "fl_x",
+                () if is_bad([centre[0], 0.0]) => "cx",
+                () if is_bad(centre) => "cy",
+                () => "k1",
+            };
+            self.error(key, format!("the camera has {problem}"), FIX_KEY)
+        })
     }
 }

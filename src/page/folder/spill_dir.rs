@@ -8,6 +8,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::host_name;
+use crate::base::say::shell_word;
 use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
@@ -151,7 +152,7 @@ impl SpillDir {
             return Ok(());
         }
         let problem = "another store has replaced the one of this run, so nothing was removed";
-        let remedy = format!("look at that store: gsscale-ckpt ls {}", self.folder.display());
+        let remedy = format!("look at that store: gsscale-ckpt ls {}", shell_word(&self.folder));
         Err(InputError::new(&self.folder, problem, remedy))
     }
 
@@ -233,7 +234,8 @@ fn check_above(folder: &Path, above: &Path) -> InputResult<()> {
     if above.is_dir() {
         return Ok(());
     }
-    let problem = format!("it cannot be created: {} is not a folder", above.display());
+    let what = if above.exists() { "is not a folder" } else { "does not exist (yet)" };
+    let problem = format!("it cannot be created: {} {what}", above.display());
     Err(InputError::new(folder, problem, format!("make that folder first, or {OTHER_FOLDER}")))
 }
 
@@ -241,7 +243,7 @@ pub(in crate::page) fn of_another_run(folder: &Path) -> InputError {
     let remedy = format!(
         "see whose it is (gsscale-ckpt ls {0}), continue that run (gsscale-train --resume with its output folder), \
          {OTHER_FOLDER}, or give that run up (rm -r {0})",
-        folder.display()
+        shell_word(folder)
     );
     InputError::new(folder, "it holds the checkpoint of another run", remedy)
 }
@@ -279,7 +281,7 @@ fn check_folder(folder: &Path) -> InputResult<()> {
         check_owner(folder, there.uid(), rustix::process::geteuid().as_raw())?;
         let is_empty = names(folder)?.is_empty();
         if there.mode() & 0o022 != 0 && !is_empty {
-            let remedy = format!("remove their permission: chmod go-w {}", folder.display());
+            let remedy = format!("remove their permission: chmod go-w {}", shell_word(folder));
             return Err(InputError::new(folder, "other users have write permission", remedy));
         }
     }

@@ -12,7 +12,7 @@ use crate::base::whole_file::{folder_of, sync_folder};
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::open::{IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
-use crate::page::folder::spill_dir::SpillDir;
+use crate::page::folder::spill_dir::{FORMAT, SpillDir};
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{HEADER_BYTES, SlotRef};
 use crate::page::map::commit::{Commits, Cut, PageChange};
@@ -51,7 +51,7 @@ pub fn part_of(target: &Path) -> PathBuf {
 }
 
 /// The `.part` name for `target`, if neither exists.
-/// Errors: one of them exists.
+/// Errors: one of them exists, or `target` lies in a store.
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
     let part = part_of(target);
     for path in [target, &part] {
@@ -59,6 +59,11 @@ pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
             let remedy = "name a folder that does not exist; its parent must";
             return Err(InputError::new(path, "exists already", remedy));
         }
+    }
+    let whole = std::path::absolute(target).unwrap_or_else(|_| target.to_path_buf());
+    if let Some(store) = whole.ancestors().skip(1).find(|above| above.join(FORMAT).is_file()) {
+        let problem = format!("it would lie in another store, {}", store.display());
+        return Err(InputError::new(target, problem, "name a folder outside of it"));
     }
     Ok(part)
 }

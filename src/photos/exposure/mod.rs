@@ -282,7 +282,7 @@ impl PhotoParameter for Appearance {
             }
         }
         let is_due = self.judged_after == Some(outcome.step.saturating_add(1)) && !self.is_dropped();
-        is_due.then(|| self.judge(outcome.dataset)).into_iter().collect()
+        if is_due { self.judge(outcome.dataset).into_iter().collect() } else { Vec::new() }
     }
 
     fn buffer_bytes(&self) -> u64 {
@@ -332,18 +332,18 @@ impl Appearance {
         self.state.images.is_empty()
     }
 
-    /// Drops the exposures if they differ by less than [`EXPOSURE_SPREAD`]. Returns what the user is told.
-    fn judge(&mut self, dataset: &Dataset) -> String {
+    /// Drops the exposures if they differ by less than [`EXPOSURE_SPREAD`]. Returns what the user is told; nothing of a single photo.
+    fn judge(&mut self, dataset: &Dataset) -> Option<String> {
         let views = dataset.train_views();
         let seen = views.into_iter().filter(|&view| self.state.images[view].sightings > 1);
         let exposures: Vec<f64> = seen.map(|view| self.state.acting(view, 1)[0]).collect();
-        let is_enough = exposures.len() >= PHOTOS_FOR_REMEDIES;
-        let spread = spread(exposures);
-        if is_enough && spread >= EXPOSURE_SPREAD {
-            return format!("exposures differ by {spread:.2} stops between photos: they stay corrected");
+        let (count, spread) = (exposures.len(), spread(exposures));
+        let said = format!("exposures differ by {spread:.2} stops between photos");
+        if count >= PHOTOS_FOR_REMEDIES && spread >= EXPOSURE_SPREAD {
+            return Some(format!("{said}: they stay corrected"));
         }
         (self.state, self.drawn) = (AppearanceState::default(), Vec::new());
-        format!("exposures differ by {spread:.2} stops between photos: they are no longer corrected")
+        (count > 1).then(|| format!("{said}: they are no longer corrected"))
     }
 }
 

@@ -11,6 +11,7 @@
 use super::checkpoint::{Checkpoint, POLL};
 use crate::base::error::{InputError, InputResult};
 use crate::base::even_sample::EvenSample;
+use crate::base::say::shell_word;
 use crate::base::units::format_bytes;
 use crate::base::whole_file::write_whole;
 use crate::dataset::loader::Dataset;
@@ -145,7 +146,7 @@ impl Results<'_> {
 
     /// What can be saved on another drive now, as a line of a message.
     fn elsewhere(&self) -> String {
-        let (out, step) = (self.out.display(), self.trainer.steps_done());
+        let (out, step) = (shell_word(&self.out), self.trainer.steps_done());
         match (self.has_ply, self.has_last_step()) {
             (true, _) => {
                 format!("\n  {} is whole and can be copied to another drive", self.out.join(PLY_FILE).display())

@@ -3,7 +3,7 @@
 use super::device_memory;
 use super::forecast::{Forecast, Reach, first_pages};
 use super::plan::LargestView;
-use crate::base::units::{format_bytes, format_grouped, format_seconds};
+use crate::base::units::{counted, format_bytes, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::values::{Choice, Chosen, Residence};
@@ -92,20 +92,20 @@ pub fn describe(
     let of_photos = trainer.photos.iter().filter_map(|parameter| parameter.plan_text());
     let photos: String = of_photos.map(|text| format!("photos  {text}\n")).collect();
     let text = format!(
-        "scene   {}: {} views to train on, {} held out, at most {size}\n\
+        "scene   {}: {} to train on, {} held out, at most {size}\n\
          {photos}\
-         start   {} Gaussians, SH degree {}{}\n\
-         run     {} steps on {} threads ({}), rendered by {}{results}\n\
+         start   {}, SH degree {}{}\n\
+         run     {} on {} ({}), rendered by {}{results}\n\
          commit  {commits}\n\
          {}{}",
         scene.display(),
-        dataset.train_views().len(),
+        counted(dataset.train_views().len() as u64, "view"),
         dataset.test_views().len(),
-        format_grouped(trainer.scene.rows()),
+        counted(trainer.scene.rows(), "Gaussian"),
         config.sh_degree,
         growth(forecast),
-        format_grouped(config.steps.into()),
-        rayon::current_num_threads(),
+        counted(config.steps.into(), "step"),
+        counted(rayon::current_num_threads() as u64, "thread"),
         limits::simd_path(config).name(),
         trainer.renderer.device(),
         describe_tiers(forecast, tiers),
@@ -273,7 +273,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
         "scene   {} views to train on, {} held out\n\
          start   {} Gaussians\n\
          pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
-         memory  {} in all, fewer than {} pages at once\n\
+         memory  {} in all, fewer than {} at once\n\
          views   unknown: their needs follow from pages on the drive, and a dry run writes none.\n        \
          The run itself checks them before its first step.",
         start.dataset.train_views().len(),
@@ -283,7 +283,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
         format_bytes(pages.saturating_mul(frame)),
         free.map_or(String::from("unknown"), format_bytes),
         format_bytes(budget),
-        (budget / frame).max(1),
+        counted((budget / frame).max(1), "page"),
     ))
 }
 

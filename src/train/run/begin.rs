@@ -310,7 +310,7 @@ pub(super) fn plan_and_train(
         let elsewhere = spill_dir_flag(request);
         crate::tell!(
             "to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}",
-            request.out.display()
+            crate::base::say::shell_word(&request.out)
         );
     }
     tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
@@ -327,5 +327,5 @@ fn spill_dir_flag(request: &RunRequest) -> String {
     let folder = |config: TrainConfig| with_absolute_paths(config).spill_dir;
     let (kept, now) = (TrainConfig::read(&request.out.join(CONFIG_FILE)).map(folder), folder(request.config.clone()));
     let is_known = now.is_empty() || kept.is_ok_and(|kept| kept == now);
-    if is_known { String::new() } else { format!(" --spill-dir {now}") }
+    if is_known { String::new() } else { format!(" --spill-dir {}", crate::base::say::shell_word(now)) }
 }

@@ -1,9 +1,12 @@
 //! The Gaussians, the scene and the config that the name of a run, or of one of its files, stands for.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::say::shell_word;
 use crate::base::whole_file::folder_of;
-use crate::config::file::read_resolved;
+use crate::config::file::{TrainConfig, read_resolved};
+use crate::exchange::foreign::refuse_folder_of_sogs;
 use crate::exchange::sog::is_tree;
+use crate::page::folder::spill_dir::SpillDir;
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
 use std::path::{Path, PathBuf};
 
@@ -29,6 +32,10 @@ impl ModelOfRun {
             ));
         }
         let is_run = model.is_dir() && (model.join(CONFIG_FILE).is_file() || model.join(PLY_FILE).is_file());
+        if is_run && !model.join(PLY_FILE).is_file() {
+            return Err(without_result(model));
+        }
+        refuse_folder_of_sogs(model)?;
         let file = if is_run { model.join(PLY_FILE) } else { model.to_path_buf() };
         if let Some(scene) = scene {
             return Ok(ModelOfRun { file, scene, config: is_run.then(|| model.join(CONFIG_FILE)) });
@@ -36,6 +43,24 @@ impl ModelOfRun {
         let (scene, config) = scene_of(program, &file)?;
         Ok(ModelOfRun { file, scene, config: Some(config) })
     }
+}
+
+/// The error for the folder of a run that has no result yet.
+fn without_result(run: &Path) -> InputError {
+    let resume = format!("gsscale-train --resume {}", shell_word(run));
+    let folder = TrainConfig::read(&run.join(CONFIG_FILE)).map(|config| config.residence().checkpoint_folder(run));
+    let remedy = match folder.ok().filter(|folder| SpillDir::exists_in(folder)) {
+        None => format!("if it was stopped, go on with it: {resume}"),
+        Some(folder) => {
+            // Only a store inside of a run's folder says its scene.
+            let scene = if folder.starts_with(run) { "" } else { " SCENE" };
+            let folder = shell_word(folder);
+            format!(
+                "if it was stopped, look at its last commit (gsscale-view {folder}{scene}) or go on with it ({resume})"
+            )
+        }
+    };
+    InputError::new(run, format!("the run still trains or was stopped: there is no {PLY_FILE}"), remedy)
 }
 
 /// The scene and the config file of the run that wrote `file`: a PLY in the run's folder, or a folder of SOGs or a store there.
@@ -57,6 +82,6 @@ fn scene_of(program: &str, file: &Path) -> InputResult<(PathBuf, PathBuf)> {
     if scene.exists() {
         return Ok((scene, config));
     }
-    let remedy = format!("if it was moved: {program} {} SCENE", file.display());
+    let remedy = format!("if it was moved: {program} {} SCENE", shell_word(file));
     Err(InputError::new(&scene, "the scene of this run is missing", remedy))
 }

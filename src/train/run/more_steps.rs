@@ -16,6 +16,7 @@ use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, PastRun};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
 use crate::base::whole_file::sync_folder;
 use crate::config::file::{Resolved, TrainConfig};
@@ -58,7 +59,7 @@ impl FinishedRun {
     pub fn start(&mut self, request: &RunRequest) -> Result<Start, TrainError> {
         let (scene, out) = (&request.scene, &request.out);
         if !scene.exists() {
-            let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", out.display());
+            let remedy = format!("if it was moved: gsscale-train --resume {} SCENE --steps N", shell_word(out));
             return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
         }
         self.changes.check(&out.join(CONFIG_FILE), self.accepts_changes)?;

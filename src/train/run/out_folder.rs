@@ -138,7 +138,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
     };
     let residence = config.residence();
     let has_result = out.join(PLY_FILE).exists();
-    let shown = out.display();
+    let shown = crate::base::say::shell_word(out);
     match SpillDir::exists_in(&residence.checkpoint_folder(out)) {
         false if has_result => {
             format!("choose another --out, or give its run more steps: gsscale-train --resume {shown} --steps N")
@@ -283,7 +283,7 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
                    removes its checkpoint";
     let remedy = format!(
         "start a new run from its Gaussians with another --out and --init-ply {}",
-        out.join(PLY_FILE).display()
+        crate::base::say::shell_word(out.join(PLY_FILE))
     );
     Err(InputError::new(out, problem, remedy))
 }
@@ -374,7 +374,10 @@ pub(super) fn is_marked(out: &Path) -> bool {
 /// Errors: the folder cannot be written.
 pub(super) fn write_mark(request: &RunRequest) -> InputResult<()> {
     let path = request.out.join(BEGUN_FILE);
-    let fail = |e: toml::ser::Error| InputError::new(&path, e.to_string(), "report this as a bug");
+    let fail = |e: toml::ser::Error| {
+        let remedy = "choose another name for the folder whose name is not UTF-8";
+        InputError::new(&path, e.to_string(), remedy)
+    };
     let config = toml::to_string(&with_absolute_paths(request.config.clone())).map_err(fail)?;
     let facts = toml::to_string(&BegunMark { resolved: Facts { scene: absolute(&request.scene) } }).map_err(fail)?;
     write_whole(&path, format!("{config}\n{facts}").as_bytes())

@@ -254,7 +254,8 @@ fn goal(
     let mut changes = Changes::of_config(file, &state.origin.config, &state.origin.simd, config)?;
     changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
-        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", request.out.display());
+        let remedy =
+            format!("if it was moved: gsscale-train --resume {} SCENE", crate::base::say::shell_word(&request.out));
         return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
     let start = Start::look(scene, config, &request.out, host_budget(config.host_mem.0))?;

@@ -11,7 +11,7 @@ use super::live::counts;
 use super::out_folder::scene_name;
 use super::scene_picture::{overview, picture};
 use crate::base::error::InputError;
-use crate::base::units::format_grouped;
+use crate::base::units::counted_are;
 use crate::checkpoint::interval::CommitEvery;
 use crate::config::file::TrainConfig;
 use crate::config::values::Chosen;
@@ -129,6 +129,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     machine::set_up(config)?;
     config.residence().spill_dir().map_or(Ok(()), check_usable)?;
     let first = ShownScene::open(request, 0, false)?;
+    crate::tell!("live page: http://{}/", live.address());
     request.saved.iter().for_each(|folder| live.set_metrics(folder.join(METRICS_FILE)));
     let overview = overview(&first.trainer.scene, &first.dataset);
     let saved = request.saved.as_deref().map_or_else(Vec::new, saved_steps);
@@ -145,7 +146,7 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
     tell(&first);
     // Until here, Ctrl-C ends the program at once; the pages go at the next start.
     let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
-    crate::tell!("{} Gaussians are shown until Ctrl-C", format_grouped(first.trainer.scene.rows()));
+    crate::tell!("{} shown until Ctrl-C", counted_are(first.trainer.scene.rows(), "Gaussian"));
     let mut shown = Some(first);
     while stop.exit_code().is_none() {
         let Some((ticket, orbit)) = live.wanted() else {

@@ -21,6 +21,7 @@ use crate::dataset::model::{PointCloud, RawScene, TakePoint};
 use crate::dataset::plane_sweep;
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::up::estimate_up;
+use crate::exchange::foreign::refuse_folder_of_sogs;
 use crate::exchange::frames::to_local;
 use crate::exchange::ply::{self, PlyContent, read_ply};
 use crate::exchange::sog::{SogReader, is_tree};
@@ -58,6 +59,15 @@ fn init_ply(config: &TrainConfig) -> Option<&Path> {
 /// The store from which the run begins, if it begins from one.
 fn store(config: &TrainConfig) -> Option<&Path> {
     init_ply(config).filter(|path| path.is_dir())
+}
+
+/// Refuses a list of pages where the run does not begin from a store.
+fn check_pages_file(config: &TrainConfig) -> InputResult<()> {
+    if config.pages_file.is_empty() || !init_ply(config).is_none_or(Path::is_file) {
+        return Ok(());
+    }
+    let problem = "it lists pages of a store, and --init-ply names none";
+    Err(InputError::new("--pages-file", problem, "name the store with --init-ply, or leave it out"))
 }
 
 /// Refuses a start without Gaussians, or with more than --max-gaussians.
@@ -110,6 +120,7 @@ impl Start {
     /// Reads the scene. Points that can be streamed take no more memory than `host_mem` allows.
     /// Errors: as [`prepare`].
     pub fn read(scene: &Path, config: &TrainConfig, host_mem: Option<u64>) -> InputResult<Start> {
+        check_pages_file(config)?;
         if config.residence().spill_dir().is_none() && store(config).is_none() {
             return Start::in_memory(scene, config, host_mem)?.with_photos_that_fit(host_mem);
         }
@@ -120,6 +131,7 @@ impl Start {
     /// files for data that exceeds memory.
     /// Errors: as [`prepare`].
     pub fn look(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        check_pages_file(config)?;
         let start = match store(config) {
             Some(store) => Start::of_store(scene, config, store, host_mem)?,
             None if init_ply(config).is_some_and(is_tree) => Start::in_memory(scene, config, host_mem)?,
@@ -155,6 +167,7 @@ impl Start {
 
     /// From the Gaussians of a store.
     fn of_store(scene: &Path, config: &TrainConfig, folder: &Path, host_mem: Option<u64>) -> InputResult<Start> {
+        refuse_folder_of_sogs(folder)?;
         let memory = host_mem.unwrap_or(BUDGET_DEFAULT);
         let mut store = StoredStart::open(folder, memory, BUDGET_SHARE).map_err(|error| match error {
             TrainError::Input(error) => error,

@@ -23,12 +23,13 @@ pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
-use crate::report::run_files::CONFIG_FILE;
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
 use crate::train::error::TrainError;
 use crate::train::stores::ownership::check_owner;
 use std::path::{Path, PathBuf};
@@ -77,11 +78,8 @@ impl StorePlace {
 /// Errors: there is no store.
 pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
     if !dir.is_dir() {
-        return Err(InputError::new(
-            dir,
-            "there is no such folder",
-            "name a run's output folder or its spill directory",
-        ));
+        let problem = if dir.exists() { "this is no folder" } else { "there is no such folder" };
+        return Err(InputError::new(dir, problem, "name a run's output folder or its spill directory"));
     }
     // If FORMAT is lost, the segments identify a store.
     if dir.join("FORMAT").exists() || segments_in(dir).is_ok_and(|segments| !segments.is_empty()) {
@@ -98,9 +96,14 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         let id = read_resolved(&file)?.run;
         return Ok(StorePlace { folder, run: Some(dir.to_path_buf()), id });
     }
-    let problem =
-        format!("the checkpoint of this run, {}, is not there: it is removed when a run ends", folder.display());
-    Err(InputError::new(dir, problem, "its result is point_cloud.ply in the same folder"))
+    let (why, remedy) = match dir.join(PLY_FILE).is_file() {
+        true => ("it is removed when a run ends", "its result is point_cloud.ply in the same folder".to_string()),
+        false => (
+            "the run has not made a commit",
+            format!("wait for one if it still trains; if it was stopped: gsscale-train --resume {}", shell_word(dir)),
+        ),
+    };
+    Err(InputError::new(dir, format!("the checkpoint of this run, {}, is not there: {why}", folder.display()), remedy))
 }
 
 /// The run state of a generation.

@@ -24,6 +24,7 @@
 use super::run_state_of;
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::checkpoint::run_state::{RunIdentity, RunState};
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
@@ -52,7 +53,8 @@ pub(super) fn check_owner(folder: &Path, of_store: &RunIdentity, run: RunId) -> 
             format!("it holds the checkpoint of another run, that of {out}"),
             format!(
                 "name the folder that holds the pages of this run with --spill-dir; the other run continues with \
-                 gsscale-train --resume {out}"
+                 gsscale-train --resume {}",
+                shell_word(out)
             ),
         ),
     };
@@ -138,7 +140,7 @@ pub(crate) fn check_removable(folder: &Path, run: RunId) -> Result<(), TrainErro
     if !SpillDir::exists_in(folder) || holds_no_commit(&SpillDir::open(folder, true)?)? {
         return Ok(());
     }
-    let by_hand = format!("if you do not need it, remove it (rm -r {}), or choose another --out", folder.display());
+    let by_hand = format!("if you do not need it, remove it (rm -r {}), or choose another --out", shell_word(folder));
     let refuse = |problem: String| InputError::new(folder, problem, by_hand.clone());
     let state = last_state(folder, Access::Pages)
         .map_err(|e| refuse(format!("the checkpoint in it cannot be opened, so it is not removed: {e}")))?;

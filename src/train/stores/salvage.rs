@@ -18,6 +18,7 @@ use super::change::{layout_for, usual_codec};
 use super::{StorePlace, options_of, run_state_of};
 use crate::base::error::InputError;
 use crate::base::ids::PageId;
+use crate::base::say::shell_word;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::{self, RunOptions};
@@ -364,7 +365,7 @@ fn without_state(
     source.notes.push(format!(
         "the trainer's state is lost. To train on from the step of its newest row: gsscale-train --resume OUT --spill-dir {to} \
          --accept-changes. To keep the scene alone: gsscale-ckpt export {to} --out FILE.ply",
-        to = request.to.display()
+        to = shell_word(&request.to)
     ));
     let (pages, to) = (kept.len() as u64, request.to.clone());
     Ok(Salvaged { to, has_state: false, step, gaussians: rows, pages, lost, notes: source.notes })

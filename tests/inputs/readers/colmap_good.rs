@@ -152,7 +152,7 @@ fn a_view_without_a_pose_is_left_out_by_name() {
             let (scene, _) = scene_with(&m, is_binary);
             let found = read(scene.path());
             assert_eq!(found.views.len(), 3);
-            warned(&found, &["images.", "1 view(s) left out", "'b.jpg'"]);
+            warned(&found, &["images.", "1 view left out", "'b.jpg'"]);
         }
     }
 }

@@ -142,7 +142,7 @@ fn names_in_a_code_page_find_their_photos() {
                 .find(|view| view.name.ends_with(photo))
                 .unwrap_or_else(|| panic!("{:?}", found.views));
             assert_eq!(view.image_path, scene.path().join("images").join(photo));
-            warned(&found, &["1 name(s) are not UTF-8", "\\x", &view.name]);
+            warned(&found, &["1 name is not UTF-8", "\\x", &view.name]);
         }
     }
 }
@@ -181,7 +181,7 @@ fn numbers_that_are_none_leave_out_a_view_or_are_named() {
             let found =
                 read(scene_of(&[(file, text.as_bytes())], &photos).path()).unwrap_or_else(|e| panic!("{word}: {e}"));
             assert_eq!((found.views.len(), found.views[0].name.ends_with("b.png")), (1, true));
-            warned(&found, &["1 view(s) left out", "a.png", "not finite"]);
+            warned(&found, &["1 view left out", "a.png", "not finite"]);
         }
     }
     let found =

@@ -118,7 +118,7 @@ fn bad_lines_of_a_csv_are_refused_by_number() {
         ("a.png,1,2,3,0,0,0,0,0,0,0,0,0,0,0,0", &["line 3", "focal length"]),
         ("a.png,1,2,3,0,0,0,18,0,0,0,0,0,0.5,0,0", &["line 3", "Brown3"]),
         ("../c.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["line 3", "climbs out"]),
-        ("b.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["1 photo(s) are missing", "'b.png'"]),
+        ("b.png,1,2,3,0,0,0,18,0,0,0,0,0,0,0,0", &["1 photo is missing", "'b.png'"]),
         (good, &["two views"]),
     ] {
         refused(read(csv(&format!("{HEADER}\n{good}\n{line}\n")).path()), "poses.csv", words);

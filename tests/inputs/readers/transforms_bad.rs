@@ -56,6 +56,8 @@ fn keys_of_the_wrong_kind_are_refused_by_name() {
         ("fl_x", json!(0), "focal length"),
         ("fl_x", json!(-1), "focal length"),
         ("fl_x", json!(1e300), "focal length"),
+        ("cx", json!(1e9), "principal point"),
+        ("cy", json!(-1e9), "principal point"),
         ("k1", json!("0.1"), "not a number"),
         ("k4", json!(0.1), "not defined"),
         ("mask_path", json!(1), "not a string"),

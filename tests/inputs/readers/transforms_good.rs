@@ -141,7 +141,7 @@ fn lists_of_file_names_prescribe_the_split() {
     let views: Vec<_> = found.views.iter().map(|v| (v.name.as_str(), v.split)).collect();
     let (train, test) = (Some(Split::Train), Some(Split::Test));
     assert_eq!(views, [("images/a.png", train), ("images/b.png", train), ("images/d.png", test)]);
-    warned(&found, &["1 view(s) left out", "'images/c.png'"]);
+    warned(&found, &["1 view left out", "'images/c.png'"]);
     top.as_object_mut().unwrap().remove("test_filenames");
     let folder = scene(top.clone(), frames.clone());
     assert_eq!(read(folder.path()).views[2].split, test);
@@ -169,7 +169,7 @@ fn invalid_poses_are_dropped_by_name() {
     frames[3]["transform_matrix"][0][0] = json!(-1.0);
     let found = read(scene(size(), frames).path());
     assert_eq!(found.views.len(), 1);
-    warned(&found, &["3 view(s) left out", "'b.png', 'c.png', 'd.png'"]);
+    warned(&found, &["3 views left out", "'b.png', 'c.png', 'd.png'"]);
 }
 
 #[test]
@@ -198,11 +198,11 @@ fn missing_photos_matter_only_while_their_size_is_unknown() {
     let folder = scene(json!({"camera_angle_x": 0.5}), vec![frame("a.png"), frame("gone")]);
     png(&folder.path().join("a.png"), 40, 30);
     let refusal = read_transforms(folder.path(), &ReadOptions::default());
-    refused(refusal, "transforms.json", &["1 photo(s) are missing", "'gone.png'", "--allow-missing"]);
+    refused(refusal, "transforms.json", &["1 photo is missing", "'gone.png'", "--allow-missing"]);
     let options = ReadOptions { allow_missing: true, ..ReadOptions::default() };
     let found = read_transforms(folder.path(), &options).unwrap();
     assert_eq!(found.views.len(), 1);
-    warned(&found, &["1 view(s) left out", "'gone.png'"]);
+    warned(&found, &["1 view left out", "'gone.png'"]);
 }
 
 #[test]

@@ -199,6 +199,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     assert!(bench.is_intact("copy"));
     assert_ne!(bench.ckpt_json("inspect copy")["identity"], bench.ckpt_json("inspect out")["identity"]);
     bench.fails("clone out copy", &["exists already"]);
+    bench.fails("clone out copy/sub", &["in another store"]);
 
     // The run then uses its copy, and does not return to a store that lacks the newer steps.
     bench.go_on_until_stopped("--spill-dir copy");
