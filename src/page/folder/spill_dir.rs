@@ -21,7 +21,7 @@ use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 
-const FORMAT: &str = "FORMAT";
+pub(in crate::page) const FORMAT: &str = "FORMAT";
 /// The FORMAT file while it is written; renamed when complete.
 const FORMAT_NEW: &str = "FORMAT.new";
 pub(in crate::page) const LOCK: &str = "LOCK";

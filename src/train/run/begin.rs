@@ -10,6 +10,7 @@ use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, train_into};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
@@ -310,7 +311,7 @@ pub(super) fn plan_and_train(
         let elsewhere = spill_dir_flag(request);
         crate::tell!(
             "to go on from the last commit: gsscale-train --resume {}{elsewhere}{more}",
-            crate::base::say::shell_word(&request.out)
+            shell_word(&request.out)
         );
     }
     tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
@@ -327,5 +328,5 @@ fn spill_dir_flag(request: &RunRequest) -> String {
     let folder = |config: TrainConfig| with_absolute_paths(config).spill_dir;
     let (kept, now) = (TrainConfig::read(&request.out.join(CONFIG_FILE)).map(folder), folder(request.config.clone()));
     let is_known = now.is_empty() || kept.is_ok_and(|kept| kept == now);
-    if is_known { String::new() } else { format!(" --spill-dir {}", crate::base::say::shell_word(now)) }
+    if is_known { String::new() } else { format!(" --spill-dir {}", shell_word(now)) }
 }

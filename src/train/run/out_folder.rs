@@ -13,6 +13,7 @@ use super::changes::with_absolute_paths;
 use super::request::{Existing, RunRequest};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::base::whole_file::{folder_of, part_path, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
@@ -138,7 +139,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
     };
     let residence = config.residence();
     let has_result = out.join(PLY_FILE).exists();
-    let shown = crate::base::say::shell_word(out);
+    let shown = shell_word(out);
     match SpillDir::exists_in(&residence.checkpoint_folder(out)) {
         false if has_result => {
             format!("choose another --out, or give its run more steps: gsscale-train --resume {shown} --steps N")
@@ -283,7 +284,7 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
                    removes its checkpoint";
     let remedy = format!(
         "start a new run from its Gaussians with another --out and --init-ply {}",
-        crate::base::say::shell_word(out.join(PLY_FILE))
+        shell_word(out.join(PLY_FILE))
     );
     Err(InputError::new(out, problem, remedy))
 }

@@ -16,6 +16,7 @@ use super::request::{Existing, RunOutcome, RunRequest};
 use super::run_folder::{Begun, PastRun};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
+use crate::base::say::shell_word;
 use crate::base::simd::SimdPath;
 use crate::base::units::{format_grouped, format_seconds};
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
@@ -254,8 +255,7 @@ fn goal(
     let mut changes = Changes::of_config(file, &state.origin.config, &state.origin.simd, config)?;
     changes.check(file, request.accept_changes)?;
     if !scene.is_dir() {
-        let remedy =
-            format!("if it was moved: gsscale-train --resume {} SCENE", crate::base::say::shell_word(&request.out));
+        let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", shell_word(&request.out));
         return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }
     let start = Start::look(scene, config, &request.out, host_budget(config.host_mem.0))?;
