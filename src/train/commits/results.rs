@@ -146,7 +146,7 @@ impl Results<'_> {
 
     /// What can be saved on another drive now, as a line of a message.
     fn elsewhere(&self) -> String {
-        let (out, step) = (shell_word(&self.out), self.trainer.steps_done());
+        let (out, step) = (shell_word(self.out), self.trainer.steps_done());
         match (self.has_ply, self.has_last_step()) {
             (true, _) => {
                 format!("\n  {} is whole and can be copied to another drive", self.out.join(PLY_FILE).display())
