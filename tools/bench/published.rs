@@ -244,7 +244,7 @@ fn train(
         return Ok(outcome.summary.ok_or(ExitCode::SUCCESS));
     }
     let [name, data, all] = [&args.run, &args.data, &setting.out].map(shell_word);
-    let resume = format!("gsscale-train --resume {}", shell_word(&out));
+    let resume = format!("gsscale-train --resume {}", shell_word(out));
     let more = if args.with_defaults { " --with-defaults" } else { "" };
     gsscale::tell!(
         "stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train"
