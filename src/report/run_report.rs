@@ -18,6 +18,7 @@ use crate::photos::parameter::Finding;
 use crate::photos::{KINDS, diagnosis};
 use serde_json::Value;
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 /// Most views: a file with more opens slowly.
@@ -320,7 +321,9 @@ pub fn listed_pictures(folder: &Path) -> BTreeMap<String, Value> {
     let views = read_json(&list).unwrap_or(Value::Null);
     let views = views.as_array().cloned().unwrap_or_default().into_iter();
     let named = views.filter_map(|view| Some((view["picture"].as_str()?.to_string(), view)));
-    named.filter(|(name, _)| folder.join(name).is_file()).collect()
+    // No name leads out of the folder.
+    let is_there = |name: &str| Path::new(name).file_name() == Some(OsStr::new(name)) && folder.join(name).is_file();
+    named.filter(|(name, _)| is_there(name)).collect()
 }
 
 /// A picture of a run; `None`, with a warning, if it cannot be read: that must not cost the page.

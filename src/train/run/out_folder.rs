@@ -103,6 +103,11 @@ pub fn check_usable_out(out: &Path, existing: Existing) -> Result<(), TrainError
     refuse_in_use(out)?;
     match existing {
         Existing::Refuse if out.exists() && !is_empty(out) => Err(exists_already(out).into()),
+        Existing::Overwrite if out.join(CONFIG_FILE).is_file() && !is_run(out) => {
+            let remedy = "choose another --out, or move that file away";
+            Err(InputError::new(out, "its config.toml is not that of a run, so --overwrite replaces nothing", remedy)
+                .into())
+        }
         Existing::Overwrite => check_removable(&checkpoint_folder(out), run_in(out)),
         Existing::Refuse | Existing::BeginAgain => Ok(()),
     }
@@ -182,9 +187,8 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     std::fs::write(&probe, b"")
         .and_then(|()| std::fs::remove_file(&probe))
         .map_err(failed(out, "making the output folder"))?;
-    // Without a run's config, files with our names may be somebody else's (such as the points of a scene).
-    let is_runs = [CONFIG_FILE, BEGUN_FILE].iter().any(|file| out.join(file).is_file());
-    if existing == Existing::Refuse || !is_runs {
+    // Otherwise files with our names may be somebody else's (such as the points of a scene).
+    if existing == Existing::Refuse || !is_run(out) {
         return Ok(());
     }
     if existing == Existing::BeginAgain {
@@ -196,6 +200,13 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     // First, because an active run in the folder makes this fail.
     remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
     Ok(remove_files(out, |_| true)?)
+}
+
+/// Whether a folder has the mark or the config.toml of a run. Other programs have files of the latter name; an empty one is nobody's.
+fn is_run(out: &Path) -> bool {
+    let config = out.join(CONFIG_FILE);
+    let is_empty = std::fs::metadata(&config).is_ok_and(|about| about.is_file() && about.len() == 0);
+    out.join(BEGUN_FILE).is_file() || is_empty || read_resolved(&config).is_ok()
 }
 
 /// Removes the evaluation of an earlier state, since comparisons would use it for this run.
@@ -427,6 +438,10 @@ mod tests {
         }
         let count = || std::fs::read_dir(&events).map_or(0, Iterator::count);
         make(out, Existing::Overwrite).unwrap();
+        std::fs::write(out.join(CONFIG_FILE), "baseURL = \"https://example.org\"").unwrap();
+        make(out, Existing::Overwrite).unwrap();
+        let refused = check_usable_out(out, Existing::Overwrite).unwrap_err().to_string();
+        assert!(refused.contains("not that of a run"), "{refused}");
         assert_eq!(count(), 2, "no run's config, so they are not a run's");
         std::fs::write(out.join("config.toml"), "").unwrap();
         std::fs::write(events.join("events.out.tfevents.0123456789.host.1.0"), "of another program").unwrap();
