@@ -72,13 +72,13 @@ impl<'de> Deserialize<'de> for CommitEvery {
     fn deserialize<D: Deserializer<'de>>(d: D) -> Result<Self, D::Error> {
         #[derive(Deserialize)]
         #[serde(untagged)]
-        enum Written {
+        enum SecondsOrText {
             Seconds(f64),
             Text(String),
         }
-        match Written::deserialize(d)? {
-            Written::Seconds(seconds) => Ok(CommitEvery::Seconds(seconds)),
-            Written::Text(text) => text.parse().map_err(serde::de::Error::custom),
+        match SecondsOrText::deserialize(d)? {
+            SecondsOrText::Seconds(seconds) => Ok(CommitEvery::Seconds(seconds)),
+            SecondsOrText::Text(text) => text.parse().map_err(serde::de::Error::custom),
         }
     }
 }

@@ -263,7 +263,10 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     assert!(machines == Some("3") && cells.0.text("city/plan.toml") == plan, "{said}");
     cells.refuses("prior scene --out other --ssim-lambda 7", &["--ssim-lambda"]);
     cells.refuses("prior scene --out scene", &["is the scene itself"]);
-    cells.refuses("cut scene --out other --cells 2", &["keys.toml", "gsscale-cells prior"]);
+    // A file that is missing may come: shared folders lag.
+    let (code, said) = cells.says("cut scene --out other --cells 2");
+    assert_eq!(code, Some(75), "{said}");
+    says(&said, &["keys.toml", "gsscale-cells prior"]);
     assert!(!cells.0.exists("other"));
     // Legs of one step: most of the time the worker is between two of them.
     let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > Some(0));

@@ -160,7 +160,7 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     let refused = |flags: &str, words: &[&str]| work.refuses_with(POSES, flags, words);
     refused("scene", &["scene/sparse", "a model is here already", "--out"]);
     work.remove("scene/sparse");
-    refused("scene --colmap nowhere/colmap", &["nowhere/colmap", "pip install pycolmap", "apt-get install colmap"]);
+    refused("scene --colmap nowhere/colmap", &["nowhere/colmap", "no such program", "leave --colmap out"]);
     let without = work.command(POSES, "scene").env("PATH", "").env_remove("GSSCALE_PYTHON").output().unwrap();
     says(&stderr(&without), &["neither COLMAP nor a Python with pycolmap", "pip install pycolmap", "--colmap PATH"]);
     // A program that is no COLMAP, and a Python that is none.

@@ -51,11 +51,11 @@ fn the_announced_memory_is_what_a_run_takes() {
     }
 }
 
-/// Runs a program, refused in 64 MiB, within exactly the memory that the refusal names as the least; `false` where the system cannot
+/// Runs a program, refused in 32 MiB, within exactly the memory that the refusal names as the least; `false` where the system cannot
 /// limit it.
 #[cfg(target_os = "linux")]
 fn succeeds_within_the_least(work: &Workdir, program: &str, flags: &str) -> bool {
-    let mebibytes = least_memory(&work.refuses_with(program, &format!("{flags} --host-mem 64MiB"), &[]));
+    let mebibytes = least_memory(&work.refuses_with(program, &format!("{flags} --host-mem 32MiB"), &[]));
     let group = match MemoryGroup::new((mebibytes * f64::from(1 << 20)) as u64) {
         Ok(group) => group,
         Err(why) => {

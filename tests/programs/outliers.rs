@@ -151,7 +151,7 @@ fn pages_on_a_device_give_the_same_bytes_without_wrong_views() {
     let Some(()) = a_device() else { return };
     let work = Workdir::city(24, 96, 64, 1500);
     let swapped = disturbed(&work, "swapped", &SWAPPED);
-    let flags = "--steps 90 --strategy none --robust-views --device gpu --optimizer-on device --page-rows 32 --view-order shuffle";
+    let flags = "--steps 110 --strategy none --robust-views --device gpu --optimizer-on device --page-rows 32 --view-order shuffle";
     for (out, slots) in [("all", "64MiB"), ("few", "5MiB")] {
         swapped.run(out, &format!("{flags} --device-mem {slots}"));
     }

@@ -304,6 +304,9 @@ pub(super) fn plan_and_train(
         }
         out_folder::make(&request.out, request.existing)?;
     }
+    if let Some(kept) = begun.past.as_ref().and_then(|past| past.keeps.as_ref()) {
+        out_folder::keep_result(&request.out, kept)?;
+    }
     let outcome = train_into(request, dataset, trainer, &stop, &mut tiers, begun, &forecast);
     // A leg is followed by the next one.
     if tiers.can_resume() && request.leg.is_none() {

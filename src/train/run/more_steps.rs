@@ -14,11 +14,10 @@ use super::begin::{FirstTrainer, first_trainer, plan_and_train};
 use super::changes::{Changes, with_absolute_paths};
 use super::request::{RunOutcome, RunRequest};
 use super::run_folder::{Begun, PastRun};
-use crate::base::error::{InputError, InputResult};
+use crate::base::error::InputError;
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
-use crate::base::whole_file::sync_folder;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
 use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, saved_ply_name};
@@ -95,9 +94,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     let host_mem = host_budget(request.config.host_mem.0);
     let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
     let kept = finished.kept_path(&out);
-    if !finished.is_kept_in(&out) {
-        keep_result(&out, &kept)?;
-    }
+    let keeps = (!finished.is_kept_in(&out)).then(|| kept.clone());
     let FinishedRun { file, run, summary, changes, .. } = finished;
     for line in &changes.numbers {
         crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
@@ -119,6 +116,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         has_changed: false,
         file: Some(file),
         first_rows,
+        keeps,
     };
     trainer.begin_after(summary.steps, summary.train_seconds);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
@@ -130,24 +128,4 @@ fn metrics_until(out: &Path, step: u32) -> u64 {
     let step_of = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["step"].as_u64();
     let is_past = |line: &&str| step_of(line).is_some_and(|at| at <= u64::from(step));
     metrics.split_inclusive('\n').take_while(is_past).map(|line| line.len() as u64).sum()
-}
-
-/// Gives the result in `out` a second name. The first one stays, where viewers look for it, until the new result replaces it as a whole.
-fn keep_result(out: &Path, kept: &Path) -> InputResult<()> {
-    let result = out.join(PLY_FILE);
-    let doing = "keeping the result under the name of its step";
-    let failed = |error: std::io::Error| InputError::io(&result, doing, &error);
-    let beside = out.join(".kept.ply.part");
-    let _ = std::fs::remove_file(&beside);
-    // A second name costs no space; some file systems have none.
-    if std::fs::hard_link(&result, &beside).is_err()
-        && let Err(error) = std::fs::copy(&result, &beside)
-    {
-        let _ = std::fs::remove_file(&beside);
-        return Err(failed(error));
-    }
-    std::fs::rename(&beside, kept).map_err(failed)?;
-    // Where folders cannot be synced, the name is durable with the next sync of a file.
-    let _ = sync_folder(out);
-    Ok(())
 }

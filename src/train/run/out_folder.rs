@@ -300,6 +300,26 @@ pub(super) fn check_restart(out: &Path) -> InputResult<()> {
     Err(InputError::new(out, problem, remedy))
 }
 
+/// Gives the result in `out` a second name. The first one stays, where viewers look for it, until the new result replaces it as a whole.
+pub(super) fn keep_result(out: &Path, kept: &Path) -> InputResult<()> {
+    let result = out.join(PLY_FILE);
+    let doing = "keeping the result under the name of its step";
+    let failed = |error: std::io::Error| InputError::io(&result, doing, &error);
+    let beside = out.join(".kept.ply.part");
+    let _ = std::fs::remove_file(&beside);
+    // A second name costs no space; some file systems have none.
+    if std::fs::hard_link(&result, &beside).is_err()
+        && let Err(error) = std::fs::copy(&result, &beside)
+    {
+        let _ = std::fs::remove_file(&beside);
+        return Err(failed(error));
+    }
+    std::fs::rename(&beside, kept).map_err(failed)?;
+    // Where folders cannot be synced, the name is durable with the next sync of a file.
+    let _ = sync_folder(out);
+    Ok(())
+}
+
 /// The PLY files that `--save-every` wrote.
 pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     let entries = std::fs::read_dir(out).map_err(failed(out, "listing the folder"))?;

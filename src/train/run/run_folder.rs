@@ -45,7 +45,7 @@ use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
 use std::cell::OnceCell;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 pub(super) struct PastRun {
@@ -60,6 +60,8 @@ pub(super) struct PastRun {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Number of its first Gaussians.
     pub first_rows: u64,
+    /// Where its result stays, if it is to be kept before the first step.
+    pub keeps: Option<PathBuf>,
 }
 
 /// Facts with which a run begins or resumes.

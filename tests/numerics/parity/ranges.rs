@@ -69,7 +69,7 @@ fn a_budget_covers_what_the_driver_allocates() {
     (view.1.fx, view.1.fy) = (300.0, 300.0);
     view.0.scales.iter_mut().for_each(|s| *s = 0.1 * *s - 1.7);
     let (options, loss) = (RenderOptions::default(), LossOptions::default());
-    for _ in 0..3 {
+    for _ in 0..2 {
         results_with(&mut gpu, &view, &options, &target, &loss).unwrap();
         let traffic = gpu.gpu().traffic();
         let Some([allocated, reserved]) = gpu.gpu().allocator_bytes() else { return };

@@ -133,7 +133,7 @@ fn a_run_that_was_cut_off_before_its_first_commit_begins_again() {
         bench.start(place, SELDOM).after_lines("out", 1).kill();
         // A refusal changes nothing, before and after the first pages are made.
         bench.does_not_go_on("--device no-such-card", &["no-such-card"]);
-        bench.does_not_go_on("--host-mem 1MiB", &["--host-mem"]);
+        bench.does_not_go_on("--host-mem 1MiB --frames 0", &["--host-mem"]);
         if place == Place::Memory {
             // A process that is killed during its first commit leaves a store, which the end of the run removes.
             let layout = SlotLayout::new(4096, 1);
