@@ -53,7 +53,7 @@ fn hardly_more_than_the_fewest(bench: &Bench, name: &str, in_flight: &str, more:
 #[test]
 fn in_every_step_hardly_more_than_the_fewest_bytes_went_up() {
     let Some(bench) = Bench::new() else { return };
-    let events = "--strategy default --refine-every 11 --reset-every 15 --sh-every 22";
+    let events = "--strategy default --refine-every 15 --reset-every 20 --sh-every 30";
     for (i, (device_mem, order, in_flight, more)) in [
         ("5MiB", "shuffle", "2", STEADY),
         ("4MiB", "shuffle", "2", STEADY),
@@ -87,7 +87,7 @@ fn a_step_that_is_taken_again_takes_up_at_most_two_payloads_for_each_of_its_page
     let [sound, faulty] = ["sound", "faults"].map(|name| loaded(&bench, name));
     let extra = faulty.last().unwrap()[0] - sound.last().unwrap()[0];
     println!("{given_up} replays took {extra} bytes up, of at most {most}");
-    assert!(given_up > 6 && extra > 0 && extra <= most, "{given_up} replays, {extra} bytes of at most {most}");
+    assert!(given_up > 8 && extra > 0 && extra <= most, "{given_up} replays, {extra} bytes of at most {most}");
     // Nothing else goes up.
     for (name, steps) in [("sound", sound), ("faults", faulty)] {
         for (i, line) in bench.metrics(name).iter().enumerate().skip(1) {

@@ -12,12 +12,9 @@ use std::fmt::Write;
 use std::ops::Deref;
 use std::process::Command;
 
-/// Steps of a run.
-const STEPS: u64 = 66;
-
-/// Two rounds, a reset and raises within these steps, with stretches between them.
-const RUN: &str = "scene --device gpu --optimizer-on device --steps 66 --refine-start 9 --refine-every 22 --grow-grad2d 0.0005 \
-    --reset-every 44 --sh-every 36 --max-gaussians 7000 --page-rows 32 --view-order groups:4 --log-every 1 --quiet --keep-checkpoint";
+/// Two rounds, a reset and raises within 90 steps, with stretches between them.
+const RUN: &str = "scene --device gpu --optimizer-on device --steps 90 --refine-start 9 --refine-every 30 --grow-grad2d 0.0005 \
+    --reset-every 60 --sh-every 50 --max-gaussians 7000 --page-rows 32 --view-order groups:4 --log-every 1 --quiet --keep-checkpoint";
 
 /// A span of a trace; times in microseconds.
 #[derive(Debug, serde::Deserialize)]
@@ -128,7 +125,7 @@ fn a_step_that_is_not_taken_leaves_no_trace_and_neither_does_the_one_behind_it()
         spans.iter().filter(of).map(|s| s.step()).collect::<Vec<u64>>()
     };
     let [with_other, alone] = [finished(true), finished(false)];
-    assert!(with_other.len() > 15 && alone.len() >= 3, "{with_other:?}, {alone:?}");
+    assert!(with_other.len() > 20 && alone.len() >= 3, "{with_other:?}, {alone:?}");
     let mut faults = String::new();
     for (i, step) in with_other.iter().step_by(3).chain(&alone).enumerate() {
         write!(faults, "{}@{step},", ["rows", "isects", "closed"][i % 3]).unwrap();
@@ -162,7 +159,7 @@ fn views_whose_loss_is_not_finite_are_skipped_however_many_steps_are_in_flight()
         bench.write("bright.ply", bytes);
         let of_run = |in_flight: &str| {
             let name = format!("bright{brightness:e}-{in_flight}");
-            let is_done = bench.run(&name, in_flight, "", "--init-ply bright.ply --view-order shuffle --steps 40");
+            let is_done = bench.run(&name, in_flight, "", "--init-ply bright.ply --view-order shuffle --steps 50");
             let summary = bench.summary(&format!("{name}.out"));
             let counts =
                 ["steps", "steps_skipped_non_finite", "rows_skipped_non_finite"].map(|key| summary[key].to_string());
@@ -184,8 +181,8 @@ fn the_next_step_is_submitted_before_this_one_is_waited_for() {
     let Some(bench) = Bench::new() else { return };
     assert!(bench.run("steady", "2", "", "--strategy none --sh-every 0 --view-order shuffle"));
     let spans = bench.spans("steady");
-    let mut both = 0u64;
-    for step in 0..STEPS - 1 {
+    let mut both = 0;
+    for step in 0..89 {
         let of = |name: &str, key: &str, value: &str| {
             let is_it = |s: &&Span| s.step() == step && s.name == name && s.args[key].as_str() == Some(value);
             spans.iter().filter(is_it).map(|s| s.began).collect::<Vec<f64>>()
@@ -199,8 +196,8 @@ fn the_next_step_is_submitted_before_this_one_is_waited_for() {
         assert!(record < submitted && submitted < read && read < f64::MAX, "step {step}: {submitted} us, {read} us");
         both += 1;
     }
-    println!("{both} of {} steps were submitted before the one before them was waited for", STEPS - 1);
-    assert!(both > STEPS * 3 / 4, "{both} of {STEPS} steps were submitted before the one before them was waited for");
+    println!("{both} of 89 steps were submitted before the one before them was waited for");
+    assert!(both > 70, "{both} of 89 steps were submitted before the one before them was waited for");
 }
 
 /// What a step of several batches does in its last one: the update is submitted, payloads of the next step go up, and then the host waits
@@ -233,14 +230,14 @@ fn views_of_several_batches_take_payloads_of_the_next_step_up_ahead() {
         same(&bench.result(device_mem), &want, device_mem);
         let spans = bench.spans(device_mem);
         // The last step has no next one.
-        let several: Vec<bool> = (1..STEPS - 1).filter_map(|step| took_payloads_up(&spans, step)).collect();
+        let several: Vec<bool> = (1..89).filter_map(|step| took_payloads_up(&spans, step)).collect();
         let ahead = several.iter().filter(|is_ahead| **is_ahead).count();
         let last = bench.metrics(device_mem).pop().unwrap();
         let (slots, peak) = (&last["slots"], last["device_bytes_peak"].as_u64().unwrap());
         let several = several.len();
         println!("{device_mem}: {ahead} of {several} steps of several batches took payloads up ahead; {slots}");
         assert!(
-            several > 15 && ahead > 7 && slots["loads_ahead"].as_u64().unwrap() > 50,
+            several > 20 && ahead > 10 && slots["loads_ahead"].as_u64().unwrap() > 50,
             "{ahead} of {several}: {slots}"
         );
         assert!(peak <= if device_mem == "3MiB" { 3 << 20 } else { 2500 << 10 }, "{peak} bytes of device memory");
