@@ -123,6 +123,20 @@ pub struct View {
 }
 
 impl Dataset {
+    #[cfg(test)]
+    pub(crate) fn without_views() -> Dataset {
+        Dataset {
+            views: Vec::new(),
+            points: Vec::new(),
+            colors: Vec::new(),
+            frame: Frame { origin: DVec3::ZERO, scale: 1.0 },
+            scene_scale: 1.0,
+            warnings: Vec::new(),
+            image_folder: PathBuf::new(),
+            root: PathBuf::new(),
+        }
+    }
+
     /// Indices of the training views, ascending; never empty.
     pub fn train_views(&self) -> Vec<usize> {
         self.views_of(Split::Train)
@@ -579,16 +593,8 @@ mod tests {
         let (root, images) = (folder.path().to_path_buf(), folder.path().join("images"));
         std::fs::create_dir(&images).unwrap();
         let is_among = |image_folder: &Path, path: &str| {
-            let dataset = Dataset {
-                views: Vec::new(),
-                points: Vec::new(),
-                colors: Vec::new(),
-                frame: Frame { origin: DVec3::ZERO, scale: 1.0 },
-                scene_scale: 1.0,
-                warnings: Vec::new(),
-                image_folder: image_folder.to_path_buf(),
-                root: root.clone(),
-            };
+            let dataset =
+                Dataset { image_folder: image_folder.to_path_buf(), root: root.clone(), ..Dataset::without_views() };
             dataset.photo_folder_around(&root.join(path)).is_some()
         };
         let of = |image_folder: &Path| {

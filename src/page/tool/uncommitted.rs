@@ -48,24 +48,25 @@ pub fn check_usable(folder: &Path) -> InputResult<()> {
     }
 }
 
-/// Creates a store in `folder`, in the place of one that holds no commit. Returns whether there was one.
+/// Creates a store with slots of this layout in `folder`, on a drive of this machine, in the place of a store that holds no commit.
+/// Returns whether there was one.
 /// Errors: as [`SpillDir::create`]; or the old store cannot be removed.
-pub fn create_or_replace(folder: &Path, layout: SlotLayout, allow_remote: bool) -> InputResult<(SpillDir, bool)> {
-    if let Ok(spill) = SpillDir::open(folder, allow_remote)
+pub fn create_or_replace(folder: &Path, layout: SlotLayout) -> InputResult<(SpillDir, bool)> {
+    if let Ok(spill) = SpillDir::open(folder, false)
         && holds_no_commit(&spill)?
     {
         return Ok((spill.replace(layout)?, true));
     }
     // This reports why a folder cannot be used.
-    Ok((SpillDir::create(folder, layout, allow_remote)?, false))
+    Ok((SpillDir::create(folder, layout, false)?, false))
 }
 
 /// Removes the store in `folder` if it holds no commit, so that a run can create its own there. Returns whether it did.
 /// Everything else stays unchanged: no store, a checkpoint, a store that cannot be opened or is in use.
 /// Errors: a file of the store cannot be removed.
-pub fn remove_uncommitted(folder: &Path, allow_remote: bool) -> InputResult<bool> {
+pub fn remove_uncommitted(folder: &Path) -> InputResult<bool> {
     // Creating a store in this folder will report why it cannot be used.
-    let Ok(spill) = SpillDir::open(folder, allow_remote) else { return Ok(false) };
+    let Ok(spill) = SpillDir::open(folder, true) else { return Ok(false) };
     if !holds_no_commit(&spill)? {
         return Ok(false);
     }

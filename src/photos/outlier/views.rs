@@ -389,11 +389,8 @@ fn finding(_: &Value, summary: &Value) -> Option<Finding> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::dataset::frame::Frame;
     use crate::scene::camera::Camera;
     use crate::scene::events::EventLog;
-    use glam::DVec3;
-    use std::path::PathBuf;
 
     /// Half of the pixels dark, half bright: variance (contrast / 2)^2 in grey levels.
     fn photo(contrast: u8) -> Target {
@@ -561,17 +558,7 @@ mod tests {
     /// Ends a step on a view, whose picture has this error.
     fn end(outliers: &mut OutlierViews, step: u32, mse: f64, (ended_group, after_reset): (Option<usize>, Option<u32>)) {
         let photo = Target::new([4, 4], (0..48).map(|i| 5 * i).collect());
-        let dataset = Dataset {
-            views: Vec::new(),
-            points: Vec::new(),
-            colors: Vec::new(),
-            frame: Frame { origin: DVec3::ZERO, scale: 1.0 },
-            scene_scale: 1.0,
-            warnings: Vec::new(),
-            image_folder: PathBuf::new(),
-            root: PathBuf::new(),
-        };
-        let (view, photo, dataset) = (step as usize % 10, &photo, &dataset);
+        let (view, photo, dataset) = (step as usize % 10, &photo, &Dataset::without_views());
         let [is_skipped, is_left_out] = [false; 2];
         let outcome =
             PhotoOutcome { view, step, is_skipped, is_left_out, ended_group, after_reset, mse, photo, dataset };

@@ -555,7 +555,7 @@ impl FirstCommit {
     pub fn make(&self, pager: &mut Pager) -> Result<(SpillDir, Commits), TrainError> {
         let layout = SlotLayout::new(self.capacity_bytes, pager.index().len() as u64);
         // An earlier process killed during its first commit leaves a store without commits.
-        remove_uncommitted(&self.folder, true)?;
+        remove_uncommitted(&self.folder)?;
         // Allow a network file system: the user chose it for the results.
         let spill = SpillDir::create(&self.folder, layout, true)?;
         match self.make_in(&spill, layout) {

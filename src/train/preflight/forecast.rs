@@ -13,7 +13,7 @@
 use super::device_memory;
 use super::plan::{Probe, TierPlan, allow_largest_view, estimate, limit_memory, plan_tiers, rows_at_most};
 use crate::base::error::{InputError, InputResult};
-use crate::base::units::format_bytes;
+use crate::base::units::{counted, format_bytes};
 use crate::checkpoint::interval::{CommitEvery, SHORTEST_SECONDS, bytes_per_hour};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
@@ -520,9 +520,10 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
         return Ok(());
     }
     let problem = format!(
-        "the drive has {} free, but the run may need {}: {pages} pages of {}, and room for pages that are being written",
+        "the drive has {} free, but the run may need {}: {} of {}, and room for pages that are being written",
         format_bytes(free),
         format_bytes(needed),
+        counted(pages, "page"),
         format_bytes(frame_bytes)
     );
     let remedy = "free space on it, choose another drive, or lower --sh-degree";

@@ -320,7 +320,7 @@ pub(super) fn plan_and_train(
     tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
     // What a process left that was killed during its first commit to the output folder.
     let folder = checkpoint_folder(&request.out);
-    if outcome.is_ok() && remove_uncommitted(&folder, true).is_ok_and(|is_removed| is_removed) {
+    if outcome.is_ok() && remove_uncommitted(&folder).is_ok_and(|is_removed| is_removed) {
         let _ = std::fs::remove_dir(folder);
     }
     outcome

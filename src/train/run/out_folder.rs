@@ -37,6 +37,9 @@ use std::path::{Path, PathBuf};
 /// Lock file of an output folder; it stays there, empty.
 const LOCK: &str = ".gsscale-lock";
 
+/// How often a lock file is opened that another process removes meanwhile.
+const LOCK_TRIES: u32 = 16;
+
 /// File that shows that an output folder can be written; removed at once.
 const PROBE: &str = ".gsscale-probe";
 
@@ -44,7 +47,7 @@ const PROBE: &str = ".gsscale-probe";
 /// Errors: another process trains into the folder.
 pub(crate) fn lock(out: &Path) -> InputResult<Option<File>> {
     let path = out.join(LOCK);
-    loop {
+    for _ in 0..LOCK_TRIES {
         let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
         let Ok(file) = file else { return Ok(None) };
         if let Err(TryLockError::WouldBlock) = file.try_lock() {
@@ -56,6 +59,8 @@ pub(crate) fn lock(out: &Path) -> InputResult<Option<File>> {
             return Ok(Some(file));
         }
     }
+    // Some network drives number a file anew each time it is opened.
+    Ok(None)
 }
 
 /// Refuses an output folder in use, without making its lock file.

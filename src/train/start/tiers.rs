@@ -142,7 +142,7 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     };
     // Only here, after everything that can refuse the run: a resume that is refused changes nothing.
-    let (spill, is_again) = create_or_replace(spill_dir, layout, false)?;
+    let (spill, is_again) = create_or_replace(spill_dir, layout)?;
     if is_again {
         crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }

@@ -126,7 +126,7 @@ pub(crate) fn last_state(folder: &Path, access: Access) -> Result<RunState, Trai
 /// begin.
 pub(crate) fn remove_checkpoint_in(folder: &Path, run: RunId) -> Result<(), TrainError> {
     check_removable(folder, run)?;
-    if SpillDir::exists_in(folder) && !remove_uncommitted(folder, true)? {
+    if SpillDir::exists_in(folder) && !remove_uncommitted(folder)? {
         SpillDir::open(folder, true)?.remove()?;
     }
     // Succeeds only if the folder is empty.
