@@ -85,15 +85,15 @@ pub fn write_whole_with(path: &Path, fill: impl FnOnce(&mut dyn Write) -> io::Re
     part.finish(written.map_err(|e| InputError::io(path, "writing", &e))?)
 }
 
-/// Refuses to write the file that a flag names in the place of something else: a slip in a command must not cost a photo or a model.
-/// `is_ours` says whether a file is what is written there. An empty file is nothing to lose.
+/// Refuses to replace a file that a flag did not write: a slip in a command must not cost a photo or a model. `is_ours` says whether the
+/// flag writes such a file. An empty file may be replaced.
 /// Errors: there is another file.
 pub fn check_replaceable(flag: &str, path: &Path, is_ours: impl FnOnce(&Path) -> bool) -> InputResult<()> {
     let is_lost = std::fs::metadata(path).is_ok_and(|found| found.is_file() && found.len() > 0) && !is_ours(path);
     if !is_lost {
         return Ok(());
     }
-    let problem = format!("{flag} would replace this file, which is nothing that it writes");
+    let problem = format!("{flag} would replace this file, but {flag} writes no such file");
     Err(InputError::new(path, problem, format!("name another file with {flag}, or move this one away")))
 }
 

@@ -151,8 +151,8 @@ impl Dataset {
         self.train_views().into_iter().map(|view| self.views[view].camera).collect()
     }
 
-    /// The folder of photos that `path`, which need not exist, is or lies in. Folders inside of a scene whose photos lie around them, or
-    /// beside them, are apart from the photos.
+    /// The photo folder that is `path` or holds it, if any; `path` need not exist. A photo folder that holds the whole scene counts only
+    /// as `path` itself, since results may lie in the scene.
     pub fn photo_folder_around(&self, path: &Path) -> Option<PathBuf> {
         let (path, root) = (resolved(path), resolved(&self.root));
         let folders: BTreeSet<&Path> = self.views.iter().filter_map(|view| view.photo.image_path.parent()).collect();

@@ -503,8 +503,8 @@ pub(crate) fn first_pages(config: &TrainConfig, rows: u64) -> [u64; 2] {
 pub fn check_first_drive(config: &TrainConfig, rows: u64) -> InputResult<()> {
     let Some(spill_dir) = config.residence().spill_dir() else { return Ok(()) };
     let Some(free) = free_bytes(&drive_of(spill_dir)).ok().flatten() else { return Ok(()) };
-    let left = segments_in(spill_dir).unwrap_or_default().into_iter().map(|(_, bytes)| bytes);
-    let free = left.fold(free, u64::saturating_add);
+    let uncommitted = segments_in(spill_dir).unwrap_or_default().into_iter().map(|(_, bytes)| bytes);
+    let free = uncommitted.fold(free, u64::saturating_add);
     let [pages, frame_bytes] = first_pages(config, rows);
     refuse_small_drive(free, pages, frame_bytes)
 }

@@ -186,7 +186,7 @@ fn plan_frames(
         let budget = HostBudget::new(budget, &memory[0], config.host_mem.0 > 0);
         trainer.memory.budget = Some(HostBudget { is_raised: host_mem != asked, ..budget });
     }
-    memory.iter_mut().for_each(|memory| reduce(config, memory, first, plan.frame_bytes));
+    memory.iter_mut().for_each(|memory| reduce_estimate(config, memory, first, plan.frame_bytes));
     Ok((first.frames, host_mem))
 }
 
@@ -315,7 +315,7 @@ fn shrink_to_budget(config: &TrainConfig, need: &LargestNeed, budget: u64, memor
         let left = budget.saturating_sub(memory.fixed() - memory.working - memory.copies);
         FirstFrames::of_batches(config, left, need.frame_bytes, memory.copies > 0)
     });
-    reduce(config, memory, first, need.frame_bytes);
+    reduce_estimate(config, memory, first, need.frame_bytes);
     first.frames
 }
 
@@ -341,7 +341,7 @@ pub(super) fn limit_memory(
 }
 
 /// Reduces the estimate to these frames, and to batches of that many pages: rows of a view, and copies of a round.
-fn reduce(config: &TrainConfig, memory: &mut MemoryEstimate, to: FirstFrames, frame_bytes: u64) {
+fn reduce_estimate(config: &TrainConfig, memory: &mut MemoryEstimate, to: FirstFrames, frame_bytes: u64) {
     memory.frames = memory.frames.min(to.frames.saturating_mul(frame_bytes));
     let pages = to.pages_most as u64;
     let working = pages.saturating_mul(page_working(config)).min(memory.working);

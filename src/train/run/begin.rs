@@ -304,7 +304,7 @@ pub(super) fn plan_and_train(
         }
         out_folder::make(&request.out, request.existing)?;
     }
-    if let Some(kept) = begun.past.as_ref().and_then(|past| past.keeps.as_ref()) {
+    if let Some(kept) = begun.past.as_ref().and_then(|past| past.keep_result_as.as_ref()) {
         out_folder::keep_result(&request.out, kept)?;
     }
     let outcome = train_into(request, dataset, trainer, &stop, &mut tiers, begun, &forecast);
@@ -318,7 +318,7 @@ pub(super) fn plan_and_train(
         );
     }
     tiers.close().iter().for_each(|word| crate::tell!("warning: {word}"));
-    // What a process left that was killed during its first commit to the output folder.
+    // A process that was killed during its first commit to the output folder left a store without a commit.
     let folder = checkpoint_folder(&request.out);
     if outcome.is_ok() && remove_uncommitted(&folder).is_ok_and(|is_removed| is_removed) {
         let _ = std::fs::remove_dir(folder);

@@ -208,7 +208,7 @@ impl<'a> Evaluator<'a> {
 
     /// Takes a folder for pictures. Its list of views, empty at first, shows a later evaluation that its pictures may be replaced.
     /// Errors: photos of the scene lie in the folder or around it, or it holds pictures that no evaluation wrote.
-    fn claim(&self, folder: &Path) -> InputResult<()> {
+    fn claim_picture_folder(&self, folder: &Path) -> InputResult<()> {
         let refused = |problem: String| Err(InputError::new(folder, problem, "name a new folder with --renders"));
         if let Some(photos) = self.dataset.photo_folder_around(folder) {
             return refused(format!("--renders would write among the photos of the scene, in {}", photos.display()));
@@ -284,7 +284,7 @@ impl<'a> Evaluator<'a> {
         pictures: Option<&Path>,
     ) -> Result<EvalFigures, TrainError> {
         let columns = self.placed(file, columns, meta)?;
-        pictures.map_or(Ok(()), |folder| self.claim(folder))?;
+        pictures.map_or(Ok(()), |folder| self.claim_picture_folder(folder))?;
         let (mut pages, run) = self.pages(&columns)?;
         let gaussians = columns.rows() as u64;
         drop(columns);

@@ -7,8 +7,8 @@
 //! without it, the rates stay at the values with which the schedule ended.
 //!
 //! Invariants: 1. the earlier result stays under the name of its step, and also as the result until the new one replaces it; 2. no file
-//! gets a name before everything is checked, and what the run could not resume with from a checkpoint is refused here, too, as far as
-//! config.toml tells it; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
+//! gets a second name before every check has passed; changes that a resume from a checkpoint refuses are refused, as far as config.toml
+//! tells them; 3. a run that is cut off before its first commit goes on from the same PLY at the next resume.
 
 use super::begin::{FirstTrainer, first_trainer, plan_and_train};
 use super::changes::{Changes, with_absolute_paths};
@@ -94,7 +94,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     let host_mem = host_budget(request.config.host_mem.0);
     let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
     let kept = finished.kept_path(&out);
-    let keeps = (!finished.is_kept_in(&out)).then(|| kept.clone());
+    let keep_result_as = (!finished.is_kept_in(&out)).then(|| kept.clone());
     let FinishedRun { file, run, summary, changes, .. } = finished;
     for line in &changes.numbers {
         crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
@@ -116,7 +116,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         has_changed: false,
         file: Some(file),
         first_rows,
-        keeps,
+        keep_result_as,
     };
     trainer.begin_after(summary.steps, summary.train_seconds);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })

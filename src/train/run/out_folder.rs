@@ -333,7 +333,7 @@ pub(crate) fn saved(out: &Path) -> InputResult<Vec<PathBuf>> {
     Ok(entries.flatten().map(|entry| entry.path()).filter(is_saved).collect())
 }
 
-/// A mark under way, in a folder that is locked from here on: what it held when it was checked it holds at the first step. Dropping it
+/// The mark of a run that has begun, and the lock of its folder: no other run changes the folder before the first step. Dropping it
 /// removes the mark and the folders that were made for it, if nothing else lies there.
 pub(super) struct Beginning {
     out: PathBuf,

@@ -296,7 +296,7 @@ fn resume_from(
         has_changed,
         file: earlier.file.clone(),
         first_rows: state.origin.dataset.first_rows,
-        keeps: None,
+        keep_result_as: None,
     };
     // Its own, that of its checkpoint, or a new one.
     let run = [earlier.run, state.origin.run.id].into_iter().find(|id| id.is_known()).unwrap_or_else(RunId::draw);

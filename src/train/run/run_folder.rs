@@ -60,8 +60,8 @@ pub(super) struct PastRun {
     pub file: Option<(TrainConfig, Resolved)>,
     /// Number of its first Gaussians.
     pub first_rows: u64,
-    /// Where its result stays, if it is to be kept before the first step.
-    pub keeps: Option<PathBuf>,
+    /// Second name that its result gets before the first step; `None` if it has one.
+    pub keep_result_as: Option<PathBuf>,
 }
 
 /// Facts with which a run begins or resumes.

@@ -49,9 +49,9 @@ pub struct Tiers {
     is_in_output: bool,
     /// The run resumed from this store.
     has_resumed: bool,
-    /// An earlier process left a store without a commit here. A run that is refused leaves one, too: without it a resume would take the
-    /// drive for one that is not mounted.
-    was_there: bool,
+    /// An earlier process left a store without a commit here. A run that is refused leaves its own: a resume that found none would take
+    /// the drive for one that is not mounted.
+    replaced_store: bool,
     /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,
     /// I/O engine, for reports; empty if all pages stay in memory.
@@ -142,13 +142,13 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
         return Ok((Pager::new(pager, PagedStore::new(engine, of_store)), tiers));
     };
     // Only here, after everything that can refuse the run: a resume that is refused changes nothing.
-    let (spill, is_again) = create_or_replace(spill_dir, layout)?;
-    if is_again {
+    let (spill, is_replaced) = create_or_replace(spill_dir, layout)?;
+    if is_replaced {
         crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
     }
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory, unless an earlier process left one.
-    tiers.was_there = is_again;
+    tiers.replaced_store = is_replaced;
     let engine = tiers.take_spill(spill, config)?;
     let opened = Opened::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, tiers.codec)?;
@@ -258,7 +258,7 @@ impl Tiers {
     /// Closes the checkpoint and removes it, unless a run can resume from it or it is to be kept. The pager must be
     /// dropped before. Returns messages for the user.
     pub fn close(&mut self) -> Vec<String> {
-        let is_kept = (self.has_checkpoint() || self.was_there) && (self.keeps || !self.is_done);
+        let is_kept = (self.has_checkpoint() || self.replaced_store) && (self.keeps || !self.is_done);
         let made = self.checkpoint.take().and_then(|checkpoint| checkpoint.spill);
         let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();
