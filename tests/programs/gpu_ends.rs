@@ -36,7 +36,7 @@ fn a_device_that_is_lost_with_steps_in_flight_loses_the_steps_since_the_last_com
     // that of the machine, so more restarts are allowed than usual.
     let mut lost_in_flight = 0;
     for (i, at) in submissions_in_flight(&bench.spans("alone")).into_iter().enumerate() {
-        if i >= 3 && lost_in_flight > 0 {
+        if i >= 2 && lost_in_flight > 0 {
             break;
         }
         let name = format!("lost{at}");

@@ -37,7 +37,7 @@ fn a_device_that_is_lost_again_and_again_ends_the_run() {
 #[test]
 fn a_step_with_all_pages_on_the_device_moves_no_row() {
     let Some(()) = a_device() else { return };
-    let work = Workdir::city(8, 128, 96, 1200);
+    let work = Workdir::city(8, 64, 48, 1200);
     let flags = "--steps 60 --strategy none --sh-every 0 --log-every 1 --device gpu --optimizer-on";
     for place in ["device", "host"] {
         work.run(place, &format!("{flags} {place}"));
@@ -46,7 +46,7 @@ fn a_step_with_all_pages_on_the_device_moves_no_row() {
     let pages = work.count("device", "pages");
     for line in &work.metrics("device")[30..59] {
         let [up, down] = ["bytes_uploaded", "bytes_read_back"].map(|key| line[key].as_u64().unwrap());
-        assert!(up <= 4 * 128 * 96 + (128 << 10), "step {}: {up} bytes up", line["step"]);
+        assert!(up <= 4 * 64 * 48 + (128 << 10), "step {}: {up} bytes up", line["step"]);
         assert!(down <= 64 * pages + 4096, "step {}: {down} bytes down for {pages} pages", line["step"]);
     }
     // The host's optimizer sums small second moments in f64, and divides exactly.

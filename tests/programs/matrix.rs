@@ -186,26 +186,26 @@ features! {
             assert!(poses["refined"].as_u64() > Some(10) && poses["shift"]["largest"].as_f64() > Some(0.0), "{poses}");
         };
 
-    gpu: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on host --steps 36 --refine-start 10 --refine-every 8 --grow-grad2d 0.001 --reset-every 15",
+    gpu: || Workdir::wide_city(3000),
+        "--device gpu --optimizer-on host --steps 28 --refine-start 8 --refine-every 6 --grow-grad2d 0.001 --reset-every 12",
         without ["--refine-every 1000"],
         shows |_| ();
 
     // Rounds, resets, raises and a cap with pages that are newer on the device than in memory.
-    gpu_pages: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on device --steps 36 --refine-start 6 --refine-every 7 --grow-grad2d 0.0005 --reset-every 16 \
-         --sh-every 10 --max-gaussians 7000 --log-every 1",
+    gpu_pages: || Workdir::wide_city(3000),
+        "--device gpu --optimizer-on device --steps 28 --refine-start 5 --refine-every 6 --grow-grad2d 0.0005 --reset-every 13 \
+         --sh-every 8 --max-gaussians 3500 --log-every 1",
         without ["--reset-every 0"],
         shows |work| {
-            assert!(work.count("alone", "gaussians") > 6100);
-            let slots = &work.metrics("alone")[35]["slots"];
-            assert!(slots["loads"].as_u64() > Some(100), "the device holds no page: {slots}");
-            assert!(slots["cleared"].as_u64() > Some(50), "rounds took all pages to the host: {slots}");
+            assert!(work.count("alone", "gaussians") > 3050);
+            let slots = &work.metrics("alone")[27]["slots"];
+            assert!(slots["loads"].as_u64() > Some(50), "the device holds no page: {slots}");
+            assert!(slots["cleared"].as_u64() > Some(25), "rounds took all pages to the host: {slots}");
         };
 
     // The device weighs rows, and a round judges them by that. Moments have 16 bits.
-    gpu_recycles: || Workdir::wide_city(6000),
-        "--device gpu --optimizer-on device --strategy long-axis --steps 36 --refine-start 6 --refine-every 7 --max-gaussians 6300 \
+    gpu_recycles: || Workdir::wide_city(3000),
+        "--device gpu --optimizer-on device --strategy long-axis --steps 28 --refine-start 5 --refine-every 6 --max-gaussians 3150 \
          --recycle 0.05 --view-order shuffle --moments bf16",
         without ["--recycle 0", "--moments f32"],
         shows |work| assert!(work.metrics("alone").last().unwrap()["slots"]["cleared"].as_u64() > Some(0));

@@ -40,7 +40,7 @@ fn named(work: &Workdir, out: &str) -> Vec<String> {
 
 /// A city large enough for quality to say something, and steps for it.
 fn large_city() -> Workdir {
-    Workdir::city(32, 160, 112, 3000)
+    Workdir::city(32, 128, 96, 3000)
 }
 
 const STEPS: &str = "--steps 600 --schedule run-length --max-gaussians 8000";
