@@ -17,6 +17,7 @@ use crate::scene::columns::Columns;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
+use crate::train::log::report::json_psnr;
 use crate::train::run::eval_file::{Evaluator, Model};
 use crate::train::step::pages::WorkingSet;
 use crate::train::step::view::{SceneNow, draw};
@@ -35,10 +36,10 @@ const HALVINGS: u32 = 20;
 pub struct SeamReport {
     /// Held-out views that show a border, and views that show none.
     pub views: [usize; 2],
-    /// Mean PSNR of the first kind: whole, and in the bands; and of the second kind.
-    pub crossing_psnr: f64,
-    pub band_psnr: f64,
-    pub other_psnr: f64,
+    /// Mean PSNR of the first kind: whole, and in the bands; and of the second kind. `None` without views.
+    pub crossing_psnr: Option<f64>,
+    pub band_psnr: Option<f64>,
+    pub other_psnr: Option<f64>,
     pub borders: Vec<BorderReport>,
 }
 
@@ -87,6 +88,9 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     let (mut crossing, mut banded, mut others) = (Vec::new(), Vec::new(), Vec::new());
     for view in dataset.test_views() {
         let (camera, target) = (&dataset.views[view].camera, targets.get(view)?);
+        if !target.counts() {
+            continue;
+        }
         let image = {
             let working = &mut WorkingSet::default();
             let mut now = SceneNow { scene: &mut pages, step: 0, working, renderer: &mut *renderer };
@@ -97,14 +101,15 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
         let banded_target = Target { mask: Some(mask), ..(*target).clone() };
         match banded_target.counts() {
             true => {
-                crossing.push(psnr(image, &target));
-                banded.push(psnr(image, &banded_target));
+                crossing.push(json_psnr(psnr(image, &target)));
+                banded.push(json_psnr(psnr(image, &banded_target)));
             }
-            false => others.push(psnr(image, &target)),
+            false => others.push(json_psnr(psnr(image, &target))),
         }
     }
     let borders = borders.iter().map(|border| beside(border, &places)).collect();
-    let [crossing_psnr, band_psnr, other_psnr] = [&crossing, &banded, &others].map(|values| mean(values));
+    let [crossing_psnr, band_psnr, other_psnr] =
+        [&crossing, &banded, &others].map(|values| (!values.is_empty()).then(|| mean(values)));
     Ok(SeamReport { views: [crossing.len(), others.len()], crossing_psnr, band_psnr, other_psnr, borders })
 }
 

@@ -24,6 +24,7 @@ use crate::config::values::ByteSize;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::tool::new_store::part_of;
 use crate::page::tool::reading::Access;
+use crate::page::tool::uncommitted::is_uncommitted;
 use crate::page::versions::slots::SlotLayout;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
@@ -237,7 +238,9 @@ impl WorkPlace {
         }
         let steps = |store: &Path| last_state(store, Access::Map).map(|state| state.trainer.step);
         let copy = newest_copy(folder).map(|(_, copy)| steps(&copy).map(|steps| (steps, copy))).transpose()?;
-        let own = steps(&store).ok();
+        // A store that cannot be read may hold the only steps of the cell: the error names what saves them.
+        let has_commit = SpillDir::exists_in(&store) && !is_uncommitted(&store)?;
+        let own = has_commit.then(|| steps(&store)).transpose()?;
         if own.is_some() && own >= copy.as_ref().map(|(steps, _)| *steps) {
             return Ok(true);
         }

@@ -19,7 +19,7 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
 
 /// Version of the layout below.
-pub const VERSION: u32 = 10;
+pub const VERSION: u32 = 11;
 
 /// Digests of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -81,6 +81,18 @@ pub struct Origin {
     pub run: RunIdentity,
 }
 
+/// The last steps in a row that changed no Gaussian.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct IdleSteps {
+    pub steps: u32,
+    /// Steps whose photo is masked completely.
+    pub masked: u32,
+    /// Steps whose view had rows.
+    pub with_rows: u32,
+    /// Steps whose view drew a row.
+    pub with_drawn: u32,
+}
+
 /// The part of a run's state that the trainer itself holds and changes. A commit saves it whole, and a resume restores
 /// it whole.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -93,6 +105,7 @@ pub struct TrainerState {
     pub steps_skipped: u32,
     /// Number of the last steps in a row that were skipped or that skipped more than .01 % of their rows.
     pub steps_skipped_in_a_row: u32,
+    pub idle: IdleSteps,
     /// Seconds spent in steps.
     pub train_seconds: f64,
     /// The last evaluation on the held-out views, if there was one.
@@ -179,11 +192,11 @@ impl RunState {
         let RunState { rows_bound, metrics_bytes, traffic, .. } = self;
         let Origin { config, simd, sh_degree_start, dataset, run } = origin;
         let TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, .. } = trainer;
-        let TrainerState { train_seconds, test, growth, .. } = trainer;
+        let TrainerState { idle, train_seconds, test, growth, .. } = trainer;
         encoding::to_bytes(&(
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
-            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
+            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, idle),
             (metrics_bytes, test, traffic, run),
             (growth, photos),
         ))
@@ -194,13 +207,21 @@ impl RunState {
         let (
             (step, config, simd, device, sh_degree_start, dataset),
             (events, histogram, rows, rows_bound),
-            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds),
+            (rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, idle),
             (metrics_bytes, test, traffic, run),
             (growth, photos),
         ) = encoding::from_bytes(bytes)?;
         let origin = Origin { config, simd, sh_degree_start, dataset, run };
-        let trainer =
-            TrainerState { step, rows_skipped, steps_skipped, steps_skipped_in_a_row, train_seconds, test, growth };
+        let trainer = TrainerState {
+            step,
+            rows_skipped,
+            steps_skipped,
+            steps_skipped_in_a_row,
+            idle,
+            train_seconds,
+            test,
+            growth,
+        };
         Ok(RunState { origin, device, trainer, photos, events, histogram, rows, rows_bound, metrics_bytes, traffic })
     }
 
@@ -219,6 +240,9 @@ impl RunState {
         let is_too_high = |e: &Event| matches!(e.kind, EventKind::RaiseShDegree { degree } if degree > 3);
         if self.origin.sh_degree_start > 3 || log.events().iter().any(is_too_high) {
             return refuse("a degree is above 3");
+        }
+        if self.rows_bound < self.rows {
+            return refuse("it has more Gaussians than its bound");
         }
         // The logit of any other value is infinite or NaN.
         let is_opacity = |x: f32| x > 0.0 && x < 1.0;

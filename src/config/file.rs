@@ -406,6 +406,8 @@ impl TrainConfig {
             ("data-factor", self.data_factor.is_finite() && self.data_factor >= 1.0, "1 or more"),
             ("test-after", self.test_after >= -1, "an index from 0 on, or -1 to hold out by --test-every"),
             ("near-plane", positive(self.near_plane), "a positive number"),
+            // TOML, in which runs keep their settings, has no larger numbers.
+            ("seed", i64::try_from(self.seed).is_ok(), "0 to 9,223,372,036,854,775,807"),
             ("sh-degree", self.sh_degree <= 3, "0, 1, 2 or 3"),
             ("sh-start", self.sh_start <= self.sh_degree, "0 to --sh-degree"),
             ("page-rows", (PAGE_ROWS_MIN..=PAGE_ROWS_MAX).contains(&self.page_rows), "16 to 65536"),

@@ -225,7 +225,7 @@ pub fn load_options(config: &TrainConfig) -> LoadOptions {
         data_factor: config.data_factor,
         max_resolution: (config.max_resolution > 0).then_some(config.max_resolution),
         test_every: (config.test_every > 0).then_some(config.test_every),
-        test_after: u32::try_from(config.test_after).ok(),
+        test_after: (config.test_after >= 0).then(|| u32::try_from(config.test_after).unwrap_or(u32::MAX)),
         masks: config.masks,
         background: config.background.0.map(|c| (255.0 * c).round() as u8),
         invert_masks: config.invert_masks,

@@ -32,8 +32,7 @@ pub struct DefaultStrategy {
     pub max_gaussians: u64,
 }
 
-/// Most steps that opacities are given to recover from a reset before the planned end of a run; less where resets follow
-/// each other faster than three times in so many steps.
+/// Steps that opacities get to recover from the last reset before the planned end of a run; a third of the reset interval if that is less.
 const RECOVERY_STEPS: u32 = 1000;
 
 impl Default for DefaultStrategy {

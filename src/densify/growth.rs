@@ -1,16 +1,16 @@
 //! The number of Gaussians, where the run decides it: doublings, as long as photos that the run does not train on gain by them.
 //!
-//! A few training views are held out while the scene may grow. Each check draws them, and as many views that are trained on. What the
-//! trained views gained since the last check may be the scene or noise; what the held-out views gained can only be the scene. As long as
-//! the held-out views gain a good share of what the trained views gain, and are not far behind them, the scene doubles. Where the held-out
-//! views gain next to nothing of it, more Gaussians fit noise, and the last doubling is undone: the rows of least weight go
-//! ([`super::long_axis`]). `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
+//! A few training views are held out while the scene may grow. Each check draws the held-out views, and as many trained views. A
+//! gain of the trained views since the last check may come from the scene or from noise; a gain of the held-out views can only come
+//! from the scene. As long as the held-out views gain a good share of what the trained views gain, and are not far behind in PSNR,
+//! the scene doubles. If the held-out views gain next to nothing, more Gaussians only fit noise, and the last doubling is undone: the
+//! rows of least weight are removed ([`super::long_axis`]). `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
 //!
 //! Photos bound the count, too: a Gaussian beyond one for each few dozen of their pixels costs time and brings next to nothing
 //! ([`GrowthRule::most`]).
 //!
-//! A doubling takes two rounds, so that checks come every two rounds. A scene that has not reached what it was allowed waits, and so does
-//! one whose views gain little yet: new Gaussians need some steps. The last check begins no doubling, since no check would judge it.
+//! A doubling takes two rounds, so checks come every two rounds. A scene waits while it has fewer Gaussians than allowed, and
+//! while its views gain little: new Gaussians need some steps. The last check begins no doubling, since no check would judge it.
 //!
 //! Not here: the measurement (`train::state::growth_checks`), which views are held out (`train::state::turns`).
 //!
@@ -33,11 +33,11 @@ pub enum Quality {
 
 /// What a doubling must have brought for another one.
 struct DoublingDemand {
-    /// Decibels that the held-out views must gain since the last check, and also since the check that decided the last doubling: a
-    /// doubling first costs them some. Training alone brings some tenths.
+    /// Least gain of the held-out views, dB, since the last check and since the check that decided the last doubling.
+    /// Both count, since a doubling first lowers the PSNR. Training alone gains some tenths.
     gain: f64,
-    /// Their share of the decibels that the trained views gain. Measured: .4 to 1.1 where doublings pay, less than .1 where they fit
-    /// noise.
+    /// Least gain of the held-out views, as a share of the gain of the trained views. Measured: .4 to 1.1 where
+    /// doublings pay, less than .1 where they fit noise.
     share: f64,
     /// Fewest pixels of training photos for a Gaussian.
     pixels: u64,
@@ -55,7 +55,7 @@ impl Quality {
 
 /// Share of the trained views' gain below which a doubling is undone.
 const UNDONE_BELOW: f64 = 0.2;
-/// Decibels by which the gain of held-out views must lag behind that of trained ones to tell anything.
+/// Decibels by which held-out views must gain less than trained views for a lag; smaller differences are noise.
 const LAG_LEAST: f64 = 0.3;
 /// Decibels by which trained views may be better than held-out ones for a doubling. Measured at doublings that pay: -.3 to 1.5; on seneca
 /// at 395 pixels, where doublings fit noise: 2.3 to 2.6.
@@ -67,9 +67,9 @@ const GAP_OF_FIRST: f64 = 1.3;
 /// Decibels by which trained views must be better than held-out ones for a lag to count: a check soon after a doubling may find either
 /// better by some tenths. Measured: -.3 to 1.5 where more Gaussians pay, 2.3 and more where they do not.
 const GAP_OF_A_LAG: f64 = 1.6;
-/// Checks after a doubling within which the held-out views must have gained anything, if the trained ones have: a doubling shakes both.
+/// Checks after which a doubling is undone if only the trained views have gained. Earlier is too soon: a doubling disturbs both.
 const PATIENCE: usize = 3;
-/// A scene begins with at least this part of the most that is allowed, and has this part at most while stages are twice as large.
+/// The first allowed number is at least this part of the most Gaussians. Below the second part, one check allows two doublings.
 const FIRST_PART_OF_MOST: u64 = 16;
 const SMALL_PART_OF_MOST: u64 = 8;
 /// The least factor of a stage of growth.
@@ -79,8 +79,8 @@ const GROWN: f64 = 0.8;
 
 /// Longest unit, steps: longer runs decide their count as early as one of this length.
 const UNIT_MOST: u32 = 3000;
-/// Shortest unit in which checks tell a scene that does not gain by growth: those of shorter runs see little but the gain of training.
-/// Measured on brighton: 1,000 and 1,500 steps undo doublings, 500 steps grow to the most.
+/// Shortest unit whose checks recognise a scene that does not gain by growth. Checks of shorter runs see little but the
+/// gain of training. Measured on brighton: 1,000 and 1,500 steps undo doublings, 500 steps grow to the most.
 const UNIT_MEASURED: u32 = 1000;
 /// Parts of a unit, and the parts at which checks are due.
 const PARTS: u32 = 15;
@@ -90,8 +90,8 @@ const LAST_PART: u32 = 11;
 /// Pixels of the largest photos that the bound was measured with.
 const MEASURED_PIXELS: u64 = 120_000;
 
-/// Pixels of a photo as they count for [`GrowthRule::most`]: all of a photo as small as those that the bound was measured with. Beyond,
-/// detail is taken to grow with the side of a photo and not with its area; this is an assumption, not a measurement.
+/// The pixels of a photo that count for [`GrowthRule::most`]. All pixels count up to the size of the photos that the bound was
+/// measured with. For larger photos, detail is assumed to grow with the side of the photo, not with its area; this was not measured.
 pub fn counted_pixels(pixels: u64) -> u64 {
     match pixels <= MEASURED_PIXELS {
         true => pixels,
@@ -213,8 +213,8 @@ impl GrowthRule {
         rows.max(self.most(pixels) / FIRST_PART_OF_MOST)
     }
 
-    /// The Gaussians of a scene of `rows`, with training photos of so many [`counted_pixels`], whose every check finds that more pay: a
-    /// round of `rounds` at most doubles the scene, up to what is allowed then.
+    /// The final number of Gaussians if every check doubles what is allowed, for a scene of `rows` and training photos
+    /// of `pixels` [`counted_pixels`]. Each round of `rounds` at most doubles the scene, up to what is allowed then.
     pub fn reachable(&self, rows: u64, pixels: u64, rounds: impl Iterator<Item = u32>) -> u64 {
         let (mut now, mut allowed, mut before) = (rows, self.first(rows, pixels), None);
         for step in rounds {
@@ -245,7 +245,7 @@ impl GrowthRule {
         u64::from(step) * u64::from(PARTS) >= u64::from(part) * u64::from(self.unit)
     }
 
-    /// Whether a check is due after `step`: one fell due since the step before at which a check was possible, `before`.
+    /// Whether a check is due after `step`: one fell due since `before`, the previous step at which a check was possible.
     pub fn is_due(&self, before: Option<u32>, step: u32) -> bool {
         (FIRST_PART..=LAST_PART)
             .any(|part| self.is_past(part, step) && !before.is_some_and(|before| self.is_past(part, before)))
@@ -284,7 +284,7 @@ impl GrowthRule {
             None if is_close => GrowthDecision::Doubles,
             None => GrowthDecision::Waits,
             Some(last) => {
-                // Since the doubling that the check judges: what fits noise may do so slowly.
+                // Gains count from the doubling that the check judges, since noise may be fitted slowly.
                 let since = doubled.map_or(last, |(checks, _)| &checks[0]);
                 let (gain, trained_gain) = (psnr - since.psnr, trained_psnr - since.trained_psnr);
                 // Differences of less are the noise of single steps.

@@ -2,10 +2,10 @@
 //! allows, and once the cap is reached, rows of little weight are removed so that better rows can take their places. The cap
 //! is `--max-gaussians`, or what the run allows at this step ([`super::growth`]). There are no opacity resets.
 //!
-//! A round takes growth as whole bins of the score histogram from the top, as many as fit under the cap, and recycles whole bins of the
-//! histogram of mean blending weights from the bottom, at most a share of the rows that enough views weighed since the last round: where
-//! views come in spatial groups, every region then loses its share when the views come to it. Only later rounds use what removed rows
-//! free, so the cap holds at every step. Where the run allows fewer rows than there are, the surplus goes in the same way.
+//! A round splits the rows in the top bins of the score histogram, as many whole bins as fit under the cap. A round recycles (removes)
+//! the rows in the lowest bins of the histogram of mean blending weights: at most a share of the rows that enough views weighed since the
+//! last round. So if views come in spatial groups, each region loses its share when its views come. Only later rounds use the places of
+//! removed rows, so the cap holds at every step. If the run allows fewer rows than there are, the surplus is removed in the same way.
 //!
 //! Where views come region by region, in epochs longer than `refine_every`, a round within an epoch would have the statistics of
 //! a few regions. So rounds come at the ends of epochs ([`Strategy::for_regions`]), and a round recycles as much as all rounds of a

@@ -97,8 +97,8 @@ impl<'a> PendingEvents<'a> {
         Ok(replay)
     }
 
-    /// Whether the events from number `applied` on do no more to a page than to clear its statistics, as far as `page` tells; false
-    /// where that is not sure. A round is among them, and none of them moves a count of rows.
+    /// Whether the events from number `applied` on certainly do nothing to a page but clear its statistics, judged by
+    /// `page`. If so, at least one of them is a round, and none changes a count of rows.
     pub fn only_clears(&self, applied: usize, page: &PageFacts) -> bool {
         let (mut largest_mean, mut least_weight, mut rounds) = (page.largest_mean, page.least_weight, 0);
         let keeps = self.events[applied..].iter().all(|event| match effect_of(&event.kind) {
@@ -106,8 +106,8 @@ impl<'a> PendingEvents<'a> {
             Effect::ResetOpacity { .. } => false,
             Effect::Round(round) => {
                 rounds += 1;
-                // One row with the largest score, one that was drawn as often as can be counted, one with the least weight; rounds
-                // judge rows one by one. The first round clears the statistics.
+                // Three rows stand for the page, since rounds judge rows one by one: the largest score, the most views,
+                // the least weight. Later rounds see cleared statistics.
                 let weight = std::mem::replace(&mut least_weight, f32::INFINITY);
                 let weighed = if weight.is_finite() { of_mean_weight(weight) } else { 1 };
                 let (grad2d, count) = ([std::mem::take(&mut largest_mean), 0.0, 0.0], [1, VIEWS_MOST, weighed]);

@@ -78,8 +78,8 @@ pub trait Strategy: fmt::Debug + Send + Sync {
     /// When rounds happen; `None` for a strategy without rounds.
     fn rounds(&self) -> Option<&RoundSteps>;
 
-    /// The strategy of a run whose views come region by region, in epochs of `epoch` steps; 0 if any stretch of views shows all regions.
-    /// `None` if the strategy needs no change.
+    /// The strategy of a run whose views come region by region, in epochs of `epoch` steps. An `epoch` of 0: any
+    /// sequence of views shows all regions. `None` if the strategy needs no change.
     fn for_regions(&self, _epoch: u32) -> Option<Arc<dyn Strategy>> {
         None
     }
@@ -217,8 +217,8 @@ pub enum Fate {
 pub trait Round: Sync {
     fn fate(&self, row: &RowFacts) -> Fate;
 
-    /// Whether statistics decide the fate of a row here. Where they do not, the fate of every row must be the one that it would have
-    /// with statistics of 0. Then the caller may skip the statistics.
+    /// Whether statistics decide the fate of any of these rows. If not, every row must have the fate that it would have
+    /// with statistics of 0, so that the caller may skip the statistics.
     fn may_edit(&self, rows: &Rows<'_>) -> bool;
 
     /// Whether all rows without statistics whose values lie within these bounds survive the round unchanged. A page that

@@ -1,15 +1,15 @@
 //! Cuts: which pages the last commit names, and the pages of a commit that is being written beside training.
 //!
-//! A cut freezes every page that differs from what the store holds. Frozen pages are written little by little, those
-//! that are needed next first. A step that needs a frozen page earlier waits until the page is written, since the step may change
-//! it. So a commit costs the steps after it a part of their pages at most, not all that memory holds.
+//! A cut freezes every page that differs from what the store holds. Frozen pages are written little by little, in the
+//! order of their next use. A step that needs a frozen page waits for the write of the page, since the step may change
+//! the page. So a step waits at most for frozen pages of its own view, never for all pages in memory.
 //!
 //! Not here: the writes themselves (`tier`), and the calls of the trainer (`pager`).
 //!
 //! Invariants: 1. a page is written for the generation of the cut as it was at the cut, and everything else for the next
-//! generation; 2. only an acknowledged commit counts as the last one, but pages of commits that were not acknowledged are taken
-//! away by the next commit if they are gone by then; 3. a cut that is given up leaves versions like others, and the commit before
-//! it stands.
+//! generation; 2. only an acknowledged commit counts as the last one. A commit that failed may be durable, so the next
+//! commit also removes the pages of the failed one that no longer exist; 3. the versions of a cut that is given up stay
+//! usable, and the commit before the cut stands.
 
 use super::frames::table::{FrameState, FrameTable};
 use super::index::PageIndex;
@@ -145,7 +145,7 @@ impl Cuts {
         Ok((changes, now))
     }
 
-    /// Pages that the drive may hold as the last commit and that `now` has not.
+    /// Removals of the pages that the last commit on the drive may name and that `now` lacks.
     pub fn removed_since<'a>(&'a self, now: &'a Versions) -> impl Iterator<Item = PageChange> + 'a {
         let not_yet_named = self.unsure.iter().filter(|page| !self.committed.contains_key(page));
         let gone = self.committed.keys().chain(not_yet_named).filter(|page| !now.contains_key(page));
@@ -171,7 +171,7 @@ impl Cuts {
     }
 }
 
-/// A page with rows of which the drive has nothing: a commit without it would take it away.
+/// The error of a page with rows and no version on the drive: a commit without the page would lose its rows.
 pub(super) fn nowhere(page: PageId) -> CommitError {
     CommitError::Contradiction(format!("page {page} has rows and was never written"))
 }

@@ -25,8 +25,8 @@ pub(super) struct Fetch<'a> {
     /// Pages that are not pinned yet, with their place in the list.
     outstanding: BTreeMap<PageNo, usize>,
     asker: Asker,
-    /// Outstanding pages that are in memory, and that a commit must write first. Only the first one is kept up to date, so that the
-    /// end of a transfer costs no search.
+    /// Outstanding pages in memory that a commit must write first. Only the front is checked against the cut, so that
+    /// the end of a transfer costs no search.
     frozen: VecDeque<PageNo>,
 }
 
@@ -121,7 +121,7 @@ impl<'a> Fetch<'a> {
                     self.tier.stop_writes(error, self.asker)?;
                 }
             } else if cuts.holds(page) {
-                // As many are being written as may be at once.
+                // This write must wait for writes in flight.
                 return Ok(());
             }
             self.frozen.pop_front();
@@ -140,8 +140,8 @@ impl<'a> Fetch<'a> {
         }
     }
 
-    /// Failures end the fetch when they are about a page that it needs, or when a step would go on although pages
-    /// cannot be written any more.
+    /// A failed read ends the fetch if the fetch needs the page. A failed write ends the fetch of a step that can still
+    /// be done again.
     fn handle_failures(&mut self, failures: Vec<Failure>) -> Result<(), PagingError> {
         for Failure { page, is_write, error } in failures {
             if is_write {

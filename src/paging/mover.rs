@@ -1,11 +1,11 @@
-//! The mover: reads and write-backs between frames and the store. It counts what is in flight, keeps what is ahead of its need
-//! within bytes, and remembers writes that failed while nobody waited for them.
+//! The mover: reads and write-backs between frames and the store. The mover counts the transfers in flight, bounds the
+//! bytes of prefetches and early write-backs, and remembers writes that failed while nobody waited for them.
 //!
 //! Not here: which page moves (`fetch`, `prefetch`), and what an end means for frames and index (`tier`).
 //!
-//! Invariants: 1. every buffer that goes to the store comes back, however the transfer ends; 2. transfers begin
-//! ahead of their need while [`Mover::may_read_ahead`] and [`Mover::may_write_ahead`] allow it, and a cut writes a few pages beyond; 3. after a failed write no other write begins ahead of its need until a step
-//! asks for pages again; 4. a mover without a store, of a run that stays in memory, moves nothing.
+//! Invariants: 1. every buffer that goes to the store comes back, however the transfer ends; 2. a transfer begins ahead of its need only where
+//! [`Mover::may_read_ahead`] or [`Mover::may_write_ahead`] allows it; a cut may write a few more pages; 3. after a failed write no other write
+//! begins ahead of its need until a step asks for pages again; 4. a mover without a store moves nothing: its run keeps all pages in memory.
 
 use super::error::PagingError;
 use super::stats::SlotSpace;
@@ -96,8 +96,8 @@ impl Mover {
         Some(SlotSpace { total: slots.total(), free: slots.free(), retired: slots.retired(), segment_bytes })
     }
 
-    /// Whether another encoded page may be in flight, in a buffer beside its frame. Where it may not, transfers are in flight, so
-    /// a caller who waits for the permission has an end to wait for.
+    /// Whether another encoded page may be in flight, in a staging buffer beside its frame. If not, some transfer is in
+    /// flight, so a caller can wait for its end.
     pub fn has_staging(&self) -> bool {
         let most = match 2 * self.ahead_max {
             // No budget was set aside for staging: pages that were all in memory are written.

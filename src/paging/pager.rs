@@ -196,8 +196,8 @@ impl Pager {
         }
     }
 
-    /// Lists the pages of some coming steps anew, by the bounds as they are now, for a tier above. Where pages leave memory, prefetch does
-    /// it.
+    /// Makes the page lists of some coming steps again, by the current bounds, for a tier above. Where pages leave
+    /// memory, prefetch does so for the farther ones.
     pub fn refresh_plan(&mut self, step: u32) {
         if self.config.plan_bytes > 0 && self.frames_max() == usize::MAX {
             self.look_ahead.refresh(step, self.tier.index.metas());
@@ -293,19 +293,14 @@ impl Pager {
         pages.iter().map(|&page| u64::from(self.tier.index.meta(page).rows)).sum()
     }
 
-    /// Pins the next batch of a step's view, in this order, leaving out pages without rows; again if `is_again`, on the way out: a step
-    /// that has changed rows already leaves a failed write to the next step. Blocks only for pages that are not in memory.
+    /// Pins the next batch of a step's view, in this order, without pages that have no rows. `is_again`: the batch is pinned a second time, in
+    /// the pass out. The step has changed rows then, so a failed write is left to the next step. Blocks only for pages that are not in memory.
     /// Errors: as [`Pager::acquire`]. Nothing of this batch is pinned then.
     pub fn pin_batch(&mut self, step: u32, pages: &[PageNo], is_again: bool) -> Result<Vec<PinnedPage>, PagingError> {
         let asker = if is_again { Asker::RestOfStep } else { Asker::Step };
         let what = format!("the view of step {step}");
-        let pinned = match Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker) {
-            // The failed write that left no frame says more than the lack of frames.
-            Err(error @ PagingError::WorkingSet { .. }) => {
-                return Err(self.tier.mover.failed_write.take().unwrap_or(error));
-            }
-            pinned => pinned?,
-        };
+        let pinned = Fetch::pin(&mut self.tier, &self.look_ahead, what, pages, asker);
+        let pinned = pinned.map_err(|error| self.failed_write_or(error))?;
         if self.tier.mover.has_store() {
             let Tier { index, frames, counters, .. } = &mut self.tier;
             let pages = pinned.iter().map(|p| (p.page, index.transfer_bytes(p.page)));
@@ -326,7 +321,17 @@ impl Pager {
     /// count as the step's.
     /// Errors: as [`Pager::acquire_pages`].
     pub fn acquire_in_step(&mut self, pages: &[PageNo]) -> Result<Vec<PinnedPage>, PagingError> {
-        Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::RestOfStep)
+        let pinned =
+            Fetch::pin(&mut self.tier, &self.look_ahead, "a list of pages".to_string(), pages, Asker::RestOfStep);
+        pinned.map_err(|error| self.failed_write_or(error))
+    }
+
+    /// The error of a step that could not pin its pages: the failed write that left no frame says more than the lack of frames.
+    fn failed_write_or(&mut self, error: PagingError) -> PagingError {
+        match error {
+            PagingError::WorkingSet { .. } => self.tier.mover.failed_write.take().unwrap_or(error),
+            error => error,
+        }
     }
 
     /// Says how the present step, which walks its view in batches, still uses these pages.
@@ -349,8 +354,8 @@ impl Pager {
         reserved.map_err(|source| PagingError::Room { pages, source })
     }
 
-    /// Starts reads for the steps after `step` and writes of the dirty pages that leave for them, as far as [`Transfers`] says. Call it
-    /// when the pages of `step` are pinned. Calling it again during the step continues what became possible since.
+    /// Starts reads for the steps after `step`, and write-backs of the dirty pages that are evicted for these reads, as [`Transfers`] says.
+    /// Call this when the pages of `step` are pinned. Further calls during the step start the transfers that have become possible since.
     pub fn prefetch(&mut self, step: u32) {
         if self.config.transfers != Transfers::Demand && self.tier.mover.has_store() {
             self.tier.poll(false);
@@ -359,8 +364,8 @@ impl Pager {
         }
     }
 
-    /// Begins to read the pages of the next batch of the present step, as far as frames of pages that the step does not need
-    /// earlier can be had, and bytes in flight allow it. Never blocks. Calling it again continues.
+    /// Begins to read the pages of the next batch of the present step, as far as frames and the limit on bytes in
+    /// flight allow. Evicts no page that the step needs earlier. Never blocks. Further calls continue.
     pub fn prefetch_batch(&mut self, pages: &[PageNo]) {
         if self.config.transfers != Transfers::Demand && self.tier.mover.has_store() {
             self.prefetching().listed(pages, Asker::Step);
@@ -383,8 +388,8 @@ impl Pager {
     }
 
     /// A frame for the upper half of a page that splits; its bytes are whatever was there before. Goes back by
-    /// [`Pager::add_split`] or [`Pager::return_frame`]. A step that has begun to change pages is seen through where only
-    /// space is missing, with a frame more than allowed: the next step gets the error.
+    /// [`Pager::add_split`] or [`Pager::return_frame`]. If only drive space is missing, the call returns one frame more
+    /// than allowed, so that a step which has begun to change pages can finish; the next step gets the error.
     /// Errors: every frame is pinned, or the store failed while one was emptied.
     pub fn take_frame(&mut self) -> Result<PageBuffer, PagingError> {
         let error = match self.tier.frame_for(Asker::Step) {
@@ -438,7 +443,7 @@ impl Pager {
         self.tier.index.set_meta(page, meta);
     }
 
-    /// Says how many pinned pages no batch uses: the largest number of pinned pages is counted without them.
+    /// Sets how many pinned pages no batch uses: these do not count in the largest number of pinned pages.
     pub fn set_held(&mut self, pages: usize) {
         self.tier.counters.held = pages;
     }

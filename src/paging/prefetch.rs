@@ -1,14 +1,14 @@
 //! Prefetch: begins the reads that the coming steps will wait for, and the write-backs of the pages that are evicted for them.
 //!
 //! The look-ahead (`plan::look_ahead`) says which pages the coming steps will read and which pages are evicted for them: while
-//! step s computes, the pages of s and of s + 1 have to be in memory. Prefetch does as much of that as is possible already. An
-//! evicted page is unused until the step that it leaves for, so a prefetch reads nothing that the look-ahead's cache would not
-//! read. Any page that the look-ahead evicts is an equally good victim: if the first of them is in use, another one makes room.
-//! For the next step alone prefetch may also evict any other page that is far from its next use, which may cost a read.
+//! step s computes, the pages of s and of s + 1 have to be in memory. Prefetch begins those of these transfers that are possible
+//! already. An evicted page has no use up to the step that gets its frame, so a prefetch reads nothing that the look-ahead's cache
+//! would not read. All pages that the look-ahead evicts are equally good victims: if the first is still in use, another makes room.
+//! For the next step alone, prefetch may also evict any other page that is far from its next use, which may cost a read.
 //!
-//! Invariants: 1. prefetch never blocks, but for [`Transfers::Ahead`]; 2. prefetch never evicts a page that the current step or a
-//! step up to the one that the frame is for needs; 3. reads and writes in flight are bounded in bytes; 4. nothing here changes
-//! what a step gets; 5. the look-ahead runs once for each step, and further calls in the same step cost what they begin.
+//! Invariants: 1. prefetch never blocks, but for [`Transfers::Ahead`]; 2. prefetch never evicts a page that is needed by the current
+//! step, by the step that gets the frame, or by a step between them; 3. reads and writes in flight are bounded in bytes; 4. nothing
+//! here changes what a step gets; 5. the look-ahead runs once for each step, and further calls in the same step cost what they begin.
 
 use super::frames::table::{FrameState, Victim};
 use super::plan::cache_model::FAR_STEPS;
@@ -103,8 +103,8 @@ impl Prefetch<'_> {
         self.tier.begin_read(admit.page, self.look_ahead.next_use(admit.page), true)
     }
 
-    /// Begins to read the listed pages, as far as frames of pages that the present step does not need earlier can be had, and
-    /// bytes in flight allow it.
+    /// Begins to read the listed pages, as far as frames and the limit on bytes in flight allow. Evicts no page that
+    /// the present step needs earlier.
     pub fn listed(&mut self, pages: &[PageNo], asker: Asker) {
         self.tier.poll(false);
         self.tier.write_frozen();

@@ -50,7 +50,7 @@ pub struct PagerStats {
 /// The counters as a pager keeps them.
 #[derive(Debug, Default)]
 pub(super) struct Counters {
-    /// Without what the store and the bound count in this life of the run.
+    /// All counters, but for this life of the run without those of the store and of the bound: [`Counters::total`] adds them.
     pub stats: PagerStats,
     /// Seconds that steps lost to commits beside them.
     pub commit_seconds: f64,

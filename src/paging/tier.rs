@@ -219,12 +219,11 @@ impl Tier {
         self.wait_until_below(1)
     }
 
-    /// Makes a frame free: at once if a clean page leaves first, otherwise by beginning to write dirty ones, as many as
-    /// there are frames wanted. Returns whether a page has left: its frame is free now, unless there were
-    /// more than there may be.
+    /// Makes room for `wanted` pages: takes the victims in order, begins to write dirty ones back, and evicts the first clean one. Stops when the
+    /// write-backs under way suffice. Returns whether a page was evicted: its frame is free now, or retired if there were more frames than allowed.
     pub fn make_room(&mut self, wanted: usize, asker: Asker) -> Result<bool, PagingError> {
         loop {
-            // Pages that are written to leave come first: a nearer one must not leave in their place.
+            // Pages whose write-back has begun will make room; evict no page with a nearer next use in their place.
             let leaving = self.frames.count(FrameState::Writing) - self.mover.writes_ahead();
             if leaving >= wanted + self.frames.excess() {
                 return Ok(false);
@@ -246,7 +245,7 @@ impl Tier {
                     && self.mover.in_flight() == 0
                     && self.frames.held_by_callers() == 0 =>
                 {
-                    // Everything in memory is dirty and cannot leave: one frame more lets the scene be written out.
+                    // All pages in memory are dirty and cannot be written: one more frame lets an export still read the scene.
                     self.frames.add_frame();
                     return Ok(true);
                 }
@@ -284,8 +283,8 @@ impl Tier {
         }
     }
 
-    /// Keeps an import at the speed of the drive: a frame that is clean already for the next page, and writes of those
-    /// that are not.
+    /// Keeps an import at the speed of the drive: evicts a clean page, so that the next page has a frame, and begins to
+    /// write dirty pages back.
     pub fn write_behind(&mut self) -> Result<(), PagingError> {
         if self.frames.has_free() || !self.mover.has_store() {
             return Ok(());

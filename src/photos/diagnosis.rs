@@ -37,7 +37,7 @@ const PIXELS_MOST: u64 = 300_000_000;
 const PHOTOS_LEAST: usize = 24;
 /// Most points that are kept of a scene: a photo of a city shows a thousandth of it.
 pub const POINTS_MOST: usize = 1 << 20;
-/// Most points that tell how many a photo shows, and that are drawn if photos show `POINTS_WANTED` of them.
+/// Most points for the estimate of how many points a photo shows. They are enough if a photo shows `POINTS_WANTED` of them.
 const POINTS_FIRST: usize = 16_384;
 const POINTS_WANTED: f64 = 512.0;
 /// Points that are drawn into all photos.
@@ -112,8 +112,8 @@ const AGREEMENT_LEAST: f64 = 0.25;
 /// Stops of [`Diagnosis::color_spread`] from which on colours are trained, too. Measured: 0 to .06 on clean scenes; .44 with white balance
 /// within .3 stops.
 const COLOR_SPREAD: f64 = 0.2;
-/// A photo shows something else if its agreement is less than this share of the median, and this multiple of the usual share of points,
-/// and at least this share, is off. Uniform photos have a low agreement, but hardly a point that is off.
+/// A photo shows something else if its agreement is below the first share of the median, and the share of its points that are off exceeds
+/// both the second factor times the median and the third value. Uniform photos have a low agreement, but hardly a point that is off.
 const WRONG_AGREEMENT: f64 = 0.5;
 const WRONG_OFF: f64 = 1.5;
 const WRONG_OFF_LEAST: f64 = 0.1;
@@ -122,8 +122,8 @@ const WRONG_OFF_LEAST: f64 = 0.1;
 /// .5 % of the scene's size.
 const SHIFT_UNITS: f64 = 1.0;
 const AGREEMENT_BY_SHIFT: f64 = 0.01;
-/// Photos that show a point, for the remedies of poor points, which cost more than they bring where photos overlap little. Measured: 38 on
-/// cross, which gains; 7 on seneca, which loses.
+/// Least number of photos that show a point (mean) for the remedies of poor points: where photos overlap less, these
+/// remedies cost more than they gain. Measured: 38 on cross, which gains; 7 on seneca, which loses.
 const PHOTOS_PER_POINT: f64 = 16.0;
 
 /// What a diagnosis asks for.

@@ -1,9 +1,9 @@
-//! The seam: what a kind of parameters of photos can do in a run.
+//! The interface of a kind of photo parameters: its values for all photos of a run, and what it does in each step.
 //!
 //! A step calls [`PhotoParameter::begin_step`], then [`PhotoParameter::correct`] and [`PhotoParameter::target`] between the
 //! picture and its loss, [`PhotoParameter::picture_back`] and [`PhotoParameter::row_gradients`] on the way of the gradient, and
-//! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on. A commit holds the values as bytes by the
-//! name of their kind, so a new kind changes no layout, and a state without it is one whose values start.
+//! [`PhotoParameter::end_step`]. A step that lacked memory is repeated from `begin_step` on. A commit holds the values as
+//! bytes under the name of their kind. So a new kind changes no layout, and a kind that a commit lacks begins with its start values.
 //!
 //! Invariants: 1. values change in `start`, `end_step` and `restore` alone, so that a step can be repeated or rehearsed; 2. what
 //! a kind does not override does nothing; 3. equal values have equal bytes.

@@ -38,8 +38,8 @@ use std::path::Path;
 pub struct Motion {
     /// By how much the centre of the camera moves, local units.
     pub shift: [f64; 3],
-    /// About which axis, and by which angle in radians as its length, the camera turns about its own centre. The angle that
-    /// acts is 2 atan(length / 2), which is the length but for a twelfth of its cube.
+    /// The turn of the camera about its own centre: the direction is the axis, the length the angle in radians. The
+    /// angle that acts is 2 atan(length / 2), which is less by about a twelfth of the cube of the length.
     pub turn: [f64; 3],
 }
 
@@ -261,7 +261,7 @@ impl PoseState {
 }
 
 /// The poses of training photos as the run leaves them.
-const FILE: &str = "poses.json";
+pub const FILE: &str = "poses.json";
 
 pub(super) const KIND: Kind = Kind { name: "poses", file: Some(FILE), first, check, finding };
 

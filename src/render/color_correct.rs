@@ -99,8 +99,7 @@ impl Pair<'_> {
         sums.into_iter().fold([0.0; N], add)
     }
 
-    /// PSNR of the fitted render. A comparison with NaN would lose the NaN of a render in the clamps of a fit, so the sum
-    /// takes up the render, too.
+    /// PSNR of the fitted render. The clamps of a fit would hide a NaN of the render, so look for NaN before the fit.
     fn psnr(&self, fitted: impl Fn(Rgb) -> Rgb + Sync) -> f64 {
         let [squares, count] = self.sum(|render, photo| {
             if render.iter().any(|x| x.is_nan()) {

@@ -122,8 +122,8 @@ pub struct CpuRenderer {
     isects: Vec<AtomicU64>,
     raster: Raster,
     partials: Vec<Partial>,
-    /// Whether the next views collect weights of rows, and whether this view does; the sums by intersection and by row,
-    /// and the error of each pixel.
+    /// Weights of rows: whether the next views collect them, whether this view does, the sums by intersection and by
+    /// row, and the error of each pixel.
     weighs_next: bool,
     weighs: bool,
     weight_partials: Vec<WeightPartial>,
@@ -131,8 +131,8 @@ pub struct CpuRenderer {
     errors: Vec<f32>,
     /// The ranges of tiles of the picture, in order.
     ranges: Vec<TileRange>,
-    /// Intersections of each row in the range that is taken back now, and their sums by chunk of rows; unused by a picture of one
-    /// range.
+    /// Intersections of each row with the range that the backward pass is in, and their sums by chunk of rows. Unused
+    /// for a picture of one range.
     range_counts: Vec<u32>,
     range_chunk_counts: Vec<u64>,
     /// Most bytes of intersections that are listed at once; `None`: all of them.
@@ -305,7 +305,6 @@ impl CpuRenderer {
         0..self.colors.len()
     }
 
-    /// Notes the bytes held now.
     fn note_bytes(&mut self) {
         self.row_bytes_most = self.row_bytes_most.max(self.bytes_of_rows());
         self.bytes_most = self.bytes_most.max(self.scratch_bytes());

@@ -14,17 +14,17 @@ use crate::scene::camera::Camera;
 use crate::scene::columns::{Column, Columns};
 use crate::scene::image::{Image, Target};
 
-/// Error of a value of a picture without a flipped decision: some hundred roundings of 6e-8.
+/// Largest difference of a picture value where both sides decided alike: some hundred roundings of 6e-8.
 const PIXEL: f32 = 5e-5;
-/// A rounding that flips a decision (a tile more, a stop one Gaussian later) moves a value by less than this.
+/// Largest difference where a rounding flipped a decision (one tile more, a stop one Gaussian later).
 const FLIPPED: f32 = 1.0 / 255.0;
-/// One value in so many may be such a one.
+/// At most one value in so many may have a flipped decision.
 const FLIPPED_ONE_OF: usize = 1000;
 /// Difference of a loss: the small variances of SSIM, and a few flipped decisions.
 const LOSS: f64 = 2e-5;
 /// Relative L2 of a column of gradients: a thousand roundings, for sums whose terms cancel.
 const GRADIENT: f64 = 2e-4;
-/// One half extent in so many may be another: it is rounded up.
+/// At most one half extent in so many may differ: rounding up may give the next integer.
 const RADIUS_ONE_OF: usize = 500;
 /// The views: Gaussians, size of the picture, SH degree; from one to several workgroups.
 const VIEWS: [(usize, [u32; 2], u8); 4] =

@@ -5,10 +5,10 @@
 //! `gpu_update`), the picture in ranges of tiles (`gpu_ranges`), steps without waits (`gpu_recorded`), the device (`crate::gpu`).
 //!
 //! # Memory
-//! The ordinary view keeps its rows and tile lists on the device. A buffer that the budget or the device refuses costs first
-//! the rows, which then come and go in chunks, and then the lists, which are then made for one range of tiles at a time. What
-//! must stay is 96 bytes a row in view (splats and gradients), 8 bytes a row for the places in a range, some 60 bytes a pixel,
-//! and the splats and lists of one tile. The result has the same bits on every path.
+//! The ordinary view keeps its rows and tile lists on the device. If the budget or the device refuses a buffer, the view first
+//! gives up its rows, which are then processed in chunks. If that is not enough, the view gives up its lists, which are then made
+//! for one range of tiles at a time. What must stay is 96 bytes a row in view (splats and gradients), 8 bytes a row for the
+//! places in a range, some 60 bytes a pixel, and the splats and lists of one tile. The result has the same bits on every path.
 //!
 //! # Bus traffic
 //! A step with n rows in view, p pixels and all colour bands uploads 236 n bytes of values and 4 p bytes of photo. The
@@ -31,8 +31,8 @@
 //! one submission and one wait.
 //!
 //! A view of one batch keeps its rows on the device, and its depth sort is recorded in `rows_in`. A view of several batches
-//! uploads the rows of each batch twice, and sorts the splats of each range of tiles. The device is idle only between two steps: the
-//! optimizer has just rewritten every row in view, and the cull of the next view reads the new means.
+//! uploads the rows of each batch twice, and sorts the splats of each range of tiles. The device is idle only between
+//! two steps: the cull of the next view must read the means that the optimizer on the host has just rewritten.
 //!
 //! A device that holds pages ([`super::pages`]) uploads 4 p bytes of photo, some 50 KB of tables and uniforms, and the payloads that it
 //! lacks; it downloads 52 bytes a page, and the payloads of pages that leave their slots. It waits for the number of listed rows, the

@@ -80,7 +80,7 @@ pub(super) fn record_picture_back(
     }
     view.unusable = Unusable::OnDevice(unusable);
     if view.columns.is_none() {
-        // The caller changes rows as soon as the first batch is out, so the pass out must not fail for want of memory.
+        // After the first batch of the pass out, the caller changes rows. So the pass must not run out of memory: check now.
         if let Some(tiles) = view.tiles_back.take() {
             gpu.submit(gpu.resume(tiles))?;
         }
@@ -130,7 +130,7 @@ fn with_unusable<'g>(stages: &'g ViewStages, view: &mut View) -> GpuResult<Recor
         match recorder.read_back("rasterize_bwd", &unusable.view()) {
             Ok(unusable) => view.unusable = Unusable::Pending(unusable),
             Err(error) => {
-                // The work that the recorder brings along goes on even if the read-back lacks memory.
+                // Submit the tile stages in any case: only the read-back lacked memory.
                 gpu.submit(recorder)?;
                 return Err(error);
             }
@@ -172,7 +172,7 @@ pub(super) fn read_loss_value(stages: &mut ViewStages, view: &mut View) -> Resul
     let no_loss = RenderError::OutOfOrder { call: "loss_value", needs: "loss" };
     let Some(loss) = &mut view.loss else { return Err(no_loss) };
     let sums = match std::mem::replace(&mut loss.sums, LossSums::Known([0.0; 4])) {
-        // The wait above has computed stale sums again, and a step that is recorded without waiting reads none.
+        // The wait above has renewed stale sums. Nobody reads the loss of a step that is recorded without waiting.
         LossSums::Stale | LossSums::OnDevice(_) => return Err(no_loss),
         LossSums::Pending(readback) => {
             let mut sums = [0.0f32; 4];

@@ -167,7 +167,7 @@ impl PageRenderer for GpuRenderer {
             return Err(needs());
         }
         let recorded = self.loss(update.target, update.loss).and_then(|()| self.picture_back());
-        // A view that has given memory back takes other ways than the recorded one.
+        // A view that has freed memory cannot take the recorded path.
         let is_whole = |view: &View| view.columns.is_some() && view.tiles_back.is_some();
         if recorded.is_ok() && !self.view.as_ref().is_some_and(is_whole) {
             self.drop_view();

@@ -80,7 +80,7 @@ pub struct PageBatch {
     pub listed: Vec<u32>,
     /// Listed rows, or those that the columns have room for.
     pub rows: u32,
-    /// `[row of the pages]`: at the first row of a page on, the numbers of its listed rows.
+    /// `[row of the pages]`: the numbers of the listed rows of each page, from the place of the page's first row on.
     pub found: Buffer,
 }
 
@@ -99,8 +99,8 @@ impl PageTable {
         self.pages.iter().map(|page| page.slab).collect()
     }
 
-    /// The pages of a dispatch, and the chunks of `size` rows of the largest: those in the slab whose listed rows reach into `rows`, and all
-    /// in the slab where only the device knows which rows are listed.
+    /// The pages of a dispatch, and the number of chunks of `size` rows of the largest page: the pages in the slab
+    /// whose listed rows reach into `rows`, or all pages in the slab if only the device knows the listed rows.
     fn chunks(&self, slab: u32, rows: &Range<u32>, size: u32) -> PageChunks {
         let reaches = |page: &DevicePage| {
             !self.is_known || (page.first_listed < rows.end && page.first_listed + page.listed > rows.start)
@@ -224,8 +224,8 @@ impl DevicePages {
         Ok((PageBatch { rows: listed.iter().sum(), listed, found }, table))
     }
 
-    /// Records which rows the camera may draw, for columns with room for `rows` rows. Returns it with the counts of the
-    /// pages and their sum.
+    /// Records the list of the rows that the camera may draw, for columns with room for `rows` rows. Returns the batch,
+    /// its table, and the counts of the pages with their sum.
     pub(super) fn list_within(
         &self,
         gpu: &Gpu,
@@ -340,7 +340,7 @@ impl DevicePages {
         let groups = groups_1d(pages.len() as u32 * WORKGROUP, WORKGROUP);
         for slab in table.slabs() {
             let uniform = recorder.uniform(&GatherUniforms { slab, ..uniforms })?;
-            // No sum of a present step is asked for: the tables stand in the place of those.
+            // The stage reads no sums of the present step, so the tables are bound in their place.
             let [slab, tables] = [self.slots.slab(slab)?, self.tables.view()];
             let views = [uniform, table.on_device.view(), slab, tables.clone(), tables, surveys.view()];
             recorder.dispatch("gather", &self.stages.survey, &views, groups)?;
@@ -373,7 +373,7 @@ impl DevicePages {
     }
 }
 
-/// The listed rows, numbered in the batch, that a window of its rows `part` binds.
+/// The listed rows, numbered in the batch, that `window` binds; `window` counts from the begin of `part`.
 fn bound_rows(part: &Range<usize>, window: Window) -> Range<u32> {
     let first = part.start as u32 + window.first as u32;
     first..first + window.rows

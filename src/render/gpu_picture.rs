@@ -140,7 +140,7 @@ impl ViewStages {
                 let frame = self.tiles.frame(gpu, &mut recorder, &splats, &ranks, blend, &pixels)?;
                 Ok((pixels, frame))
             });
-            // Without a frame, the colours at least.
+            // Submit the colours in any case: the picture in ranges needs them.
             gpu.submit(recorder)?;
             match recorded {
                 Ok((pixels, (frame, demand))) => {

@@ -125,7 +125,7 @@ impl Tally {
                 planned.push(whole);
                 continue;
             }
-            // The sums of a part come in one piece.
+            // The sums of a part are one buffer, so they must fit one binding.
             let of_part = |splats: u64| {
                 self.fits(splats, splats, limits) && BYTES_OF_SUMS * (splats + self.slack) <= limits.binding
             };

@@ -6,9 +6,9 @@
 //! lets the update write only if every list fitted and the numbers are sound. Everything else is recorded as in other
 //! steps, and has the same bits: entries without a row are never drawn, and the empty tail of a list changes no sum.
 //!
-//! Two submissions bring uploads (tables, photo), the third brings backward pass, gate and update. Buffers of a step are handed to the
-//! next one as soon as they are recorded, because the device works in the order of the submissions; only the two read-backs of a step
-//! in flight stay.
+//! The first two submissions hold uploads (tables, photo), the third holds backward pass, gate and update. The device
+//! works in the order of the submissions, so the next step may use the buffers of a step as soon as that step is
+//! recorded. A step in flight keeps its two read-backs only.
 //!
 //! Not here: which steps may be recorded (`train`).
 //!
@@ -77,7 +77,7 @@ pub(super) fn back_and_update(
     let needs = || RenderError::OutOfOrder { call: "record_update", needs: "record_picture" };
     let (tiles_back, columns) = (view.tiles_back.take().ok_or_else(needs)?, view.columns.take().ok_or_else(needs)?);
     let mut recorder = stages.gpu.resume(tiles_back);
-    let verdict = decide(&mut recorder, (held, records), &view, update)?;
+    let verdict = record_gate(&mut recorder, (held, records), &view, update)?;
     let (batch, segment) = (of_view.batches.first().ok_or_else(needs)?, view.segments.first().ok_or_else(needs)?);
     let source = held.source(of_view, batch, &records.table);
     let pages = records.table.pages.len();
@@ -92,8 +92,7 @@ pub(super) fn back_and_update(
     Ok(InFlight { verdict, results, plan: view.loss.ok_or_else(needs)?.plan })
 }
 
-/// Records the gate of a step.
-fn decide(
+fn record_gate(
     recorder: &mut Recorder<'_>,
     (held, records): (&DevicePages, &Recorded),
     view: &View,
@@ -128,7 +127,7 @@ fn decide(
     Ok(recorder.read_back("gate", &verdict.view())?)
 }
 
-/// Waits for a step in flight. The sizes of the lists of a step that was taken are those that `tiles` predicts the next ones by.
+/// Waits for a step in flight. If the step was taken, `tiles` notes its list sizes, to predict those of the next steps.
 pub(super) fn finish(step: InFlight, tiles: &mut TileStages) -> GpuResult<StepDone> {
     let mut of_step = [StepVerdict::zeroed()];
     step.verdict.copy_to(&mut of_step)?;

@@ -88,7 +88,6 @@ fn submit_chunk(
     gpu.submit(recorder).map(|_| ())
 }
 
-/// Allocates and zeroes the gradients of the splats.
 pub(super) fn zero_gradients(gpu: &Gpu, segments: &mut [Segment]) -> GpuResult<()> {
     let mut recorder = gpu.begin("backward");
     for segment in segments {

@@ -14,7 +14,7 @@ const SLOT_STEP: u64 = 256;
 /// Most bytes of slots that are read back at once.
 const READ_BYTES: u64 = 8 << 20;
 /// Most bytes of slots whose reads have begun and not ended.
-const UNDER_WAY_BYTES: u64 = 64 << 20;
+const IN_FLIGHT_BYTES: u64 = 64 << 20;
 /// Reads beside the work on a view take at most this part of the memory that the view leaves.
 const READ_SHARE: u64 = 8;
 
@@ -35,7 +35,7 @@ pub struct Slots {
     is_packed: bool,
     slabs: Vec<Slab>,
     /// Reads that have begun and not ended, with the slots that they read, in the order of their beginning.
-    under_way: VecDeque<(SlotPage, Readback)>,
+    in_flight: VecDeque<(SlotPage, Readback)>,
 }
 
 impl Slots {
@@ -54,7 +54,6 @@ impl Slots {
         self.slot_bytes
     }
 
-    /// Whether there are no slots.
     pub fn is_empty(&self) -> bool {
         self.slabs.is_empty()
     }
@@ -136,25 +135,25 @@ impl Slots {
     /// Begins to read slots; returns how many, from the first: those that memory allows. Does not
     /// wait.
     pub fn begin_reads(&mut self, gpu: &Gpu, slots: &[SlotPage]) -> GpuResult<usize> {
-        let reading = self.under_way.len() as u64 * self.slot_bytes;
-        let most = UNDER_WAY_BYTES.saturating_sub(reading).min(gpu.room() / READ_SHARE) / self.slot_bytes;
-        let before = self.under_way.len();
+        let reading = self.in_flight.len() as u64 * self.slot_bytes;
+        let most = IN_FLIGHT_BYTES.saturating_sub(reading).min(gpu.room() / READ_SHARE) / self.slot_bytes;
+        let before = self.in_flight.len();
         let mut recorder = gpu.begin("pages");
         for page in slots.iter().take(most as usize) {
             match recorder.read_back("pages", &self.view(*page)?) {
-                Ok(read) => self.under_way.push_back((*page, read)),
+                Ok(read) => self.in_flight.push_back((*page, read)),
                 Err(error) if error.is_out_of_memory() => break,
                 Err(error) => return Err(error),
             }
         }
         gpu.submit(recorder)?;
-        Ok(self.under_way.len() - before)
+        Ok(self.in_flight.len() - before)
     }
 
     /// Ends the reads that began first, into the payloads of the same slots. Waits for them alone.
     pub fn finish_reads(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> GpuResult<()> {
-        let count = payloads.len().min(self.under_way.len());
-        let ending: Vec<(SlotPage, Readback)> = self.under_way.drain(..count).collect();
+        let count = payloads.len().min(self.in_flight.len());
+        let ending: Vec<(SlotPage, Readback)> = self.in_flight.drain(..count).collect();
         if !ending.iter().map(|(page, _)| page).eq(payloads.iter().map(|(page, _)| page)) {
             return Err(wrong_slots("slots whose reads have not begun"));
         }

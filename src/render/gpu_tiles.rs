@@ -140,8 +140,8 @@ impl TileStages {
         self.scan_summed(gpu, recorder, (values, &sums.view(), SCAN_BLOCK), count, offsets)
     }
 
-    /// As [`TileStages::scan`], for values that are summed already, so many values to a sum. Where a block would read more than
-    /// [`SCAN_SUMS`] of them, the values are summed by blocks; where it would read too many of these, they are scanned first.
+    /// As [`TileStages::scan`], with given `sums` of groups of `values_of_sum` values. If a block would read more than [`SCAN_SUMS`] of
+    /// the sums, the values are summed by blocks instead. If a block would read too many sums of blocks, these sums are scanned first.
     fn scan_summed(
         &self,
         gpu: &Gpu,
@@ -151,7 +151,7 @@ impl TileStages {
         offsets: &BufferView,
     ) -> GpuResult<()> {
         let blocks = count.div_ceil(SCAN_BLOCK);
-        // Values before a block in a group that it shares with another.
+        // Most values before a block that lie in the same group as the block's first value.
         let shared = if SCAN_BLOCK.is_multiple_of(values_of_sum) { 0 } else { values_of_sum.min(count) };
         let is_too_much = blocks > 1 && count / values_of_sum.max(1) + shared > self.scan_sums;
         if is_too_much && values_of_sum != SCAN_BLOCK {

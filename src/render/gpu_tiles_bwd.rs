@@ -41,7 +41,7 @@ pub enum Fold<'a> {
     Part(&'a Buffer),
 }
 
-/// Windows of fewer intersections are not tried, nor more than a few windows of any size: each window is a pass over all lists.
+/// Least intersections of a window, and most windows: each window costs a pass over all lists.
 const WINDOW_MIN: u32 = 1 << 10;
 const WINDOWS_MOST: u32 = 4;
 
@@ -124,7 +124,7 @@ impl BackStages {
         let (own_carry, partials, window);
         let carry = match fold {
             Fold::Part(carry) => {
-                // A second window would find the state of the pixels after this part instead of the state before it.
+                // One window: a second one would begin with the pixels as they are after this part, not before it.
                 window = demand.isects.max(1);
                 partials = gpu.buffer("sums of intersections", isect_bytes * u64::from(window))?;
                 carry

@@ -114,9 +114,9 @@ pub trait PageRenderer: Renderer {
     /// Copies slots into payloads. Waits.
     fn read_slots(&mut self, payloads: &mut [(SlotPage, &mut [u8])]) -> Result<(), RenderError>;
 
-    /// Begins to copy slots back, as they are after the work submitted so far; returns how many, from
-    /// the first. Fewer than all, even none, where memory is short. Does not wait. The slots may be given other payloads at once: the
-    /// device copies in the order of the calls.
+    /// Begins to copy slots to the host, as they are after the work submitted so far, from the first on; returns how
+    /// many. Fewer than all, even none, if memory is short. Does not wait. The slots may get other payloads at once,
+    /// because the device copies in the order of the calls.
     fn begin_reads(&mut self, slots: &[SlotPage]) -> Result<usize, RenderError>;
 
     /// Ends the copies that [`PageRenderer::begin_reads`] began first, into payloads in the same order. Waits for the copies, not for work

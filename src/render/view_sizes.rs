@@ -21,8 +21,8 @@ impl ViewSizes {
         }
     }
 
-    /// The view with `growth` times as many Gaussians. A few that cover the picture say little about many, which are
-    /// smaller: their intersections are taken to be those of ordinary scenes.
+    /// The view with `growth` times as many Gaussians. Few Gaussians that cover the picture reach more tiles each than
+    /// many smaller ones, so the grown view has at most the intersections of ordinary scenes.
     pub fn grown(self, growth: f64) -> ViewSizes {
         let [rows, isects] = [self.rows, self.isects].map(|size| (size as f64 * growth).ceil() as u64);
         let isects = isects.min(self.isects.max(rows.saturating_mul(ISECTS_PER_ROW)));

@@ -148,8 +148,8 @@ pub fn staging_bytes(prefetch_bytes: usize, codec: Codec) -> u64 {
     (PLAN_BYTES + if codec == Codec::Raw { 0 } else { prefetch_bytes }) as u64
 }
 
-/// Memory of a run that holds `rest` bytes besides staging, if staging took `staging` of `budget` bytes: more memory
-/// means more frames, and up to an eighth of the frames may be in transfer.
+/// The budget of a run that holds `rest` bytes besides staging, if a budget of `budget` bytes had `staging` bytes of
+/// staging. A larger budget has more frames, and with them more staging: up to an eighth of the frames may be in transfer.
 pub(crate) fn with_staging(rest: u64, staging: u64, budget: u64) -> u64 {
     let of_plan = staging.min(PLAN_BYTES as u64);
     let share = ((staging - of_plan) as f64 / budget.max(1) as f64).min(0.5);
@@ -281,9 +281,9 @@ impl HostBudget {
         self.frames_left(scene, view.at_last, growth_due(scene)).max(with_splits).max(bare).max(FRAMES_LEAST)
     }
 
-    /// How a step walks a view that does not fit in one batch: the frames, and the most pages of a batch. The renderer holds
-    /// `rendering` bytes, and the working set `working_row` bytes for each row of a batch. A batch takes as many frames again for the
-    /// next batch and for pages that split, its share of the working set, and copies of its pages in a densification round.
+    /// The frames, and the most pages of a batch, for a view that does not fit in one batch. The renderer holds `rendering` bytes,
+    /// and the working set `working_row` bytes for each row of a batch. For each page, a batch takes two frames (the second for the
+    /// next batch and for pages that split), a part of the working set and, in a densification round, a copy of the page.
     pub(crate) fn batches(&self, scene: &PagedScene, rendering: u64, working_row: usize) -> (usize, usize) {
         let taken = self.bytes_beside_frames(scene, rendering, growth_due(scene)) - self.copies(scene) + self.staging;
         let left = self.bytes.saturating_sub(taken);
@@ -358,8 +358,8 @@ impl HostBudget {
     }
 }
 
-/// Frames and pages of a batch within `left` bytes: twice the frames of a batch, and for each page of a batch `working` bytes of
-/// the working set and, if densification `copies` pages, a copy. At least one page and [`FRAMES_LEAST`] frames, though they may not fit.
+/// The frames, and the pages of a batch, within `left` bytes. Each page of a batch takes two frames, `working` bytes of the working
+/// set and, if densification `copies` pages, a copy. At least one page and [`FRAMES_LEAST`] frames, even if they do not fit.
 pub(crate) fn frames_and_batch(left: u64, frame: u64, working: u64, copies: bool) -> (usize, usize) {
     let copied = if copies { PAGES_PER_BATCH as u64 } else { 0 };
     let few = left / (2 * frame + working + if copies { frame } else { 0 });

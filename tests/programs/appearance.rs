@@ -3,7 +3,7 @@
 use crate::support::a_device;
 use crate::support::exif::{Settings, add_exif};
 use crate::support::scenes::TextModel;
-use crate::support::workdir::Workdir;
+use crate::support::workdir::{EVAL, TRAIN, Workdir};
 use std::path::Path;
 
 /// Stops by which a training photo is changed: 1.2 up or down, and back.
@@ -81,11 +81,35 @@ fn without_points_the_run_finds_out_whether_exposures_differ() {
     let errors = errors(&work, "flickering", &changed);
     // A pass over random points finds less than one over the points of the scene.
     assert!(mean(&errors) < 0.3, "{errors:?}");
+    let evaluated = work.output(EVAL, "flickering --device cpu --json flickering.json");
+    assert!(
+        evaluated.status.success() && work.json("flickering.json")["test"]["predicted"].is_object(),
+        "exposures are not used"
+    );
     let clean = Workdir::city(24, 112, 80, 1500);
     without_points(&clean);
     let told = said(&clean, "clean", flags);
     assert!(told.contains("stops between photos: they are no longer corrected"), "{told}");
     assert!(!clean.exists("clean/appearance.json") && clean.summary("clean")["test"]["predicted_psnr"].is_null());
+    // More steps of a run whose checkpoint is gone find it out again.
+    let told = clean.train("--resume clean --steps 180 --device cpu");
+    assert!(told.contains("its Gaussians") && told.contains("they are no longer corrected"), "{told}");
+    assert!(!clean.exists("clean/appearance.json"));
+}
+
+/// Exposures of another run, whose mean is held, are part of a commit: a run that goes on needs no file.
+#[test]
+fn a_run_that_goes_on_keeps_the_mean_of_given_exposures() {
+    let (work, _) = flickering_city();
+    run(&work, "given", "--steps 60 --appearance exposure");
+    let flags = "--steps 90 --appearance exposure --first-appearance given/appearance.json";
+    run(&work, "whole", flags);
+    run(&work, "other", "--steps 90 --appearance exposure");
+    assert!(work.ply("other") != work.ply("whole"), "given exposures change nothing, so the test shows little");
+    let cut = format!("scene --quiet --out cut --device cpu {FLAGS} {flags} --commit-every 0.01 --log-every 1");
+    assert!(work.begin(&cut).after_lines("cut", 40).kill());
+    let resumed = work.output(TRAIN, "--resume cut --quiet --device cpu --first-appearance=");
+    assert!(resumed.status.success() && work.ply("cut") == work.ply("whole"), "the mean of given exposures is lost");
 }
 
 #[test]
@@ -116,7 +140,7 @@ fn exposures_that_change_are_found_and_cost_little() {
     let report = work.text("exposure/report.html");
     assert!(report.contains("Appearance") && report.contains("fitted on the left"));
     // An evaluation of the run gives the figures too, and the same ones.
-    let again = work.json_of(crate::support::workdir::EVAL, "exposure scene");
+    let again = work.json_of(EVAL, "exposure scene");
     for (part, figure) in [
         ("half_fitted", "fitted_right_psnr"),
         ("predicted", "predicted_psnr"),

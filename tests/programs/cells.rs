@@ -283,6 +283,18 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
         cells.refuses("run city --cell 1", &["was changed after the cut"]);
         cells.0.write(&file, before);
     }
+    // The only steps of a cell, in a store that cannot be read.
+    std::fs::create_dir(cells.0.path("pages")).unwrap();
+    let flags = "run city --cell 1 --spill-dir pages";
+    let has_logged = || {
+        let mut runs = std::fs::read_dir(cells.0.path("pages")).unwrap();
+        runs.any(|run| cells.0.lines(run.unwrap().path().join("run").to_str().unwrap()) > 30)
+    };
+    assert!(cells.begin(&format!("{flags} --commit-every 0.01 --log-every 1")).once(has_logged).kill());
+    let store = format!("{}/pages", cells.place("pages", 1));
+    cells.0.write(&cells.only(&store, "witness"), "");
+    let (code, said) = cells.says(flags);
+    assert!(code != Some(0) && cells.0.exists(&format!("{store}/FORMAT")), "{code:?}: {said}");
     cells.refuses("cut scene --out city --cells 3", &["the city is cut already"]);
     says(&cells.done("cut scene --out city --cells 2"), &["is cut", "2 cells"]);
 }

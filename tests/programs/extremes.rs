@@ -143,7 +143,11 @@ fn a_run_whose_masks_are_all_black_stops() {
         let name = Path::new(&view.name).with_extension("png");
         image::GrayImage::new(96, 64).save(work.path("scene/masks").join(name)).unwrap();
     }
-    stopped(&work, "out", "--steps 1000", &["exclude every pixel", "--invert-masks", "images: step "]);
+    // Ten photos to train on: the step after two epochs ends the run, also if the run goes on from a commit between.
+    let words = ["exclude every pixel", "--invert-masks", "images: step "];
+    let step_of = |said: &str| said.split("images: step ").nth(1).unwrap().split(':').next().unwrap().to_string();
+    let said = stopped(&work, "out", "--steps 1000 --save-every 15", &words);
+    assert_eq!(step_of(&work.refuses("--resume out --device cpu", &words)), step_of(&said));
     done(&work, "inverted", "--steps 60 --invert-masks");
 }
 
@@ -162,6 +166,20 @@ fn a_run_that_sees_loses_or_draws_no_gaussian_stops() {
     // Alpha below 1/255 is not drawn, so no gradient raises it.
     let faint = "--init-opacity 0.001 --strategy none --steps 1000";
     stopped(&work, "faint", faint, &["too transparent", "--init-opacity"]);
+}
+
+/// Each is legal where it is read.
+#[test]
+fn numbers_at_the_ends_of_their_types_mean_what_they_say() {
+    let work = small_city();
+    // The settings of a run are TOML, whose numbers have 63 bits.
+    work.refuses("scene --out out --seed 9223372036854775808", &["--seed", "0 to 9,223,372,036,854,775,807"]);
+    done(&work, "seed", "--steps 1 --seed 9223372036854775807 --save-every 1 --keep-checkpoint");
+    work.train("--resume seed --steps 2 --quiet --device cpu");
+    // Behind all photos.
+    done(&work, "after", "--steps 1 --test-after 5000000000");
+    assert!(work.summary("after")["test"].is_null());
+    work.train("scene --out dry --dry-run --commit-every 1e-45 --spill-dir pages");
 }
 
 #[test]

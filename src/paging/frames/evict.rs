@@ -14,7 +14,7 @@ use std::collections::BinaryHeap;
 /// Next use of a page that no planned step needs.
 pub const NEVER: u32 = u32::MAX;
 
-/// Entries of the heap that are kept beyond the pages in it before outdated entries are dropped.
+/// Outdated entries that the heap may always hold before they are dropped.
 const OUTDATED_LEAST: usize = 1024;
 
 /// Which page is evicted first: of a run and of a simulation.

@@ -21,7 +21,7 @@ const ABSENT: u32 = u32::MAX;
 pub struct FewestReads {
     /// By page: the step that last had it, counted here.
     last_use: Vec<u32>,
-    /// Spare frames at the steps from `first` on: without the pages that the step needed, and the pages kept for later.
+    /// Spare frames at each step from `first` on: all frames less those of the step's own pages and of the pages that are kept across the step.
     spare: VecDeque<u32>,
     /// No interval reaches back before this step: the step before it has no spare frame.
     first: u32,
@@ -82,7 +82,7 @@ impl FewestReads {
 
     /// Keeps a page between two steps, if every step between them has a spare frame.
     fn keep(&mut self, last: u32, now: u32) -> bool {
-        // A step without a frame to spare is before `first`; the page's own steps have one for it.
+        // Steps without a spare frame lie before `first`. The two steps that need the page have a frame for it.
         if last == ABSENT || last + 1 < self.first {
             return false;
         }

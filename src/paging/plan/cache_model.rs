@@ -17,10 +17,10 @@ use std::fmt;
 use std::ops::Range;
 
 /// A page that is not needed for this number of steps may be evicted for a page that the next step would wait for. That
-/// costs at most one more read in this number of steps. With frames for a tenth of a large survey, of which a view needs
-/// 5 % of the pages, 4, 16 and 40 steps read 4.3, 1.7 and 1.4 % more than necessary (measured while only the next step
-/// was planned anew: .3 % since), and steps waited for 2.5, 3.1 and 3.1 % of their pages; with less reading 40 was the
-/// fastest, in small surveys as well.
+/// costs at most one more read in this number of steps. Measured on a large survey, with frames for a tenth of the
+/// pages and views of 5 % of them: 4, 16 and 40 steps read 4.3, 1.7 and 1.4 % more than necessary, and steps waited for
+/// 2.5, 3.1 and 3.1 % of their pages. (Only the list of the next step was renewed then; since more lists are, 40 steps
+/// read .3 % more.) 40 was the fastest, in small surveys as well.
 pub const FAR_STEPS: u32 = 40;
 
 /// Steps before its own in which a page may be read: how far a run looks ahead.
@@ -90,8 +90,8 @@ impl CacheModel {
         }
     }
 
-    /// The same cache, which reads ahead as a run does: it evicts a page of the step before only where no other page is
-    /// unneeded for [`FAR_STEPS`], so that frames are free while that step still computes.
+    /// The same cache, but reading ahead as a run does. Reads then begin while the previous step still computes, so
+    /// pages of that step are evicted only if every other page is needed within [`FAR_STEPS`].
     pub fn reading_ahead(self) -> CacheModel {
         CacheModel { reads_ahead: true, ..self }
     }
@@ -177,8 +177,8 @@ impl CacheModel {
         Ok(())
     }
 
-    /// What this cache, which stands before the first of `steps`, will do in these steps by `plan`, if nothing becomes known
-    /// that is not known now. `steps` must begin with the plan, and end with it at the latest.
+    /// The changes of this cache in `steps`, by `plan` and what is known now. The cache must stand before the first of
+    /// `steps`. `steps` must begin where the plan begins, and end where it ends or earlier.
     /// Errors: a step needs more frames than there are.
     pub fn changes(&self, plan: &Plan, steps: Range<u32>) -> Result<Vec<PlannedStep>, TooFewFrames> {
         let mut cache = self.clone();
@@ -198,8 +198,8 @@ impl CacheModel {
         is_last || ignores_plan || victim.next_use > batch.saturating_add(FAR_STEPS)
     }
 
-    /// The page that is evicted first by the next uses as they are known now. What became known since a page entered the
-    /// order only brings its next use nearer, so the first page whose next use is exact is the farthest.
+    /// The page that is evicted first, by the next uses known now. What has become known since a page entered the order
+    /// can only bring the next use of the page nearer. So the first page whose next use is up to date is the farthest.
     fn first_exact(&mut self, next_use: impl Fn(PageNo) -> Option<u32>) -> Option<Candidate> {
         loop {
             let first = self.idle.first()?;

@@ -18,10 +18,10 @@ use crate::paging::frames::table::{FrameState, FrameTable};
 use crate::scene::page_meta::PageMeta;
 use std::collections::BTreeMap;
 
-/// Steps whose page lists are made anew before the look-ahead, by the bounds as they are now, counted from the present step: the
-/// next step, the last one that is played, and one far enough for pages to be kept for it. Pages may have been planned two
-/// epochs ago, and their rows move. Without the latter two a cache for half of a small survey read 8 % more, for half of a
-/// large one 2 %.
+/// The coming steps (counted from the present step) whose page lists are made again before the look-ahead, by the
+/// current bounds: the next step, the last step that is played, and a step so far ahead that pages are kept for it. A
+/// list may be two epochs old, and rows have moved since. Without the last two, a cache for half of a small survey read
+/// 8 % more, and for half of a large survey 2 % more.
 const REFRESHED: [u32; 3] = [1, STEPS_AHEAD, 4 * STEPS_AHEAD];
 /// Bounds of pages that [`LookAhead::refresh_near`] tests for a step: some .3 ms.
 const NEAR_BOUNDS: usize = 50_000;
@@ -116,8 +116,8 @@ impl LookAhead {
         REFRESHED.into_iter().for_each(|far| self.views.refresh(step.saturating_add(far), index));
     }
 
-    /// Makes the page lists of the coming steps anew, as many as [`NEAR_BOUNDS`] allows: all of a small scene. For a tier above that
-    /// holds few of the pages, so that an inexact next use evicts the wrong one.
+    /// Makes the page lists of the coming steps again, for as many steps as [`NEAR_BOUNDS`] allows: for all steps in a
+    /// small scene. A tier above that holds few pages needs this, since an inexact next use would evict the wrong page.
     pub fn refresh_near(&mut self, step: u32, index: &[PageMeta]) {
         let steps = (NEAR_BOUNDS / index.len().max(1)) as u32;
         let planned = self.views.planned_to().saturating_sub(step);

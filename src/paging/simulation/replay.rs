@@ -53,8 +53,8 @@ pub struct StepTraffic {
     pub pages_read: u32,
     /// Bytes of the pages that were read.
     pub bytes_read: u64,
-    /// Bytes among them of pages that are needed before the first eviction: a run that has just made its pages has these
-    /// in memory.
+    /// The part of `bytes_read` that fills frames for the first time. A run that has just made its pages has these
+    /// pages in memory already.
     pub bytes_first: u64,
     /// Number of pages that are needed before the first eviction.
     pub pages_first: u32,
@@ -138,7 +138,7 @@ struct Coming<'a> {
     batches: Vec<(u32, bool)>,
     /// Batches of the step that is planned now and are not planned yet.
     waiting: VecDeque<Vec<PageNo>>,
-    /// Batches among them before the one that is pinned once: from there on the step updates.
+    /// Number of the batches in `waiting` before the one at the turn, which is pinned once: from that batch on the step updates.
     forwards: usize,
     next_step: u32,
     /// Whether every next use was known whenever a page left.

@@ -109,8 +109,12 @@ const PASSES: usize = 4;
 
 struct Appearance {
     mode: AppearanceMode,
-    /// The step after which exposures are judged, if they are.
+    /// The number of steps after which exposures are judged, if they are.
     judged_after: Option<u32>,
+    /// Steps that these values have had. More steps of a finished run begin with new values, at a later step of the run.
+    steps: u32,
+    /// The values are those of a commit.
+    is_restored: bool,
     /// For each view, the number of its group of equal cameras.
     camera_groups: Vec<usize>,
     state: AppearanceState,
@@ -133,6 +137,8 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
         Box::new(Appearance {
             mode: options.appearance,
             judged_after: is_judged.then_some(u32::try_from(passes).unwrap_or(u32::MAX)),
+            steps: 0,
+            is_restored: false,
             state: AppearanceState::new(&camera_groups),
             camera_groups,
             first_exposures: 0,
@@ -144,9 +150,9 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
     })
 }
 
-/// As [`PhotoParameter::save`] writes them: the values, and how many exposures started from EXIF data.
-fn decoded(saved: &Encoded) -> Result<(AppearanceState, u32), ValuesError> {
-    saved.decoded(|(state, _): &(AppearanceState, u32)| state.check())
+/// As [`PhotoParameter::save`] writes them: the values, how many exposures started from EXIF data, and the steps.
+fn decoded(saved: &Encoded) -> Result<(AppearanceState, u32, u32), ValuesError> {
+    saved.decoded(|(state, ..): &(AppearanceState, u32, u32)| state.check())
 }
 
 fn check(saved: &Encoded) -> Result<(), ValuesError> {
@@ -177,26 +183,28 @@ impl PhotoParameter for Appearance {
     }
 
     fn save(&self) -> Result<Encoded, EncodingError> {
-        Encoded::of(&(&self.state, self.first_exposures))
+        Encoded::of(&(&self.state, self.first_exposures, self.steps))
     }
 
     fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        let (state, first_exposures) = decoded(saved)?;
+        let (state, first_exposures, steps) = decoded(saved)?;
         if state.has_same_counts(&self.state) || (self.judged_after.is_some() && state.images.is_empty()) {
-            (self.state, self.first_exposures) = (state, first_exposures);
+            (self.state, self.first_exposures, self.steps) = (state, first_exposures, steps);
+            self.is_restored = true;
         }
         Ok(())
     }
 
-    /// Starts from the values of another run, which then hold the mean, or else starts the exposures from EXIF data if more than half of the training photos state one. A function of the files alone.
+    /// Starts from another run's values and holds the mean at theirs, or else starts the exposures from EXIF data if
+    /// more than half of the training photos state one. The result depends on the files alone. Values of a commit stay.
     fn start(&mut self, dataset: &Dataset) -> Vec<String> {
+        if self.is_restored {
+            return Vec::new();
+        }
         if let Some(given) = &self.given {
             let value = |view: usize| given.get(&dataset.views[view].name).map(|&(values, seen)| (view, values, seen));
             let values: Vec<_> = dataset.train_views().into_iter().filter_map(value).collect();
             self.state.tie(&values);
-            return Vec::new();
-        }
-        if self.state.images.iter().any(|image| image.sightings > 0) {
             return Vec::new();
         }
         let views = dataset.train_views();
@@ -272,7 +280,7 @@ impl PhotoParameter for Appearance {
         self.look.back(&self.drawn, photo, &mut gradient.v_rgb);
     }
 
-    /// A photo that is left out is fitted too, or the exposure of a first look, at a rough scene, would keep a right photo out.
+    /// Fits also a photo that is left out: otherwise an exposure that was fitted to a rough scene could keep out a sound photo.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
         let found = self.found.take().filter(|_| !outcome.is_skipped);
         if let (Some(found), Some(&group)) = (found, self.camera_groups.get(outcome.view)) {
@@ -281,7 +289,8 @@ impl PhotoParameter for Appearance {
                 false => self.state.learn(self.mode, (outcome.view, group), &found),
             }
         }
-        let is_due = self.judged_after == Some(outcome.step.saturating_add(1)) && !self.is_dropped();
+        self.steps = self.steps.saturating_add(1);
+        let is_due = self.judged_after == Some(self.steps) && !self.is_dropped();
         if is_due { self.judge(outcome.dataset).into_iter().collect() } else { Vec::new() }
     }
 
@@ -347,7 +356,7 @@ impl Appearance {
     }
 }
 
-/// What acted on each photo of a run, by name, and the steps that had seen it. Cameras start anew.
+/// The corrections of another run's photos, by name, with the number of steps that had seen each. Vignetting is not taken over.
 pub type GivenValues = Arc<BTreeMap<String, ([f64; IMAGE_VALUES], u32)>>;
 
 /// Reads the appearance.json of a run.

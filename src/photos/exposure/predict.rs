@@ -1,12 +1,12 @@
 //! The values of photos that were not trained on, from those of trained photos that stand near and are turned alike: a camera that sets its
 //! exposure by itself sets it by what it sees.
 //!
-//! Each trained photo counts by a normal distribution of its distance, as wide as photos usually stand apart, and by its turn. Where such
-//! neighbours predict trained photos no better than the mean of all does, as with random exposures, the mean counts.
-//! Measured on two flights: photos are off by .11 and .08 stops from the mean, by .035 and .05 from the prediction.
+//! The weight of a trained photo falls with its distance (a normal distribution, as wide as the usual spacing of photos) and with the turn
+//! between the two cameras. If such neighbours predict trained photos no better than the mean of all, as with random exposures, the mean is
+//! the prediction. Measured on two flights: photos are off by .11 and .08 stops from the mean, by .035 and .05 from the prediction.
 //!
-//! Where EXIF data state the exposures of more than half of the trained photos, the same is done with what is left of the values less the
-//! stated exposures. The way that predicts trained photos better counts.
+//! If EXIF data state the exposures of more than half of the trained photos, the same is done with the values less the
+//! stated exposures. Of the two predictions, the one that fits trained photos better is taken.
 //!
 //! Invariant: no pixel of a photo is looked at: the values are a function of trained values, poses and EXIF data.
 
@@ -15,9 +15,9 @@ use super::model::IMAGE_VALUES;
 use super::state::PER_STOP;
 use crate::scene::camera::Camera;
 
-/// Weight of the mean beside that of the neighbours: photos without any get it.
+/// Weight of the mean of all photos beside the neighbours: a photo without neighbours gets the mean.
 const WEIGHT_OF_MEAN: f64 = 0.02;
-/// What a turn by a right angle takes from the logarithm of a weight.
+/// A turn by a right angle lowers the logarithm of a weight by this.
 const TURN: f64 = 3.0;
 /// Photos by which spacing and neighbours are judged.
 const JUDGED_MOST: usize = 256;

@@ -5,9 +5,9 @@
 //! lies where the photo has much contrast. So the score of a block is the running mean of its residuals (`grid`) over the
 //! contrast of the photo around it.
 //!
-//! At each visit of a view, a block is masked if its score lies far above the median of the view, by the median absolute
-//! deviation, or half as far if it touches a masked block or was masked before. Masked blocks are still measured: a block returns when
-//! the scene, trained on the other photos, shows it. Rims of masked blocks do not count either.
+//! At each visit of a view, a block is masked if its score lies far above the median of the view, in units of the median absolute
+//! deviation. Half of that distance suffices if the block touches a masked block or was masked before. Masked blocks are still measured:
+//! a block counts again once the scene, trained on the other photos, shows the same. The rims of masked blocks are masked, too.
 //!
 //! Masks cost clean scenes decibels. So a run that masks [`BlockMasks::IfNeeded`] measures residuals for some passes without masks, and
 //! decides by its landmarks ([`super::landmarks`]).
@@ -49,7 +49,7 @@ const FIRST_LOOK_LATEST: u32 = 500;
 const PASSES: usize = 6;
 const PASSES_LEAST: usize = 3;
 const DECIDED_FROM: usize = 600;
-/// Passes, and steps at most, that measure residuals for it.
+/// Residuals are measured during this many passes before the decision, but during at most this many steps.
 const PASSES_MEASURED: usize = 2;
 const STEPS_MEASURED: usize = 600;
 /// Blocks are masked if this share of the landmarks in photos is contradicted. Measured: .001 to .016 on clean scenes; .033 to .08 with 20 boxes
@@ -60,7 +60,7 @@ const SHARE: f64 = 0.03;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BlockMasks {
     Off,
-    /// As `On`, from the step on at which landmarks show that masks are needed; else as `Off`.
+    /// As `Off` until landmarks show that masks are needed, then as `On`.
     IfNeeded,
     On,
 }

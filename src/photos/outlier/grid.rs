@@ -1,11 +1,11 @@
 //! How a photo is cut into blocks: the residual of each (how far the mean colour of the picture lies from that of the photo), and the
 //! rims of masked ones.
 //!
-//! A rim is what belongs to a transient object beside its masked blocks. The blocks at the border of an object show it in part, and
-//! their mean colours may differ too little for a mask, yet they teach the scene the border. Where objects are a dozen pixels wide, a
-//! mask of the blocks that lie wholly in an object wins half of what exact masks win, and one of the blocks that lie at least half in
-//! it five sixths (`benches/RESULTS.md`). So a pixel of a block beside a masked block is left out if the mean colour of the masked
-//! block explains the pixel far better than the picture does.
+//! A rim is the part of a transient object outside its masked blocks. Blocks at the border of an object show the object in
+//! part. Their mean colours may differ too little for a mask, yet training on them teaches the scene the border. For
+//! objects a dozen pixels wide, masks of the blocks that lie wholly in an object gain half of what exact masks gain; masks
+//! of the blocks that lie at least half in an object gain five sixths (`benches/RESULTS.md`). So a pixel of a block beside
+//! a masked block is left out if the mean colour of the masked block explains the pixel far better than the picture does.
 //!
 //! Invariants: 1. a photo has at most [`BlockGrid::BLOCKS_MOST`] blocks; 2. all is a function of photo, picture and masked blocks
 //! alone, the same for any number of threads; 3. masked pixels do not count; 4. a rim is at most one block wide, and what the picture

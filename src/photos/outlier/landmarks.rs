@@ -16,7 +16,7 @@ use rayon::prelude::*;
 pub const LANDMARKS_MOST: usize = 4096;
 /// A contradiction has at least this residual, of values in 0..1 ...
 const RESIDUAL_LEAST: f64 = 0.08;
-/// ... and so many times the median of the other photos, which counts at least as noise.
+/// ... and at least this many times the median residual of the other photos, which counts as [`OTHERS_LEAST`] if less.
 const TIMES_OTHERS: f64 = 4.0;
 const OTHERS_LEAST: f64 = 0.01;
 /// Fewest other photos that show a landmark.
@@ -46,7 +46,7 @@ pub fn contradicted_share(landmarks: &[[f32; 3]], views: &[ViewResiduals<'_>]) -
     for residuals in of_landmark.iter_mut().filter(|residuals| residuals.len() > OTHERS) {
         residuals.sort_unstable_by(f64::total_cmp);
         sightings += residuals.len();
-        // The median of the others of any residual above it; those below it are no contradictions.
+        // For a residual above this value, this value is the median of all others. Residuals below are no contradictions.
         let others = residuals[(residuals.len() - 2) / 2].max(OTHERS_LEAST);
         contradicted += residuals.iter().filter(|&&own| own >= RESIDUAL_LEAST && own >= TIMES_OTHERS * others).count();
     }

@@ -3,13 +3,13 @@
 //! A photo with a wrong pose differs from its picture about as much as two unrelated photos differ. So the measure of a view is the
 //! logarithm of the share of its photo's variance that its picture leaves unexplained, which does not depend on the contrast.
 //!
-//! At the end of each epoch, a view whose measure lies far above the median of those measured in it, by the median absolute deviation,
-//! gets a strike; any other of them loses one. A view is an outlier from its second strike on, until it has lost all strikes, so that one
-//! bad epoch does not count. Views that are left out are still measured, so they can return.
+//! At the end of each epoch, a measured view gets a strike if its measure lies far above the median of the epoch, in units
+//! of the median absolute deviation; otherwise it loses a strike. A view is an outlier from its second strike until it has
+//! lost all strikes, so that one bad epoch does not count. Views that are left out are still measured, so they can return.
 //!
-//! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first epochs the step
-//! does not train on the photo ([`ViewOutliers::contradicts`]). The picture is compared with those of the last steps, because measures
-//! fall fast at first; where views come in large groups, with those of the same group.
+//! Strikes take epochs, and a short run has few. So a clear contradiction is a first strike at once, and in the first
+//! epochs the step does not train on such a photo ([`ViewOutliers::contradicts`]). The measure is compared with those of
+//! the last steps, because measures fall fast at first. If views come in large groups, only steps of the same group count.
 //!
 //! Invariants: 1. measures are stored as fixed-point numbers, and a verdict follows from them alone; 2. fewer than half of
 //! the views can be outliers of an epoch; 3. no verdict on fewer than eight views, or before the second epoch.
@@ -221,8 +221,8 @@ const FIGURE: &str = "outlier_views";
 pub(in crate::photos) const KIND: Kind = Kind { name: "outliers", file: None, first, check, finding };
 
 const NAMES_LISTED: usize = 20;
-/// In a group of at least so many views, a view is compared with earlier views of the group only. In a smaller group hardly a view would
-/// come after the first eight, which are compared with nothing.
+/// In a group of at least so many views, a view is compared with earlier views of its group only. The first eight views
+/// of a group are compared with nothing, so in a smaller group hardly any view would be judged.
 const COMPARED_WITHIN: usize = 16;
 /// A view that is left out is measured once in this many epochs. In the others its turn goes to another view.
 const MEASURED_EVERY: usize = 4;
@@ -239,8 +239,8 @@ struct OutlierViews {
     is_rehearsal: bool,
     is_contradicted: bool,
     steps: u32,
-    /// Views that this process has named, ascending.
-    told: Vec<usize>,
+    /// Views that this process has warned of, ascending.
+    warned: Vec<usize>,
 }
 
 fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParameter>> {
@@ -252,7 +252,7 @@ fn first(options: &PhotoOptions, dataset: &Dataset) -> Option<Box<dyn PhotoParam
         is_rehearsal: false,
         is_contradicted: false,
         steps: options.steps,
-        told: Vec::new(),
+        warned: Vec::new(),
     }))
 }
 
@@ -310,8 +310,8 @@ impl PhotoParameter for OutlierViews {
 
     /// Notes the error of the view, also of a step that was skipped, and after an epoch names the views that have become outliers.
     fn end_step(&mut self, outcome: &PhotoOutcome<'_>) -> Vec<String> {
-        // The picture is dark then, whatever its photo shows. Each view misses one turn; in epochs of more than [`STEPS_AFTER_RESET`]
-        // steps only some do.
+        // After an opacity reset pictures are dark, whatever the photos show. Each view misses one measurement; in
+        // epochs of more than [`STEPS_AFTER_RESET`] steps only some views do.
         let is_dark = outcome.after_reset.is_some_and(|steps| steps <= STEPS_AFTER_RESET.min(self.train_views));
         if !is_dark {
             self.state.measure(outcome.view, outcome.mse, outcome.photo);
@@ -330,9 +330,9 @@ impl PhotoParameter for OutlierViews {
             if done < WARNED_FROM_EPOCH * self.train_views || done < self.steps / 2 {
                 return Vec::new();
             }
-            found = self.state.named().filter(|view| self.told.binary_search(view).is_err()).collect();
-            self.told.extend(&found);
-            self.told.sort_unstable();
+            found = self.state.named().filter(|view| self.warned.binary_search(view).is_err()).collect();
+            self.warned.extend(&found);
+            self.warned.sort_unstable();
         }
         self.warning(&found, done, outcome.dataset).into_iter().collect()
     }
@@ -530,7 +530,7 @@ mod tests {
             is_rehearsal: false,
             is_contradicted: false,
             steps: 400,
-            told: Vec::new(),
+            warned: Vec::new(),
         }
     }
 

@@ -31,8 +31,8 @@ use crate::train::state::trainer::Trainer;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-/// Pages by whose rows exports decide, and means among them by which they know the depth of the scene: enough for shares of a
-/// thousandth, and read in a second.
+/// Pages in the sample by which exports decide, and means in it by which exports estimate the depth of the scene:
+/// enough for shares of a thousandth, and read in a second.
 const SAMPLE_PAGES: usize = 512;
 const SAMPLE_ROWS: usize = 8192;
 
@@ -116,8 +116,8 @@ impl Results<'_> {
         );
     }
 
-    /// Waits until there is more space, a stop is requested, or the time is over; where the system does not tell the space, or
-    /// a quota limits it, until the next look.
+    /// Waits until there is more free space, a stop is requested, or the time is over. Also returns from time to time,
+    /// since a quota, or a system that does not report its free space, shows no change.
     fn await_space(&self, began: Instant) {
         let then = self.free();
         // A result that is tried in vain costs time: an evaluation draws all held-out views.

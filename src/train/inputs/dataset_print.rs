@@ -84,7 +84,6 @@ impl GaussiansPrint {
         }
     }
 
-    /// Digest of all Gaussians added.
     pub fn digest(&self) -> u64 {
         self.0.digest()
     }

@@ -130,7 +130,6 @@ pub(crate) struct GaussianWriter<'a> {
 }
 
 impl<'a> GaussianWriter<'a> {
-    /// An empty writer.
     pub fn new(file: &'a Path, budget: Budget<'a>) -> Self {
         GaussianWriter { file, budget, rows: SpoolWriter::new(budget.space()), next: 0, width: ROW_HEAD }
     }

@@ -108,7 +108,7 @@ pub struct TrainingPhotos {
 }
 
 impl TrainingPhotos {
-    /// Whether too few photos see a place for more Gaussians to pay. Few photos that nearly all see it are enough.
+    /// Whether so few photos see a page that more Gaussians do not pay. In a scene of few photos, it is enough if nearly all see the page.
     fn overlap_little(&self) -> bool {
         self.per_page < PHOTOS_PER_PAGE_LEAST.min(SHARE_OF_PHOTOS * self.count as f64)
     }
@@ -116,8 +116,8 @@ impl TrainingPhotos {
 
 /// The number of Gaussians that a run with `rows` Gaussians after `steps_done` steps will reach, and how that is known. A guess is at most one
 /// Gaussian for each of the `pixels` of the training photos: a Gaussian without a pixel of its own soon has no gradient that splits it.
-/// A run that decides its count rarely changes it after the first of its `checks`. Before that, it is expected to stay as it is where few
-/// photos see each place and the run is long enough to find that out, and otherwise to double at every check.
+/// A run that decides its count rarely changes it after the first of its `checks`. Before the first check, the forecast is the first
+/// allowed number if few photos see each place and the run is long enough to find that out, and otherwise a doubling at every check.
 pub fn reach(
     config: &TrainConfig,
     rows: u64,
@@ -381,7 +381,7 @@ impl Forecast {
 }
 
 impl DriveUse {
-    /// The mean over the steps to do: from a step of now to one with the Gaussians of the end, as their number grows.
+    /// The mean over the steps to do: a step is between a present step and one with the final Gaussians, by its number of Gaussians.
     fn mean_of_steps(&self, growing: &GrowingSteps, growth: f64) -> StepUse {
         let ramp = growing.mean(growth, 1.0);
         let share = if growth > 1.0 { (ramp - 1.0) / (growth - 1.0) } else { 0.0 };
@@ -402,18 +402,18 @@ fn store_bytes_peak(slots: u64, slot_bytes: u64, segment_bytes: u64) -> u64 {
     (slots * slot_bytes).next_multiple_of(segment_bytes.max(1)) + MAP_BYTES + slots * MAP_PAGE_BYTES
 }
 
-/// Most versions of the first pages and of the last ones on the drive of a run that commits so many times before its end: those of the last
-/// two commits, and that of a commit being written or, with a spill directory, of the steps since the last one. The import to a spill
-/// directory is its first commit, and the end of a run that has committed is one as well.
+/// Most versions of the first pages, and of the final pages, on the drive of a run with `commits` commits before its end.
+/// Versions are kept for the last two commits, and for a commit that is being written or, with a spill directory, for the steps
+/// since the last commit. The import to a spill directory counts as a commit, and so does the end of a run that has committed.
 fn versions(is_in_memory: bool, commits: u64) -> [u64; 2] {
     match (is_in_memory, commits) {
         (true, 0) => [0, 1],
         (false, 0 | 1) => [1, commits + 1],
-        _ => [0, VERSIONS.min(commits + 1)],
+        _ => [0, VERSIONS.min(commits.saturating_add(1))],
     }
 }
 
-/// Slots for one version of each of `pages` pages, and for the others of `of_all` versions where a page of the changed share has them.
+/// Slots for `pages` pages: one version of each, and the other versions (up to `of_all` in total) only of the share of pages that change.
 fn slots_of(pages: u64, of_all: u64, changed_share: f64) -> u64 {
     pages + (changed_share * of_all.saturating_sub(pages) as f64).ceil() as u64
 }
@@ -422,7 +422,7 @@ fn ply_bytes(config: &TrainConfig, rows: u64) -> u64 {
     rows * (PLY_ROW_BYTES + 12 * (u64::from(config.sh_degree) + 1).pow(2))
 }
 
-/// The steps to do, by what the number of Gaussians does meanwhile.
+/// The numbers of steps to do before, during and after the growth of the scene.
 struct GrowingSteps {
     before: f64,
     /// Steps in which it grows, evenly.
@@ -602,7 +602,7 @@ fn drive_use(
         let options = ReplayOptions { frames, policy: config.evict, reads_ahead, steps, plan_bytes: PLAN_BYTES as u64 };
         replay(&views, &page_bytes, trainer.view_order(), &options).unwrap_or_default()
     };
-    // With more Gaussians a page stands for several: a drive that is slower by as much takes as long.
+    // At the end, a present page stands for `growth` pages, so the simulated drive is slower by that factor.
     let of_step = |frames: usize, growth: f64, step_seconds: f64| {
         let (_, written) = play(frames, false).totals();
         let (read_rate, write_rate) = (drive.read / growth, drive.write / growth);
@@ -614,7 +614,7 @@ fn drive_use(
             waits: waits / steady.len().max(1) as f64,
         }
     };
-    // Pages of now in the frames of now, and as large a share of them as the same frames hold of the pages at the end.
+    // Present frames, and the frames that hold the same share of the present pages as the final frames will hold of the final pages.
     let growth = growth.max(1.0);
     let [frames, then] =
         [frames[0] as f64, frames[1] as f64 / growth].map(|n| (n as usize).clamp(1, index.len().max(1)));

@@ -40,8 +40,8 @@ const GROWTH_UNLIKELY: f64 = 20.0;
 const PROBE_BATCH_SHARE: u64 = 16;
 /// Bytes that a renderer holds for a row in view at least, beside intersections.
 const SPLAT_BYTES: u64 = 150;
-/// A view whose rows take more than this share of the budget, of 4, is measured in batches: program, photos and lists of
-/// intersections need the rest.
+/// A view whose rows take more than this many quarters of the budget is measured in batches: program, photos and lists
+/// of intersections need the rest.
 const PROBE_WHOLE_OF_4: u64 = 3;
 
 /// The training view that needs most pages, by page bounds. Held-out views do not count: evaluation visits their pages
@@ -245,14 +245,14 @@ fn least_memory(need: &LargestNeed, memory: &MemoryEstimate, host_mem: Option<u6
     with_margin(with_staging(rest, memory.staging, host_mem.unwrap_or(u64::MAX)), memory)
 }
 
-/// A budget that is enough at the next start too: the part of the graphics driver is measured, and differs from start to
-/// start by up to 1/20.
+/// The budget with a margin that makes it enough at the next start, too: the memory of the graphics driver differs from
+/// start to start by up to 1/20.
 fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
     bytes + bytes / 50 + memory.base / 16
 }
 
-/// What lists of intersections may take more in a run with `bytes`, which were measured in a run with `budget`: lists fill their share of
-/// the budget where a view needs longer ones. An eighth of what is added goes to lists again.
+/// Bytes that lists of intersections may take in a budget of `bytes` beyond those measured in a budget of `budget`:
+/// where a view needs longer lists, they fill their share of the budget. Lists get an eighth of this addition, too.
 fn more_lists(bytes: u64, budget: u64) -> u64 {
     let more = list_bytes(bytes).saturating_sub(list_bytes(budget));
     more + more / 7
@@ -283,7 +283,7 @@ fn frames_of_budget(
         return Ok(whole);
     }
     let rendering = memory.view - memory.working;
-    // The margin for a larger view is left out where only the smallest batch remains: a run that grew into its budget resumes in it.
+    // Frames leave this margin for a larger view, but the smallest batch needs no margin: a run that has grown into its budget must resume in it.
     let spare = (rendering - memory.view_pixels.min(rendering)) / 8;
     let beside = memory.fixed() - memory.working - memory.copies;
     let of_a_page = 2 * need.frame_bytes + page_working(config) + memory.copies.min(need.frame_bytes);
@@ -408,7 +408,7 @@ fn auto_order(
 ) -> InputResult<Order> {
     let cameras = dataset.train_cameras();
     let views = ViewPages::new(trainer.scene.pager.index(), &cameras);
-    // A run whose views fit now is planned as one whose views fit.
+    // If every view fits into the frames now, plan with frames for every view.
     let least = if frames as usize >= views.most() { views.most() } else { 1 };
     let frames = if frames >= most { now } else { frames * now / most };
     let frames = (frames as usize).max(least);
@@ -566,7 +566,7 @@ pub(super) fn estimate(
     let base = base + trainer.photos.iter().map(|parameter| parameter.value_bytes(dataset)).sum::<u64>();
     let memory = [rows, rows_at_most(config, rows), last_rows].map(|rows_then| {
         let growth = rows_then as f64 / rows.max(1) as f64;
-        // The parts of few rows say little about those of many: most of them is what a renderer holds for any number.
+        // Rows of a small scene take more bytes each than rows of a large one, so the grown estimate has an upper limit for each row.
         let most = |bytes: f64, row_bytes: u64| bytes.max((bytes * growth).min((rows_then * row_bytes) as f64));
         let page_rows = config.page_rows as usize;
         let fills_up = growth * first_fill(page_rows, true) as f64 > page_rows as f64;

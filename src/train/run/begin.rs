@@ -114,7 +114,7 @@ fn adapt_to_photos(
     Ok((request, start, diagnosis))
 }
 
-/// The start, what the photos say, and whether the start is from points that the photos agree on, since the scene has none that are of use.
+/// The start, the diagnosis of the photos, and whether the start is from swept points, because the scene has no useful ones.
 /// Errors: the scene cannot be read.
 fn with_useful_points(
     request: &RunRequest,
@@ -308,7 +308,7 @@ pub(super) fn plan_and_train(
         out_folder::keep_result(&request.out, kept)?;
     }
     let outcome = train_into(request, dataset, trainer, &stop, &mut tiers, begun, &forecast);
-    // A leg is followed by the next one.
+    // After a leg the next leg resumes, so no hint is needed.
     if tiers.can_resume() && request.leg.is_none() {
         let more = outcome.as_ref().err().map_or(String::new(), TrainError::memory_flags);
         let elsewhere = spill_dir_flag(request);

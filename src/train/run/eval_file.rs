@@ -197,7 +197,7 @@ impl<'a> Evaluator<'a> {
     /// Takes exposures from the file of a run. Not of a run with `--appearance full`, whose vignetting is more than an exposure.
     fn take_exposures(&mut self, values: &Path) -> InputResult<()> {
         let run = RunOptions::new(self.config, self.dataset.scene_scale);
-        if run.photos.appearance == AppearanceMode::Exposure {
+        if matches!(run.photos.appearance, AppearanceMode::Exposure | AppearanceMode::IfNeeded) {
             let options = PhotoOptions { first_appearance: Some(read_values(values)?), ..run.photos };
             self.photos = first_parameters(&options, &self.dataset);
             // Its warnings are those of a run that begins.

@@ -20,7 +20,9 @@ use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
-use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, saved_ply_name};
+use crate::photos::outlier::blocks::MASKED_SHARE;
+use crate::photos::pose;
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::{self, absolute};
 use crate::train::log::report::Summary;
@@ -89,6 +91,9 @@ impl FinishedRun {
 pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRun) -> Result<RunOutcome, TrainError> {
     let out = request.out.clone();
     machine::set_up(&request.config)?;
+    if has_masked(&out) {
+        request.config.robust_pixels.0.get_or_insert(true);
+    }
     let start = finished.start(&request)?;
     let first_rows = start.rows;
     let host_mem = host_budget(request.config.host_mem.0);
@@ -100,10 +105,11 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
     }
     crate::tell!(
-        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments are \
+        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments{} are \
          lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
         out.display(),
-        kept.display()
+        kept.display(),
+        if out.join(pose::FILE).exists() { " and the refined poses" } else { "" }
     );
     if let Some(rates) = text_of_rates(&request.config) {
         crate::tell!("{rates}");
@@ -120,6 +126,12 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     };
     trainer.begin_after(summary.steps, summary.train_seconds);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
+}
+
+/// Whether the finished run masked parts of photos. Its own decision about masks holds: more steps would begin behind the step of the decision.
+fn has_masked(out: &Path) -> bool {
+    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
+    serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary[MASKED_SHARE].is_number())
 }
 
 /// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.

@@ -192,7 +192,7 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     std::fs::write(&probe, b"")
         .and_then(|()| std::fs::remove_file(&probe))
         .map_err(failed(out, "making the output folder"))?;
-    // Otherwise files with our names may be somebody else's (such as the points of a scene).
+    // In a folder that is not a run's, files with names of results may be somebody else's (such as the points of a scene).
     if existing == Existing::Refuse || !is_run(out) {
         return Ok(());
     }
@@ -284,8 +284,8 @@ pub(super) fn has_results(out: &Path) -> bool {
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
-    // A PLY without a summary is that of a run without commits that was killed while it wrote its results: beginning again gives
-    // the same one, which replaces it as a whole.
+    // A PLY beside metrics but without a summary comes from a run without commits that was killed while it wrote its
+    // results. Beginning again gives the same PLY, which replaces the old one as a whole.
     let has_ply = has(PLY_FILE) && metrics.is_empty();
     has_ply || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }

@@ -192,7 +192,8 @@ pub(super) fn train_into(
     let mut results = Results {
         trainer: &mut trainer,
         metrics: &mut metrics,
-        checkpoint: tiers.checkpoint.as_mut(),
+        // A run that has diverged keeps the commit before its unsound steps.
+        checkpoint: tiers.checkpoint.as_mut().filter(|_| !matches!(looped, Err(TrainError::NonFinite { .. }))),
         out,
         stop,
         // A run that has failed, perhaps after such a wait, ends.

@@ -2,7 +2,7 @@
 //! drive space between two steps: a scene in memory that has outgrown it starts paging to the drive of its checkpoint, and a run that
 //! ends for lack of memory commits first, with an error that names the photo and the memory that suffices.
 //!
-//! Not here: views in batches (`step`), frames of a growing scene (`state::memory`).
+//! Not here: views in batches (`step`), frames of a growing scene (`state::run_memory`).
 //!
 //! Invariants: 1. logging, evaluation, saves and commits change no bit of the result; 2. a step that lacks drive space
 //! or frames is repeated once they are available, or the run ends with its last good step committed; no step is lost.

@@ -283,8 +283,8 @@ impl Start {
         Ok(landmarks.kept)
     }
 
-    /// The start from points that photos agree on ([`plane_sweep`]) and true, or this one if they agree on too few. The print stays that of the
-    /// scene's own points, so that a resumed run does not search again.
+    /// Returns a start from points on which the photos agree ([`plane_sweep`]) and true, or this start and false if there are
+    /// too few such points. The print stays that of the scene's own points, so that a resumed run need not search again.
     /// Errors: as [`prepare`].
     pub(crate) fn with_swept_points(mut self, scene: &Path, config: &TrainConfig) -> InputResult<(Start, bool)> {
         let (points, colors) = plane_sweep::sweep(&self.dataset, config.seed);

@@ -49,8 +49,8 @@ pub struct Tiers {
     is_in_output: bool,
     /// The run resumed from this store.
     has_resumed: bool,
-    /// An earlier process left a store without a commit here. A run that is refused leaves its own: a resume that found none would take
-    /// the drive for one that is not mounted.
+    /// An earlier process left a store without a commit here, and this run has replaced it. If this run is refused, its
+    /// store stays: without a store, a later resume would take the drive for one that is not mounted.
     replaced_store: bool,
     /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,

@@ -68,7 +68,7 @@ pub(crate) struct RunMemory<'a> {
 }
 
 impl RunMemory<'_> {
-    /// Bytes of one view: rows of the working set; renderer and picture. What is held, and what the coming view needs on top.
+    /// Bytes of one view: `[working set, renderer with picture and photos]`; what is held now, with what the coming view needs on top.
     pub fn view_bytes(&self) -> [u64; 2] {
         let due = self.memory.row_bytes_due.saturating_sub(self.renderer.host_bytes_of_rows());
         let photos: u64 = self.photos.iter().map(|parameter| parameter.buffer_bytes()).sum();
@@ -103,8 +103,8 @@ impl RunMemory<'_> {
         ViewMemory { now: held.now.max(now), at_last: held.at_last.max(at_last) }
     }
 
-    /// Prepares memory for a view whose pages hold `rows` rows: frees what only far wider views need in the renderer and the
-    /// working set, so that frames can have it, and expects what the renderer will need if no view as wide was rendered since.
+    /// Prepares memory for a view whose pages hold `rows` rows. Frees memory of renderer and working set that only far wider views
+    /// need, so that frames can have it. Counts what the renderer will need if no view as wide was rendered since its rows were freed.
     fn expect_rows(&mut self, rows: u64, budget: HostBudget) {
         let visible = (rows as f64 * self.memory.visible_share) as u64;
         let due = self.renderer.host_bytes_for_rows(visible);

@@ -39,7 +39,7 @@ use crate::train::step::comparison::Comparison;
 use crate::train::step::device_flights::StepToRecord;
 use crate::train::step::device_tier::{DeviceRows, DeviceTier};
 use crate::train::step::pages::{PagedScene, WorkingSet};
-use crate::train::step::soundness::{Idle, note_soundness};
+use crate::train::step::soundness::{note_idle, note_soundness};
 use crate::train::step::train_step::{StepOutcome, StepView, train_step};
 use crate::train::step::view::{SceneNow, rehearse};
 use std::path::{Path, PathBuf};
@@ -77,7 +77,6 @@ pub struct Trainer {
     /// The memory budget, and what views have taken so far.
     pub(crate) memory: MemoryState,
     /// The steps since a row was last rewritten.
-    pub(super) idle: Idle,
     /// Steps recorded ahead.
     pub(crate) ahead: Ahead,
 }
@@ -152,7 +151,6 @@ impl Trainer {
             state: TrainerState::default(),
             is_torn: false,
             memory: MemoryState::default(),
-            idle: Idle::default(),
             ahead: Ahead::default(),
         }
     }
@@ -301,11 +299,11 @@ impl Trainer {
         self.memory.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.ahead.note_rows_of(view, outcome.rows);
         let sound = note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply);
-        // A step that was taken counts, also as the last one: rows of its view belong to the step after it.
+        // A step that was taken counts even if it ends the run, since its rows have already moved to the next step.
         if sound.is_err() && outcome.skipped.is_some() {
             return sound.map(|()| outcome);
         }
-        self.idle.note(&outcome, self.state.step, self.scene.rows(), &target, dataset)?;
+        note_idle(&mut self.state, &outcome, self.scene.rows(), &target, dataset)?;
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
@@ -318,7 +316,6 @@ impl Trainer {
         sound.map(|()| outcome)
     }
 
-    /// Attempts a step on a view.
     fn attempt(
         &mut self,
         dataset: &Dataset,
@@ -433,7 +430,7 @@ impl Trainer {
     fn has_no_event_or_end_after(&self, step: u32) -> bool {
         let strategy = &self.options.strategy;
         let reads = strategy.reads_histogram(step) || strategy.is_growth_checked(step);
-        let is_steady = self.state.steps_skipped_in_a_row == 0 && self.idle.is_busy();
+        let is_steady = self.state.steps_skipped_in_a_row == 0 && self.state.idle.steps == 0;
         if reads || !is_steady || self.options.sh_degree_at(step + 1) > self.scene.rules.sh_degree {
             return false;
         }
@@ -580,7 +577,7 @@ impl Trainer {
             return Ok(());
         }
         let started = Instant::now();
-        // The view after a held-out one is trained on in its place, so twice as often as others. Views that were trained on may have moved.
+        // The trained views are the second ones after the held-out views: the first ones train twice as often as others. Poses may be refined.
         let views = &self.turns.views;
         let [held_out, trained] = [0, 2].map(|after| {
             let view = |&at: &usize| views[(at + after) % views.len()];
@@ -593,8 +590,8 @@ impl Trainer {
             targets,
             render: &self.render_options(),
             pages_most: self.memory.pages_most,
-            // A photo that was never trained on has no exposure yet.
-            correct: self.photos.iter().any(|parameter| parameter.corrects()).then_some(ColorCorrect::Affine),
+            // A photo that was never trained on has no exposure yet. All checks of a run use one measure, also after exposures were dropped.
+            correct: self.options.photos.appearance.is_on().then_some(ColorCorrect::Affine),
         };
         // Without a view that counts the count stays as it is, too.
         let measured = [&held_out, &trained].map(|views| mean_psnr(&mut self.now(), &compared, views));
@@ -610,7 +607,6 @@ impl Trainer {
 }
 
 impl Ahead {
-    /// Notes how many rows a view listed.
     fn note_rows_of(&mut self, view: usize, rows: usize) {
         if self.rows_of_views.len() <= view {
             self.rows_of_views.resize(view + 1, 0);

@@ -54,7 +54,8 @@ impl Turns {
         (step..).zip(&coming).map(|(at, &position)| self.view_in_turn(at, position, photos)).collect()
     }
 
-    /// A view that is held out or left out gives its turn to one of the next ones, in each epoch another.
+    /// The view that trains in the turn of `position`. Held-out and left-out views give their turns to later views,
+    /// left-out views in each epoch to another.
     fn view_in_turn(&self, step: u32, position: usize, photos: &PhotoParameters) -> usize {
         let views = self.views.len();
         let at = |position: usize| self.views[self.held_out.trained_at(step, position)];

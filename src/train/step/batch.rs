@@ -85,8 +85,8 @@ pub trait RowBackend {
         working: &mut WorkingSet,
     ) -> Result<usize, TrainError>;
 
-    /// Takes the gradients of the splats back to the rows of a batch, by its number; where its pages were pinned again, the
-    /// rows are gathered again.
+    /// Propagates the gradients of the splats to the rows of a batch. `batch_again`: the number of the batch, and
+    /// whether its pages were pinned again; then the rows are gathered again, too.
     /// Errors: the renderer failed.
     fn rows_out(
         &mut self,

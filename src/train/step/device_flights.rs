@@ -25,9 +25,9 @@
 //! | the step before was not taken | this file |
 //! | memory for the step is short | the renderer; this file tries again some steps later |
 //!
-//! Payloads that the device lacks go up when a step is recorded, into slots of pages that leave behind the steps in flight
-//! (`device_slots`). So the order of eviction is that of a run that waits. A step that was not taken, and the step behind it, are taken
-//! again with other pages in slots: a page of them goes up again if it has left, and so does the page that leaves for it.
+//! Payloads that the device lacks are copied up when a step is recorded, into slots of pages that leave behind the
+//! steps in flight (`device_slots`). So the order of eviction is that of a run that waits. When a step that was not
+//! taken is repeated, other pages lie in slots, so some pages are copied up again.
 //!
 //! A view of several batches gives each slot to several pages within its step. The host copies a page back before the slot takes
 //! the next one, so it waits several times in such a step whatever is recorded. A step recorded behind it would need slots for its own pages
@@ -68,7 +68,7 @@ const ROWS_MORE: u64 = 256;
 enum RecordedStep {
     /// It is in flight.
     Done,
-    /// There is no memory for what must leave behind the step in flight: the step can be recorded when that one is finished.
+    /// Memory for the copies back behind the step in flight is short. The step can be recorded when the step in flight is finished.
     TooEarly,
     /// Memory is short.
     Short,
@@ -95,7 +95,8 @@ pub struct StepToRecord<'a> {
 }
 
 impl StepToRecord<'_> {
-    /// Capacity for the listed rows of the view, whose pages hold `in_pages` rows: an eighth more than this view, or any view, has listed.
+    /// Capacity for the listed rows of the view: an eighth more than this view listed last. If that is unknown, the
+    /// largest listed share of any view is applied to the `in_pages` rows in its pages.
     fn rows_room(&self, in_pages: u64) -> u32 {
         let likely = match self.rows_before {
             0 => (in_pages as f64 * self.share) as u64,
@@ -155,7 +156,7 @@ impl Flights {
         self.steps.len()
     }
 
-    /// Whether one more step may be in flight. None behind a step that may well not be taken: both would be taken again.
+    /// Whether one more step may be in flight. A step whose predicted list sizes are doubtful stays alone: a refusal would cost two steps.
     pub fn may_record(&self) -> bool {
         self.in_flight() < if self.is_sure { self.most } else { self.most.min(1) }
     }
@@ -204,7 +205,7 @@ impl Flights {
             return false;
         }
         let others = self.pages.keys().filter(|page| !pages.contains(page)).count() + cache.pages_leaving();
-        // A step behind another one must not wait: frames for both and as many again, and no frame that is still to be filled.
+        // A step behind another must not wait. So there must be frames for both and as many again, and no page of the step may still be leaving.
         self.steps.is_empty()
             || (scene.pager.frames_max() >= 2 * (others + pages.len())
                 && !pages.iter().any(|page| cache.is_leaving(*page)))
@@ -307,7 +308,7 @@ impl Flights {
         }
         if let Some((next, camera)) = step.next {
             let of_next = self.pages_behind(scene, camera, step.step);
-            // Pages of a step that may well be taken again stay.
+            // If the step may have to be repeated, its pages stay.
             let leaves = if self.is_sure { Leaves::Used } else { Leaves::Unused };
             cache.load_ahead(scene, renderer, (next, &of_next), leaves)?;
         }

@@ -1,26 +1,26 @@
 //! The cache of pages on a device: which page lies in which slot, which slots are newer than their frames, how pages come and go,
 //! and traffic counters.
 //!
-//! A device is one more level of the cache of [`crate::paging`], with the same table of frames and Belady's order of eviction. A page
-//! that lies on the device has its frame as well while a step works on it, and until its slot was copied back: a page whose slot
-//! is newer than its frame stays pinned in the pager (it is *held*), so that the pager neither writes nor evicts it.
+//! A device is one more level of the cache of [`crate::paging`], with the same frame table and Belady's order of eviction. A page on
+//! the device also has a frame in host memory while a step works on the page, and until its slot has been copied back. A page whose
+//! slot is newer than its frame is *held*: it stays pinned in the pager, so that the pager neither writes nor evicts the page.
 //!
 //! # Room for pages that come
-//! A step that waits for its numbers copies back first, and waits (`SlotCache::load`). Where nothing may wait, pages leave in the
-//! order of the device's queue (`SlotCache::load_evicting`): behind the queued work, and another payload takes the slot.
+//! A step that waits for its numbers first copies pages back, and waits for the copies (`SlotCache::load`). Where nothing may wait, the copy
+//! back is queued behind the work on the device, and the copy of the next payload into the slot behind that (`SlotCache::load_evicting`).
 //!
 //! ```text
 //! host    submits update s │ submits copy back, copy up │ records step s+1 ...              │ finishes s │ fills the frame
 //! device  ......... update s writes slot 7 ........ │ slot 7 to staging │ staging to slot 7 │ step s+1 reads slot 7 ...
 //! ```
 //!
-//! So pages of the view that is being computed may leave too. A page that has left is *leaving* until the copy back fills its
-//! frame, when the step is finished that was submitted last at that time. A step that the gate refuses changes nothing, so the copy
-//! back is the payload from before the step, and the frame gets that.
+//! So pages of the view that is being computed may leave, too. Such a page is *leaving* until the copy back has filled
+//! its frame. The frame is filled when the last step that was submitted before the copy is finished. A step that the
+//! gate refuses changes nothing, so the frame then gets the payload from before that step.
 //!
 //! # Payloads of the next step
-//! They go up while the device computes this one (`SlotCache::load_ahead`). A step that is recorded without waiting has one place
-//! for that, behind its update. So has a step of several batches, whose view needs all slots until its last update.
+//! These payloads are copied while the device computes the present step (`SlotCache::load_ahead`). A step that is recorded without
+//! waiting does this once, behind its update. So does a step of several batches, since its view needs all slots until the last update.
 //!
 //! ```text
 //! host    picture, loss, gradients submitted │ load_ahead: unused pages leave │ wait │ update submitted │ load_ahead: any page leaves │ wait
@@ -119,7 +119,7 @@ pub(super) struct ComingUse<'a> {
 /// Which pages may leave.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Leaves {
-    /// Pages that no step uses. Pages of the present step keep their turn in the order, but stay.
+    /// Only pages that no step uses. Where the order of eviction comes to a page of the present step, no other page leaves in its place.
     Unused,
     /// Also pages of the steps that are submitted as a whole.
     Used,
@@ -142,7 +142,7 @@ pub(crate) struct SlotCache {
     /// Slots of the batch of a step, or of the steps in flight.
     in_use: BTreeMap<PageNo, SlotInUse>,
     pub(super) traffic: SlotTraffic,
-    /// Loads that no order of eviction avoids.
+    /// The fewest loads of any order of eviction.
     pub(super) fewest: FewestReads,
     /// The next 0-based step whose events edit every page, [`NEVER`] if there is none; `None` until it is known.
     edits_after: Option<u32>,
@@ -186,7 +186,7 @@ pub(super) fn facts(page: &PageMeta, survey: &PageSurvey) -> PageFacts {
     }
 }
 
-/// What a page would be like that no round edits.
+/// The facts of a page that no round would edit.
 pub(super) fn best_facts(page: &PageMeta) -> PageFacts {
     let [lowest_opacity, least_weight] = [f32::INFINITY.to_bits(); 2];
     facts(page, &PageSurvey { largest_mean: 0, lowest_opacity, least_weight, pad: 0 })
@@ -266,8 +266,8 @@ impl SlotCache {
         self.fit(scene, renderer)
     }
 
-    /// Pins the pages of a batch, as [`crate::paging::pager::Pager::pin_batch`]; those that are held are pinned already. Held pages give
-    /// up frames that the batch needs. Steps in flight have pinned `pages_in_flight` pages.
+    /// Pins the pages of a batch, as [`crate::paging::pager::Pager::pin_batch`]. Held pages are pinned already. If the
+    /// batch needs frames, other held pages are copied back. Steps in flight have pinned `pages_in_flight` pages.
     pub fn pin(
         &mut self,
         scene: &mut PagedScene,
@@ -395,8 +395,8 @@ impl SlotCache {
         Ok(())
     }
 
-    /// As `SlotCache::load`, for a step that is recorded: room is made behind the steps in flight, and nothing waits. Without memory for
-    /// that, a step that is alone waits; `None` for a step behind another one.
+    /// As `SlotCache::load`, for a step that is recorded: room is made behind the steps in flight, and nothing waits. If memory
+    /// for the copies back is short, a step without another in flight waits; for a step behind another, returns `None`.
     pub(super) fn load_after_queued_work(
         &mut self,
         scene: &mut PagedScene,
@@ -448,9 +448,9 @@ impl SlotCache {
         self.load_evicting(scene, renderer, (step.saturating_sub(1), leaves, true), &coming, of_view).map(|_| ())
     }
 
-    /// Copies payloads up, in this order, as far as there are slots; pages leave for them, but none of `kept`, and none that is needed as soon
-    /// as they are. `behind` is the step that was submitted last; `is_ahead` says that its work may still be under way. Returns how many went
-    /// up. Does not wait.
+    /// Copies payloads to the device, in this order, as far as there are slots. Evicts pages for them, but none of
+    /// `kept`, and none that is needed as early as the payloads. `behind` is the last submitted step; `is_ahead`: the
+    /// device may still compute that step. Returns the number of payloads copied. Does not wait.
     fn load_evicting(
         &mut self,
         scene: &PagedScene,
@@ -521,7 +521,7 @@ impl SlotCache {
         for page in victims.iter().map(|victim| victim.page) {
             match self.in_use.get(&page) {
                 Some(_) if leaves == Leaves::Unused => {}
-                // Whether a step in flight changes the page is not known yet.
+                // A step in flight may change the page, so copy it back in any case.
                 Some(in_use) => {
                     pages.push(page);
                     reads.push(SlotPage { slot: in_use.slot, layout: in_use.layout });
@@ -630,8 +630,8 @@ impl SlotCache {
         }
     }
 
-    /// Takes over from the plan when the pages in slots are needed next. No step needs the slot of a page that
-    /// events edit first.
+    /// Sets the next uses of the pages in slots by the plan. A page that events edit before its next use counts as
+    /// never needed: its payload in the slot serves no step.
     fn plan_uses(&mut self, scene: &PagedScene) {
         let pages: Vec<PageNo> = self.slots.held().map(|(_, held)| held.page).collect();
         for page in pages {
@@ -712,7 +712,7 @@ impl SlotCache {
         Ok(())
     }
 
-    /// Fills the frames of pages, which are their own, or those of steps.
+    /// Fills the frames of leaving pages; the frame of a page that a step has is in `of_steps`.
     fn fill_frames_of(
         &mut self,
         renderer: &mut dyn Renderer,

@@ -1,8 +1,8 @@
 //! The pages of a run on a device ([`DeviceTier`]): the cache of their slots, the steps in flight on them, gather and update, and events.
 //!
 //! A step uploads the payloads of the pages that the device lacks and one table of the optimizer, and downloads some 50 bytes a page.
-//! The host applies an event: the page is drained, edited and loaded again. Only a round that edits no row of a page, and so does no more
-//! than to clear its statistics, is left to the device. A cap that is reached makes most rounds such rounds.
+//! The host applies events: a page is drained, edited and loaded again. The device only handles rounds that edit no row
+//! of a page, and so only clear its statistics. Once the cap on Gaussians is reached, most rounds are of this kind.
 //!
 //! ```text
 //! pages behind in events │ survey: largest score, lowest opacity, least weight: 16 bytes a page │ ── no row is edited ──> cleared on the device
@@ -166,7 +166,7 @@ impl RowBackend for DeviceRows<'_> {
         self.tier.cache.slots()
     }
 
-    /// A view that needs several batches anyway leaves slots free for pages of the next step: smaller batches copy no byte more.
+    /// In a view of several batches, each batch leaves slots for pages of the next step. Smaller batches copy no more bytes.
     fn pages_per_batch(&self, pages: usize) -> usize {
         let slots = self.tier.cache.slots();
         if pages <= slots { slots } else { slots - slots / SLOTS_AHEAD_SHARE }
@@ -254,8 +254,8 @@ impl RowBackend for DeviceRows<'_> {
     }
 }
 
-/// Prepares pinned pages for the events that they are behind in: the device clears the statistics of those of which nothing else
-/// changes, and they are behind no more; the others are copied back, and their slots given up.
+/// Prepares pinned pages for their pending events. If the events only clear the statistics of a page, the device does
+/// that, and nothing is pending any more. All other pages are copied back, and give up their slots.
 pub(super) fn before_events(
     cache: &mut SlotCache,
     scene: &PagedScene,

@@ -8,27 +8,13 @@
 
 use super::train_step::{Skipped, StepOutcome};
 use crate::base::error::InputError;
-use crate::checkpoint::run_state::TrainerState;
+use crate::checkpoint::run_state::{IdleSteps, TrainerState};
 use crate::dataset::loader::Dataset;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
 
 /// Consecutive unsound steps that end a run.
 const UNSOUND_STEPS_MAX: u32 = 3;
-
-/// The steps since a row was last rewritten, in this process.
-#[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Idle {
-    steps: usize,
-    /// Steps whose photo is masked completely.
-    masked: usize,
-    /// Steps whose view had rows.
-    with_rows: usize,
-    /// Steps whose view drew a row.
-    with_drawn: usize,
-    /// The user was told of steps that draw rows and change none.
-    is_told: bool,
-}
 
 /// A run in which no training view sees a Gaussian, before its first step or later.
 pub(crate) fn no_view_sees(dataset: &Dataset, gaussians: u64) -> InputError {
@@ -93,66 +79,57 @@ pub(crate) fn note_soundness(
     Err(TrainError::NonFinite { problem, step, view: view.to_string(), count, remedy })
 }
 
-impl Idle {
-    /// Whether the last step changed rows.
-    pub fn is_busy(&self) -> bool {
-        self.steps == 0
+/// Counts in `state` the steps in a row that changed no row.
+/// Errors: no Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
+/// masked completely, no view sees a Gaussian, or no Gaussian is opaque enough to be drawn.
+pub(crate) fn note_idle(
+    state: &mut TrainerState,
+    outcome: &StepOutcome,
+    gaussians: u64,
+    target: &Target,
+    dataset: &Dataset,
+) -> Result<(), TrainError> {
+    let place = format!("step {}", state.step);
+    if gaussians == 0 {
+        return Err(no_gaussian_left(dataset).at(place).into());
     }
-
-    /// Counts steps that change no row.
-    /// Errors: no Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
-    /// masked completely, no view sees a Gaussian, or no Gaussian is opaque enough to be drawn.
-    pub fn note(
-        &mut self,
-        outcome: &StepOutcome,
-        step: u32,
-        gaussians: u64,
-        target: &Target,
-        dataset: &Dataset,
-    ) -> Result<(), TrainError> {
-        let place = format!("step {step}");
-        if gaussians == 0 {
-            return Err(no_gaussian_left(dataset).at(place).into());
-        }
-        if outcome.updated > 0 {
-            *self = Idle { is_told: self.is_told, ..Idle::default() };
-        }
-        if outcome.updated > 0 || outcome.skipped.is_some() {
-            return Ok(());
-        }
-        self.steps += 1;
-        self.masked += usize::from(!target.counts());
-        self.with_rows += usize::from(outcome.rows > 0);
-        self.with_drawn += usize::from(outcome.drawn > 0);
-        let views = dataset.train_views().len();
-        // So many steps in a row hold a whole epoch.
-        if self.steps < 2 * views {
-            return Ok(());
-        }
-        let fail = |problem: String, remedy: &str| {
-            Err(InputError::new(&dataset.image_folder, problem, remedy).at(place.as_str()).into())
-        };
-        if self.masked == self.steps {
-            let problem = format!("the masks of all {views} training views exclude every pixel: nothing is trained");
-            let remedy = "white in masks/ and opaque in photos means keep: see --invert-masks, or use --masks=false";
-            return fail(problem, remedy);
-        }
-        if self.with_rows == 0 {
-            return Err(no_view_sees(dataset, gaussians).at(place).into());
-        }
-        if self.with_drawn == 0 {
-            let problem =
-                format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
-            let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
-            return fail(problem, remedy);
-        }
-        if !std::mem::replace(&mut self.is_told, true) {
-            crate::tell!(
-                "warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch"
-            );
-        }
-        Ok(())
+    let idle = &mut state.idle;
+    if outcome.updated > 0 {
+        *idle = IdleSteps::default();
     }
+    if outcome.updated > 0 || outcome.skipped.is_some() {
+        return Ok(());
+    }
+    idle.steps = idle.steps.saturating_add(1);
+    idle.masked += u32::from(!target.counts());
+    idle.with_rows += u32::from(outcome.rows > 0);
+    idle.with_drawn += u32::from(outcome.drawn > 0);
+    let views = dataset.train_views().len();
+    // So many steps in a row hold a whole epoch.
+    let epochs = 2 * views as u64;
+    if u64::from(idle.steps) < epochs {
+        return Ok(());
+    }
+    let fail = |problem: String, remedy: &str| {
+        Err(InputError::new(&dataset.image_folder, problem, remedy).at(place.as_str()).into())
+    };
+    if idle.masked == idle.steps {
+        let problem = format!("the masks of all {views} training views exclude every pixel: nothing is trained");
+        let remedy = "white in masks/ and opaque in photos means keep: see --invert-masks, or use --masks=false";
+        return fail(problem, remedy);
+    }
+    if idle.with_rows == 0 {
+        return Err(no_view_sees(dataset, gaussians).at(place).into());
+    }
+    if idle.with_drawn == 0 {
+        let problem = format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
+        let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
+        return fail(problem, remedy);
+    }
+    if u64::from(idle.steps) == epochs {
+        crate::tell!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
+    }
+    Ok(())
 }
 
 /// What is wrong with an unsound step.

@@ -5,7 +5,7 @@ use super::with_mode;
 use crate::{ONE_AT_A_TIME, Target};
 use gsscale::base::ids::PageId;
 use gsscale::checkpoint::run_state::{
-    DatasetPrint, LastTest, Origin, RunIdentity, RunState, TrainerState, VERSION, ViewPrint,
+    DatasetPrint, IdleSteps, LastTest, Origin, RunIdentity, RunState, TrainerState, VERSION, ViewPrint,
 };
 use gsscale::densify::growth::{GrowthCheck, GrowthDecision, GrowthState};
 use gsscale::densify::stats::GradHistogram;
@@ -216,7 +216,7 @@ fn photos() -> SavedValues {
     let photo = image::Target::new([8, 32], vec![0; 3 * 256]);
     let picture: Vec<f32> = (0..3 * 256).map(|i| f32::from(u8::from(i % 256 / 8 < 4 && i % 8 < 4))).collect();
     let values = [
-        ("appearance", Encoded::of(&(AppearanceState::new(&[0, 1]), 2u32))),
+        ("appearance", Encoded::of(&(AppearanceState::new(&[0, 1]), 2u32, 5u32))),
         ("outliers", Encoded::of(&ViewOutliers::new(2))),
         ("blocks", Encoded::of(&vec![Vec::new(), look(&[], &picture, &photo).unwrap()])),
         ("poses", Encoded::of(&poses)),
@@ -265,6 +265,7 @@ fn sample() -> RunState {
             rows_skipped: 1,
             steps_skipped: 2,
             steps_skipped_in_a_row: 1,
+            idle: IdleSteps { steps: 4, masked: 3, with_rows: 2, with_drawn: 1 },
             train_seconds: 0.1,
             test: Some(LastTest { step: 8, views: 2, psnr: 20.5, ssim: 0.75 }),
             growth: GrowthState {
@@ -283,7 +284,7 @@ fn sample() -> RunState {
 }
 
 fn check_state(state: &RunState) {
-    assert!(state.event_log().is_ok());
+    assert!(state.event_log().is_ok() && state.rows <= state.rows_bound);
     assert!(GradHistogram::from_filled(&state.histogram).is_some());
     let bytes = state.to_bytes().unwrap();
     assert_eq!(RunState::from_bytes(&bytes).unwrap().to_bytes().unwrap(), bytes);
@@ -335,7 +336,7 @@ fn states_come_back_and_other_versions_do_not() {
 fn appearance(change: fn(&mut AppearanceState)) -> SavedValues {
     let mut state = AppearanceState::new(&[0, 1]);
     change(&mut state);
-    [("appearance".to_string(), Encoded::of(&(state, 0u32)).unwrap())].into()
+    [("appearance".to_string(), Encoded::of(&(state, 0u32, 0u32)).unwrap())].into()
 }
 
 #[test]
@@ -348,6 +349,7 @@ fn impossible_states_are_refused() {
         assert!(RunState::from_bytes(&bytes).is_err_and(|e| e.contains("inconsistent")));
     };
     refused(|s| s.trainer.step = 8);
+    refused(|s| s.rows_bound = s.rows - 1);
     refused(|s| s.events.reverse());
     refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 0.0 });
     refused(|s| s.events[0].kind = EventKind::ResetOpacity { max_opacity: 1.0 });
