@@ -295,7 +295,10 @@ fn neighbour(
 
 fn summary_of_prior<T: DeserializeOwned>(city: &City) -> InputResult<T> {
     let file = city.prior_run().join(SUMMARY_FILE);
-    let text = std::fs::read_to_string(&file).map_err(|e| InputError::io(&file, "reading", &e))?;
+    let text = std::fs::read_to_string(&file).map_err(|e| {
+        let remedy = "finish the prior with the command that began it: gsscale-cells prior SCENE --out CITY";
+        InputError { remedy: remedy.into(), ..InputError::io(&file, "reading the result of the prior", &e) }
+    })?;
     serde_json::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), "train the prior again"))
 }
 

@@ -234,7 +234,10 @@ impl WorkPlace {
         let parent = store.parent().unwrap_or(&self.out);
         // Not its parents: the folder that the user named may be a drive that is not mounted.
         if !parent.is_dir() {
-            std::fs::create_dir(parent).map_err(|e| InputError::io(parent, "making the folder of the cell", &e))?;
+            std::fs::create_dir(parent).map_err(|e| {
+                let remedy = "make the folder that --spill-dir names, or mount its drive";
+                InputError { remedy: remedy.into(), ..InputError::io(parent, "making the folder of the cell", &e) }
+            })?;
         }
         let steps = |store: &Path| last_state(store, Access::Map).map(|state| state.trainer.step);
         let copy = newest_copy(folder).map(|(_, copy)| steps(&copy).map(|steps| (steps, copy))).transpose()?;

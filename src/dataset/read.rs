@@ -171,6 +171,20 @@ fn is_searched(scene: &Path) -> bool {
 /// Photos of a drone's card lie in folders of folders.
 const FOLDERS_DEEP: usize = 3;
 
+/// One of the two files that a COLMAP model has for poses, without the other one, whose name is the second value.
+fn lone_file(folder: &Path) -> Option<(PathBuf, String)> {
+    let places = ["sparse/0", "sparse", ""].map(|place| folder.join(place));
+    let pairs = places.iter().flat_map(|place| ["bin", "txt"].map(|ending| (place, ending)));
+    pairs.into_iter().find_map(|(place, ending)| {
+        let [cameras, images] = ["cameras", "images"].map(|name| place.join(format!("{name}.{ending}")));
+        match (cameras.is_file(), images.is_file()) {
+            (true, false) => Some((cameras, format!("images.{ending}"))),
+            (false, true) => Some((images, format!("cameras.{ending}"))),
+            _ => None,
+        }
+    })
+}
+
 /// The error, which says how to get poses, for a folder of photos without a model that a reader knows.
 fn without_poses(folder: &Path) -> Option<InputError> {
     let images = folder.join("images");
@@ -178,7 +192,15 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     let of_search = if search.join(SEARCH_STATE).is_file() { photos_below(&search, FOLDERS_DEEP - 1) } else { 0 };
     let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
     let count = counts.into_iter().find(|n| *n > 0)?;
-    let place = shell_word(folder);
+    let mut place = shell_word(folder);
+    if let Some((file, missing)) = lone_file(folder) {
+        let problem = format!("there is no {missing} beside it");
+        return Some(InputError::new(file, problem, "copy the whole model: cameras, images and points3D"));
+    }
+    if counts[0] == 0 && photos_below(folder, 1) == 0 {
+        // In sub-folders alone.
+        place += " --out FOLDER";
+    }
     // What would only send the user back.
     if is_searched(folder) {
         let problem = format!("gsscale-poses has found no poses: the {count} photos show too little in common");

@@ -29,8 +29,7 @@ pub enum TrainError {
     /// The drive is full, and no space was freed in time.
     #[error(
         "the drive of {folder} is full: it needs {needed} more{kept}\n  remedy: free space on it, then continue from \
-         the last commit with gsscale-train --resume and the output folder; a run without commits starts again \
-         with another --out{elsewhere}",
+         the last commit with gsscale-train --resume and the output folder, which begins a run without commits again{elsewhere}",
         kept = .last_step.map_or(String::new(), |step| format!("; the commit after step {step} is intact"))
     )]
     DriveFull {

@@ -178,6 +178,14 @@ impl SpillDir {
         Ok(foreign)
     }
 
+    /// Removes everything but what shows that the folder holds a store, which has no commit then.
+    /// Errors: the folder holds another store, or a file cannot be removed.
+    pub fn clear(&self) -> InputResult<()> {
+        self.check_identity()?;
+        let (ours, _) = self.files()?;
+        remove_files(&self.folder, ours.iter().filter(|name| ![FORMAT, LOCK].contains(&name.as_str())))
+    }
+
     /// The names of this store's files, in the order of their removal, and those of the other files in its folder.
     fn files(&self) -> InputResult<(Vec<String>, Vec<String>)> {
         let mut foreign = Vec::new();

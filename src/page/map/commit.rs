@@ -350,7 +350,10 @@ pub enum CommitError {
     /// Pages could not be made durable.
     #[error(transparent)]
     Pages(#[from] PageError),
-    #[error("{0}\n  remedy: acknowledged commits are intact; check the drive, then start again")]
+    #[error(
+        "{0}\n  remedy: check the drive, then start again: acknowledged commits are intact; if the map itself is damaged, \
+         gsscale-ckpt salvage rebuilds it from the pages, in another folder"
+    )]
     Map(#[from] MapError),
     /// No space. Nothing is lost; the commit may be repeated once there is space.
     #[error("there is no space for a commit: {0}\n  remedy: {REMEDY_SPACE}")]

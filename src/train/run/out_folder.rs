@@ -14,6 +14,7 @@ use super::request::{Existing, RunRequest};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
+use crate::base::units::format_grouped;
 use crate::base::whole_file::{folder_of, part_path, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
@@ -21,6 +22,7 @@ use crate::dataset::loader::Dataset;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
 use crate::page::folder::spill_dir::{SpillDir, is_same_file};
+use crate::page::tool::reading::Access;
 use crate::photos;
 use crate::report::run_files::{
     BEGUN_FILE, CONFIG_FILE, METRICS_FILE, PLY_FILE, RUN_FILES, RunFile, SUMMARY_FILE, Tells, saved_step,
@@ -28,7 +30,7 @@ use crate::report::run_files::{
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::absolute;
 use crate::train::log::report::StepLine;
-use crate::train::stores::ownership::{check_removable, remove_checkpoint_in};
+use crate::train::stores::ownership::{check_removable, last_state, remove_checkpoint_in};
 use serde::{Deserialize, Serialize};
 use std::ffi::OsStr;
 use std::fs::{File, OpenOptions, TryLockError};
@@ -203,8 +205,20 @@ pub(crate) fn make(out: &Path, existing: Existing) -> Result<(), TrainError> {
     // Before anything is removed: without its config the rest would not be taken for a run's.
     ExportFormat::ALL.into_iter().try_for_each(|format| check_results(out, format))?;
     // First, because an active run in the folder makes this fail.
-    remove_checkpoint_in(&checkpoint_folder(out), run_in(out))?;
+    let checkpoint = checkpoint_folder(out);
+    let state = last_state(&checkpoint, Access::Map).ok();
+    remove_checkpoint_in(&checkpoint, run_in(out))?;
+    if let Some(state) = state {
+        let (folder, steps) = (checkpoint.display(), format_grouped(state.trainer.step.into()));
+        crate::tell!("warning: --overwrite has removed the checkpoint of {steps} steps in {folder}");
+    }
     Ok(remove_files(out, |_| true)?)
+}
+
+/// Whether a folder holds what a run or its checkpoint leaves.
+pub(super) fn may_be_run(out: &Path) -> bool {
+    [CONFIG_FILE, BEGUN_FILE, METRICS_FILE].iter().any(|name| out.join(name).exists())
+        || checkpoint_folder(out).exists()
 }
 
 /// Whether a folder has the mark or the config.toml of a run. Other programs have files of the latter name; an empty one is nobody's.

@@ -79,8 +79,8 @@ impl ResumeRequest {
 /// Resumes a run and trains to its end.
 /// Errors: no run can be resumed, or it has changed (the folder stays unchanged then); else as [`super::begin::run`].
 pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
-    // Do not read or remove files of an active run.
-    let lock = if request.out.is_dir() { out_folder::lock(&request.out)? } else { None };
+    // Do not read or remove files of an active run, and write nothing into a folder that is none.
+    let lock = if out_folder::may_be_run(&request.out) { out_folder::lock(&request.out)? } else { None };
     if let Some((config, scene)) = settings_of_mark(&request.out, &request.keys, request.scene.as_deref())? {
         drop(lock);
         crate::tell!("{} was cut off before its first step: it begins again", request.out.display());
@@ -159,7 +159,10 @@ impl Earlier {
                 folder.display(),
                 state.origin.run.out
             );
-            let remedy = "name that output folder, or one that does not exist yet";
+            let remedy = format!(
+                "name that output folder; or resume into a new one: gsscale-train --resume NEW --spill-dir {}",
+                shell_word(&folder)
+            );
             return Err(InputError::new(&request.out, problem, remedy).into());
         }
         // The leg of a run that came from another machine has none.
@@ -200,7 +203,7 @@ impl Earlier {
 }
 
 /// A run that did all of its steps, has no checkpoint any more, and is to do more steps, whose rate schedule becomes that of the run. A run
-/// that was to keep its checkpoint is not continued: the drive of the checkpoint may not be mounted.
+/// that was to keep its checkpoint on another drive is not continued: that drive may not be mounted.
 /// Errors: its config.toml cannot be read.
 fn result_to_continue(
     request: &ResumeRequest,
@@ -211,8 +214,8 @@ fn result_to_continue(
     let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps);
     // An attempt to go on that was killed before its first commit leaves a store without one.
     let is_gone = !SpillDir::exists_in(folder) || is_uncommitted(folder).is_ok_and(|is_empty| is_empty);
-    let (Some(summary), Some(file)) = (summary.filter(|_| is_gone && !earlier.config.keep_checkpoint), &earlier.file)
-    else {
+    let is_kept = earlier.config.keep_checkpoint && earlier.config.residence().spill_dir().is_some();
+    let (Some(summary), Some(file)) = (summary.filter(|_| is_gone && !is_kept), &earlier.file) else {
         return Ok(None);
     };
     keep_rates(config, &request.keys, &earlier.config);
@@ -340,9 +343,14 @@ fn print_resume(
         free => format!("; {}", free.join(", ")),
     };
     crate::tell!("resume  {} after {} of {} steps{other}", request.out.display(), state.trainer.step, config.steps);
-    if let Some(rates) = text_of_rates(config) {
+    if let Some(rates) = text_of_rates(config).filter(|_| is_extended(config, state)) {
         crate::tell!("{rates}");
     }
+}
+
+/// Whether a run that resumes from `state` is to do more steps than it was to do when it was started.
+fn is_extended(config: &TrainConfig, state: &RunState) -> bool {
+    TrainConfig::parse(&state.origin.config).is_ok_and(|then| config.steps > then.steps)
 }
 
 /// Handles a run that did all steps and wrote its results: trains nothing. Removes a checkpoint that a kill left
@@ -483,7 +491,7 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
             "{} Gaussians of {PLY_FILE}",
             format_grouped(summary.gaussians.saturating_sub(summary.gaussians_left_out))
         );
-        return Ok(with_changes(steps_to_do(&request.out, &from, summary.steps, &config), &changes));
+        return Ok(with_changes(steps_to_do(&request.out, &from, summary.steps, &config, true), &changes));
     }
     match state {
         Some(state) => committed(request, &earlier, config, &state),
@@ -503,20 +511,22 @@ fn committed(
 ) -> Result<String, TrainError> {
     let (changes, ..) = goal(request, earlier, &mut config, state)?;
     let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
-    Ok(with_changes(steps_to_do(&request.out, &from, state.trainer.step, &config), &changes))
+    let is_extended = is_extended(&config, state);
+    Ok(with_changes(steps_to_do(&request.out, &from, state.trainer.step, &config, is_extended), &changes))
 }
 
 fn with_changes(text: String, changes: &Changes) -> String {
     changes.free.iter().chain(&changes.numbers).fold(text, |text, change| format!("{text}\nchange  {change}"))
 }
 
-fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig) -> String {
+fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig, is_extended: bool) -> String {
     let left = config.steps.saturating_sub(done);
     let [done, all, more] = [done, config.steps, left].map(|steps| format_grouped(steps.into()));
     let time = seconds_of_a_step(out).map_or(String::new(), |seconds| {
         format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
     });
-    let rates = text_of_rates(config).map_or(String::new(), |rates| format!("\n{rates}"));
+    let rates = text_of_rates(config).filter(|_| is_extended);
+    let rates = rates.map_or(String::new(), |rates| format!("\n{rates}"));
     format!(
         "resume  {} after {done} of {all} steps, from {from}\ntime    {more} steps to do{time}{rates}",
         out.display()

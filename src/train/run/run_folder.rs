@@ -188,6 +188,7 @@ pub(super) fn train_into(
         forecast: Some(forecast),
     }
     .run();
+    tiers.has_trained = true;
     let step_costs = StepCosts { forecast: Some(forecast.facts()), ..costs_since(&before, &trainer, tiers, &metrics) };
     let mut results = Results {
         trainer: &mut trainer,

@@ -41,6 +41,9 @@ pub struct Tiers {
     pub checkpoint: Option<Checkpoint>,
     /// The run is finished, so its checkpoint is not needed.
     pub is_done: bool,
+    /// The run has trained. If it ends without a commit, an empty store stays: without a store, a later resume would take the drive for
+    /// one that is not mounted.
+    pub has_trained: bool,
     /// `--keep-checkpoint`.
     keeps: bool,
     /// All pages are in memory; the store holds committed versions only.
@@ -262,6 +265,10 @@ impl Tiers {
         let made = self.checkpoint.take().and_then(|checkpoint| checkpoint.spill);
         let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();
+        if self.has_trained && !self.is_done && !self.is_in_output {
+            let cleared = spill.clear();
+            return cleared.err().map(|error| format!("pages could not be removed: {error}")).into_iter().collect();
+        }
         match spill.remove() {
             Ok(foreign) if foreign.is_empty() => {
                 if self.is_in_output {

@@ -113,3 +113,44 @@ fn a_run_that_is_refused_leaves_no_mark() {
     refused();
     assert!(work.files("new").is_empty());
 }
+
+/// A photo that cannot be decoded ends a run before its first commit.
+#[test]
+fn a_run_that_ends_by_an_error_before_its_first_commit_begins_again() {
+    let work = scene();
+    let flags = "--steps 40 --log-every 1 --image-cache 1KiB --strategy none --schedule-steps 20";
+    work.run("alone", flags);
+    let photo = &work.photos()[5];
+    let sound = std::fs::read(photo).unwrap();
+    // The start reads its header.
+    std::fs::write(photo, &sound[..sound.len() / 3]).unwrap();
+    let spilled = format!("scene --quiet --device cpu --out out {flags} --spill-dir spill --commit-every 0");
+    work.refuses(&spilled, &[photo.file_name().unwrap().to_str().unwrap()]);
+    assert_eq!(work.files("spill").len(), 1, "the mark of a store, but no pages");
+    std::fs::write(photo, &sound).unwrap();
+    let said = work.train("--resume out --quiet --device cpu");
+    assert!(said.contains("begins again") && work.ply("out") == work.ply("alone"), "{said}");
+    assert!(!work.exists("spill/FORMAT"));
+    // A run that goes on as it was planned is that of a run that nothing stopped.
+    let cut = format!("scene --quiet --device cpu --out cut {flags} --commit-every 0.01");
+    assert!(work.begin(&cut).after_lines("cut", 10).kill());
+    let said = work.train("--resume cut --device cpu");
+    assert!(!said.contains("final values") && work.ply("cut") == work.ply("alone"), "{said}");
+}
+
+#[test]
+fn a_resume_writes_nothing_into_a_folder_that_is_no_run() {
+    let work = scene();
+    let before = work.files("scene").len();
+    work.refuses("--resume scene", &["neither a config.toml nor a checkpoint"]);
+    assert_eq!(work.files("scene").len(), before);
+    // Half of a model, and photos that lie in sub-folders: neither goes around in circles.
+    let cameras = ["bin", "txt"].map(|ending| work.path(&format!("scene/sparse/0/cameras.{ending}")));
+    cameras.iter().for_each(|file| drop(std::fs::remove_file(file)));
+    work.refuses("scene --out half", &["there is no cameras."]);
+    std::fs::create_dir_all(work.path("card/DCIM")).unwrap();
+    for photo in work.photos() {
+        std::fs::copy(&photo, work.path("card/DCIM").join(photo.file_name().unwrap())).unwrap();
+    }
+    work.refuses("card --out card_run", &["gsscale-poses card --out FOLDER"]);
+}

@@ -41,6 +41,19 @@ fn saves_are_named_checkpoints() {
     }
 }
 
+/// A checkpoint in the output folder that its user has deleted cannot lie on a drive that is not mounted.
+#[test]
+fn a_kept_checkpoint_that_was_deleted_is_no_obstacle_to_more_steps() {
+    let work = Workdir::city(8, 64, 48, 300);
+    work.run("out", "--steps 10 --keep-checkpoint");
+    work.remove("out/checkpoint");
+    let said = work.train("--resume out --steps 20 --device cpu");
+    assert!(said.contains("goes on from its Gaussians") && work.summary("out")["steps"] == 20, "{said}");
+    assert!(work.exists("out/checkpoint/FORMAT"));
+    let said = work.train("scene --out out --overwrite --steps 5 --device cpu --quiet");
+    assert!(said.contains("--overwrite has removed the checkpoint of 20 steps"), "{said}");
+}
+
 /// More steps than planned: the learning-rate schedule stays the same, whenever the change is given and however the run
 /// is interrupted.
 #[test]
