@@ -192,15 +192,14 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     let of_search = if search.join(SEARCH_STATE).is_file() { photos_below(&search, FOLDERS_DEEP - 1) } else { 0 };
     let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
     let count = counts.into_iter().find(|n| *n > 0)?;
-    let mut place = shell_word(folder);
+    let place = shell_word(folder);
     if let Some((file, missing)) = lone_file(folder) {
         let problem = format!("there is no {missing} beside it");
         return Some(InputError::new(file, problem, "copy the whole model: cameras, images and points3D"));
     }
-    if counts[0] == 0 && photos_below(folder, 1) == 0 {
-        // In sub-folders alone.
-        place += " --out FOLDER";
-    }
+    // Photos in sub-folders alone leave no place for the model among them.
+    let is_nested = counts[0] == 0 && photos_below(folder, 0) == 0;
+    let place_of_model = if is_nested { " --out FOLDER" } else { "" };
     // What would only send the user back.
     if is_searched(folder) {
         let problem = format!("gsscale-poses has found no poses: the {count} photos show too little in common");
@@ -215,7 +214,7 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     }
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(
-        "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}\n  \
+        "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}{place_of_model}\n  \
          (--poses auto does that, and then trains), or with another program:\n  \
          OpenDroneMap:   its project folder (with opensfm/reconstruction.json and images/) is read as it is\n  \
          RealityScan, RealityCapture:  export 'Internal/External camera parameters' (CSV) into {place}\n  \

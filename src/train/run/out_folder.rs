@@ -307,7 +307,11 @@ pub(super) fn has_results(out: &Path) -> bool {
 /// Refuses to begin a run again that left results.
 /// Errors: there are results, which would be replaced.
 pub(super) fn check_restart(out: &Path) -> InputResult<()> {
-    if !has_results(out) {
+    // A run that ended by an error before its first commit wrote what it had; the same steps come again.
+    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
+    let is_partial =
+        serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary["finished"] == false);
+    if is_partial || !has_results(out) {
         return Ok(());
     }
     let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
