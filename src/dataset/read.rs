@@ -171,8 +171,8 @@ fn is_searched(scene: &Path) -> bool {
 /// Photos of a drone's card lie in folders of folders.
 const FOLDERS_DEEP: usize = 3;
 
-/// One of the two files that a COLMAP model has for poses, without the other one, whose name is the second value.
-fn lone_file(folder: &Path) -> Option<(PathBuf, String)> {
+/// A file of a COLMAP model without its partner, and the name of the partner: poses take both `cameras` and `images`.
+fn file_without_partner(folder: &Path) -> Option<(PathBuf, String)> {
     let places = ["sparse/0", "sparse", ""].map(|place| folder.join(place));
     let pairs = places.iter().flat_map(|place| ["bin", "txt"].map(|ending| (place, ending)));
     pairs.into_iter().find_map(|(place, ending)| {
@@ -193,13 +193,13 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
     let count = counts.into_iter().find(|n| *n > 0)?;
     let place = shell_word(folder);
-    if let Some((file, missing)) = lone_file(folder) {
+    if let Some((file, missing)) = file_without_partner(folder) {
         let problem = format!("there is no {missing} beside it");
         return Some(InputError::new(file, problem, "copy the whole model: cameras, images and points3D"));
     }
-    // Photos in sub-folders alone leave no place for the model among them.
+    // gsscale-poses needs --out where all photos lie in sub-folders.
     let is_nested = counts[0] == 0 && photos_below(folder, 0) == 0;
-    let place_of_model = if is_nested { " --out FOLDER" } else { "" };
+    let out_flag = if is_nested { " --out FOLDER" } else { "" };
     // What would only send the user back.
     if is_searched(folder) {
         let problem = format!("gsscale-poses has found no poses: the {count} photos show too little in common");
@@ -214,7 +214,7 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     }
     let problem = format!("{count} photos, but no camera poses");
     let remedy = format!(
-        "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}{place_of_model}\n  \
+        "find the poses first, with COLMAP or pycolmap:  gsscale-poses {place}{out_flag}\n  \
          (--poses auto does that, and then trains), or with another program:\n  \
          OpenDroneMap:   its project folder (with opensfm/reconstruction.json and images/) is read as it is\n  \
          RealityScan, RealityCapture:  export 'Internal/External camera parameters' (CSV) into {place}\n  \

@@ -111,7 +111,7 @@ struct Appearance {
     mode: AppearanceMode,
     /// The number of steps after which exposures are judged, if they are.
     judged_after: Option<u32>,
-    /// Steps that these values have had. More steps of a finished run begin with new values, at a later step of the run.
+    /// Steps since these values began: fewer than the steps of a run that was given more steps, since its values begin anew.
     steps: u32,
     /// The values are those of a commit.
     is_restored: bool,

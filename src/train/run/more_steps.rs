@@ -128,7 +128,8 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }
 
-/// Whether the finished run masked parts of photos. Its own decision about masks holds: more steps would begin behind the step of the decision.
+/// Whether the finished run masked parts of photos. Further steps keep that decision: they begin after the step at which a run decides, when
+/// nothing has been measured.
 fn has_masked(out: &Path) -> bool {
     let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
     serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary[MASKED_SHARE].is_number())

@@ -150,7 +150,7 @@ pub fn remedy_of_existing(out: &Path) -> String {
         return "choose another --out; --overwrite replaces the results of a run".to_string();
     };
     let residence = config.residence();
-    let has_result = out.join(PLY_FILE).exists();
+    let has_result = has_results(out);
     let shown = shell_word(out);
     match SpillDir::exists_in(&residence.checkpoint_folder(out)) {
         false if has_result => {
@@ -298,20 +298,21 @@ pub(super) fn has_results(out: &Path) -> bool {
     let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
-    // A PLY beside metrics but without a summary comes from a run without commits that was killed while it wrote its
-    // results. Beginning again gives the same PLY, which replaces the old one as a whole.
-    let has_ply = has(PLY_FILE) && metrics.is_empty();
-    has_ply || has(SUMMARY_FILE) || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    let has_result = match std::fs::read(out.join(SUMMARY_FILE)) {
+        // A run that an error ended before its first commit wrote the Gaussians that it had. Beginning again passes through them.
+        Ok(summary) => !serde_json::from_slice(&summary)
+            .is_ok_and(|summary: serde_json::Value| summary["finished"] == false && summary["commits"] == 0),
+        // A PLY beside metrics but without a summary comes from a run without commits that was killed while it wrote its
+        // results. Beginning again gives the same PLY, which replaces the old one as a whole.
+        Err(_) => has(SUMMARY_FILE) || (has(PLY_FILE) && metrics.is_empty()),
+    };
+    has_result || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Refuses to begin a run again that left results.
 /// Errors: there are results, which would be replaced.
 pub(super) fn check_restart(out: &Path) -> InputResult<()> {
-    // A run that ended by an error before its first commit wrote what it had; the same steps come again.
-    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
-    let is_partial =
-        serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary["finished"] == false);
-    if is_partial || !has_results(out) {
+    if !has_results(out) {
         return Ok(());
     }
     let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \

@@ -188,7 +188,7 @@ pub(super) fn train_into(
         forecast: Some(forecast),
     }
     .run();
-    tiers.has_trained = true;
+    tiers.leaves_store = true;
     let step_costs = StepCosts { forecast: Some(forecast.facts()), ..costs_since(&before, &trainer, tiers, &metrics) };
     let mut results = Results {
         trainer: &mut trainer,

@@ -41,9 +41,9 @@ pub struct Tiers {
     pub checkpoint: Option<Checkpoint>,
     /// The run is finished, so its checkpoint is not needed.
     pub is_done: bool,
-    /// The run has trained. If it ends without a commit, an empty store stays: without a store, a later resume would take the drive for
-    /// one that is not mounted.
-    pub has_trained: bool,
+    /// A run that ends before its first commit leaves its spill directory as an empty store: without a store, a later resume would take
+    /// the drive for one that is not mounted. Of a run that has trained, or that has replaced such a store.
+    pub leaves_store: bool,
     /// `--keep-checkpoint`.
     keeps: bool,
     /// All pages are in memory; the store holds committed versions only.
@@ -52,9 +52,6 @@ pub struct Tiers {
     is_in_output: bool,
     /// The run resumed from this store.
     has_resumed: bool,
-    /// An earlier process left a store without a commit here, and this run has replaced it. If this run is refused, its
-    /// store stays: without a store, a later resume would take the drive for one that is not mounted.
-    replaced_store: bool,
     /// For a dry run: a folder on the drive of the spill directory.
     planned_on: Option<PathBuf>,
     /// I/O engine, for reports; empty if all pages stay in memory.
@@ -147,11 +144,11 @@ pub fn open(config: &TrainConfig, pages: usize, host_mem: u64, dry: bool) -> Res
     // Only here, after everything that can refuse the run: a resume that is refused changes nothing.
     let (spill, is_replaced) = create_or_replace(spill_dir, layout)?;
     if is_replaced {
-        crate::tell!("removing pages in {} of a run that was cut off before its first commit", spill_dir.display());
+        crate::tell!("replacing the store in {} of a run that ended before its first commit", spill_dir.display());
     }
     let (folder, of_commits) = (DriveFolder::new(spill.folder()), commit_config(&spill));
     // From here on, an error removes the directory, unless an earlier process left one.
-    tiers.replaced_store = is_replaced;
+    tiers.leaves_store = is_replaced;
     let engine = tiers.take_spill(spill, config)?;
     let opened = Opened::create(Box::new(folder), of_commits)?;
     let store = opened.paged_store(engine, layout, tiers.codec)?;
@@ -261,11 +258,11 @@ impl Tiers {
     /// Closes the checkpoint and removes it, unless a run can resume from it or it is to be kept. The pager must be
     /// dropped before. Returns messages for the user.
     pub fn close(&mut self) -> Vec<String> {
-        let is_kept = (self.has_checkpoint() || self.replaced_store) && (self.keeps || !self.is_done);
+        let is_kept = self.has_checkpoint() && (self.keeps || !self.is_done);
         let made = self.checkpoint.take().and_then(|checkpoint| checkpoint.spill);
         let Some(spill) = self.spill.take().or(made).filter(|_| !is_kept) else { return Vec::new() };
         let folder = spill.folder().to_path_buf();
-        if self.has_trained && !self.is_done && !self.is_in_output {
+        if self.leaves_store && !self.is_done && !self.is_in_output {
             let cleared = spill.clear();
             return cleared.err().map(|error| format!("pages could not be removed: {error}")).into_iter().collect();
         }

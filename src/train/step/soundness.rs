@@ -105,9 +105,9 @@ pub(crate) fn note_idle(
     idle.with_rows += u32::from(outcome.rows > 0);
     idle.with_drawn += u32::from(outcome.drawn > 0);
     let views = dataset.train_views().len();
-    // So many steps in a row hold a whole epoch.
-    let epochs = 2 * views as u64;
-    if u64::from(idle.steps) < epochs {
+    // Among so many steps in a row is a whole epoch.
+    let most = 2 * views as u64;
+    if u64::from(idle.steps) < most {
         return Ok(());
     }
     let fail = |problem: String, remedy: &str| {
@@ -126,7 +126,7 @@ pub(crate) fn note_idle(
         let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
         return fail(problem, remedy);
     }
-    if u64::from(idle.steps) == epochs {
+    if u64::from(idle.steps) == most {
         crate::tell!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
     }
     Ok(())

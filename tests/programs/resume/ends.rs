@@ -124,16 +124,19 @@ fn a_run_that_ends_by_an_error_before_its_first_commit_begins_again() {
     let flags = "--steps 600 --log-every 1 --image-cache 1KiB --strategy none --schedule-steps 20";
     work.run("alone", flags);
     let (photo, away) = (&work.photos()[5], work.path("away.jpg"));
-    let spilled = format!("scene --quiet --device cpu --out out {flags} --spill-dir spill --commit-every 0");
-    let begun = work.begin(&spilled).after_lines("out", 10);
-    std::fs::rename(photo, &away).unwrap();
-    let said = begun.ends(1);
-    assert!(said.contains(photo.file_name().unwrap().to_str().unwrap()), "{said}");
-    assert_eq!(work.files("spill").len(), 1, "the mark of a store, but no pages");
-    std::fs::rename(&away, photo).unwrap();
-    let said = work.train("--resume out --quiet --device cpu");
-    assert!(said.contains("begins again") && work.ply("out") == work.ply("alone"), "{said}");
-    assert!(!work.exists("spill/FORMAT"));
+    // In memory, which needs no flag, and through the drive.
+    for (out, drive) in [("memory", ""), ("drive", "--spill-dir spill")] {
+        let begun = work.begin(&format!("scene --quiet --device cpu --out {out} {flags} {drive} --commit-every 0"));
+        let begun = begun.after_lines(out, 10);
+        std::fs::rename(photo, &away).unwrap();
+        let said = begun.ends(1);
+        assert!(said.contains(photo.file_name().unwrap().to_str().unwrap()), "{said}");
+        assert!(drive.is_empty() || work.files("spill").len() == 1, "the mark of a store, but no pages");
+        std::fs::rename(&away, photo).unwrap();
+        let said = work.train(&format!("--resume {out} --quiet --device cpu"));
+        assert!(said.contains("begins again") && work.ply(out) == work.ply("alone"), "{said}");
+        assert!(!work.exists("spill/FORMAT"));
+    }
     // A run that goes on as it was planned is that of a run that nothing stopped.
     let cut = format!("scene --quiet --device cpu --out cut {flags} --commit-every 0.01");
     assert!(work.begin(&cut).after_lines("cut", 10).kill());
