@@ -10,7 +10,7 @@ use gsscale::cells::merge::{MergeRequest, merge};
 use gsscale::cells::plan::{CellCount, CityPlan};
 use gsscale::cells::prior::{PriorRequest, prior};
 use gsscale::cells::seam::seam;
-use gsscale::cells::work::{COPY_EVERY, WorkRequest, code_of, status, work};
+use gsscale::cells::work::{COPY_EVERY, WorkError, WorkRequest, code_of, status, work};
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::TrainOverrides;
 use gsscale::config::values::ByteSize;
@@ -190,7 +190,10 @@ fn start(command: Command) -> Result<i32, TrainError> {
         }
         Command::Run(args) => {
             let RunArgs { city, cell, scene, copy_every, quiet, keys } = *args;
-            work(&WorkRequest { city, cell, scene, keys, copy_every, quiet })
+            work(&WorkRequest { city, cell, scene, keys, copy_every, quiet }).or_else(|WorkError { error, code }| {
+                gsscale::tell!("error: {error}");
+                Ok(code)
+            })
         }
         Command::Status { city } => show_status(&city),
         Command::Merge { city, out, host_mem } => {

@@ -26,6 +26,16 @@ pub fn host_name() -> String {
     std::env::var("COMPUTERNAME").unwrap_or_default()
 }
 
+/// A name of this machine as long as its system runs: its name in the network with a part of the kernel's identity, in which clones and
+/// containers on other machines differ. Off Linux the name alone.
+pub fn system_name() -> String {
+    let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
+    match boot.split('-').next().unwrap_or("").trim() {
+        "" => host_name(),
+        boot => format!("{}-{boot}", host_name()),
+    }
+}
+
 /// The processor's name as the system gives it, else its architecture.
 pub fn cpu_model() -> String {
     let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();

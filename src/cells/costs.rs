@@ -42,7 +42,7 @@ impl std::str::FromStr for AsIf {
     }
 }
 
-/// The photos of a scene on average, bytes.
+/// The photos of a scene on average, bytes: as files, and decoded at the size at which cells train on them.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PhotoBytes {
     pub file: f64,

@@ -4,11 +4,11 @@
 //! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. if
 //! several processes find no owner, one of them makes the lock file, which appears with the owner's name in it and the system's lock held; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
 //! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
-//! and no result: the bytes are the same.
+//! and no result: both give the same bytes, and only the owner gives its copy a name.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
-use crate::base::machine::host_name;
+use crate::base::machine::system_name;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Error, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -38,7 +38,7 @@ impl CellLock {
     pub fn take(folder: &Path) -> InputResult<Result<CellLock, String>> {
         let path = folder.join(LOCK);
         let failed = |e: Error| InputError::io(&path, "taking the cell", &e);
-        let token = format!("{} process {} {:032x}", host_name(), std::process::id(), draw_identity());
+        let token = format!("{} process {} {:032x}", system_name(), std::process::id(), draw_identity());
         let mut options = OpenOptions::new();
         options.read(true).write(true);
         // The file appears under its name when it has its owner and is locked: who finds it unlocked knows that its owner is gone.
@@ -61,7 +61,7 @@ impl CellLock {
                 let is_gone = match file.try_lock() {
                     Err(TryLockError::WouldBlock) => return Ok(Err(owner)),
                     // The system's lock says nothing about processes of other machines.
-                    locked => locked.is_ok() && machine_of(&owner) == host_name(),
+                    locked => locked.is_ok() && machine_of(&owner) == system_name(),
                 };
                 if !is_gone && age(&path, folder)? < LOST_AFTER {
                     return Ok(Err(owner));

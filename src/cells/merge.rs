@@ -12,7 +12,8 @@
 use super::costs::POLISH_SHARE;
 use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
-use super::work::{copy_of, done_of};
+use super::prior::OF_FIRST_POINTS;
+use super::work::{check_prior, copy_of, done_of};
 use super::{City, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
@@ -110,6 +111,7 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     }
     let (mut open, mut copies) = (Vec::new(), Vec::new());
     for cell in 0..plan.cells.len() {
+        plan.cell(&city, cell)?;
         match done_of(&plan, &city, cell)? {
             Some(done) => copies.push(copy_of(&city.cell(cell), done.copy)),
             None => open.push(cell.to_string()),
@@ -122,6 +124,8 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
         };
         return Err(InputError::new(&city.0, problem, "run them: gsscale-cells run CITY --cell K").into());
     }
+    let memory = host_budget(request.host_mem).unwrap_or(1 << 30);
+    check_prior(&plan, &city, memory)??;
     let keys = city.given_keys()?;
     let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
     let facts = read_resolved(&city.prior_run().join(CONFIG_FILE))?;
@@ -131,7 +135,6 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     let (meta, ply) = (meta_of(&plan, &config, &facts), folder.path().join(PLY_FILE));
     let most: u64 = plan.cells.iter().map(|cell| cell.max_gaussians).sum();
     let mut sink = ExportFormat::Ply.create(&ply, config.sh_degree, most, &meta)?;
-    let memory = host_budget(request.host_mem).unwrap_or(1 << 30);
     let owner = |page: &PageMeta| (page.id, plan.cell_at(plan.ground(page.bounds.centre())));
     let mut prior = StoredStart::open(&city.prior_store(), memory, 2)?;
     let owners = prior.scene().pager.index().iter().map(owner).collect();
@@ -272,8 +275,10 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path, folder: &mut PartFolde
     let ended = config_of(&city.cell(0), of_cell, &TrainOverrides::default())?;
     keys.extend(remedies_of_prior(city)?);
     keys.remove("max-gaussians");
+    keys.remove(OF_FIRST_POINTS);
     keys.insert("steps".into(), i64::from((whole.steps / POLISH_SHARE).max(1)).into());
-    for (key, word) in [("strategy", "none"), ("schedule", "classic")] {
+    // Most Gaussians are on few of these photos, or on none.
+    for (key, word) in [("strategy", "none"), ("schedule", "classic"), ("export-clean", "off")] {
         keys.insert(key.into(), word.into());
     }
     let mut paths = vec![("init-ply", out.join(PLY_FILE)), ("views-file", out.join(POLISH_VIEWS_FILE))];

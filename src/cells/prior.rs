@@ -21,6 +21,8 @@ use std::path::PathBuf;
 /// The prior takes this part of the steps, and of the Gaussians.
 pub(crate) const STEPS_SHARE: u32 = 4;
 pub(crate) const GAUSSIANS_SHARE: u64 = 5;
+/// A key that has no meaning for cells, which begin from Gaussians.
+pub(crate) const OF_FIRST_POINTS: &str = "sweep-points";
 /// Longest side of its photos, pixels.
 const RESOLUTION_MOST: u32 = 800;
 const SH_DEGREE_MOST: u8 = 1;
@@ -48,6 +50,7 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     let whole = config_of(&city.keys(), keys.clone(), &TrainOverrides::default())?;
     let of_prior = keys.clone().into_iter().chain(machine).chain(keys_of_prior(&whole)).collect();
     let config = config_of(&city.keys(), of_prior, &TrainOverrides::default())?;
+    check_keys_of_cells(&city, keys.clone())?;
     fix_keys(&city, &keys)?;
     if city.prior_store().is_dir() {
         crate::say!("the prior in {} is done", city.0.display());
@@ -73,6 +76,18 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     })?;
     crate::say!("the prior in {} is done: {} Gaussians in {} pages", city.0.display(), rows.gaussians, rows.pages);
     Ok(0)
+}
+
+/// Errors: every cell would refuse a key.
+fn check_keys_of_cells(city: &City, mut keys: toml::Table) -> InputResult<()> {
+    keys.remove(OF_FIRST_POINTS);
+    for path in ["init-ply", "views-file", "pages-file"] {
+        keys.insert(path.into(), path.into());
+    }
+    let remedy = "leave it out: cells begin from the prior's Gaussians, and keep those around them as they are";
+    config_of(&city.keys(), keys, &TrainOverrides::default())
+        .map(|_| ())
+        .map_err(|error| InputError { remedy: remedy.to_string(), ..error })
 }
 
 /// Keeps the keys of the whole scene, or compares them with those that the city has. They may change until the prior's run has begun.

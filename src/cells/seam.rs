@@ -7,8 +7,8 @@
 
 use super::plan::{CityPlan, GroundRect};
 use super::{City, check_range};
-use crate::base::error::InputError;
-use crate::config::file::TrainConfig;
+use crate::base::error::{InputError, InputResult};
+use crate::config::file::{TrainConfig, read_resolved};
 use crate::dataset::loader::Dataset;
 use crate::render::metrics::{mean, psnr};
 use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
@@ -23,7 +23,7 @@ use crate::train::step::pages::WorkingSet;
 use crate::train::step::view::{SceneNow, draw};
 use glam::DVec3;
 use serde::Serialize;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Points along a border, and the strips beside it in which Gaussians are counted, as a share of its length.
 const POINTS: usize = 256;
@@ -75,7 +75,10 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     let Model::Ply(read) = Model::open(&file)? else {
         return Err(InputError::new(&file, "it is no PLY", "name the folder of a merge or a run").into());
     };
-    let scene = scene.map_or_else(|| city.scene(), |scene| Ok(scene.to_path_buf()))?;
+    let scene = match scene {
+        Some(scene) => scene.to_path_buf(),
+        None => scene_of_both(&city, model)?,
+    };
     let mut evaluator = Evaluator::open(&scene, &config, None)?;
     let (columns, meta) = *read;
     let columns = evaluator.placed(&file, columns, &meta)?;
@@ -111,6 +114,22 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     let [crossing_psnr, band_psnr, other_psnr] =
         [&crossing, &banded, &others].map(|values| (!values.is_empty()).then(|| mean(values)));
     Ok(SeamReport { views: [crossing.len(), others.len()], crossing_psnr, band_psnr, other_psnr, borders })
+}
+
+/// The scene of a city, of which `model` must be, too.
+/// Errors: it is of another one.
+fn scene_of_both(city: &City, model: &Path) -> InputResult<PathBuf> {
+    let (scene, of_model) = (city.scene()?, read_resolved(&model.join(CONFIG_FILE))?.scene);
+    let whole = |path: &Path| path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
+    if whole(&scene) == whole(&of_model) {
+        return Ok(scene);
+    }
+    let problem = format!("it is of {}, the city of {}", of_model.display(), scene.display());
+    Err(InputError::new(
+        model,
+        problem,
+        "name a run of the city's photos; if both are the same, name the scene with --scene",
+    ))
 }
 
 /// Each row's place on the ground and its height, in the plan's frame.

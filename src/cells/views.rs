@@ -13,7 +13,7 @@ use crate::base::ids::{PageId, PageNo};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits::RunOptions;
 use crate::config::values::Up;
-use crate::dataset::loader::View;
+use crate::dataset::loader::{View, target_size};
 use crate::dataset::model::Split;
 use crate::render::RenderOptions;
 use crate::scene::page_meta::PageBounds;
@@ -67,12 +67,12 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     if !city.prior_store().is_dir() {
         return Err(InputError::new(city.prior_store(), "the city has no finished prior", NO_PRIOR).into());
     }
-    let (config, asked_up) = prior_config(city, keys)?;
+    let (config, whole) = prior_config(city, keys)?;
     machine::set_up(&config)?;
     let host_mem = host_budget(config.host_mem.0);
     // The points decide the frame, as they did for the prior.
     let start = Start::look(scene, &config, &city.0, host_mem)?;
-    let up = match asked_up {
+    let up = match whole.up {
         Up::Along(up) => up,
         Up::Auto | Up::Keep => start.up()?.unwrap_or(VIEWER_UP),
     };
@@ -103,7 +103,10 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     for View { name, split, camera, photo: source } in &dataset.views {
         let file = std::fs::metadata(&source.image_path).map_or(0, |of| of.len());
         photo.file += file as f64 * share;
-        photo.decoded += source.target_bytes() as f64 * share;
+        let pixels = |(width, height): (u32, u32)| f64::from(width) * f64::from(height);
+        let limit = Some(whole.max_resolution).filter(|&most| most > 0);
+        let of_cell = target_size((source.header.width, source.header.height), whole.data_factor, limit);
+        photo.decoded += source.target_bytes() as f64 * pixels(of_cell) / pixels(source.target) * share;
         let mut now = SceneNow { scene: store.scene(), step, working: &mut working, renderer: &mut *renderer };
         let weights = weigh_pages(&mut now, camera, &render)?.into_iter().filter(|(_, weight)| *weight > 0.0);
         let weights = weights.map(|(page, weight)| (place[page.index()], weight)).collect();
@@ -114,12 +117,12 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes, photo, sh_degree })
 }
 
-/// The config of the prior's run with the keys of this machine, and what the user says of up.
-fn prior_config(city: &City, machine: &TrainOverrides) -> InputResult<(TrainConfig, Up)> {
+/// The configs of the prior's run and of the whole scene, with the keys of this machine.
+fn prior_config(city: &City, machine: &TrainOverrides) -> InputResult<(TrainConfig, TrainConfig)> {
     let mut keys = city.given_keys()?;
     let whole = config_of(&city.keys(), keys.clone(), machine)?;
     keys.extend(keys_of_prior(&whole));
-    Ok((config_of(&city.keys(), keys, machine)?, whole.up))
+    Ok((config_of(&city.keys(), keys, machine)?, whole))
 }
 
 fn seen_page(id: PageId, bounds: &PageBounds, rows: u32, axes: &[[f64; 3]; 2]) -> SeenPage {

@@ -5,8 +5,9 @@
 //!
 //! | in `cells/K/` | is |
 //! | --- | --- |
-//! | `run-MACHINE/` | the run's own folder and pages, without `--spill-dir` |
-//! | `copy/N/` | a commit; the largest N that is whole counts |
+//! | `run-MACHINE/` | the run's own folder and pages, without `--spill-dir`, until this machine starts again |
+//! | `copy/N/` | a commit; the largest N that can be read counts |
+//! | `copy/of-.../` | a copy that its worker has not finished, or not named |
 //! | `done.toml` | the last step is in the copy |
 //!
 //! Invariants: 1. `done.toml` comes after the copy of the last commit; 2. only stores that are whole, and only under the cell's lock, get
@@ -16,8 +17,9 @@ use super::lock::{CellLock, owner_of};
 use super::plan::{CityPlan, prior_digest};
 use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
-use crate::base::machine::host_name;
-use crate::base::whole_file::write_whole;
+use crate::base::identity::draw_identity;
+use crate::base::machine::system_name;
+use crate::base::whole_file::{sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::new_run;
 use crate::config::values::ByteSize;
@@ -44,8 +46,33 @@ pub const AGAIN: i32 = 75;
 /// Exit code: no further attempt will succeed.
 pub const NEVER: i32 = 2;
 
+/// Beginning of the name of a copy that has no number yet.
+const UNNAMED: &str = "of-";
+
 /// Usual seconds between copies.
 pub const COPY_EVERY: f64 = 900.0;
+
+/// An error of a worker, and the exit code that it gives.
+#[derive(Debug)]
+pub struct WorkError {
+    pub error: TrainError,
+    pub code: i32,
+}
+
+impl<E: Into<TrainError>> From<E> for WorkError {
+    fn from(error: E) -> WorkError {
+        let error = error.into();
+        WorkError { code: code_of(&error), error }
+    }
+}
+
+impl WorkError {
+    /// Of a run, which may lack what this machine lacks: its drive, its memory, the photos. Only one that diverges will do so again.
+    fn of_run(error: TrainError) -> WorkError {
+        let code = if matches!(error, TrainError::NonFinite { .. }) { NEVER } else { AGAIN };
+        WorkError { error, code }
+    }
+}
 
 /// Work on a cell.
 #[derive(Debug, Clone)]
@@ -75,8 +102,10 @@ pub struct Done {
 }
 
 /// Works on a cell until it is done, or a signal stops it. Returns the exit code.
-/// Errors: those of a run; see [`code_of`].
-pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
+/// Errors: those of a run.
+pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
+    // A request to stop counts from the beginning.
+    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
     let city = City(request.city.clone());
     check_machine_keys(&request.keys)?;
     check_range("--copy-every", request.copy_every, 0.0..=1e9)?;
@@ -84,12 +113,17 @@ pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
     let files = &plan.cell(&city, request.cell)?.files;
     let folder = city.cell(request.cell);
     let place = WorkPlace::of(request, &plan, &city)?;
-    if done_of(&plan, &city, request.cell)?.is_some() {
+    let is_done = || done_of(&plan, &city, request.cell).map(|done| done.is_some());
+    let leave_done = || {
         crate::say!("cell {} is done", request.cell);
         // A process that was killed behind its last word left them.
-        return place.clear().map(|()| 0);
+        place.clear().map_err(WorkError::of_run).map(|()| 0)
+    };
+    if is_done()? {
+        return leave_done();
     }
-    check_prior(&plan, &city, &request.keys)?;
+    let memory = host_budget(request.keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
+    check_prior(&plan, &city, memory).map_err(WorkError::of_run)??;
     let lock = match CellLock::take(&folder)? {
         Ok(lock) => lock,
         Err(owner) => {
@@ -97,39 +131,39 @@ pub fn work(request: &WorkRequest) -> Result<i32, TrainError> {
             return Ok(AGAIN);
         }
     };
-    let stop = StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e))?;
+    // The owner before may have ended in the meantime.
+    if is_done()? {
+        return leave_done();
+    }
     let scene = request.scene.clone().map_or_else(|| city.scene(), Ok)?;
     let keys = place.keys(&city, &folder, &request.keys);
     let config = config_of(&folder.join("cell.toml"), keys_of_cell(&folder)?, &keys)?;
-    let mut has_begun = place.fetch(&folder)?;
-    while stop.exit_code().is_none() {
-        let leg = Some(Duration::from_secs_f64(request.copy_every));
-        let (config, keys) = (TrainConfig { keep_checkpoint: true, ..config.clone() }, keys.clone());
-        let (out, quiet) = (place.out.as_path(), request.quiet);
-        let outcome = begin_or_resume(AnyRun { scene: &scene, out, has_begun, config, keys, leg, quiet })?;
-        has_begun = true;
-        if !lock.is_held() {
-            break;
-        }
-        let copy = publish(&folder, &place.out)?;
-        if let Some(summary) = outcome.summary.filter(|summary| summary.finished) {
-            if !lock.is_held() {
-                break;
+    let train = || -> Result<i32, TrainError> {
+        let mut has_begun = place.fetch(&folder)?;
+        while stop.exit_code().is_none() {
+            let leg = Some(Duration::from_secs_f64(request.copy_every));
+            let (config, keys) = (TrainConfig { keep_checkpoint: true, ..config.clone() }, keys.clone());
+            let (out, quiet) = (place.out.as_path(), request.quiet);
+            let outcome = begin_or_resume(AnyRun { scene: &scene, out, has_begun, config, keys, leg, quiet })?;
+            has_begun = true;
+            let Some(copy) = publish(&folder, &place.out, &lock)? else { break };
+            if let Some(summary) = outcome.summary.filter(|summary| summary.finished) {
+                let psnr = summary.test.map(|test| test.psnr);
+                let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
+                let (file, done) =
+                    (folder.join("done.toml"), Done { files: files.clone(), copy, steps, gaussians, seconds, psnr });
+                write_whole(&file, toml_of(&file, &done)?.as_bytes())?;
+                place.clear()?;
+                return Ok(0);
             }
-            let psnr = summary.test.map(|test| test.psnr);
-            let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
-            let (file, done) =
-                (folder.join("done.toml"), Done { files: files.clone(), copy, steps, gaussians, seconds, psnr });
-            write_whole(&file, toml_of(&file, &done)?.as_bytes())?;
-            place.clear()?;
-            return Ok(0);
         }
-    }
-    if !lock.is_held() {
-        let owner = owner_of(&folder).unwrap_or_default();
-        crate::tell!("another process has taken cell {} over: {owner}", request.cell);
-    }
-    Ok(AGAIN)
+        if !lock.is_held() {
+            let owner = owner_of(&folder).unwrap_or_default();
+            crate::tell!("another process has taken cell {} over: {owner}", request.cell);
+        }
+        Ok(AGAIN)
+    };
+    train().map_err(WorkError::of_run)
 }
 
 /// The exit code for an error: [`NEVER`] for bad input and for a run that diverges, which it will do again; [`AGAIN`] for what another
@@ -163,28 +197,47 @@ pub(crate) fn copy_of(folder: &Path, number: u32) -> PathBuf {
     folder.join("copy").join(number.to_string())
 }
 
-/// The newest copy of a cell with its number.
-fn newest_copy(folder: &Path) -> Option<(u32, PathBuf)> {
-    let entries = std::fs::read_dir(folder.join("copy")).ok()?.flatten();
-    let number = |entry: std::fs::DirEntry| entry.file_name().to_str()?.parse().ok().map(|n: u32| (n, entry.path()));
-    entries.filter_map(number).max()
+/// The copies of a cell with their numbers, the newest first.
+/// Errors: they cannot be listed.
+fn copies_of(folder: &Path) -> InputResult<Vec<(u32, PathBuf)>> {
+    let mut copies: Vec<(u32, PathBuf)> = Vec::new();
+    for path in listed(&folder.join("copy"))? {
+        let number = path.file_name().and_then(|name| name.to_str()?.parse().ok());
+        copies.extend(number.map(|number| (number, path)));
+    }
+    copies.sort_unstable_by(|a, b| b.cmp(a));
+    Ok(copies)
 }
 
-/// Steps of the newest copy of a cell.
+/// What is in a folder; nothing where it does not exist.
+/// Errors: it cannot be listed.
+fn listed(folder: &Path) -> InputResult<Vec<PathBuf>> {
+    let failed = |e: std::io::Error| InputError::io(folder, "listing the copies", &e);
+    match std::fs::read_dir(folder) {
+        Err(e) if e.kind() == ErrorKind::NotFound => Ok(Vec::new()),
+        entries => entries.map_err(failed)?.map(|entry| Ok(entry.map_err(failed)?.path())).collect(),
+    }
+}
+
+/// Steps of the last commit in a store.
+fn steps_in(store: &Path) -> Result<u32, TrainError> {
+    last_state(store, Access::Map).map(|state| state.trainer.step)
+}
+
+/// Steps of the newest copy of a cell that can be read.
 fn copied_steps(folder: &Path) -> Option<u32> {
-    let (_, copy) = newest_copy(folder)?;
-    last_state(&copy, Access::Map).ok().map(|state| state.trainer.step)
+    copies_of(folder).ok()?.iter().find_map(|(_, copy)| steps_in(copy).ok())
 }
 
-/// Refuses a prior that is not the one that was cut.
-fn check_prior(plan: &CityPlan, city: &City, keys: &TrainOverrides) -> Result<(), TrainError> {
-    let memory = host_budget(keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
+/// Refuses, by the inner error, a prior that is not the one that was cut.
+/// Errors: it cannot be read in this memory.
+pub(crate) fn check_prior(plan: &CityPlan, city: &City, memory: u64) -> Result<InputResult<()>, TrainError> {
     let rows = StoredStart::open(&city.prior_store(), memory, 2)?.digest()?;
     if prior_digest(city, rows)? == plan.prior {
-        return Ok(());
+        return Ok(Ok(()));
     }
     let problem = "it is not the prior that was cut";
-    Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder").into())
+    Ok(Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder")))
 }
 
 fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
@@ -202,7 +255,7 @@ impl WorkPlace {
     /// Machines that share a folder, and cities that share a drive, have places of their own.
     fn of(request: &WorkRequest, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
         let Some(drive) = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) else {
-            let out = city.cell(request.cell).join(format!("run-{}", host_name()));
+            let out = city.cell(request.cell).join(format!("run-{}", system_name()));
             return Ok(WorkPlace { out, pages: None });
         };
         let own = absolute(Path::new(drive)).join(format!("cell-{}-{}", request.cell, plan.digest(&city.plan())?));
@@ -239,13 +292,27 @@ impl WorkPlace {
                 InputError { remedy: remedy.into(), ..InputError::io(parent, "making the folder of the cell", &e) }
             })?;
         }
-        let steps = |store: &Path| last_state(store, Access::Map).map(|state| state.trainer.step);
-        let copy = newest_copy(folder).map(|(_, copy)| steps(&copy).map(|steps| (steps, copy))).transpose()?;
         // A store that cannot be read may hold the only steps of the cell: the error names what saves them.
         let has_commit = SpillDir::exists_in(&store) && !is_uncommitted(&store)?;
-        let own = has_commit.then(|| steps(&store)).transpose()?;
+        let own = has_commit.then(|| steps_in(&store)).transpose()?;
+        let (mut copy, mut unreadable) = (None, None);
+        for (_, path) in copies_of(folder)? {
+            match steps_in(&path) {
+                Ok(steps) => copy = Some((steps, path)),
+                Err(error) => {
+                    crate::tell!("warning: the copy in {} is passed over: {error}", path.display());
+                    unreadable.get_or_insert(path);
+                    continue;
+                }
+            }
+            break;
+        }
         if own.is_some() && own >= copy.as_ref().map(|(steps, _)| *steps) {
             return Ok(true);
+        }
+        if let (None, Some(copy)) = (&copy, unreadable) {
+            let remedy = "try again where it can be read; remove it to begin the cell again";
+            return Err(InputError::new(copy, "the cell has no copy that can be read", remedy).into());
         }
         // What lies here is of a run that the other machine did not go on with.
         self.clear()?;
@@ -263,19 +330,43 @@ impl WorkPlace {
     }
 }
 
-/// Copies the last commit of the run in `out` into the city; returns the number of the copy.
+/// Copies the last commit of the run in `out` into the city; returns the number of the copy, `None` if the cell has another owner by now.
 /// Errors: the commit is damaged, or the city cannot be written.
-fn publish(folder: &Path, out: &Path) -> Result<u32, TrainError> {
+fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, TrainError> {
+    if !lock.is_held() {
+        return Ok(None);
+    }
     let copies = folder.join("copy");
     std::fs::create_dir_all(&copies).map_err(|e| InputError::io(&copies, "making the folder of copies", &e))?;
-    let number = newest_copy(folder).map_or(0, |(number, _)| number + 1);
-    clone_into(out, &copy_of(folder, number))?;
-    for older in (0..number).map(|older| copy_of(folder, older)) {
-        if let Err(error) = remove_store(&older) {
+    // What others left that were killed, or were taken for lost. One that still writes has it in use.
+    let is_unnamed = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(UNNAMED));
+    listed(&copies)?.iter().filter(|path| is_unnamed(path)).for_each(|path| drop(remove_store(path)));
+    let before = copies_of(folder)?;
+    let number = before.first().map_or(0, |(number, _)| number + 1);
+    let (made, copy) = (copies.join(format!("{UNNAMED}{:032x}", draw_identity())), copy_of(folder, number));
+    clone_store(&find_store(out)?, &made)?;
+    // Copying takes long. Another owner's copy of this number stays: no folder is renamed over one with files.
+    let named = if lock.is_held() { std::fs::rename(&made, &copy) } else { Err(ErrorKind::Other.into()) };
+    if let Err(error) = named {
+        remove_store(&made)?;
+        if lock.is_held() {
+            return Err(InputError::io(&copy, "naming the copy", &error).into());
+        }
+        return Ok(None);
+    }
+    sync_folder(&copies).map_err(|e| InputError::io(&copies, "naming the copy", &e))?;
+    let steps = steps_in(&copy)?;
+    for (_, older) in before {
+        let removed = match steps_in(&older) {
+            Ok(older_steps) if older_steps > steps || !lock.is_held() => Ok(()),
+            Ok(_) => remove_store(&older),
+            Err(error) => Err(error),
+        };
+        if let Err(error) = removed {
             crate::tell!("warning: an older copy stays: {error}");
         }
     }
-    Ok(number)
+    Ok(Some(number))
 }
 
 /// Copies a store to the folder `to`, which does not exist; what a killed process left of such a copy goes.

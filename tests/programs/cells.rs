@@ -2,6 +2,7 @@
 
 use crate::support::scenes::{add_boxes, told};
 use crate::support::workdir::{CKPT, Running, Workdir, says};
+use gsscale::dataset::synthetic::{CityOptions, write_city};
 use gsscale::exchange::meta::ExportFrame;
 use gsscale::scene::columns::Column;
 use gsscale::train::stores::StoredStart;
@@ -104,6 +105,22 @@ fn cells_mask_what_their_prior_has_masked() {
     says(&cells.0.text("city/cells/1/cell.toml"), &["robust-pixels = \"on\""]);
 }
 
+/// Swept points are for the prior; cells begin from its Gaussians.
+#[test]
+fn a_city_of_swept_points_is_trained_and_keys_that_no_cell_takes_are_refused_at_once() {
+    let cells = Cells(Workdir::city(16, 64, 48, 800));
+    cells.done(&format!("prior scene --out city --steps 40 {KEYS} --sweep-points --view-order auto"));
+    cells.done("cut scene --out city --cells 1");
+    let cell = cells.0.text("city/cells/0/cell.toml");
+    assert!(cell.contains("view-order = \"shuffle\"") && !cell.contains("sweep-points"), "{cell}");
+    cells.done("run city --cell 0");
+    let flags = format!("prior scene --out other --steps 40 {KEYS} --optimizer-on device --device gpu");
+    let output = cells.0.output(CELLS, &flags);
+    assert_eq!(output.status.code(), Some(2), "{}", told(&output));
+    says(&told(&output), &["--optimizer-on device", "leave it out"]);
+    assert!(!cells.0.exists("other"));
+}
+
 #[test]
 fn one_cell_equals_the_plain_run_from_the_same_prior() {
     let cells = Cells::cut(120, "--cells 1");
@@ -156,7 +173,12 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
     let (code, said) = cells.says("merge city --out whole");
     assert!(code != Some(0) && !cells.0.exists("whole") && !cells.0.exists(".whole.part"), "{said}");
     std::fs::rename(&away, &pages).unwrap();
+    let listed = cells.0.text("city/cells/2/pages.txt");
+    cells.0.write("city/cells/2/pages.txt", listed.lines().rev().map(|line| format!("{line}\n")).collect::<String>());
+    cells.refuses("merge city --out whole", &["was changed after the cut"]);
+    cells.0.write("city/cells/2/pages.txt", listed);
     let merged = cells.done("merge city --out whole");
+    says(&cells.0.text("whole/polish.toml"), &["export-clean = \"off\"", "strategy = \"none\""]);
     merge_is_by_place(&cells, &merged);
     assert_eq!(cells.done("merge city --out whole"), merged, "a second merge says what the first one has done");
     // As if nothing had been done; then machines in turn, each killed once it has copied a commit, the first one before.
@@ -173,13 +195,27 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
         let worker = cells.begin(&format!("{flags} --copy-every 0.05 {place}"));
         assert!(worker.once(|| cells.newest(1) > before).kill(), "{place}");
         // What a copy that is killed at its beginning leaves.
-        let part = format!("city/cells/1/copy/{}.part", cells.newest(1).unwrap() + 1);
-        std::fs::create_dir_all(cells.0.path(&part)).unwrap();
-        cells.0.write(&format!("{part}/LOCK"), "");
+        std::fs::create_dir_all(cells.0.path("city/cells/1/copy/of-1.part")).unwrap();
+        cells.0.write("city/cells/1/copy/of-1.part/LOCK", "");
     }
-    cells.done("run city --cell 1 --spill-dir two");
+    // A copy that cannot be read is passed over.
+    let damaged = format!("city/cells/1/copy/{}", cells.newest(1).unwrap() + 1);
+    std::fs::create_dir(cells.0.path(&damaged)).unwrap();
+    let (code, said) = cells.says("run city --cell 1 --spill-dir two");
+    assert_eq!(code, Some(0), "{said}");
+    says(&said, &[&damaged, "passed over"]);
+    assert!(!cells.0.exists("city/cells/1/copy/of-1.part"));
     assert!(cells.0.ply(&run_on("two")) == alone, "the scene is another");
     says(&cells.done("merge city --out again"), &[merged.split(": ").nth(1).unwrap()]);
+    // A run of other photos is not measured at the borders of this city.
+    write_city(
+        &cells.0.path("other"),
+        &CityOptions { views: 8, width: 48, height: 36, ..CityOptions::default() },
+        &|_, _| {},
+    )
+    .unwrap();
+    cells.0.train("other --out of-other --steps 4 --quiet --device cpu");
+    cells.refuses("seam city of-other", &["it is of", "other", "--scene"]);
 }
 
 /// The rows of the ring are those of the prior, bit for bit.
@@ -275,6 +311,18 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     says(&said, &["another process works on cell 0"]);
     worker.signal("TERM").ends(75);
     says(&cells.done("status city"), &["cell 0:", "waiting", "0 of 2 cells are done"]);
+    // What this machine lacks, another one may have.
+    std::fs::rename(cells.0.scene(), cells.0.path("away")).unwrap();
+    assert_eq!(cells.says("run city --cell 0").0, Some(75));
+    std::fs::rename(cells.0.path("away"), cells.0.scene()).unwrap();
+    assert_eq!(cells.says("run city --cell 0 --host-mem 1MiB").0, Some(75));
+    // A worker that was taken for lost gives its copy no name.
+    let before = cells.newest(0);
+    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > before);
+    let worker = worker.signal("STOP");
+    cells.0.write("city/cells/0/lock", "another process 1 of another machine");
+    says(&worker.signal("CONT").ends(75), &["another process has taken cell 0 over", "another machine"]);
+    std::fs::remove_file(cells.0.path("city/cells/0/lock")).unwrap();
     cells.refuses("merge city --out whole", &["cells 0, 1 are not done"]);
     for (file, from, to) in [("plan.toml", "steps = ", "steps = 1"), ("cells/1/pages.txt", "\n", " frozen\n")] {
         let file = format!("city/{file}");

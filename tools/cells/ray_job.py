@@ -30,9 +30,14 @@ class TryAgain(Exception):
 
 
 def run_cell(city: str, cell: int, flags: list[str]) -> int:
-    code = subprocess.run([PROGRAM, "run", city, "--cell", str(cell), "--quiet", *flags], check=False).returncode
-    if code == AGAIN:
-        time.sleep(PAUSE)
+    lock = pathlib.Path(city, "cells", str(cell), "lock")
+    while True:
+        code = subprocess.run([PROGRAM, "run", city, "--cell", str(cell), "--quiet", *flags], check=False).returncode
+        if code == AGAIN:
+            time.sleep(PAUSE)
+        # Waiting for another process that has the cell is no attempt.
+        if code != AGAIN or not lock.exists():
+            break
     # A signal that nobody handled, such as that of a machine without memory, gives a negative code.
     if code == AGAIN or code < 0:
         raise TryAgain(f"cell {cell}: exit code {code}")
