@@ -11,9 +11,9 @@ use gsscale::base::units::{counted, format_grouped, format_seconds};
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
-use gsscale::dataset::read::{MORE_OVERLAP, lacks_poses};
+use gsscale::dataset::read::lacks_poses;
 use gsscale::dataset::synthetic::{CityOptions, is_generated, write_city};
-use gsscale::poses::{PoseSearch, PosesRequest};
+use gsscale::poses::{PoseSearch, PosesRequest, check_found};
 use gsscale::report::live::{Live, parse_address};
 use gsscale::report::run_files::{CONFIG_FILE, PLY_FILE, REPORT_FILE, SETTINGS_FILE};
 use gsscale::train::error::TrainError;
@@ -198,14 +198,15 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
                 return Ok(RunOutcome::of_nothing(out));
             }
             let found = search.run_shown(args.quiet)?;
-            if 2 * found.registered < found.photos {
-                let problem = format!("only {} of {} photos have poses", found.registered, found.photos);
-                let remedy = format!("{MORE_OVERLAP}; to train with these: gsscale-train {}", shell_word(&found.scene));
-                return Err(InputError::new(&photos, problem, remedy).into());
-            }
+            check_found(&photos)?;
             found.scene
         }
-        Some(scene) => scene,
+        Some(scene) => {
+            if args.poses.is_some() {
+                check_found(&scene)?;
+            }
+            scene
+        }
         None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
         None => demo_scene(&out, &config, args.quiet)?,
     };

@@ -15,6 +15,7 @@ use crate::base::text::{has_raw_bytes, read_text, shown};
 use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
+use crate::config::habits::ALIASES;
 use crate::config::values::{ByteSize, Chosen, Device, LogFormat, Residence, RgbColor, Schedule, Up};
 use crate::densify::growth::Quality;
 use crate::densify::long_axis::GrowthScore;
@@ -34,6 +35,8 @@ use crate::render::SsimPadding;
 use crate::render::color_correct::ColorCorrect;
 use crate::render::metrics::SsimVariant;
 use crate::schedule::order::Order;
+use clap::Args as _;
+use clap::error::{ContextKind, ContextValue};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -376,7 +379,7 @@ impl TrainConfig {
             .map_err(|problem| InputError::new(path, problem, "see configs/default.toml for every key and its meaning"))
     }
 
-    /// Parses a config text over the defaults. Errors: the text is no TOML, or has an unknown key or word.
+    /// Parses a config text over the defaults. Errors: the text is no TOML, or has an unknown key or value.
     pub fn parse(text: &str) -> Result<TrainConfig, String> {
         Ok(TrainConfig::parse_with_keys(text)?.0)
     }
@@ -387,8 +390,26 @@ impl TrainConfig {
         for name in TABLES {
             table.remove(name);
         }
+        for (key, value) in &table {
+            TrainConfig::check_key(key, value).map_err(|problem| {
+                let name =
+                    |line: &str| line.split('=').next().unwrap_or("").trim().trim_matches(['"', '\'']).to_string();
+                let line = text.lines().position(|line| name(line) == *key);
+                line.map_or(String::new(), |at| format!("line {}: ", at + 1)) + &problem
+            })?;
+        }
         let given = table.keys().map(|key| key.replace('-', "_")).collect();
         Ok((TrainConfig::deserialize(table).map_err(|e| e.to_string())?, given))
+    }
+
+    /// Errors: there is no such key (the error has the most similar one), or the key takes no such value.
+    pub fn check_key(key: &str, value: &toml::Value) -> Result<(), String> {
+        if let Some(known) = KEYS.iter().find(|known| known.name() == key) {
+            let alone = toml::Table::from_iter([(known.name(), value.clone())]);
+            return TrainConfig::deserialize(alone).map(|_| ()).map_err(|e| format!("{key}: {}", e.message()));
+        }
+        let tip = similar_key(key).map_or(String::new(), |similar| format!("; perhaps {similar} is meant"));
+        Err(format!("there is no key {key}{tip}"))
     }
 
     /// Checks ranges and relations between keys. Not here: whether files exist and whether a run fits.
@@ -521,6 +542,20 @@ impl ConfigKey {
     pub fn name(&self) -> String {
         self.field.replace('_', "-")
     }
+}
+
+/// The key that other programs call by this name, or that the name resembles most.
+fn similar_key(name: &str) -> Option<String> {
+    let name = name.replace('_', "-");
+    let is_ours = KEYS.iter().any(|key| key.name() == name);
+    let same = ALIASES.iter().find(|(names, _)| names.contains(&name.as_str())).map(|(_, key)| (*key).to_string());
+    if let Some(key) = same.or_else(|| is_ours.then(|| name.clone())) {
+        return Some(key);
+    }
+    let flags = TrainOverrides::augment_args(clap::Command::new("keys").no_binary_name(true));
+    let error = flags.try_get_matches_from([format!("--{name}")]).err()?;
+    let ContextValue::String(flag) = error.get(ContextKind::SuggestedArg)? else { return None };
+    flag.trim_start_matches('-').split([' ', '=']).next().map(str::to_string)
 }
 
 /// Where help shows a key.
@@ -663,6 +698,20 @@ pub fn read_resolved(path: &Path) -> InputResult<Resolved> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn unknown_keys_are_refused_with_their_line_and_a_similar_key() {
+        let refusals = [
+            ("steps = 3\n\nmax_gaussians = 5", "line 3: there is no key max_gaussians; perhaps max-gaussians is meant"),
+            ("max-gausians = 5", "line 1: there is no key max-gausians; perhaps max-gaussians is meant"),
+            ("iterations = 5", "line 1: there is no key iterations; perhaps steps is meant"),
+            ("qq = 1", "line 1: there is no key qq"),
+            ("max-gaussians = \"2M\"", "line 1: max-gaussians: invalid type: string \"2M\", expected u64"),
+        ];
+        for (text, want) in refusals {
+            assert_eq!(TrainConfig::parse(text).unwrap_err(), want);
+        }
+    }
 
     #[test]
     fn values_out_of_range_are_refused_by_name() {

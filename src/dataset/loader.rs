@@ -16,11 +16,11 @@ use super::name_index::is_photo;
 use super::photo::{Alpha, PhotoSource, holds_0_and_1, intrinsics_at};
 use super::photo_files::PhotoFiles;
 use super::photo_header::read_header;
-use super::resize::{Size, divided_size, same_shape};
+use super::resize::{Size, divided_size, is_rounded_shape, same_shape};
 use super::undistort::Undistorter;
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
-use crate::base::units::counted_are;
+use crate::base::units::{counted, counted_are};
 use crate::scene::camera::Camera;
 use glam::DVec3;
 use rayon::prelude::*;
@@ -437,6 +437,24 @@ fn list_names<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
     text
 }
 
+/// The first of the errors of photos of these names, with the names of the other photos.
+pub fn first_error(errors: Vec<(&str, InputError)>) -> Option<InputError> {
+    let (mut names, mut first) = (Vec::new(), None);
+    for (name, error) in errors {
+        match first {
+            None => first = Some(error),
+            Some(_) => names.push(name),
+        }
+    }
+    first.map(|mut error| {
+        if !names.is_empty() {
+            let others = counted(names.len() as u64, "other photo");
+            error.problem.push_str(&format!(", and {others} cannot be used either: {}", list_names(names.into_iter())));
+        }
+        error
+    })
+}
+
 /// Checks headers, shapes and masks of all views, in parallel; returns the first error in view order.
 fn check_photos(
     views: &[(RawView, Split)],
@@ -450,16 +468,18 @@ fn check_photos(
     let found = index.assign(&named, warnings);
     let checked: Vec<InputResult<PhotoSource>> =
         views.par_iter().zip(found).map(|((view, _), mask)| check_photo(view, mask, options)).collect();
-    let bad = checked.iter().filter(|c| c.is_err()).count();
     let mut photos = Vec::with_capacity(checked.len());
-    for photo in checked {
-        photos.push(photo.map_err(|mut error| {
-            if bad > 1 {
-                error.problem.push_str(&format!(" ({} other photos or masks cannot be used either)", bad - 1));
-            }
-            error
-        })?);
+    let mut errors = Vec::new();
+    for ((view, _), photo) in views.iter().zip(checked) {
+        match photo {
+            Ok(photo) => photos.push(photo),
+            Err(error) => errors.push((view.name.as_str(), error)),
+        }
     }
+    if let Some(error) = first_error(errors) {
+        return Err(error);
+    }
+    warn_about_shapes(views, &photos, warnings);
     let transparent = photos.iter().filter(|p| p.is_masked_by_alpha()).count();
     if transparent > 0 {
         let have = if transparent == 1 { "photo has" } else { "photos have" };
@@ -481,6 +501,23 @@ fn check_photos(
         warnings.push(format!("{without} of {total} photos have no mask: all of their pixels are used"));
     }
     Ok(photos)
+}
+
+/// Photos whose shape differs from their camera's by more than rounding, as those do that were undistorted or cropped after the model was made.
+fn warn_about_shapes(views: &[(RawView, Split)], photos: &[PhotoSource], warnings: &mut Vec<String>) {
+    let sizes = |view: &RawView, photo: &PhotoSource| {
+        [(photo.header.width, photo.header.height), (view.intrinsics.width, view.intrinsics.height)]
+    };
+    let pairs = views.iter().zip(photos).map(|((view, _), photo)| (view, sizes(view, photo)));
+    let mut odd = pairs.filter(|(_, [photo, stated])| !is_rounded_shape(*photo, *stated));
+    if let Some((view, [photo, stated])) = odd.next() {
+        let have = counted(1 + odd.count() as u64, "photo");
+        warnings.push(format!(
+            "{have} of another shape than the camera, such as {} ({} x {}, its camera {} x {}): if the photos were undistorted or cropped \
+             after the model was made, its poses are not theirs",
+            view.name, photo.0, photo.1, stated.0, stated.1
+        ));
+    }
 }
 
 /// A mask of 0 and 1, if the first ones are such.
@@ -516,7 +553,7 @@ fn check_photo(view: &RawView, found: Option<FoundMask>, options: &LoadOptions) 
         image_path: view.image_path.clone(),
         header,
         intrinsics: intrinsics_at(&stated, size),
-        target: target_size(size, options),
+        target: target_size(size, options.data_factor, options.max_resolution),
         mask,
         alpha: if options.masks { Alpha::Mask } else { Alpha::Over(options.background) },
     })
@@ -542,10 +579,10 @@ fn of_mask(error: InputError, view: &RawView) -> InputError {
 
 /// Size of the target: the photo's divided by `data_factor`; if the longer side then exceeds `max_resolution`, the
 /// photo's scaled to that limit instead (one rounding, from the full size).
-fn target_size(photo: Size, options: &LoadOptions) -> Size {
-    let size = divided_size(photo, options.data_factor);
+pub fn target_size(photo: Size, data_factor: f64, max_resolution: Option<u32>) -> Size {
+    let size = divided_size(photo, data_factor);
     let longest = photo.0.max(photo.1);
-    match options.max_resolution {
+    match max_resolution {
         Some(limit) if size.0.max(size.1) > limit => divided_size(photo, f64::from(longest) / f64::from(limit)),
         _ => size,
     }
@@ -577,9 +614,7 @@ mod tests {
 
     #[test]
     fn targets_round_once_from_the_full_size() {
-        let with = |factor: f64, limit: Option<u32>| {
-            target_size((4608, 3456), &LoadOptions { data_factor: factor, max_resolution: limit, ..Default::default() })
-        };
+        let with = |factor: f64, limit: Option<u32>| target_size((4608, 3456), factor, limit);
         assert_eq!(with(1.0, None), (4608, 3456));
         assert_eq!(with(3.4175, None), (1348, 1011));
         assert_eq!(with(1.0, Some(1600)), (1600, 1200));

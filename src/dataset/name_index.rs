@@ -52,6 +52,20 @@ pub(super) fn photos_below(folder: &Path, deepest: usize) -> usize {
     photos_in(folder) + folders.map(|entry| photos_below(&entry.path(), deepest - 1)).sum::<usize>()
 }
 
+/// Pictures in a folder, in folders in it and theirs, that cannot be read.
+pub(super) fn unreadable_below(folder: &Path, deepest: usize) -> usize {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().take(FILES_MAX);
+    let count = |entry: std::fs::DirEntry| match entry.file_type() {
+        Ok(kind) if kind.is_dir() && deepest > 0 => unreadable_below(&entry.path(), deepest - 1),
+        Ok(kind) if kind.is_dir() => 0,
+        _ => {
+            let name = entry.file_name().to_string_lossy().into_owned();
+            usize::from(split_ending(&name).1.is_some_and(|ending| !READABLE.contains(&ending.as_str())))
+        }
+    };
+    entries.map(count).sum()
+}
+
 /// The folders in front of a name, and its last component.
 pub(super) fn split_folder(name: &str) -> (&str, &str) {
     name.rsplit_once('/').unwrap_or(("", name))

@@ -258,6 +258,9 @@ fn decode_with(decoder: impl ImageDecoder, path: &Path, header: &PhotoHeader) ->
 fn undecodable(path: &Path, e: &ImageError) -> InputError {
     match e {
         ImageError::IoError(e) => InputError::io(path, "decoding the photo", e),
-        e => InputError::new(path, format!("the picture cannot be decoded: {e}"), "copy it again from its source"),
+        e => {
+            let remedy = "copy it again from its source, or move it away and add --allow-missing";
+            InputError::new(path, format!("the picture cannot be decoded: {e}"), remedy)
+        }
     }
 }

@@ -51,13 +51,23 @@ pub(super) struct PhotoFiles {
     near: RefCell<BTreeMap<String, (String, PathBuf)>>,
     /// Names of views that were stated outside of the scene, and what was stated.
     outside: RefCell<BTreeMap<String, String>>,
+    code_page: RefCell<CodePageNames>,
 }
 
 impl PhotoFiles {
     /// The photos of a scene whose names are relative to `bases`.
     pub fn in_folders(root: &Path, bases: Vec<PathBuf>, allow_missing: bool) -> PhotoFiles {
-        let (index, listed, near, outside) = Default::default();
-        PhotoFiles { root: root.to_path_buf(), bases, skips_folder: false, allow_missing, index, listed, near, outside }
+        PhotoFiles {
+            root: root.to_path_buf(),
+            bases,
+            skips_folder: false,
+            allow_missing,
+            index: RefCell::default(),
+            listed: RefCell::default(),
+            near: RefCell::default(),
+            outside: RefCell::default(),
+            code_page: RefCell::default(),
+        }
     }
 
     /// The photos of a scene whose names include their folder: in `root` and, if the image folder is `images` (many programs'
@@ -94,7 +104,8 @@ impl PhotoFiles {
         let is_outside = read.outside.is_some();
         let written = read.tails().flat_map(|tail| self.places(tail, is_outside)).find_map(|place| look(&place));
         let bases = || self.bases.iter().chain([&self.root]);
-        let of_bytes = || Some((bases().find_map(|base| in_code_page(base, &read.name))?, String::new()));
+        let of_bytes =
+            || Some((bases().find_map(|base| self.code_page.borrow_mut().find(base, &read.name))?, String::new()));
         let found = written.or_else(of_bytes);
         let name = read.name.clone() + found.as_ref().map_or(missing_ending, |(_, ending)| ending);
         if is_outside {
@@ -220,7 +231,12 @@ impl PhotoFiles {
         }
         // A folder, a pipe, or a link to itself.
         if let Some(other) = places().find(|path| path.symlink_metadata().is_ok()) {
-            return format!("; {} is there, but is no file that can be read", other.display());
+            return match other.is_file() {
+                true => {
+                    format!("; {} is in the scene: names with their folders are read with --images .", other.display())
+                }
+                false => format!("; {} is there, but is no file that can be read", other.display()),
+            };
         }
         let mut shown = Vec::new();
         for name in missing {
@@ -278,34 +294,48 @@ fn with_ending(path: &Path, ending: &str) -> PathBuf {
     PathBuf::from(path)
 }
 
-/// The file inside `folder` that a cleaned name with bytes of a code page (Windows-1252, GBK, Shift-JIS) means; `None` if there is
-/// none, or if several may be meant, or if the name has no such bytes. The name on the drive decides: it has the same bytes, or it
-/// is the name in Windows-1252, or it is the only one that agrees in all ASCII characters.
-fn in_code_page(folder: &Path, name: &str) -> Option<PathBuf> {
-    if !has_raw_bytes(name) {
-        return None;
-    }
-    let part_in = |folder: PathBuf, part| {
-        if has_raw_bytes(part) { code_page_entry(&folder, part) } else { Some(folder.join(part)) }
-    };
-    let path = name.split('/').try_fold(folder.to_path_buf(), part_in)?;
-    path.is_file().then_some(path)
+/// Finds files by names with bytes of a code page (Windows-1252, GBK, Shift-JIS). Each folder is listed once.
+#[derive(Default)]
+struct CodePageNames {
+    /// The entries of folders by their names without characters beyond ASCII ([`ascii_of`]).
+    entries: BTreeMap<PathBuf, BTreeMap<String, Vec<String>>>,
 }
 
-/// The entry of a folder that a part of a name means.
-fn code_page_entry(folder: &Path, part: &str) -> Option<PathBuf> {
-    let known = [os_name(raw_bytes(part)), Some(as_windows_1252(part).into())];
-    let mut known = known.into_iter().flatten().map(|name| folder.join(name));
-    if let Some(path) = known.find(|path| path.exists()) {
-        return Some(path);
+impl CodePageNames {
+    /// The file inside `folder` that a cleaned name means; `None` if there is none, or if several may be meant, or if the name has no such
+    /// bytes. The name on the drive decides: it has the same bytes, or it is the name in Windows-1252, or it is the only one that agrees in
+    /// all ASCII characters.
+    fn find(&mut self, folder: &Path, name: &str) -> Option<PathBuf> {
+        if !has_raw_bytes(name) {
+            return None;
+        }
+        let part_in = |folder: PathBuf, part| {
+            if has_raw_bytes(part) { self.entry(&folder, part) } else { Some(folder.join(part)) }
+        };
+        let path = name.split('/').try_fold(folder.to_path_buf(), part_in)?;
+        path.is_file().then_some(path)
     }
-    let entries = std::fs::read_dir(folder).ok()?.flatten();
-    let entries: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
-    [false, true].into_iter().find_map(|in_pairs| {
-        let wanted = ascii_of(part, in_pairs);
-        let mut fitting = entries.iter().filter(|entry| ascii_of(entry, false) == wanted);
-        fitting.next().filter(|_| fitting.next().is_none()).map(|entry| folder.join(entry))
-    })
+
+    /// The entry of a folder that a part of a name means.
+    fn entry(&mut self, folder: &Path, part: &str) -> Option<PathBuf> {
+        let known = [os_name(raw_bytes(part)), Some(as_windows_1252(part).into())];
+        let mut known = known.into_iter().flatten().map(|name| folder.join(name));
+        if let Some(path) = known.find(|path| path.exists()) {
+            return Some(path);
+        }
+        let entries = self.entries.entry(folder.to_path_buf()).or_insert_with(|| {
+            let mut by_ascii: BTreeMap<String, Vec<String>> = BTreeMap::new();
+            for entry in std::fs::read_dir(folder).into_iter().flatten().flatten() {
+                let Ok(name) = entry.file_name().into_string() else { continue };
+                by_ascii.entry(ascii_of(&name, false)).or_default().push(name);
+            }
+            by_ascii
+        });
+        [false, true].into_iter().find_map(|in_pairs| match entries.get(&ascii_of(part, in_pairs)).map(Vec::as_slice) {
+            Some([only]) => Some(folder.join(only)),
+            _ => None,
+        })
+    }
 }
 
 /// A name with one mark for each run of characters that are not ASCII. In GBK and Shift-JIS the second byte of a character

@@ -7,7 +7,7 @@ use crate::base::units::{counted, counted_are};
 use crate::dataset::gathered::{listed, sort_views};
 use crate::dataset::model::RawScene;
 pub use crate::dataset::model::ReadOptions;
-use crate::dataset::name_index::{photos_below, photos_in};
+use crate::dataset::name_index::{photos_below, photos_in, unreadable_below};
 use crate::dataset::{colmap, mega_nerf, opensfm, reality_capture, transforms};
 use std::path::{Path, PathBuf};
 
@@ -157,7 +157,9 @@ pub const SEARCH_STATE: &str = "state.json";
 pub const SEARCH_END: &str = "model";
 /// What to do if photos have no pose.
 pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
-    blurred photos; if all is sharp and overlaps, try gsscale-poses with --max-resolution 2400";
+    blurred photos; if all is sharp and overlaps, rename the folder sparse and try gsscale-poses with --max-resolution 2400";
+/// What to do with photos that cannot be read.
+pub const CONVERT_PHOTOS: &str = "convert them to JPEG, for example with ImageMagick: mogrify -format jpg *.HEIC";
 /// Fewest photos for which poses can be found.
 pub const PHOTOS_LEAST: usize = 3;
 
@@ -191,7 +193,11 @@ fn without_poses(folder: &Path) -> Option<InputError> {
     let search = folder.join(SEARCH_FOLDER);
     let of_search = if search.join(SEARCH_STATE).is_file() { photos_below(&search, FOLDERS_DEEP - 1) } else { 0 };
     let counts = [photos_below(&images, FOLDERS_DEEP), photos_below(folder, FOLDERS_DEEP).saturating_sub(of_search)];
-    let count = counts.into_iter().find(|n| *n > 0)?;
+    let Some(count) = counts.into_iter().find(|n| *n > 0) else {
+        let others = unreadable_below(folder, FOLDERS_DEEP) as u64;
+        let problem = format!("{} here neither JPEG nor PNG", counted_are(others, "picture"));
+        return (others > 0).then(|| InputError::new(folder, problem, CONVERT_PHOTOS));
+    };
     let place = shell_word(folder);
     if let Some((file, missing)) = file_without_partner(folder) {
         let problem = format!("there is no {missing} beside it");

@@ -30,6 +30,14 @@ pub fn same_shape(size: Size, stated: Size) -> bool {
     (x / y - 1.0).abs() <= SHAPE_TOLERANCE || (w - sw * y).abs() <= 1.5 && (h - sh * x).abs() <= 1.5
 }
 
+/// Whether the sizes are equal up to scale and to the rounding of either.
+pub fn is_rounded_shape(size: Size, stated: Size) -> bool {
+    let [w, h, sw, sh] = [size.0, size.1, stated.0, stated.1].map(f64::from);
+    let (x, y) = (w / sw, h / sh);
+    let rounding = 1.5 * x.max(y).max(1.0);
+    (w - sw * y).abs() <= rounding && (h - sh * x).abs() <= rounding
+}
+
 /// The range of a source row that one target pixel covers.
 #[derive(Debug, Clone, Copy)]
 struct SourceSpan {
@@ -246,6 +254,17 @@ mod tests {
         assert_eq!(resized(&[100 * 256 + 200, 101 * 256 + 60], 1), [101]);
         for to in [1, LARGEST_SIDE - 1] {
             assert!(resized(&vec![255 * 256; LARGEST_SIDE as usize], to).iter().all(|&x| x == 255));
+        }
+    }
+
+    #[test]
+    fn shapes_are_equal_up_to_the_rounding_of_either_size() {
+        for (size, stated) in [((640, 480), (640, 480)), ((187, 140), (640, 480)), ((5472, 3648), (1600, 1066))] {
+            assert!(is_rounded_shape(size, stated) && same_shape(size, stated), "{size:?} {stated:?}");
+        }
+        // Undistorted after the model was made: used, with a warning.
+        for (size, stated) in [((640, 476), (640, 480)), ((3968, 2988), (4000, 3000))] {
+            assert!(!is_rounded_shape(size, stated) && same_shape(size, stated), "{size:?} {stated:?}");
         }
     }
 

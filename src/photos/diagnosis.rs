@@ -22,7 +22,7 @@ use super::parameter::{Curve, Finding, write_values};
 use super::visible::{points_in, visible_points};
 use crate::base::error::InputResult;
 use crate::base::units::format_grouped;
-use crate::dataset::loader::Dataset;
+use crate::dataset::loader::{Dataset, first_error};
 use crate::dataset::photo::decode;
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
@@ -165,9 +165,9 @@ pub fn finding(file: &Value) -> Option<Finding> {
     Some(Finding { title: "Photos before training", text: text.join("; ") + ".", table: None, curve })
 }
 
-/// Looks at the training photos. `points` are first points with their colours, evenly drawn from `count` points. A photo that cannot be
-/// read is passed over: training names it.
-pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagnosis {
+/// Looks at the training photos. `points` are first points with their colours, evenly drawn from `count` points.
+/// Errors: the first photo of those that cannot be read, with the names of the others.
+pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> InputResult<Diagnosis> {
     let views = dataset.train_views();
     let first = thinned(points, points.len().div_ceil(POINTS_FIRST));
     let in_view = |&view: &usize| points_in(&first, |point| point.0, &dataset.views[view].camera).len() as f64;
@@ -180,18 +180,25 @@ pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagn
     let affordable = (PIXELS_MOST as f64 / (pixels as f64 / views.len() as f64)) as usize;
     let affordable = affordable.min(DRAWN_MOST / points.len().max(1));
     let looked_at = views.len().min(affordable.max(PHOTOS_LEAST));
-    let mut photos = Vec::with_capacity(looked_at);
+    let (mut photos, mut errors) = (Vec::with_capacity(looked_at), Vec::new());
     for number in 0..looked_at {
         let view = &dataset.views[views[number * views.len() / looked_at]];
-        let Ok(photo) = decode(&view.photo) else { continue };
-        let found = PhotoLook::new(&photo, &view.camera, points).finding();
-        photos.extend(found.map(|found| PhotoFinding { name: view.name.clone(), ..found }));
+        match decode(&view.photo) {
+            Ok(photo) => {
+                let found = PhotoLook::new(&photo, &view.camera, points).finding();
+                photos.extend(found.map(|found| PhotoFinding { name: view.name.clone(), ..found }));
+            }
+            Err(error) => errors.push((view.name.as_str(), error)),
+        }
+    }
+    if let Some(error) = first_error(errors) {
+        return Err(error);
     }
     let of = |value: &dyn Fn(&PhotoFinding) -> f64| photos.iter().map(value).collect::<Vec<f64>>();
     let agreement = median(of(&|photo| photo.agreement));
     let off_most = (WRONG_OFF * median(of(&|photo| photo.off))).max(WRONG_OFF_LEAST);
     let is_wrong = |photo: &PhotoFinding| photo.agreement < WRONG_AGREEMENT * agreement && photo.off > off_most;
-    Diagnosis {
+    Ok(Diagnosis {
         photos_per_point: in_views.iter().sum::<f64>() / first.len().max(1) as f64,
         points_per_photo: share * count as f64,
         exposure_spread: spread(of(&|photo| photo.gain[1])),
@@ -203,7 +210,7 @@ pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Diagn
         are_colored: points.iter().any(|(_, color)| *color != points[0].1),
         wrong: (0..photos.len()).filter(|&number| is_wrong(&photos[number])).collect(),
         photos,
-    }
+    })
 }
 
 impl Diagnosis {

@@ -21,7 +21,7 @@ pub mod similar;
 use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
-use crate::base::units::{format_grouped, format_seconds};
+use crate::base::units::{counted, format_grouped, format_seconds};
 use crate::base::whole_file::write_whole;
 use crate::base::whole_folder::remove_ours;
 use crate::dataset::colmap::looks_like_colmap;
@@ -148,9 +148,9 @@ impl PoseSearch {
         let is_empty = |folder: &Path| std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
         if sparse.exists() && !is_empty(&sparse) {
             let remedy = format!(
-                "to train with it: gsscale-train {}; for new poses: gsscale-poses {} --out FOLDER",
+                "to train with it: gsscale-train {}; for new poses: rename {} and give the command again, or add --out FOLDER",
                 shell_word(&scene),
-                shell_word(&request.photos)
+                sparse.display()
             );
             return Err(InputError::new(sparse, "a model is here already", remedy));
         }
@@ -554,14 +554,47 @@ impl SearchState {
     }
 }
 
+/// Refuses the model that a search has left for the photos in `named`, if it is of other photos than those there now, or of less than half
+/// of them. Of a model that no search made it says nothing.
+/// Errors: it is refused, or the photos cannot be listed.
+pub fn check_found(named: &Path) -> InputResult<()> {
+    let (scene, folder) = home_of(named);
+    let Some(state) = SearchState::read(&scene.join(WORK_FOLDER)) else { return Ok(()) };
+    let (photos, _) = list_photos(&folder, &scene)?;
+    let (place, sparse) = (shell_word(&scene), scene.join(SPARSE));
+    let ways = format!(
+        "to search again, rename {} and give the command again; to train with these: gsscale-train {place}",
+        sparse.display()
+    );
+    let has = |photo: &FoundPhoto| state.photos.iter().any(|of| of.name == photo.name && of.bytes == photo.bytes);
+    let new = photos.iter().filter(|photo| !has(photo)).count();
+    if new > 0 {
+        let problem = format!("the poses there are from a search without {}", counted(new as u64, "photo"));
+        return Err(InputError::new(named, problem, ways));
+    }
+    let registered = read_scene(&scene, &ReadOptions { allow_missing: true, ..ReadOptions::default() })?.views.len();
+    if 2 * registered < photos.len() {
+        let problem = format!("only {registered} of {} photos have poses", photos.len());
+        return Err(InputError::new(named, problem, format!("{MORE_OVERLAP}; {ways}")));
+    }
+    Ok(())
+}
+
 /// The folder of the scene whose photos are named, and the folder of the photos.
 fn home_of(named: &Path) -> (PathBuf, PathBuf) {
     let images = named.join("images");
     if images.is_dir() {
         return (named.to_path_buf(), images);
     }
-    match named.parent().filter(|above| !above.as_os_str().is_empty()) {
-        Some(above) if named.file_name().is_some_and(|name| name == "images") => {
+    // The user may be inside: `images`, or `.` there.
+    let whole = std::path::absolute(named).unwrap_or_else(|_| named.to_path_buf());
+    let above = match (named.parent(), named.file_name()) {
+        (Some(above), Some(_)) if above.as_os_str().is_empty() => Some(Path::new(".")),
+        (Some(above), Some(_)) => Some(above),
+        _ => whole.parent(),
+    };
+    match above {
+        Some(above) if whole.file_name().is_some_and(|name| name == "images") => {
             (above.to_path_buf(), named.to_path_buf())
         }
         _ => (named.to_path_buf(), named.to_path_buf()),
@@ -717,6 +750,8 @@ mod tests {
         assert_eq!(home_of(&above), (above.clone(), images.clone()));
         assert_eq!(home_of(&images), (above, images.clone()));
         assert_eq!(home_of(root.path()), (root.path().to_path_buf(), root.path().to_path_buf()));
+        // From inside of the scene.
+        assert_eq!(home_of(Path::new("images")), (PathBuf::from("."), PathBuf::from("images")));
     }
 
     #[test]

@@ -8,6 +8,7 @@ use crate::base::units::{counted, counted_are};
 use crate::dataset::exif::{GpsPlace, camera_and_place};
 use crate::dataset::masks::FOLDERS as MASK_FOLDERS;
 use crate::dataset::photo_header::{PhotoHeader, read_header};
+use crate::dataset::read::{CONVERT_PHOTOS, SEARCH_FOLDER, SEARCH_STATE};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::Metadata;
@@ -73,7 +74,8 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
             Some(first) => format!("{} can be read ({first})", counted(photos.len() as u64, "photo")),
             None => format!("{} here (JPEG or PNG)", counted_are(photos.len() as u64, "photo")),
         };
-        return Err(InputError::new(folder, problem, "name a folder with at least three photos that overlap"));
+        let remedy = if others > 0 { CONVERT_PHOTOS } else { "name a folder with at least three photos that overlap" };
+        return Err(InputError::new(folder, problem, remedy));
     }
     Ok((photos, said))
 }
@@ -82,6 +84,19 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
 pub(super) fn modified_at(file: &Metadata) -> u64 {
     let since = file.modified().ok().and_then(|at| at.duration_since(UNIX_EPOCH).ok());
     since.map_or(0, |since| since.as_nanos() as u64)
+}
+
+/// Refuses photos in the folder of the scene, among those that are searched. Its links of an earlier search are none.
+fn refuse_photos_in(scene: &Path) -> InputResult<()> {
+    let mut names = Vec::new();
+    if !scene.join(SEARCH_FOLDER).join(SEARCH_STATE).is_file() {
+        add_names(scene, None, "", &mut names, &mut 0)?;
+    }
+    if names.is_empty() {
+        return Ok(());
+    }
+    let problem = format!("its {} would be left out", counted(names.len() as u64, "photo"));
+    Err(InputError::new(scene, problem, "name a folder without photos with --out"))
 }
 
 /// Adds the names of photos in `folder`; counts pictures that are not used. `scene` is left out.
@@ -108,8 +123,11 @@ fn add_names(
             continue;
         } else if kind.is_dir() {
             let is_scene = || scene.is_some_and(|scene| path.canonicalize().is_ok_and(|path| path == scene));
-            if !is_deep && !OTHERS.contains(&folded.as_str()) && !MASK_FOLDERS.contains(&folded.as_str()) && !is_scene()
-            {
+            if is_deep || OTHERS.contains(&folded.as_str()) || MASK_FOLDERS.contains(&folded.as_str()) {
+                continue;
+            } else if is_scene() {
+                refuse_photos_in(&path)?;
+            } else {
                 add_names(&path, scene, &format!("{prefix}{name}/"), names, others)?;
             }
         } else if is_photo {
@@ -213,7 +231,8 @@ pub(super) mod tests {
     #[test]
     fn folders_of_masks_and_the_scene_are_left_out() {
         let root = tempfile::tempdir().unwrap();
-        for name in ["x/1.jpg", "x/2.JPG", "_masks/1.jpg", "out/images/1.jpg", "x/3.heic", "x/1.dng"] {
+        let state = "out/poses/state.json";
+        for name in ["x/1.jpg", "x/2.JPG", "_masks/1.jpg", "out/images/1.jpg", state, "x/3.heic", "x/1.dng"] {
             std::fs::create_dir_all(root.path().join(name).parent().unwrap()).unwrap();
             std::fs::write(root.path().join(name), b"").unwrap();
         }
@@ -222,6 +241,10 @@ pub(super) mod tests {
         add_names(root.path(), Some(&scene), "", &mut names, &mut others).unwrap();
         names.sort();
         assert_eq!((names, others), (vec!["x/1.jpg".to_string(), "x/2.JPG".to_string()], 1));
+        // Photos that no search has put there.
+        std::fs::remove_file(root.path().join(state)).unwrap();
+        let error = add_names(root.path(), Some(&scene), "", &mut Vec::new(), &mut 0).unwrap_err();
+        assert_eq!(error.problem, "its 1 photo would be left out");
     }
 
     #[test]

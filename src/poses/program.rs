@@ -6,6 +6,7 @@
 //! Invariant: what a program prints goes to the log, never to the terminal.
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::say::shell_word;
 use serde_json::json;
 use std::fs::File;
 use std::io::Read;
@@ -17,6 +18,8 @@ use std::time::Duration;
 const OLDEST: (u32, u32) = (3, 8);
 /// What pycolmap runs.
 const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
+/// What it says of a version that it cannot use, before its number.
+const OLD_PYCOLMAP: &str = "old pycolmap ";
 /// Lines of the log that an error shows.
 const LAST_LINES: usize = 6;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
@@ -116,11 +119,29 @@ impl Program {
         if colmap.as_ref().is_ok_and(|program| program.uses_gpu) {
             return colmap;
         }
-        let named = std::env::var_os("GSSCALE_PYTHON").map(|path| whole(&PathBuf::from(path)));
-        let pythons = named.into_iter().chain(["python3", "python"].map(PathBuf::from));
-        let found = pythons.map(|python| Program::pycolmap(&python)).find_map(Result::ok);
+        let named = std::env::var_os("GSSCALE_PYTHON").map(|path| Program::pycolmap(&whole(&PathBuf::from(path))));
+        if let Some(Err(error)) = &named
+            && error.kind == Some(std::io::ErrorKind::NotFound)
+        {
+            return of_user(Err(error.clone()), "GSSCALE_PYTHON");
+        }
+        let others = ["python3", "python"].into_iter().map(|python| Program::pycolmap(Path::new(python)));
+        // One that is there and does not work is told before one that is not there.
+        let (mut found, mut broken) = (None, None);
+        for python in named.into_iter().chain(others) {
+            match python {
+                Ok(program) if found.is_none() => found = Some(program),
+                Err(error) if error.problem.contains(OLD_PYCOLMAP) || is_broken(&error) => {
+                    broken.get_or_insert(error);
+                }
+                _ => {}
+            }
+        }
         found.map_or(colmap, Ok).map_err(|mut error| {
             if error.kind == Some(std::io::ErrorKind::NotFound) {
+                if let Some(broken) = broken {
+                    return broken;
+                }
                 error.problem = "neither COLMAP nor a Python with pycolmap is on this machine".to_string();
             }
             error
@@ -147,6 +168,11 @@ impl Program {
 
     fn pycolmap(python: &Path) -> InputResult<Program> {
         let said = said_by(python, &["-c", SCRIPT, "version", "{}"])?;
+        if let Some(old) = said.lines().find_map(|line| line.strip_prefix(OLD_PYCOLMAP)) {
+            let problem = format!("{OLD_PYCOLMAP}{old} is there, and 3.13 or newer is needed");
+            let remedy = format!("{} -m pip install --upgrade pycolmap", shell_word(python));
+            return Err(InputError::new(python, problem, remedy));
+        }
         let Some(name) = said.lines().find(|line| line.starts_with("pycolmap ")) else {
             let last = said.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("nothing");
             return Err(InputError::new(
@@ -299,6 +325,11 @@ fn said_by(path: &Path, arguments: &[&str]) -> InputResult<String> {
         .output()
         .map_err(|e| InputError { remedy: INSTALL.to_string(), ..InputError::io(path, "starting the program", &e) })?;
     Ok([output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).join("\n"))
+}
+
+/// Whether the error is of a pycolmap that is there and cannot be loaded.
+fn is_broken(error: &InputError) -> bool {
+    error.problem.contains("Error: ") && !error.problem.contains("No module named 'pycolmap'")
 }
 
 /// Major and minor version in the first line of COLMAP's help: `COLMAP 3.12.0.dev0 -- Structure-from-Motion ...`.

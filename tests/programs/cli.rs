@@ -6,6 +6,7 @@ use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
 use gsscale::config::habits::ADVICE;
 use gsscale::config::values::choices;
+use std::path::Path;
 use std::process::{Command, Output};
 
 /// Asserts that the run trains to the end; returns stderr.
@@ -245,15 +246,33 @@ fn held_out_photos_that_are_masked_count_for_nothing() {
     assert!(work.summary("none")["test"].is_null(), "{said}");
 }
 
+/// Damages the pixels of a photo of 96x64 whose header and end stay intact, so that it passes at load.
+fn damage_pixels(path: &Path) {
+    image::RgbImage::new(96, 64).save_with_format(path, image::ImageFormat::Png).unwrap();
+    let mut bytes = std::fs::read(path).unwrap();
+    bytes[45] ^= 0xff;
+    std::fs::write(path, bytes).unwrap();
+}
+
+/// All at once, and before the run has a folder.
+#[test]
+fn photos_that_cannot_be_decoded_are_named_before_training() {
+    let (work, model) = Workdir::small_model();
+    let names = [1, 3, 10].map(|i| model.views[i].name.as_str());
+    let photos = names.map(|name| work.path("scene/images").join(name));
+    let refused = |flags: &str| work.refuses(flags, &[&names[..], &["2 other photos", "--allow-missing"]].concat());
+    photos.iter().for_each(|photo| damage_pixels(photo));
+    refused("scene --out out --steps 20 --device cpu");
+    refused("scene --dry-run --device cpu");
+    assert!(!work.exists("out"));
+    photos.iter().for_each(|photo| std::fs::remove_file(photo).unwrap());
+    trains(&work, "--allow-missing");
+}
+
 #[test]
 fn a_held_out_photo_that_cannot_be_decoded_loses_no_run() {
     let (work, model) = Workdir::small_model();
-    // Header and end are intact, so the photo passes at load; the pixels between are damaged.
-    let path = work.path("scene/images").join(&model.views[0].name);
-    image::RgbImage::new(96, 64).save_with_format(&path, image::ImageFormat::Png).unwrap();
-    let mut bytes = std::fs::read(&path).unwrap();
-    bytes[45] ^= 0xff;
-    std::fs::write(&path, bytes).unwrap();
+    damage_pixels(&work.path("scene/images").join(&model.views[0].name));
     let said = trains(&work, "--eval-every 6");
     let named = format!("the held-out photo '{}' cannot be read and is not compared", model.views[0].name);
     assert_eq!(said.matches(&named).count(), 2, "{said}");

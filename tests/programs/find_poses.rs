@@ -101,7 +101,16 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     // The flight is some 60 m above a flat park, so its own scale and height are known to a metre or two.
     assert!(errors[errors.len() / 2] < 1.0 && errors[errors.len() - 1] < 4.0, "{errors:?}");
     assert!(raw.views.iter().all(|view| -view.pose.rotation.row(2).z > 0.95), "cameras that looked down do not");
-    work.refuses_with(POSES, "photos --out scan", &["a model is here already", "gsscale-train scan"]);
+    work.refuses_with(
+        POSES,
+        "photos --out scan",
+        &["a model is here already", "gsscale-train scan", "rename scan/sparse"],
+    );
+    // A photo that came later has no pose: whoever asks for poses is told.
+    work.succeeds(TRAIN, "scan --out out --dry-run --poses auto");
+    std::fs::copy(work.path("scan/images/photo 0018.JPG"), work.path("scan/images/later.jpg")).unwrap();
+    work.refuses("scan --dry-run --poses auto", &["a search without 1 photo", "rename scan/sparse"]);
+    std::fs::remove_file(work.path("scan/images/later.jpg")).unwrap();
 
     // Finished phases are not done again: without a model in the scene it is written again from what is there.
     let database = || std::fs::metadata(work.path("scan/poses/database.db")).unwrap().modified().unwrap();
@@ -162,6 +171,9 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     work.remove("scene/sparse");
     refused("scene --colmap nowhere/colmap", &["nowhere/colmap", "no such program", "leave --colmap out"]);
     let without = work.command(POSES, "scene").env("PATH", "").env_remove("GSSCALE_PYTHON").output().unwrap();
+    let misnamed =
+        work.command(POSES, "scene").env("PATH", "").env("GSSCALE_PYTHON", "nowhere/python").output().unwrap();
+    says(&stderr(&misnamed), &["nowhere/python", "no such program", "leave GSSCALE_PYTHON out"]);
     says(&stderr(&without), &["neither COLMAP nor a Python with pycolmap", "pip install pycolmap", "--colmap PATH"]);
     // A program that is no COLMAP, and a Python that is none.
     let echo = if cfg!(unix) { "/bin/echo" } else { "hostname" };
@@ -175,6 +187,13 @@ fn what_cannot_work_is_refused_with_a_remedy() {
         std::fs::copy(&photo, work.path("card/DCIM").join(photo.file_name().unwrap())).unwrap();
     }
     refused("card", &["sub-folders", "DCIM/", "--out"]);
+    refused("card --out card/DCIM", &["DCIM", "3 photos would be left out"]);
+    // Pictures of a telephone.
+    std::fs::create_dir(work.path("heic")).unwrap();
+    (0..4).for_each(|i| work.write(&format!("heic/IMG_{i}.HEIC"), "?"));
+    refused("heic", &["neither JPEG nor PNG", "convert them"]);
+    work.refuses("heic --poses auto", &["neither JPEG nor PNG", "convert them"]);
+    work.refuses("heic", &["4 pictures are here neither JPEG nor PNG", "convert them"]);
     // A folder of the name of ours, and photos in the place of links.
     if let Some(python) = python_with("pycolmap") {
         let program = format!("--python {python}");

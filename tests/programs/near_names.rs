@@ -28,6 +28,24 @@ fn rename_photos(folder: &Path, new: impl Fn(&str) -> String) {
     }
 }
 
+/// COLMAP ran with the scene as its folder of photos, so its names begin with the folders in it.
+#[test]
+fn photos_in_several_folders_of_a_scene_are_found() {
+    let (work, mut model) = Workdir::small_model();
+    let (expected, _) = run(&work);
+    for (i, view) in model.views.iter_mut().enumerate() {
+        let name = format!("cam{}/{}", i / 6, view.name);
+        fs::create_dir_all(work.path(&format!("scene/cam{}", i / 6))).unwrap();
+        fs::rename(work.path(&format!("scene/images/{}", view.name)), work.path(&format!("scene/{name}"))).unwrap();
+        view.name = name;
+    }
+    fs::remove_dir(work.path("scene/images")).unwrap();
+    model.write(&work.scene());
+    let (ply, said) = run(&work);
+    assert!(ply == expected && said.contains("the photos are read from cam0, cam1"), "{said}");
+    work.refuses("scene --dry-run --images cam0", &["6 of 12 photos are missing", "--images ."]);
+}
+
 #[test]
 fn models_whose_names_nearly_match_train_as_if_they_matched() {
     let (work, model) = Workdir::small_model();

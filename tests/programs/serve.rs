@@ -87,6 +87,12 @@ fn a_page_shows_the_run_and_changes_no_byte_of_it() {
     let rebound = served.get_as("/status", "evil.example").0;
     assert!(rebound.starts_with("HTTP/1.1 403"), "a name of another site: {rebound}");
 
+    let asked_by =
+        |site: &str, path: &str| served.get_as(path, &format!("{}\r\nSec-Fetch-Site: {site}", served.address)).0;
+    assert!(asked_by("cross-site", "/picture?show=photo").starts_with("HTTP/1.1 403"), "a page of another site");
+    assert!(asked_by("same-origin", "/status").starts_with("HTTP/1.1 200"));
+    assert!(asked_by("cross-site", "/").starts_with("HTTP/1.1 200"), "a link");
+
     let status = served.json("/status");
     assert!(status["step"].as_u64().unwrap() > 0 && status["steps"] == 1600, "{status}");
     assert!(status["gaussians"].as_u64().unwrap() >= 6000 && status["views"].as_u64().unwrap() > 3, "{status}");
@@ -192,6 +198,9 @@ fn a_finished_run_is_shown_beside_its_photos() {
     work.refuses_with(VIEW, "out/point_cloud.spz", &["point_cloud.spz", "does not exist"]);
     work.refuses_with(VIEW, "scene", &["this folder holds no run", "gsscale-view runs/NAME"]);
     work.write("bare.ply", work.bytes("out/point_cloud.ply"));
+    std::fs::create_dir(work.path("copied")).unwrap();
+    std::fs::copy(work.path("bare.ply"), work.path("copied/point_cloud.ply")).unwrap();
+    work.succeeds(EVAL, "copied scene --device cpu");
     work.refuses_with(VIEW, "bare.ply", &["bare.ply", "name the scene: gsscale-view FILE SCENE"]);
 }
 

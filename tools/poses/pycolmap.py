@@ -46,12 +46,14 @@ def reconstruct(database, photos, model):
 
 def version():
     # Names that versions before 3.13 lack.
-    pycolmap.FeatureExtractionOptions().sift
-    pycolmap.match_image_pairs
+    if not hasattr(pycolmap, "FeatureExtractionOptions") or not hasattr(pycolmap, "match_image_pairs"):
+        print("old pycolmap", pycolmap.__version__)
+        return
     print("pycolmap", pycolmap.__version__, "with CUDA" if pycolmap.has_cuda else "")
 
 
 if __name__ == "__main__":
-    pycolmap.logging.logtostderr = True
     phase, arguments = sys.argv[1], json.loads(sys.argv[2])
+    if phase != "version":
+        pycolmap.logging.logtostderr = True
     {"features": extract, "matches": match, "model": reconstruct, "version": version}[phase](**arguments)

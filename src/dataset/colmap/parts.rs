@@ -109,6 +109,11 @@ pub(super) fn image_folders(
         return Ok(vec![scene.to_path_buf()]);
     }
     let found = folders.iter().map(|path| name(path)).collect::<Vec<_>>().join(", ");
+    // The model was made of all of them: its names begin with the folders.
+    if options.images.is_none() && folders.len() > 1 {
+        warnings.push(format!("{} does not exist: the photos are read from {found}", stated.display()));
+        return Ok(vec![scene.to_path_buf()]);
+    }
     let problem = match folders.is_empty() {
         true => String::from("the image folder does not exist"),
         false => format!("the image folder does not exist; these hold pictures: {found}"),

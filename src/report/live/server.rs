@@ -116,14 +116,18 @@ async fn serve(listener: TcpListener, app: Router) -> io::Result<()> {
 }
 
 /// Refuses a request to a loopback address whose host name is not this machine's. Otherwise a page of another site could read the
-/// answer by resolving its own name to the loopback address (DNS rebinding).
+/// answer by resolving its own name to the loopback address (DNS rebinding). Pages of other sites cannot embed pictures either: browsers say
+/// where a request comes from.
 async fn check_host(State(live): State<Live>, request: Request, next: Next) -> Response {
     let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok()).unwrap_or_default();
     // Without its port; an IPv6 address stands in brackets.
     let name = host.rsplit_once(':').filter(|_| !host.ends_with(']')).map_or(host, |(name, _)| name);
     let is_own = name == "localhost" || name.trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+    let site = request.headers().get("sec-fetch-site").and_then(|site| site.to_str().ok());
+    // A link of another page may lead here.
+    let is_foreign = request.uri().path() != "/" && site.is_some_and(|site| !["same-origin", "none"].contains(&site));
     // Any name if the network sees the page.
-    match is_own || !live.address().ip().is_loopback() {
+    match !is_foreign && (is_own || !live.address().ip().is_loopback()) {
         true => next.run(request).await,
         false => (StatusCode::FORBIDDEN, "this page answers only requests to its own address").into_response(),
     }

@@ -38,7 +38,9 @@ impl ModelOfRun {
         refuse_folder_of_sogs(model)?;
         let file = if is_run { model.join(PLY_FILE) } else { model.to_path_buf() };
         if let Some(scene) = scene {
-            return Ok(ModelOfRun { file, scene, config: is_run.then(|| model.join(CONFIG_FILE)) });
+            // A folder that another program wrote has no config.
+            let config = is_run.then(|| model.join(CONFIG_FILE)).filter(|config| config.is_file());
+            return Ok(ModelOfRun { file, scene, config });
         }
         let (scene, config) = scene_of(program, &file)?;
         Ok(ModelOfRun { file, scene, config: Some(config) })

@@ -22,7 +22,7 @@ use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::check_usable;
 use crate::photos::exposure::AppearanceMode;
-use crate::report::live::{Live, Status};
+use crate::report::live::{Live, PictureKind, Status};
 use crate::report::run_files::{METRICS_FILE, saved_ply_name, saved_step};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
@@ -157,7 +157,8 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
             live.show((ticket, orbit), Err(format!("no Gaussians of step {} are saved", orbit.step)));
             continue;
         }
-        if shown.as_ref().is_none_or(|shown| shown.step != orbit.step) {
+        let is_shown = |shown: &ShownScene| shown.step == orbit.step || orbit.show == PictureKind::Photo;
+        if !shown.as_ref().is_some_and(is_shown) {
             // Not both in memory.
             if let Some(before) = shown.take() {
                 before.close();

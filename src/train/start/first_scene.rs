@@ -268,11 +268,11 @@ impl Start {
     }
 
     /// What the training photos say before training; `None` where the run starts from Gaussians or random points.
-    /// Errors: the points cannot be read.
+    /// Errors: the points or a photo cannot be read.
     pub(crate) fn diagnose(&self) -> InputResult<Option<Diagnosis>> {
         let mut points = EvenSample::new(POINTS_MOST);
         self.for_each_point(&mut |position, color| points.add((position, color)))?;
-        Ok((points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)))
+        (points.seen > 0).then(|| diagnose(&self.dataset, &points.kept, points.seen)).transpose()
     }
 
     /// Some of the first points; none where the run starts from Gaussians or random points.
