@@ -52,6 +52,8 @@ mod report;
 #[cfg(unix)]
 mod resume;
 mod serve;
+#[cfg(unix)]
+mod soak;
 mod sweeps;
 #[cfg(target_os = "linux")] // /dev/full, and the options of GNU env
 mod terminal;

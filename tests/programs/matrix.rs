@@ -16,10 +16,10 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::process::Command;
 
-struct Feature {
-    name: &'static str,
+pub struct Feature {
+    pub name: &'static str,
     scene: fn() -> Workdir,
-    flags: &'static str,
+    pub flags: &'static str,
     /// With each of these the scene is another.
     matters: &'static [&'static str],
     /// What the undisturbed run, in `alone`, must show beside.
@@ -33,7 +33,7 @@ const COMMON: &str = "scene --quiet --device cpu --page-rows 32 --steps 120 --vi
 /// The features, and a test of each.
 macro_rules! features {
     ($($name:ident: $scene:expr, $flags:expr, without [$($other:literal),*], shows $shows:expr;)*) => {
-        const FEATURES: &[Feature] = &[$(Feature {
+        pub const FEATURES: &[Feature] = &[$(Feature {
             name: stringify!($name),
             scene: $scene,
             flags: $flags,
@@ -243,11 +243,11 @@ const DEVICE: usize = 7;
 const VALUES: [usize; 8] = [FEATURES.len(), 5, 2, 4, 3, 5, 3, 4];
 
 /// The value 0 is for runs in memory. For moments of 16 bits their own codec stands for `raw`.
-const ENGINES: [&str; 4] = ["", "uring", "pread", "mmap"];
-const CODECS: [&str; 3] = ["", "raw", "zstd:1"];
+pub const ENGINES: [&str; 4] = ["", "uring", "pread", "mmap"];
+pub const CODECS: [&str; 3] = ["", "raw", "zstd:1"];
 /// The signal, if any, and whether the run goes on with other threads and in another place.
 const ENDS: [(&str, bool); 5] = [("", false), ("KILL", false), ("KILL", true), ("INT", false), ("INT", true)];
-const HABITS: [&str; 3] =
+pub const HABITS: [&str; 3] =
     ["", "--image-cache 1KiB --evict lru --prefetch-bytes 1MiB", "--transfers demand --commit-every 0.01"];
 
 type Row = [usize; 8];
@@ -323,11 +323,42 @@ fn results(work: &Workdir, out: &str) -> (BTreeMap<PathBuf, Vec<u8>>, Vec<Value>
 }
 
 /// What the undisturbed run of a feature took.
-struct Alone {
-    pages: u64,
+pub struct Alone {
+    pub pages: u64,
     /// The most pages of a step.
-    pinned: u64,
+    pub pinned: u64,
     device_bytes: u64,
+}
+
+/// A feature's scene, and its run that nothing disturbs, in `alone`.
+pub struct World {
+    pub work: Workdir,
+    pub flags: String,
+    want: (BTreeMap<PathBuf, Vec<u8>>, Vec<Value>),
+    pub alone: Alone,
+}
+
+impl World {
+    pub fn of(feature: &Feature) -> World {
+        let (work, flags) = ((feature.scene)(), format!("{COMMON} {}", feature.flags));
+        work.train(&format!("{flags} --out alone"));
+        let want = results(&work, "alone");
+        let peaks = work.metrics("alone").into_iter().filter_map(|line| line["device_bytes_peak"].as_u64());
+        let [pages, pinned] = ["pages", "pages_pinned_max"].map(|key| work.count("alone", key));
+        let alone = Alone { pages, pinned, device_bytes: peaks.max().unwrap() };
+        World { work, flags, want, alone }
+    }
+
+    /// The results in `out` are those of the run that nothing disturbs.
+    #[track_caller]
+    pub fn is_matched_by(&self, out: &str, what: &str) {
+        let (got, want) = (results(&self.work, out), &self.want);
+        assert!(got.0.keys().eq(want.0.keys()), "{what}: {:?} instead of {:?}", got.0.keys(), want.0.keys());
+        let differ: Vec<_> =
+            got.0.iter().filter(|(file, bytes)| &want.0[*file] != *bytes).map(|(file, _)| file).collect();
+        assert!(differ.is_empty(), "{what}: other bytes in {differ:?}");
+        assert_eq!(got.1, want.1, "{what}: other values");
+    }
 }
 
 fn holds(name: &str) {
@@ -335,27 +366,17 @@ fn holds(name: &str) {
     if feature.flags.contains("--device gpu") && a_device().is_none() {
         return;
     }
-    let work = (feature.scene)();
-    let flags = format!("{COMMON} {}", feature.flags);
-    work.train(&format!("{flags} --out alone"));
-    (feature.shows)(&work);
-    let want = results(&work, "alone");
+    let world = World::of(feature);
+    let World { work, flags, alone, .. } = &world;
+    (feature.shows)(work);
     for other in feature.matters {
         work.train(&format!("{flags} --out other --overwrite {other}"));
         assert!(work.ply("other") != work.ply("alone"), "{name} {other} changes nothing, so the rows show little");
     }
-    let peaks = work.metrics("alone").iter().filter_map(|line| line["device_bytes_peak"].as_u64()).collect::<Vec<_>>();
-    let [pages, pinned] = ["pages", "pages_pinned_max"].map(|key| work.count("alone", key));
-    let alone = Alone { pages, pinned, device_bytes: peaks.into_iter().max().unwrap() };
     let mut moved = 0;
     for row in matrix().into_iter().filter(|row| row[FEATURE] == number) {
-        let what = live(&work, &flags, &row, &alone);
-        let got = results(&work, "out");
-        assert!(got.0.keys().eq(want.0.keys()), "{what}: {:?} instead of {:?}", got.0.keys(), want.0.keys());
-        let differ: Vec<_> =
-            got.0.iter().filter(|(file, bytes)| &want.0[*file] != *bytes).map(|(file, _)| file).collect();
-        assert!(differ.is_empty(), "{what}: other bytes in {differ:?}");
-        assert_eq!(got.1, want.1, "{what}: other values");
+        let what = live(work, flags, &row, alone);
+        world.is_matched_by("out", &what);
         let [frames, pages, evictions] = ["frames", "pages", "evictions"].map(|key| work.count("out", key));
         assert!(frames >= pages || evictions > 0, "{what}: no page left its frame");
         moved += evictions;
@@ -445,7 +466,7 @@ fn ends_early(mut run: Running, signal: &str) -> bool {
 }
 
 /// The engine, if it works here: containers often forbid io_uring.
-fn engine(name: &'static str) -> &'static str {
+pub fn engine(name: &'static str) -> &'static str {
     let folder = tempfile::tempdir().unwrap();
     if open_engine(name.parse().unwrap(), folder.path(), 4).is_ok() {
         return name;
