@@ -146,8 +146,8 @@ pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
 
 /// Prints one line per adapter, and one for the CPU renderer, which always exists.
 fn list_devices() {
-    for adapter in gsscale::gpu::list_adapters() {
-        gsscale::say!("{adapter}");
+    for (number, adapter) in (1..).zip(gsscale::gpu::list_adapters()) {
+        gsscale::say!("#{number} {adapter}");
     }
     gsscale::say!("cpu: the CPU renderer");
 }

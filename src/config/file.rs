@@ -352,8 +352,8 @@ config_keys! {
         threads: u32 = 0 => Free;
         /// Instruction path: auto, avx512, avx2 or baseline. Each path always gives the same bits
         simd: Chosen<SimdPath> = Chosen(None) => Instructions hidden;
-        /// Renderer: auto (a hardware GPU, else the CPU), gpu (also a software adapter), cpu, or part of a name from
-        /// --list-devices
+        /// Renderer: auto (a hardware GPU, else the CPU), gpu (also a software adapter), cpu, or a number (#2) or part of a
+        /// name from --list-devices
         device: Device = Device::Gpu(DeviceChoice::Auto) => Free common;
         /// Memory limit on the device; 0 = all of its memory
         device_mem: ByteSize = ByteSize(0) => Free;

@@ -448,9 +448,9 @@ impl std::str::FromStr for Device {
             "cpu" => Ok(Device::Cpu),
             "auto" => Ok(Device::Gpu(DeviceChoice::Auto)),
             "gpu" => Ok(Device::Gpu(DeviceChoice::Gpu)),
-            name if name.trim().is_empty() => {
-                Err(format!("unknown --device '{name}': use auto, gpu, cpu, or a part of a name from --list-devices"))
-            }
+            name if name.trim().is_empty() => Err(format!(
+                "unknown --device '{name}': use auto, gpu, cpu, or a number (#2) or a part of a name from --list-devices"
+            )),
             name => Ok(Device::Gpu(DeviceChoice::Named(name.to_string()))),
         }
     }

@@ -169,6 +169,14 @@ pub(super) fn limits_to_request(has: &wgpu::Limits) -> wgpu::Limits {
     }
 }
 
+/// Whether a name, in part and in any case, means the adapter: `4090`, `vulkan`, or `#2` for the second of the list.
+fn is_named(adapter: &AdapterSummary, number: usize, name: &str) -> bool {
+    match name.strip_prefix('#') {
+        Some(wanted) => wanted.parse() == Ok(number),
+        None => format!("{} ({})", adapter.name, adapter.backend).to_lowercase().contains(&name.to_lowercase()),
+    }
+}
+
 /// The best adapter that `choice` means.
 pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, AdapterSummary)> {
     let all = adapters();
@@ -177,15 +185,16 @@ pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, Adapter
     } else {
         all.iter().map(|(_, s)| s.to_string()).collect::<Vec<_>>().join("; ")
     };
-    let fits = |s: &AdapterSummary| {
+    let fits = |number: usize, s: &AdapterSummary| {
         s.refusal.is_none()
             && match choice {
                 DeviceChoice::Auto => s.kind != DeviceKind::Software,
                 DeviceChoice::Gpu => true,
-                DeviceChoice::Named(name) => s.name.to_lowercase().contains(&name.to_lowercase()),
+                DeviceChoice::Named(name) => is_named(s, number, name),
             }
     };
-    all.into_iter().find(|(_, s)| fits(s)).ok_or_else(|| match choice {
+    let found_at = (1..).zip(&all).position(|(number, (_, s))| fits(number, s));
+    found_at.and_then(|at| all.into_iter().nth(at)).ok_or_else(|| match choice {
         DeviceChoice::Auto => GpuError::NoHardwareGpu { found },
         DeviceChoice::Gpu => GpuError::NoSuchDevice { wanted: "gpu".into(), found },
         DeviceChoice::Named(name) => GpuError::NoSuchDevice { wanted: name.clone(), found },
@@ -195,6 +204,27 @@ pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, Adapter
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn adapters_of_one_name_are_told_apart_by_their_number_or_their_api() {
+        let adapter = AdapterSummary {
+            name: "NVIDIA RTX 4090".into(),
+            kind: DeviceKind::Discrete,
+            backend: "Dx12".into(),
+            max_binding_bytes: 0,
+            max_buffer_bytes: 0,
+            workgroup_storage_bytes: 0,
+            subgroup_sizes: None,
+            timestamps: false,
+            refusal: None,
+        };
+        for name in ["rtx 4090", "4090 (dx12", "dx12", "#2"] {
+            assert!(is_named(&adapter, 2, name), "{name}");
+        }
+        for name in ["vulkan", "#1", "#", "#22"] {
+            assert!(!is_named(&adapter, 2, name), "{name}");
+        }
+    }
 
     #[test]
     fn direct3d_without_its_new_compiler_says_what_is_missing() {

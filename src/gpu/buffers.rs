@@ -199,7 +199,7 @@ impl Pool {
     }
 
     /// Asks the driver for a buffer and counts it. After a refusal of a needed buffer all free buffers go back to the device, once it
-    /// has finished with them; a second refusal lowers the budget to what is allocated.
+    /// has finished with them; a second refusal lowers the budget below what would have been allocated.
     fn allocate(
         &self,
         state: &mut PoolState,
@@ -223,7 +223,7 @@ impl Pool {
         let raw = asked.map_err(|error| match error {
             GpuError::OutOfMemory { .. } => {
                 if is_needed {
-                    state.budget = state.usage.allocated;
+                    state.budget = state.budget.min(state.usage.allocated + size - 1);
                 }
                 GpuError::DeviceFull { what: label.into(), need: size, in_use: state.usage.in_use }
             }

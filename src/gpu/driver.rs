@@ -52,7 +52,7 @@ impl Driver {
         device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| reports.report(&error)));
         let losses = Arc::clone(&faults);
         device.set_device_lost_callback(move |_, message| losses.lost(message));
-        let submitter = Submitter::new(&device, &queue, bus.is_some())?;
+        let submitter = Submitter::new(&device, &queue, &faults, bus.is_some())?;
         Ok(Driver { device, faults, submitter, timestamp_period: queue.get_timestamp_period(), bus })
     }
 
@@ -81,7 +81,7 @@ impl Driver {
         if self.faults.is_reported() {
             // Without work the device reports its loss. An error of the wait itself says less than those.
             self.submitter.drain();
-            let _ = self.device.poll(wgpu::PollType::Wait { submission_index: None, timeout: None });
+            let _ = self.faults.poll(&self.device, wgpu::PollType::Wait { submission_index: None, timeout: None });
         }
         self.faults.check()
     }
@@ -114,8 +114,8 @@ impl Driver {
                 None
             }
         };
-        let waited = self.device.poll(wgpu::PollType::Wait { submission_index, timeout: None });
+        let waited = self.faults.poll(&self.device, wgpu::PollType::Wait { submission_index, timeout: None });
         self.faults.check()?;
-        waited.map(|_| ()).map_err(|e| GpuError::validation(stage, e))
+        waited.map_err(|e| GpuError::validation(stage, e))
     }
 }

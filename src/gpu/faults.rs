@@ -4,6 +4,7 @@
 //! the call that caused it or, if the report came late, by the next call.
 
 use super::error::{GpuError, GpuResult};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// Locks, even after another holder panicked: every holder leaves valid data.
@@ -54,6 +55,18 @@ impl Faults {
         let mut state = lock(&self.state);
         let stage = state.doing.clone();
         state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
+    }
+
+    /// Polls a device. wgpu 30 ends a poll that finds the device lost with a panic; here that is a loss which the next check returns.
+    pub(super) fn poll(&self, device: &wgpu::Device, until: wgpu::PollType) -> Result<(), wgpu::PollError> {
+        match catch_unwind(AssertUnwindSafe(|| device.poll(until))) {
+            Ok(polled) => polled.map(|_| ()),
+            Err(panic) => {
+                let message = panic.downcast_ref::<String>().map_or("the driver reports no reason", String::as_str);
+                self.lost(message.to_string());
+                Ok(())
+            }
+        }
     }
 
     /// Returns the collected error, if any.

@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex, OnceLock};
 use std::thread::{Builder, JoinHandle};
 
 use super::error::{GpuError, GpuResult};
-use super::faults::lock;
+use super::faults::{Faults, lock};
 
 /// Where staging memory is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -124,7 +124,7 @@ impl Drop for Waker {
 
 impl Job {
     /// Submits the recording. The driver reports errors of the submission by itself.
-    fn run(self, device: &wgpu::Device, queue: &wgpu::Queue) -> Result<(), wgpu::PollError> {
+    fn run(self, device: &wgpu::Device, queue: &wgpu::Queue, faults: &Faults) -> Result<(), wgpu::PollError> {
         for (raw, bytes) in &self.uniforms {
             queue.write_buffer(raw, 0, bytes);
         }
@@ -134,9 +134,9 @@ impl Job {
         }
         // Without a poll a lost device would go unnoticed, because submissions to it are silently dropped. Mappings that are ready are
         // noted before the ticket is, so a host that waits for this one need not poll, which takes as long as a submission under way.
-        let polled = device.poll(wgpu::PollType::Poll);
+        let polled = faults.poll(device, wgpu::PollType::Poll);
         self.waker.submitted(index);
-        polled.map(|_| ())
+        polled
     }
 }
 
@@ -152,6 +152,7 @@ struct Worker {
 pub(super) struct Submitter {
     device: wgpu::Device,
     queue: wgpu::Queue,
+    faults: Arc<Faults>,
     worker: Option<Worker>,
     last: Mutex<Option<Ticket>>,
 }
@@ -159,16 +160,25 @@ pub(super) struct Submitter {
 impl Submitter {
     /// Submits to `queue`: on a thread if `beside_host` is set.
     /// Errors: the thread could not be started.
-    pub(super) fn new(device: &wgpu::Device, queue: &wgpu::Queue, beside_host: bool) -> GpuResult<Submitter> {
-        let worker = if beside_host { Some(Worker::start(device.clone(), queue.clone())?) } else { None };
-        Ok(Submitter { device: device.clone(), queue: queue.clone(), worker, last: Mutex::default() })
+    pub(super) fn new(
+        device: &wgpu::Device,
+        queue: &wgpu::Queue,
+        faults: &Arc<Faults>,
+        beside_host: bool,
+    ) -> GpuResult<Submitter> {
+        let (device, queue, faults) = (device.clone(), queue.clone(), Arc::clone(faults));
+        let worker = match beside_host {
+            true => Some(Worker::start(device.clone(), queue.clone(), Arc::clone(&faults))?),
+            false => None,
+        };
+        Ok(Submitter { device, queue, faults, worker, last: Mutex::default() })
     }
 
     /// Submits a recording called `name`, or has the thread do so.
     /// Errors: the driver could not be asked for its progress, or the thread has ended.
     pub(super) fn submit(&self, name: &'static str, job: Job) -> GpuResult<()> {
         let Some(worker) = &self.worker else {
-            return job.run(&self.device, &self.queue).map_err(|e| GpuError::validation(name, e));
+            return job.run(&self.device, &self.queue, &self.faults).map_err(|e| GpuError::validation(name, e));
         };
         *lock(&self.last) = Some(job.waker.0.clone());
         worker.jobs.send(job).map_err(|_| GpuError::validation(name, "the thread that submits has ended"))
@@ -184,12 +194,12 @@ impl Submitter {
 }
 
 impl Worker {
-    fn start(device: wgpu::Device, queue: wgpu::Queue) -> GpuResult<Worker> {
+    fn start(device: wgpu::Device, queue: wgpu::Queue, faults: Arc<Faults>) -> GpuResult<Worker> {
         let (jobs, received) = channel::<Job>();
         let work = move || {
             for job in received {
                 // The next wait for the device returns the same error.
-                let _ = job.run(&device, &queue);
+                let _ = job.run(&device, &queue, &faults);
             }
         };
         let thread = Builder::new().name("submit".into()).spawn(work);

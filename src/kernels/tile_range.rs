@@ -31,6 +31,14 @@ impl TileRange {
         columns * rows
     }
 
+    /// The range in bands of whole rows of tiles, with at most `tiles` tiles each where a row has no more.
+    pub fn bands(self, tiles: u32) -> impl Iterator<Item = TileRange> {
+        let ([first, end], width) = (self.rows, u32::from(self.columns[1] - self.columns[0]));
+        let height = (tiles / width.max(1)).clamp(1, u32::from(u16::MAX)) as u16;
+        let band = move |row: u16| TileRange { rows: [row, row.saturating_add(height).min(end)], ..self };
+        (first..end).step_by(height.into()).map(band)
+    }
+
     /// Whether a tile, by its number in the picture, belongs to the range.
     #[inline(always)]
     pub fn contains(&self, grid: Grid, tile: usize) -> bool {
@@ -97,6 +105,18 @@ fn cut_column(
 mod tests {
     use super::*;
     use crate::base::rng::{Purpose, Stream};
+
+    #[test]
+    fn bands_have_every_row_once() {
+        let range = TileRange { columns: [2, 12], rows: [3, 10] };
+        for (tiles, rows) in [(0, 7), (10, 7), (29, 4), (30, 3), (70, 1), (u32::MAX, 1)] {
+            let bands: Vec<TileRange> = range.bands(tiles).collect();
+            assert_eq!(bands.len(), rows, "{tiles}");
+            assert!(bands.iter().all(|band| band.columns == range.columns && band.tiles() <= tiles.max(10)));
+            assert!(bands.windows(2).all(|pair| pair[0].rows[1] == pair[1].rows[0]));
+            assert_eq!([bands[0].rows[0], bands[rows - 1].rows[1]], range.rows);
+        }
+    }
 
     #[test]
     fn ranges_cover_every_tile_once_in_column_order_and_keep_their_limit() {

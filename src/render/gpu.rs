@@ -126,6 +126,11 @@ impl GpuRenderer {
         self.stages.tiles.set_capacity(isects);
     }
 
+    /// Sets the most pairs of a pixel and a list entry in one dispatch.
+    pub fn set_dispatch_pairs(&mut self, pairs: u64) {
+        self.stages.tiles.back.dispatch_pairs = pairs;
+    }
+
     /// Frames so far that were recorded again because a buffer was too small.
     pub fn frames_rerecorded(&self) -> u64 {
         self.stages.frames_rerecorded

@@ -62,20 +62,27 @@ impl Slots {
         self.slabs.last().map_or(0, |slab| slab.first + slab.slots)
     }
 
-    /// Makes up to `wanted` slots in slabs as large as one binding allows; returns how many the device had memory for.
+    /// Makes up to `wanted` slots in slabs as large as one binding allows; returns how many the device had memory for. Of a device that is
+    /// filled to its end, because no limit was stated, about half is given back: views need it.
     pub fn add(&mut self, gpu: &Gpu, wanted: usize) -> GpuResult<usize> {
         let most = (gpu.max_binding_bytes() / self.slot_bytes).max(1) as usize;
         let (mut added, mut next) = (0, wanted.min(most));
         while added < wanted {
             next = next.min(wanted - added);
-            match gpu.buffer("pages", next as u64 * self.slot_bytes) {
-                Ok(buffer) => {
+            match gpu.optional_buffer("pages", next as u64 * self.slot_bytes)? {
+                Some(buffer) => {
                     self.slabs.push(Slab { buffer, first: self.len(), slots: next as u32 });
                     added += next;
                 }
-                Err(error) if error.is_out_of_memory() && next > 1 => next /= 2,
-                Err(error) if error.is_out_of_memory() => break,
-                Err(error) => return Err(error),
+                None if next > 1 => next /= 2,
+                None => break,
+            }
+        }
+        if added < wanted && gpu.room() > u64::MAX / 2 {
+            let least = (added / 2).max(1);
+            let is_spare = |last: &mut Slab, added: usize| added.checked_sub(last.slots as usize) >= Some(least);
+            while let Some(last) = self.slabs.pop_if(|last| is_spare(last, added)) {
+                added -= last.slots as usize;
             }
         }
         Ok(added)

@@ -29,6 +29,9 @@ const CAPACITY_MIN: u32 = 1 << 16;
 /// Most intersections of a view: sums saturate at 2^32 - 1, and the index of a folded dispatch may exceed the count.
 const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
 
+/// List entries that the longest list of the first frame is taken to have.
+const FIRST_LIST: u32 = 2048;
+
 /// Capacities of frames whose demand nobody waits for are multiples of this: few sizes of buffers.
 const LIST_STEP: u32 = 1 << 10;
 
@@ -352,11 +355,13 @@ impl TileStages {
         pixels: &Pixels,
     ) -> GpuResult<()> {
         let segments = frame.room.list_max.div_ceil(SEGMENT_FWD).max(1);
-        for segment in 0..segments {
+        let entries = self.seen.map_or(FIRST_LIST, |seen| seen.list_max).min(SEGMENT_FWD);
+        let bands: Vec<TileRange> = self.back.bands(frame.range, entries);
+        for (segment, &band) in (0..segments).flat_map(|segment| bands.iter().map(move |band| (segment, band))) {
             let mut flags = 0;
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_FIRST } else { 0 };
             flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_LAST } else { 0 };
-            let uniforms = raster_uniforms(&frame.blend, frame.range, segment, SEGMENT_FWD, flags);
+            let uniforms = raster_uniforms(&frame.blend, band, segment, SEGMENT_FWD, flags);
             let view = recorder.uniform(&RasterUniforms { list_base: frame.part.base, ..uniforms })?;
             let views = [
                 view,
@@ -368,7 +373,7 @@ impl TileStages {
                 pixels.t_final.view(),
                 pixels.stops.view(),
             ];
-            let groups = groups_1d(frame.range.tiles(), 1);
+            let groups = groups_1d(band.tiles(), 1);
             recorder.dispatch("rasterize_fwd", &self.pipelines.rasterize_fwd, &views, groups)?;
         }
         Ok(())

@@ -13,7 +13,7 @@ use crate::gpu::{Buffer, BufferView, Gpu, GpuResult, Pipeline, Recorder, groups_
 use crate::kernels::tile_range::TileRange;
 use crate::kernels::uniforms::{
     FOLD_CARRIED, FOLD_ROWS, FOLD_UNFINISHED, FOLD_WITHOUT_LISTS, HAS_V_ALPHA, RasterUniforms, SEGMENT_BWD,
-    SEGMENT_FIRST, SEGMENT_LAST, SUMS, WEIGHED_FOLD_ROWS, WEIGHED_SUMS,
+    SEGMENT_FIRST, SEGMENT_LAST, SUMS, WEIGHED_FOLD_ROWS, WEIGHED_SUMS, range_words,
 };
 use std::ops::Range;
 use std::sync::Arc;
@@ -74,9 +74,15 @@ struct Sums {
     rows_per_group: u32,
 }
 
+/// Most pairs of a pixel and a list entry in one dispatch. Windows takes a device for hung that works on one for longer than two seconds, in
+/// which a small integrated GPU blends some 4 G pairs backwards.
+const DISPATCH_PAIRS: u64 = 1 << 32;
+
 /// The compiled tile stages of the backward pass.
 #[derive(Debug)]
 pub struct BackStages {
+    /// [`DISPATCH_PAIRS`]; tests lower it. It changes no result.
+    pub dispatch_pairs: u64,
     plain: Sums,
     /// `None` before [`BackStages::weigh_rows`].
     weighing: Option<Sums>,
@@ -87,7 +93,13 @@ impl BackStages {
         let get = |entry: &str| gpu.pipeline("rasterize_bwd.wgsl", entry, &[]);
         let (rasterize_bwd, fold_rows) = (get("rasterize_bwd")?, get("fold_rows")?);
         let plain = Sums { rasterize_bwd, fold_rows, count: SUMS, rows_per_group: FOLD_ROWS };
-        Ok(BackStages { plain, weighing: None })
+        Ok(BackStages { dispatch_pairs: DISPATCH_PAIRS, plain, weighing: None })
+    }
+
+    /// The tiles of a range in as many parts as there are dispatches for lists of so many entries.
+    pub(super) fn bands(&self, range: TileRange, entries: u32) -> Vec<TileRange> {
+        let pairs_of_tile = 256 * u64::from(entries.max(1));
+        range.bands(u32::try_from(self.dispatch_pairs / pairs_of_tile).unwrap_or(u32::MAX)).collect()
     }
 
     /// Compiles what the backward pass needs to collect weights.
@@ -119,6 +131,7 @@ impl BackStages {
         fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
+        let bands = self.bands(frame.range, demand.list_max.min(SEGMENT_BWD));
         let stages = self.stages(picture.errors.is_some());
         let isect_bytes = 4 * u64::from(stages.count);
         let (own_carry, partials, window);
@@ -142,7 +155,7 @@ impl BackStages {
             let isects = first..demand.isects.min(first.saturating_add(window));
             let (carry, partials) = (carry.view(), partials.view());
             let buffers = (splats, pixels, &carry, &partials);
-            self.sums(recorder, frame, segments, isects.clone(), picture, buffers)?;
+            self.sums(recorder, frame, (segments, &bands), isects.clone(), picture, buffers)?;
             let mut fold = window_uniforms(frame, 0, fold_flags, isects.clone());
             (fold.row_count, fold.isect_count) = (ranks.rows, demand.isects);
             let views = [
@@ -165,22 +178,25 @@ impl BackStages {
     }
 
     /// Records one pass over all lists, back to front, that stores the sums of the intersections in the window
-    /// `isects`.
+    /// `isects`: for each segment of the lists, the tiles in bands.
     fn sums(
         &self,
         recorder: &mut Recorder<'_>,
         frame: &Frame,
-        segments: u32,
+        (segments, bands): (u32, &[TileRange]),
         isects: Range<u32>,
         PictureGradientBuffers { v_rgb, has_v_alpha, errors }: PictureGradientBuffers<'_>,
         (splats, pixels, carry, partials): (&BufferView, &Pixels, &BufferView, &BufferView),
     ) -> GpuResult<()> {
-        for segment in (0..segments).rev() {
+        for (segment, band) in (0..segments).rev().flat_map(|segment| bands.iter().map(move |band| (segment, *band))) {
             let mut flags = if has_v_alpha { HAS_V_ALPHA } else { 0 };
             flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_FIRST } else { 0 };
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_LAST } else { 0 };
             let mut views = vec![
-                recorder.uniform(&window_uniforms(frame, segment, flags, isects.clone()))?,
+                recorder.uniform(&RasterUniforms {
+                    range: range_words(band),
+                    ..window_uniforms(frame, segment, flags, isects.clone())
+                })?,
                 splats.clone(),
                 frame.row_from_isect.view(),
                 frame.isects.view(),
@@ -192,7 +208,7 @@ impl BackStages {
                 carry.clone(),
             ];
             views.extend(errors.cloned());
-            let groups = groups_1d(frame.range.tiles(), 1);
+            let groups = groups_1d(band.tiles(), 1);
             recorder.dispatch("rasterize_bwd", &self.stages(errors.is_some()).rasterize_bwd, &views, groups)?;
         }
         Ok(())

@@ -4,7 +4,7 @@
 use crate::support::a_device;
 use crate::support::gpu;
 use crate::support::scenes::{stderr, told};
-use crate::support::workdir::{EVAL, TRAIN, Workdir};
+use crate::support::workdir::{EVAL, TRAIN, Workdir, says};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::limits::RunOptions;
 use gsscale::dataset::target_cache::TargetCache;
@@ -17,6 +17,7 @@ use gsscale::scene::columns::Column;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
 use std::path::Path;
+use std::process::Command;
 
 const SHORT: &str = "--steps 60 --strategy none --sh-every 20 --log-every 1";
 
@@ -132,6 +133,29 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
     let first = work.logged("lost", "step").into_iter().filter(|&step| step > steps).min();
     assert_eq!(first, Some(steps + 1), "steps before the loss were trained again, or the run began anew");
     assert!(work.ply("lost") == work.ply("alone"), "the resumed run gives another scene");
+}
+
+/// The driver itself reports the loss: a library between the program and the driver answers a wait with it.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_loss_that_the_driver_reports_is_committed_and_restarted() {
+    let Some(()) = a_device() else { return };
+    let work = Workdir::city(8, 64, 48, 300);
+    let of_run = "--device gpu --steps 60 --strategy none --view-order shuffle";
+    work.run("alone", of_run);
+    let library = work.path("lost_device.so");
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/lost_device.c");
+    let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).args([source, "-ldl"]).status();
+    assert!(compiled.unwrap().success());
+    for place in ["", "--spill-dir spill --spill-codec raw"] {
+        let flags = format!("scene --out lost --overwrite --quiet {of_run} {place} --commit-every 0");
+        let mut run = work.command(TRAIN, &flags);
+        let output = run.env("LD_PRELOAD", &library).env("GSSCALE_LOST_AT", "90").output().unwrap();
+        let said = stderr(&output);
+        assert!(output.status.success(), "{said}");
+        says(&said, &["is answered with its loss", "the device was lost", "(restart 1 of at most 3)"]);
+        assert!(work.ply("lost") == work.ply("alone"), "{place}: the scene is another");
+    }
 }
 
 /// The real thing: the driver is asked for memory until it refuses. A software adapter takes the program's own memory, so

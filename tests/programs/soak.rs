@@ -128,7 +128,8 @@ impl<'a> Life<'a> {
         let frames =
             *self.dice.pick(&[0, alone.pages, alone.pinned, alone.pinned * 2 / 3, (alone.pinned / 3).max(2), 2]);
         let threads = 1 + self.dice.below(3);
-        match self.spill.is_some() || !self.told.is_empty() {
+        // A run that begins with frames and without a drive makes no commits.
+        match self.spill.is_some() || self.store().is_some() {
             true => format!("--threads {threads} --frames {frames}"),
             false => format!("--threads {threads}"),
         }

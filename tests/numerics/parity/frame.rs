@@ -227,6 +227,16 @@ fn buffers_that_are_too_small_are_made_larger() {
 }
 
 #[test]
+fn tiles_in_bands_change_no_bit() {
+    let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
+    let (view, options, target) = (scene(1500, 80, 64), RenderOptions::default(), photo(80, 64, false));
+    let want = bits(&results(&mut gpu, &view, &options, &target));
+    // A dispatch for each row of tiles.
+    gpu.set_dispatch_pairs(1);
+    assert!(bits(&results(&mut gpu, &view, &options, &target)) == want);
+}
+
+#[test]
 fn limits_and_forms_of_a_device_change_no_bit() {
     let plain = GpuOptions::default();
     let Some(mut whole) = renderer(&plain) else { return };
