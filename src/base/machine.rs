@@ -26,8 +26,8 @@ pub fn host_name() -> String {
     std::env::var("COMPUTERNAME").unwrap_or_default()
 }
 
-/// A name of this machine as long as its system runs: its name in the network with a part of the kernel's identity, in which clones and
-/// containers on other machines differ. Off Linux the name alone.
+/// The name of this machine with a part of the identity that its kernel draws at each start, such as `node7-1c9f02ab`: machines that share a
+/// name, as clones and containers may, differ in it. Off Linux the name alone.
 pub fn system_name() -> String {
     let boot = std::fs::read_to_string("/proc/sys/kernel/random/boot_id").unwrap_or_default();
     match boot.split('-').next().unwrap_or("").trim() {

@@ -2,9 +2,9 @@
 //! the file system has locks, and by a heartbeat where it has none, or other machines do not see them.
 //!
 //! Invariants: 1. ages of heartbeats are differences between two times of the folder's own clock, so clocks of machines do not count; 2. if
-//! several processes find no owner, one of them makes the lock file, which appears with the owner's name in it and the system's lock held; 3. a heartbeat writes the same bytes in place, so nobody reads a file without them; 4. who
-//! has lost the cell finds out before it publishes (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work
-//! and no result: both give the same bytes, and only the owner gives its copy a name.
+//! several processes find no owner, one of them makes the lock file, which appears with the owner's name in it and the system's lock held; 3. a
+//! heartbeat writes the same bytes in place, so nobody reads a file without them; 4. a worker that has lost the cell finds that out before its
+//! copy gets a number (`CellLock::is_held`). Two owners at once, which a folder that lags can cause, cost work and no result.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;

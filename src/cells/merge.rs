@@ -125,7 +125,7 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
         return Err(InputError::new(&city.0, problem, "run them: gsscale-cells run CITY --cell K").into());
     }
     let memory = host_budget(request.host_mem).unwrap_or(1 << 30);
-    check_prior(&plan, &city, memory)??;
+    check_prior(&plan, &city, memory).map_err(|refused| refused.error)?;
     let keys = city.given_keys()?;
     let config = config_of(&city.keys(), keys, &TrainOverrides::default())?;
     let facts = read_resolved(&city.prior_run().join(CONFIG_FILE))?;

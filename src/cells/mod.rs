@@ -16,9 +16,9 @@
 //! What its photos show beyond is a ring of frozen pages ([`crate::base::ids::PageId::frozen`]): rendered, never changed. All cells may grow
 //! by the same factor of the prior's rows, so both sides of a border get the same density.
 //!
-//! Invariants: 1. a cell's result is a function of the plan, the prior and the photos; machines, budgets, kills and schedulers change no byte,
-//! while a GPU and a CPU give other last bits; 2. a command that is repeated goes on or says that it is done; 3. nothing is published in the city but under the lock of its cell, and
-//! only complete: `done.toml` is the last.
+//! Invariants: 1. a cell's result is a function of the plan, the prior, the photos, and the kind of device (a GPU and a CPU give other last
+//! bits); machines, budgets, kills and schedulers change no byte; 2. a command that is repeated goes on or says that it is done; 3. nothing is
+//! published in the city but under the lock of its cell, and only complete: `done.toml` is the last.
 
 pub mod costs;
 pub mod cut;

@@ -5,7 +5,7 @@
 //!
 //! | in `cells/K/` | is |
 //! | --- | --- |
-//! | `run-MACHINE/` | the run's own folder and pages, without `--spill-dir`, until this machine starts again |
+//! | `run-MACHINE/` | the run's own folder and pages, without `--spill-dir`; a machine that was started anew has another one |
 //! | `copy/N/` | a commit; the largest N that can be read counts |
 //! | `copy/of-.../` | a copy that its worker has not finished, or not named |
 //! | `done.toml` | the last step is in the copy |
@@ -46,8 +46,9 @@ pub const AGAIN: i32 = 75;
 /// Exit code: no further attempt will succeed.
 pub const NEVER: i32 = 2;
 
-/// Beginning of the name of a copy that has no number yet.
+/// Beginnings of the names of a copy that has no number yet, and of the folder of a run in the city.
 const UNNAMED: &str = "of-";
+const RUN: &str = "run-";
 
 /// Usual seconds between copies.
 pub const COPY_EVERY: f64 = 900.0;
@@ -117,13 +118,13 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let leave_done = || {
         crate::say!("cell {} is done", request.cell);
         // A process that was killed behind its last word left them.
-        place.clear().map_err(WorkError::of_run).map(|()| 0)
+        place.clear_all(&folder).map_err(WorkError::of_run).map(|()| 0)
     };
     if is_done()? {
         return leave_done();
     }
     let memory = host_budget(request.keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
-    check_prior(&plan, &city, memory).map_err(WorkError::of_run)??;
+    check_prior(&plan, &city, memory)?;
     let lock = match CellLock::take(&folder)? {
         Ok(lock) => lock,
         Err(owner) => {
@@ -153,7 +154,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
                 let (file, done) =
                     (folder.join("done.toml"), Done { files: files.clone(), copy, steps, gaussians, seconds, psnr });
                 write_whole(&file, toml_of(&file, &done)?.as_bytes())?;
-                place.clear()?;
+                place.clear_all(&folder)?;
                 return Ok(0);
             }
         }
@@ -219,6 +220,11 @@ fn listed(folder: &Path) -> InputResult<Vec<PathBuf>> {
     }
 }
 
+/// Whether the name of a path begins so.
+fn has_name_of(path: &Path, beginning: &str) -> bool {
+    path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(beginning))
+}
+
 /// Steps of the last commit in a store.
 fn steps_in(store: &Path) -> Result<u32, TrainError> {
     last_state(store, Access::Map).map(|state| state.trainer.step)
@@ -229,15 +235,15 @@ fn copied_steps(folder: &Path) -> Option<u32> {
     copies_of(folder).ok()?.iter().find_map(|(_, copy)| steps_in(copy).ok())
 }
 
-/// Refuses, by the inner error, a prior that is not the one that was cut.
-/// Errors: it cannot be read in this memory.
-pub(crate) fn check_prior(plan: &CityPlan, city: &City, memory: u64) -> Result<InputResult<()>, TrainError> {
-    let rows = StoredStart::open(&city.prior_store(), memory, 2)?.digest()?;
-    if prior_digest(city, rows)? == plan.prior {
-        return Ok(Ok(()));
+/// Compares the prior with the one that was cut. `memory` is in bytes.
+/// Errors: it is another one, which no further attempt changes; or it cannot be read in this memory.
+pub(crate) fn check_prior(plan: &CityPlan, city: &City, memory: u64) -> Result<(), WorkError> {
+    let prior = StoredStart::open(&city.prior_store(), memory, 2).map_err(WorkError::of_run)?;
+    if prior_digest(city, prior.digest()?)? == plan.prior {
+        return Ok(());
     }
     let problem = "it is not the prior that was cut";
-    Ok(Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder")))
+    Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder").into())
 }
 
 fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
@@ -255,7 +261,7 @@ impl WorkPlace {
     /// Machines that share a folder, and cities that share a drive, have places of their own.
     fn of(request: &WorkRequest, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
         let Some(drive) = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) else {
-            let out = city.cell(request.cell).join(format!("run-{}", system_name()));
+            let out = city.cell(request.cell).join(format!("{RUN}{}", system_name()));
             return Ok(WorkPlace { out, pages: None });
         };
         let own = absolute(Path::new(drive)).join(format!("cell-{}-{}", request.cell, plan.digest(&city.plan())?));
@@ -324,9 +330,17 @@ impl WorkPlace {
         Ok(copy.is_some())
     }
 
-    /// Removes the pages of the cell; its results stay.
+    /// Removes the pages of the cell here; its results stay.
     fn clear(&self) -> Result<(), TrainError> {
         remove_store(&self.store())
+    }
+
+    /// As [`WorkPlace::clear`], and removes pages that workers of the cell in `folder` left in the city. Pages in use stay.
+    fn clear_all(&self, folder: &Path) -> Result<(), TrainError> {
+        for run in listed(folder)?.iter().filter(|path| has_name_of(path, RUN)) {
+            drop(remove_store(&run.join("checkpoint")));
+        }
+        self.clear()
     }
 }
 
@@ -339,8 +353,7 @@ fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, Tr
     let copies = folder.join("copy");
     std::fs::create_dir_all(&copies).map_err(|e| InputError::io(&copies, "making the folder of copies", &e))?;
     // What others left that were killed, or were taken for lost. One that still writes has it in use.
-    let is_unnamed = |path: &PathBuf| path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(UNNAMED));
-    listed(&copies)?.iter().filter(|path| is_unnamed(path)).for_each(|path| drop(remove_store(path)));
+    listed(&copies)?.iter().filter(|path| has_name_of(path, UNNAMED)).for_each(|path| drop(remove_store(path)));
     let before = copies_of(folder)?;
     let number = before.first().map_or(0, |(number, _)| number + 1);
     let (made, copy) = (copies.join(format!("{UNNAMED}{:032x}", draw_identity())), copy_of(folder, number));

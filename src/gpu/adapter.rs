@@ -205,19 +205,23 @@ pub(super) fn choose(choice: &DeviceChoice) -> GpuResult<(wgpu::Adapter, Adapter
 mod tests {
     use super::*;
 
-    #[test]
-    fn adapters_of_one_name_are_told_apart_by_their_number_or_their_api() {
-        let adapter = AdapterSummary {
-            name: "NVIDIA RTX 4090".into(),
+    fn card(name: &str, backend: &str) -> AdapterSummary {
+        AdapterSummary {
+            name: name.into(),
             kind: DeviceKind::Discrete,
-            backend: "Dx12".into(),
+            backend: backend.into(),
             max_binding_bytes: 0,
             max_buffer_bytes: 0,
             workgroup_storage_bytes: 0,
             subgroup_sizes: None,
             timestamps: false,
             refusal: None,
-        };
+        }
+    }
+
+    #[test]
+    fn adapters_of_one_name_are_told_apart_by_their_number_or_their_api() {
+        let adapter = card("NVIDIA RTX 4090", "Dx12");
         for name in ["rtx 4090", "4090 (dx12", "dx12", "#2"] {
             assert!(is_named(&adapter, 2, name), "{name}");
         }
@@ -228,17 +232,7 @@ mod tests {
 
     #[test]
     fn direct3d_without_its_new_compiler_says_what_is_missing() {
-        let summary = AdapterSummary {
-            name: "card".into(),
-            kind: DeviceKind::Discrete,
-            backend: "Dx12, driver 1".into(),
-            max_binding_bytes: 0,
-            max_buffer_bytes: 0,
-            workgroup_storage_bytes: 0,
-            subgroup_sizes: None,
-            timestamps: false,
-            refusal: None,
-        };
+        let summary = card("card", "Dx12, driver 1");
         assert!(summary.to_string().contains("dxcompiler.dll"));
         let with_subgroups = AdapterSummary { subgroup_sizes: Some((32, 32)), ..summary.clone() };
         let of_vulkan = AdapterSummary { backend: "Vulkan".into(), ..summary };

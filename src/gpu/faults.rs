@@ -4,8 +4,9 @@
 //! the call that caused it or, if the report came late, by the next call.
 
 use super::error::{GpuError, GpuResult};
-use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::cell::Cell;
+use std::panic::{AssertUnwindSafe, catch_unwind, set_hook, take_hook};
+use std::sync::{Mutex, MutexGuard, Once, PoisonError};
 
 /// Locks, even after another holder panicked: every holder leaves valid data.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -57,9 +58,14 @@ impl Faults {
         state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
     }
 
-    /// Polls a device. wgpu 30 ends a poll that finds the device lost with a panic; here that is a loss which the next check returns.
+    /// Polls a device. wgpu 30 ends a poll that finds the device lost with a panic; here that is a loss, which the next check returns.
+    /// Errors: those of the poll.
     pub(super) fn poll(&self, device: &wgpu::Device, until: wgpu::PollType) -> Result<(), wgpu::PollError> {
-        match catch_unwind(AssertUnwindSafe(|| device.poll(until))) {
+        silence_polls();
+        IS_POLLING.set(true);
+        let polled = catch_unwind(AssertUnwindSafe(|| device.poll(until)));
+        IS_POLLING.set(false);
+        match polled {
             Ok(polled) => polled.map(|_| ()),
             Err(panic) => {
                 let message = panic.downcast_ref::<String>().map_or("the driver reports no reason", String::as_str);
@@ -77,6 +83,24 @@ impl Faults {
         }
         state.first.take().map_or(Ok(()), Err)
     }
+}
+
+thread_local! {
+    /// Whether this thread polls a device: a panic is a loss then, and is told as one.
+    static IS_POLLING: Cell<bool> = const { Cell::new(false) };
+}
+
+/// Keeps panics in polls from being printed; other panics are printed as before.
+fn silence_polls() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let print = take_hook();
+        set_hook(Box::new(move |panic| {
+            if !IS_POLLING.get() {
+                print(panic);
+            }
+        }));
+    });
 }
 
 /// An error with its chain of causes on one line.

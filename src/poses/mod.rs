@@ -34,6 +34,7 @@ use pairs::{ChosenBy, choose_pairs, count_of, way_of};
 use photos::{FoundPhoto, camera_groups, list_photos, modified_at};
 use program::{CHUNK, DATABASE, FeatureOptions, LIST, PHOTOS, Phase, Program, ProgramPaths, SPARSE};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::fmt;
 use std::fs::{File, Metadata, TryLockError};
 use std::io::ErrorKind::NotFound;
@@ -554,9 +555,8 @@ impl SearchState {
     }
 }
 
-/// Refuses the model that a search has left for the photos in `named`, if it is of other photos than those there now, or of less than half
-/// of them. Of a model that no search made it says nothing.
-/// Errors: it is refused, or the photos cannot be listed.
+/// Checks the model that a search has left for the photos in `named`; a model of another program passes.
+/// Errors: a photo has come or changed since the search; fewer than half of the photos have a pose; the photos cannot be listed.
 pub fn check_found(named: &Path) -> InputResult<()> {
     let (scene, folder) = home_of(named);
     let Some(state) = SearchState::read(&scene.join(WORK_FOLDER)) else { return Ok(()) };
@@ -566,8 +566,8 @@ pub fn check_found(named: &Path) -> InputResult<()> {
         "to search again, rename {} and give the command again; to train with these: gsscale-train {place}",
         sparse.display()
     );
-    let has = |photo: &FoundPhoto| state.photos.iter().any(|of| of.name == photo.name && of.bytes == photo.bytes);
-    let new = photos.iter().filter(|photo| !has(photo)).count();
+    let searched: BTreeSet<(&str, u64)> = state.photos.iter().map(|of| (of.name.as_str(), of.bytes)).collect();
+    let new = photos.iter().filter(|photo| !searched.contains(&(photo.name.as_str(), photo.bytes))).count();
     if new > 0 {
         let problem = format!("the poses there are from a search without {}", counted(new as u64, "photo"));
         return Err(InputError::new(named, problem, ways));
@@ -586,14 +586,9 @@ fn home_of(named: &Path) -> (PathBuf, PathBuf) {
     if images.is_dir() {
         return (named.to_path_buf(), images);
     }
-    // The user may be inside: `images`, or `.` there.
     let whole = std::path::absolute(named).unwrap_or_else(|_| named.to_path_buf());
-    let above = match (named.parent(), named.file_name()) {
-        (Some(above), Some(_)) if above.as_os_str().is_empty() => Some(Path::new(".")),
-        (Some(above), Some(_)) => Some(above),
-        _ => whole.parent(),
-    };
-    match above {
+    // `images` has no parent, and `.` inside of it neither.
+    match named.parent().filter(|above| !above.as_os_str().is_empty()).or(whole.parent()) {
         Some(above) if whole.file_name().is_some_and(|name| name == "images") => {
             (above.to_path_buf(), named.to_path_buf())
         }
@@ -751,7 +746,7 @@ mod tests {
         assert_eq!(home_of(&images), (above, images.clone()));
         assert_eq!(home_of(root.path()), (root.path().to_path_buf(), root.path().to_path_buf()));
         // From inside of the scene.
-        assert_eq!(home_of(Path::new("images")), (PathBuf::from("."), PathBuf::from("images")));
+        assert_eq!(home_of(Path::new("images")), (std::env::current_dir().unwrap(), PathBuf::from("images")));
     }
 
     #[test]

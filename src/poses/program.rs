@@ -18,7 +18,7 @@ use std::time::Duration;
 const OLDEST: (u32, u32) = (3, 8);
 /// What pycolmap runs.
 const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
-/// What it says of a version that it cannot use, before its number.
+/// What the script prints before the number of a version that lacks what the phases call.
 const OLD_PYCOLMAP: &str = "old pycolmap ";
 /// Lines of the log that an error shows.
 const LAST_LINES: usize = 6;
@@ -130,7 +130,10 @@ impl Program {
         let (mut found, mut broken) = (None, None);
         for python in named.into_iter().chain(others) {
             match python {
-                Ok(program) if found.is_none() => found = Some(program),
+                Ok(program) => {
+                    found = Some(program);
+                    break;
+                }
                 Err(error) if error.problem.contains(OLD_PYCOLMAP) || is_broken(&error) => {
                     broken.get_or_insert(error);
                 }
@@ -327,7 +330,7 @@ fn said_by(path: &Path, arguments: &[&str]) -> InputResult<String> {
     Ok([output.stdout, output.stderr].map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).join("\n"))
 }
 
-/// Whether the error is of a pycolmap that is there and cannot be loaded.
+/// Whether the error is of a pycolmap that is installed and cannot be loaded.
 fn is_broken(error: &InputError) -> bool {
     error.problem.contains("Error: ") && !error.problem.contains("No module named 'pycolmap'")
 }

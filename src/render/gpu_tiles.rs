@@ -29,7 +29,7 @@ const CAPACITY_MIN: u32 = 1 << 16;
 /// Most intersections of a view: sums saturate at 2^32 - 1, and the index of a folded dispatch may exceed the count.
 const CAPACITY_MAX: u64 = (1 << 32) - (1 << 25);
 
-/// List entries that the longest list of the first frame is taken to have.
+/// Length of the longest list before a frame has shown it, entries.
 const FIRST_LIST: u32 = 2048;
 
 /// Capacities of frames whose demand nobody waits for are multiples of this: few sizes of buffers.

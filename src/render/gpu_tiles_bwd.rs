@@ -81,7 +81,7 @@ const DISPATCH_PAIRS: u64 = 1 << 32;
 /// The compiled tile stages of the backward pass.
 #[derive(Debug)]
 pub struct BackStages {
-    /// [`DISPATCH_PAIRS`]; tests lower it. It changes no result.
+    /// [`DISPATCH_PAIRS`], of the forward pass, too; tests lower it. It changes no result.
     pub dispatch_pairs: u64,
     plain: Sums,
     /// `None` before [`BackStages::weigh_rows`].
@@ -96,7 +96,7 @@ impl BackStages {
         Ok(BackStages { dispatch_pairs: DISPATCH_PAIRS, plain, weighing: None })
     }
 
-    /// The tiles of a range in as many parts as there are dispatches for lists of so many entries.
+    /// The bands of tiles of a range that get a dispatch each, if no list has more than `entries` entries.
     pub(super) fn bands(&self, range: TileRange, entries: u32) -> Vec<TileRange> {
         let pairs_of_tile = 256 * u64::from(entries.max(1));
         range.bands(u32::try_from(self.dispatch_pairs / pairs_of_tile).unwrap_or(u32::MAX)).collect()
@@ -131,7 +131,6 @@ impl BackStages {
         fold: Fold<'_>,
     ) -> GpuResult<()> {
         let segments = demand.list_max.div_ceil(SEGMENT_BWD).max(1);
-        let bands = self.bands(frame.range, demand.list_max.min(SEGMENT_BWD));
         let stages = self.stages(picture.errors.is_some());
         let isect_bytes = 4 * u64::from(stages.count);
         let (own_carry, partials, window);
@@ -155,7 +154,7 @@ impl BackStages {
             let isects = first..demand.isects.min(first.saturating_add(window));
             let (carry, partials) = (carry.view(), partials.view());
             let buffers = (splats, pixels, &carry, &partials);
-            self.sums(recorder, frame, (segments, &bands), isects.clone(), picture, buffers)?;
+            self.sums(recorder, frame, demand.list_max, isects.clone(), picture, buffers)?;
             let mut fold = window_uniforms(frame, 0, fold_flags, isects.clone());
             (fold.row_count, fold.isect_count) = (ranks.rows, demand.isects);
             let views = [
@@ -178,17 +177,19 @@ impl BackStages {
     }
 
     /// Records one pass over all lists, back to front, that stores the sums of the intersections in the window
-    /// `isects`: for each segment of the lists, the tiles in bands.
+    /// `isects`: a dispatch for each segment of the lists, which have up to `list_max` entries, and each band of tiles.
     fn sums(
         &self,
         recorder: &mut Recorder<'_>,
         frame: &Frame,
-        (segments, bands): (u32, &[TileRange]),
+        list_max: u32,
         isects: Range<u32>,
         PictureGradientBuffers { v_rgb, has_v_alpha, errors }: PictureGradientBuffers<'_>,
         (splats, pixels, carry, partials): (&BufferView, &Pixels, &BufferView, &BufferView),
     ) -> GpuResult<()> {
-        for (segment, band) in (0..segments).rev().flat_map(|segment| bands.iter().map(move |band| (segment, *band))) {
+        let segments = list_max.div_ceil(SEGMENT_BWD).max(1);
+        let bands = self.bands(frame.range, list_max.min(SEGMENT_BWD));
+        for (segment, &band) in (0..segments).rev().flat_map(|segment| bands.iter().map(move |band| (segment, band))) {
             let mut flags = if has_v_alpha { HAS_V_ALPHA } else { 0 };
             flags |= if segment + 1 == segments && frame.part.is_farthest { SEGMENT_FIRST } else { 0 };
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_LAST } else { 0 };

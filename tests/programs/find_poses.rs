@@ -175,6 +175,23 @@ fn what_cannot_work_is_refused_with_a_remedy() {
         work.command(POSES, "scene").env("PATH", "").env("GSSCALE_PYTHON", "nowhere/python").output().unwrap();
     says(&stderr(&misnamed), &["nowhere/python", "no such program", "leave GSSCALE_PYTHON out"]);
     says(&stderr(&without), &["neither COLMAP nor a Python with pycolmap", "pip install pycolmap", "--colmap PATH"]);
+    // A pycolmap that is too old, and one that cannot be loaded, are named as what they are.
+    #[cfg(unix)]
+    for (prints, words) in [
+        (
+            "old pycolmap 3.11.1",
+            ["old pycolmap 3.11.1 is there, and 3.13 or newer is needed", "-m pip install --upgrade pycolmap"],
+        ),
+        ("ImportError: libGL.so.1: no such file", ["no pycolmap that can be used: ImportError: libGL.so.1", "install"]),
+    ] {
+        let folder = work.path("bin");
+        std::fs::create_dir_all(&folder).unwrap();
+        work.write("bin/python3", format!("#!/bin/sh\necho '{prints}'\n"));
+        let may_run = std::os::unix::fs::PermissionsExt::from_mode(0o755);
+        std::fs::set_permissions(folder.join("python3"), may_run).unwrap();
+        let said = work.command(POSES, "scene").env("PATH", &folder).env_remove("GSSCALE_PYTHON").output().unwrap();
+        says(&stderr(&said), &words);
+    }
     // A program that is no COLMAP, and a Python that is none.
     let echo = if cfg!(unix) { "/bin/echo" } else { "hostname" };
     refused(&format!("scene --colmap {echo}"), &["COLMAP 3.8 or newer is needed"]);

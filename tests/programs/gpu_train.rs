@@ -16,7 +16,7 @@ use gsscale::render::gpu::GpuRenderer;
 use gsscale::scene::columns::Column;
 use gsscale::train::start::first_scene::{Prepared, prepare};
 use gsscale::train::state::trainer::Trainer;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 const SHORT: &str = "--steps 60 --strategy none --sh-every 20 --log-every 1";
@@ -135,7 +135,35 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
     assert!(work.ply("lost") == work.ply("alone"), "the resumed run gives another scene");
 }
 
-/// The driver itself reports the loss: a library between the program and the driver answers a wait with it.
+/// A library between programs and the driver that has faults of drivers of hardware (tests/support/device_faults.c).
+#[cfg(target_os = "linux")]
+fn device_faults(work: &Workdir) -> PathBuf {
+    let library = work.path("device_faults.so");
+    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/device_faults.c");
+    let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).args([source, "-ldl"]).status();
+    assert!(compiled.unwrap().success());
+    library
+}
+
+/// The pages exceed a device whose limit nobody states: those that it can hold leave room for views.
+#[test]
+#[cfg(target_os = "linux")]
+fn a_device_that_the_pages_exceed_trains() {
+    let Some(device) = gpu::open(&GpuOptions::default()) else { return };
+    if device.summary().kind != gsscale::gpu::DeviceKind::Software {
+        println!("skipped: the blocks of a driver of hardware are larger than this test allows");
+        return;
+    }
+    drop(device);
+    let work = Workdir::city_of(12, [64, 48], 150_000, 6);
+    let flags = "scene --out out --quiet --device gpu --optimizer-on device --steps 4 --strategy none --test-every 0";
+    let mut run = work.command(TRAIN, flags);
+    run.env("LD_PRELOAD", device_faults(&work)).env("GSSCALE_MEMORY_MOST", (128 << 20).to_string());
+    let output = run.output().unwrap();
+    assert!(output.status.success() && stderr(&output).contains("a block of memory is refused"), "{}", told(&output));
+}
+
+/// The driver itself reports the loss.
 #[test]
 #[cfg(target_os = "linux")]
 fn a_loss_that_the_driver_reports_is_committed_and_restarted() {
@@ -143,10 +171,7 @@ fn a_loss_that_the_driver_reports_is_committed_and_restarted() {
     let work = Workdir::city(8, 64, 48, 300);
     let of_run = "--device gpu --steps 60 --strategy none --view-order shuffle";
     work.run("alone", of_run);
-    let library = work.path("lost_device.so");
-    let source = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/support/lost_device.c");
-    let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&library).args([source, "-ldl"]).status();
-    assert!(compiled.unwrap().success());
+    let library = device_faults(&work);
     for place in ["", "--spill-dir spill --spill-codec raw"] {
         let flags = format!("scene --out lost --overwrite --quiet {of_run} {place} --commit-every 0");
         let mut run = work.command(TRAIN, &flags);
@@ -154,6 +179,7 @@ fn a_loss_that_the_driver_reports_is_committed_and_restarted() {
         let said = stderr(&output);
         assert!(output.status.success(), "{said}");
         says(&said, &["is answered with its loss", "the device was lost", "(restart 1 of at most 3)"]);
+        assert!(!said.contains("panicked"), "{said}");
         assert!(work.ply("lost") == work.ply("alone"), "{place}: the scene is another");
     }
 }

@@ -165,6 +165,9 @@ fn a_finished_run_is_shown_beside_its_photos() {
         let early = served.picture("view=2&width=64&step=40");
         assert!(difference(&early, &scene) > 64 * 48, "{flags}");
         assert_eq!(served.json("/status")["step"], 40);
+        // A photo needs no Gaussians, so those of step 40 stay.
+        served.picture("view=2&width=64&show=photo");
+        assert_eq!(served.json("/status")["step"], 40);
         assert!(served.picture("view=2&width=64") == scene, "{flags}");
         let (head, body) = served.get("/picture?view=2&step=41");
         let said = String::from_utf8_lossy(&body);
