@@ -13,11 +13,12 @@ use super::bus::EmulatedBus;
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
 use super::faults::lock;
-use super::injected::{InjectedFault, Injector};
+use super::injected::{FaultKind, InjectedFault, Injector};
 use super::profile::{Profiler, StageTime};
 use super::readback::Staging;
 use super::shader::{Pipeline, Pipelines};
 use super::sources::{Defines, SOURCES, Source};
+use super::submission_count::SubmissionCount;
 use super::{DeviceChoice, Traffic, Work};
 
 /// Smallest and largest memory block under a budget, bytes: the API raises smaller ones to 4 MiB.
@@ -123,6 +124,8 @@ pub struct Gpu {
     pub(super) uniforms: Mutex<UniformRing>,
     pub(super) profiler: Mutex<Profiler>,
     pub(super) injector: Injector,
+    /// `None` where the driver reports work that it gives up.
+    pub(super) progress: Option<SubmissionCount>,
     pub(super) uploaded: AtomicU64,
     pub(super) work: Mutex<Work>,
     /// Every open recording holds a reference.
@@ -160,7 +163,19 @@ impl Gpu {
         let in_order = !is_native || open(defines.clone())?.has_subgroups_in_order()?;
         let gpu = open(if in_order { defines } else { Vec::new() })?;
         let fault = options.fault.or_else(InjectedFault::from_environment);
-        Ok(Gpu { injector: Injector::new(fault), ..gpu })
+        let gives_up_silently = gpu.summary.backend.starts_with("Metal");
+        let counts = gives_up_silently || fault.is_some_and(|fault| fault.kind == FaultKind::GivenUp);
+        let progress = if counts { Some(gpu.count_submissions()?) } else { None };
+        Ok(Gpu { injector: Injector::new(fault), progress, ..gpu })
+    }
+
+    fn count_submissions(&self) -> GpuResult<SubmissionCount> {
+        let pipeline = self.pipeline("progress.wgsl", "count", &[])?;
+        let mut recorder = self.begin("progress");
+        let finished = recorder.buffer_zeroed("finished submissions", 4)?;
+        let submission = self.submit(recorder)?;
+        self.wait(&submission)?;
+        Ok(SubmissionCount::new(pipeline, finished))
     }
 
     /// A device with nothing on it yet, on an open driver.
@@ -187,6 +202,7 @@ impl Gpu {
             uniforms: Mutex::new(UniformRing::new(Arc::clone(&driver), Arc::clone(&pool), u64::from(alignment))),
             profiler: Mutex::new(profiler),
             injector: Injector::default(),
+            progress: None,
             uploaded: AtomicU64::new(0),
             work: Mutex::default(),
             recordings: Arc::default(),

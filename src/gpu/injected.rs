@@ -14,6 +14,8 @@ const FILL_BUFFERS: usize = 8192;
 pub enum FaultKind {
     /// The device is destroyed, as if unplugged or reset.
     Lost,
+    /// The commands are not run, and nothing reports that.
+    GivenUp,
     /// A command is recorded that the graphics API refuses.
     Validation,
     /// The driver reports that memory has run out. The report is simulated, because really filling a device that shares
@@ -32,7 +34,8 @@ pub struct InjectedFault {
     pub submission: u64,
 }
 
-/// Environment variable that injects a fault into any program: `lost@40`, `validation@40`, `memory@40`, `full@40`.
+/// Environment variable that injects a fault into any program: `lost@40`, `given-up@40`, `validation@40`,
+/// `memory@40`, `full@40`.
 const VARIABLE: &str = "GSSCALE_GPU_FAULT";
 
 impl InjectedFault {
@@ -41,6 +44,7 @@ impl InjectedFault {
         let (kind, at) = text.split_once('@')?;
         let kind = match kind {
             "lost" => FaultKind::Lost,
+            "given-up" => FaultKind::GivenUp,
             "validation" => FaultKind::Validation,
             "memory" => FaultKind::OutOfMemory,
             "full" => FaultKind::Full,

@@ -24,7 +24,7 @@
 //! 6. Only one recorder may be open, set aside or not: reused buffers rely on commands that run in the order recorded.
 //!
 //! Files import each other in one direction: `error` <- `bus`, `faults` <- `submitter` <- `driver` (the wgpu device that the others
-//! share) <- `buffers`, `belt`, `shader` <- `readback` <- `profile` <- `device` <- `record`.
+//! share) <- `buffers`, `belt`, `shader` <- `submission_count` <- `readback` <- `profile` <- `device` <- `record`.
 
 mod adapter;
 mod belt;
@@ -41,6 +41,7 @@ mod readback;
 mod record;
 mod shader;
 mod sources;
+mod submission_count;
 mod submitter;
 
 pub use adapter::{AdapterSummary, DeviceKind, STORAGE_BUFFERS_MOST, WORKGROUP, list_adapters};

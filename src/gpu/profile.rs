@@ -97,7 +97,7 @@ impl Profiler {
         let count = 2 * u32::try_from(stages.len()).unwrap_or(PASSES_MAX);
         encoder.resolve_query_set(set, 0..count, resolved, 0);
         let view = BufferView { raw: resolved.clone(), label: "stage times", offset: 0, size: u64::from(count) * 8 };
-        let (readback, pending) = self.staging.record(encoder, "stage times", &view, ticket)?;
+        let (readback, pending) = self.staging.record(encoder, "stage times", &view, ticket, None)?;
         self.under_way.push((readback, stages));
         Ok(Some(pending))
     }

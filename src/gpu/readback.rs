@@ -1,8 +1,8 @@
 //! Read-back of results: copies into staging memory that is mapped when the device has finished. Staging buffers come from the
 //! pool and are charged to its budget.
 //!
-//! Invariants: (1) a read-back returns the bytes as of its place in the recording; (2) reading before the recorder was
-//! submitted is an error, never an endless wait.
+//! Invariants: (1) a read-back returns the bytes as of its place in the recording, or, on a device that counts its submissions
+//! ([`super::submission_count`]), the loss of the device; (2) reading before the recorder was submitted is an error, never an endless wait.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -11,6 +11,7 @@ use super::belt::COPY_PART;
 use super::buffers::{Buffer, BufferView, Pool, Purpose};
 use super::driver::Driver;
 use super::error::{GpuError, GpuResult};
+use super::submission_count::BEHIND;
 use super::submitter::{MapState, Mapping, SharedState, Ticket};
 use crate::base::trace;
 use rayon::prelude::*;
@@ -28,29 +29,39 @@ impl Staging {
         Arc::new(Staging { driver, pool, read: AtomicU64::new(0) })
     }
 
-    /// Records the copy of `view` for `stage`, in a recording that `ticket` submits.
+    /// Records the copy of `view` for `stage`, in a recording that `ticket` submits. `count` is the count of finished submissions, and what
+    /// it must be by then.
     pub(super) fn record(
         self: &Arc<Self>,
         encoder: &mut wgpu::CommandEncoder,
         stage: &'static str,
         view: &BufferView,
         ticket: &Ticket,
+        count: Option<(BufferView, u32)>,
     ) -> GpuResult<(Readback, Mapping)> {
         let size = view.size;
-        let mut to = self.pool.take("read-back staging", size, Purpose::ReadBack)?;
+        let mapped = size + if count.is_some() { COUNT_BYTES } else { 0 };
+        let mut to = self.pool.take("read-back staging", mapped, Purpose::ReadBack)?;
         to.set_reusable(false); // until the host has read and unmapped it
         encoder.copy_buffer_to_buffer(&view.raw, view.offset, to.raw(), 0, size);
+        let finished = count.map(|(count, expected)| {
+            encoder.copy_buffer_to_buffer(&count.raw, count.offset, to.raw(), size, COUNT_BYTES);
+            expected
+        });
         self.read.fetch_add(size, Ordering::Relaxed);
         let state = SharedState::new(MapState::Recorded);
-        let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, size, &state);
+        let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, mapped, &state);
         let ticket = ticket.clone();
-        Ok((Readback { buffer: to, stage, state, ticket, staging: Arc::clone(self) }, mapping))
+        Ok((Readback { buffer: to, size, finished, stage, state, ticket, staging: Arc::clone(self) }, mapping))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
         self.read.load(Ordering::Relaxed)
     }
 }
+
+/// Bytes of a count of submissions, which follows the bytes of a read-back.
+const COUNT_BYTES: u64 = 4;
 
 /// Copies mapped bytes to host memory of the same length.
 fn empty(mapped: &[u8], out: &mut [u8]) {
@@ -68,6 +79,10 @@ fn empty(mapped: &[u8], out: &mut [u8]) {
 #[must_use]
 pub struct Readback {
     buffer: Buffer,
+    /// Bytes without the count.
+    size: u64,
+    /// The count of finished submissions that must follow them.
+    finished: Option<u32>,
     stage: &'static str,
     state: SharedState,
     ticket: Ticket,
@@ -78,7 +93,7 @@ impl Readback {
     /// Waits, then returns the elements.
     /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn to_vec<T: bytemuck::Pod>(self) -> GpuResult<Vec<T>> {
-        let mut out = vec![T::zeroed(); usize::try_from(self.buffer.size()).unwrap_or(0) / size_of::<T>().max(1)];
+        let mut out = vec![T::zeroed(); usize::try_from(self.size).unwrap_or(0) / size_of::<T>().max(1)];
         self.copy_to(&mut out)?;
         Ok(out)
     }
@@ -87,9 +102,17 @@ impl Readback {
     /// Errors: the recorder was not submitted, the device was lost, or its work failed.
     pub fn copy_to<T: bytemuck::Pod>(mut self, out: &mut [T]) -> GpuResult<()> {
         self.wait()?;
-        let (out, size) = (bytemuck::cast_slice_mut::<T, u8>(out), self.buffer.size());
-        let view = self.buffer.raw().get_mapped_range(..size).map_err(|e| GpuError::validation(self.stage, e))?;
-        let n = out.len().min(view.len());
+        let (out, size) = (bytemuck::cast_slice_mut::<T, u8>(out), self.size);
+        let mapped = self.buffer.size();
+        let view = self.buffer.raw().get_mapped_range(..mapped).map_err(|e| GpuError::validation(self.stage, e))?;
+        let bytes = size as usize; // as many as are mapped
+        if let Some(expected) = self.finished
+            && view[bytes..] != expected.to_le_bytes()
+        {
+            self.staging.driver.faults.lost(BEHIND.to_string());
+            return self.staging.driver.faults.check();
+        }
+        let n = out.len().min(bytes);
         let span = trace::span("read back").of("what", self.stage).with("bytes", size);
         self.staging.driver.cross(size, || empty(&view[..n], &mut out[..n]));
         drop(span);

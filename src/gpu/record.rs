@@ -16,6 +16,7 @@ use super::faults::lock;
 use super::injected::{FaultKind, fill_device};
 use super::readback::Readback;
 use super::shader::{BindingKind, Pipeline};
+use super::submission_count::SubmissionCount;
 use super::submitter::{Job, Mapping, Ticket, Waker};
 use crate::base::trace;
 
@@ -115,6 +116,12 @@ impl Recorder<'_> {
         lock(&self.gpu.uniforms).pack(&mut self.work.uniforms, bytemuck::bytes_of(value))
     }
 
+    /// Submits the commands recorded so far and goes on recording. Systems reset a device that works for seconds on one submission.
+    /// Errors: as [`Gpu::submit`].
+    pub fn submit_so_far(&mut self) -> GpuResult<()> {
+        self.flush().map(|_| ())
+    }
+
     /// A new buffer containing `data`.
     /// Errors: as [`Gpu::buffer`] and [`Recorder::upload`].
     pub fn buffer_with<T: bytemuck::NoUninit>(&mut self, label: &'static str, data: &[T]) -> GpuResult<Buffer> {
@@ -197,7 +204,10 @@ impl Recorder<'_> {
         self.check_copy("read_back", view, view.size)?;
         self.work.pass = None;
         self.gpu.driver.faults.set_stage(stage);
-        let (readback, pending) = self.gpu.staging.record(&mut self.work.encoder, stage, view, &self.work.ticket)?;
+        // No other recorder is submitted before this one.
+        let count = self.gpu.progress.as_ref().map(SubmissionCount::expected);
+        let (encoder, ticket) = (&mut self.work.encoder, &self.work.ticket);
+        let (readback, pending) = self.gpu.staging.record(encoder, stage, view, ticket, count)?;
         self.work.readbacks.push(pending);
         Ok(readback)
     }
@@ -330,6 +340,7 @@ impl Recorder<'_> {
         match self.gpu.injector.next() {
             None => {}
             Some(FaultKind::Lost) => self.gpu.driver.device.destroy(),
+            Some(FaultKind::GivenUp) => self.work.encoder = self.gpu.driver.encoder(self.work.name),
             Some(FaultKind::Validation) => {
                 if let Ok(raw) = lock(&self.gpu.uniforms).chunk(0) {
                     self.work.encoder.clear_buffer(&raw, 0, Some(2 * UNIFORM_CHUNK)); // beyond its end
@@ -346,6 +357,9 @@ impl Recorder<'_> {
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
         let _span = trace::span("submit").of("what", self.work.name);
+        if let Some((pipeline, finished)) = gpu.progress.as_ref().map(SubmissionCount::next) {
+            self.dispatch("progress", &pipeline, &[finished], [1; 3])?;
+        }
         self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
         let stamps = profiler.resolve(&mut self.work.encoder, &self.work.ticket)?;

@@ -41,6 +41,7 @@ sources![
     "image_loss.wgsl",
     "isect_emit.wgsl",
     "isect_offsets.wgsl",
+    "progress.wgsl",
     "project_bwd.wgsl",
     "project_fwd.wgsl",
     "radix_sort.wgsl",

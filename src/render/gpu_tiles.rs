@@ -375,6 +375,9 @@ impl TileStages {
             ];
             let groups = groups_1d(band.tiles(), 1);
             recorder.dispatch("rasterize_fwd", &self.pipelines.rasterize_fwd, &views, groups)?;
+            if bands.len() > 1 {
+                recorder.submit_so_far()?;
+            }
         }
         Ok(())
     }

@@ -74,14 +74,14 @@ struct Sums {
     rows_per_group: u32,
 }
 
-/// Most pairs of a pixel and a list entry in one dispatch. Windows takes a device for hung that works on one for longer than two seconds, in
-/// which a small integrated GPU blends some 4 G pairs backwards.
+/// Most pairs of a pixel and a list entry in one dispatch. Windows resets a device whose dispatch takes longer than two seconds. A small
+/// integrated GPU blends some 4 G pairs backwards in that time (estimated).
 const DISPATCH_PAIRS: u64 = 1 << 32;
 
 /// The compiled tile stages of the backward pass.
 #[derive(Debug)]
 pub struct BackStages {
-    /// [`DISPATCH_PAIRS`], of the forward pass, too; tests lower it. It changes no result.
+    /// Most pairs of a pixel and a list entry in one dispatch, of the forward pass, too; tests lower it. It changes no result.
     pub dispatch_pairs: u64,
     plain: Sums,
     /// `None` before [`BackStages::weigh_rows`].
@@ -96,7 +96,8 @@ impl BackStages {
         Ok(BackStages { dispatch_pairs: DISPATCH_PAIRS, plain, weighing: None })
     }
 
-    /// The bands of tiles of a range that get a dispatch each, if no list has more than `entries` entries.
+    /// The bands of tiles of a range that get a dispatch each, and a submission each if there are several. No list has more than `entries`
+    /// entries.
     pub(super) fn bands(&self, range: TileRange, entries: u32) -> Vec<TileRange> {
         let pairs_of_tile = 256 * u64::from(entries.max(1));
         range.bands(u32::try_from(self.dispatch_pairs / pairs_of_tile).unwrap_or(u32::MAX)).collect()
@@ -211,6 +212,9 @@ impl BackStages {
             views.extend(errors.cloned());
             let groups = groups_1d(band.tiles(), 1);
             recorder.dispatch("rasterize_bwd", &self.stages(errors.is_some()).rasterize_bwd, &views, groups)?;
+            if bands.len() > 1 {
+                recorder.submit_so_far()?;
+            }
         }
         Ok(())
     }

@@ -1,7 +1,9 @@
 //! The GPU runtime on any adapter, software adapters included: uploads, dispatches, read-backs, budgets and limits.
 //! Without an adapter the tests print a skip; in CI they fail.
 
-use gsscale::gpu::{DeviceChoice, DeviceKind, Gpu, GpuError, GpuOptions, Source, Subgroups, groups_1d};
+use gsscale::gpu::{
+    DeviceChoice, DeviceKind, FaultKind, Gpu, GpuError, GpuOptions, InjectedFault, Source, Subgroups, groups_1d,
+};
 
 use crate::support::gpu::open;
 
@@ -158,6 +160,29 @@ fn results_of_several_submissions_can_be_under_way() {
     }
     for (k, readback) in (0..5u32).zip(waiting) {
         assert_eq!(readback.to_vec::<u32>().unwrap(), [k, k + 1]);
+    }
+}
+
+/// As Metal does: no error, and the memory of read-backs holds what it held before.
+#[test]
+fn work_that_the_device_gives_up_without_an_error_is_found() {
+    let opened = |submission| {
+        let fault = Some(InjectedFault { kind: FaultKind::GivenUp, submission });
+        open(&GpuOptions { fault, ..GpuOptions::default() })
+    };
+    let values: Vec<u32> = (0..1000).collect();
+    // The submission of the read-back itself, and one before it that reads nothing.
+    for (submission, empty) in [(4, false), (3, true)] {
+        let Some(gpu) = opened(submission) else { return };
+        for _ in 0..2 {
+            assert_eq!(run_add(&gpu, &values, 7, &[]).unwrap()[999], 1006);
+        }
+        gpu.submit(gpu.begin("nothing")).unwrap();
+        assert!(!empty || gpu.wait(&gpu.submit(gpu.begin("more")).unwrap()).is_ok(), "nothing was reported");
+        let lost =
+            |error: &GpuError| matches!(error, GpuError::DeviceLost { message, .. } if message.contains("gave up"));
+        assert!(run_add(&gpu, &values, 7, &[]).is_err_and(|error| lost(&error)), "submission {submission}");
+        assert!(run_add(&gpu, &values, 7, &[]).is_err_and(|error| lost(&error)), "a lost device stays lost");
     }
 }
 

@@ -39,9 +39,10 @@ fn a_device_that_is_lost_with_steps_in_flight_loses_the_steps_since_the_last_com
         if i >= 2 && lost_in_flight > 0 {
             break;
         }
-        let name = format!("lost{at}");
+        let kind = ["lost", "given-up"][i % 2];
+        let name = format!("{kind}{at}");
         let mut run = bench.command_of(&name, &format!("{SELDOM} --restarts 9"));
-        let output = run.env("GSSCALE_GPU_FAULT", format!("lost@{at}")).output().unwrap();
+        let output = run.env("GSSCALE_GPU_FAULT", format!("{kind}@{at}")).output().unwrap();
         let said = stderr(&output);
         assert!(output.status.success() && said.contains("(restart 1 of at most 9)"), "{said}");
         same(&bench.result(&name), &want, &name);

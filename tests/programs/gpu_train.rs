@@ -108,7 +108,12 @@ fn assert_ends_with_last_good_step(work: &Workdir, fault: &str, address_space: O
 fn a_device_that_fails_in_mid_run_leaves_the_last_good_step() {
     let Some(()) = a_device() else { return };
     let work = Workdir::city(8, 64, 48, 300);
-    let cases = [("lost", "the device was lost"), ("validation", "refused the work"), ("memory", "out of memory")];
+    let cases = [
+        ("lost", "the device was lost"),
+        ("given-up", "gave up work without an error"),
+        ("validation", "refused the work"),
+        ("memory", "out of memory"),
+    ];
     for (kind, expected) in cases {
         // Five submissions a step; the memory estimate renders some views before the first.
         let line = assert_ends_with_last_good_step(&work, &format!("{kind}@150"), None);
@@ -123,16 +128,18 @@ fn a_run_whose_device_is_lost_resumes_from_its_last_good_step() {
     let work = Workdir::city(8, 64, 48, 300);
     let of_run = "--device gpu --steps 60 --strategy none --view-order shuffle";
     work.run("alone", of_run);
-    let drive = "--spill-dir spill --spill-codec raw --commit-every 0 --restarts 0";
-    let mut run = work.command(TRAIN, &format!("scene --out lost --quiet {of_run} {drive}"));
-    let output = run.env("GSSCALE_GPU_FAULT", "lost@150").output().unwrap();
-    assert!(stderr(&output).contains("the device was lost"), "{}", stderr(&output));
-    let steps = work.count("lost", "steps");
-    assert!(steps > 10 && steps < 60, "{steps} steps before the loss");
-    work.train("--resume lost --log-every 1");
-    let first = work.logged("lost", "step").into_iter().filter(|&step| step > steps).min();
-    assert_eq!(first, Some(steps + 1), "steps before the loss were trained again, or the run began anew");
-    assert!(work.ply("lost") == work.ply("alone"), "the resumed run gives another scene");
+    for kind in ["lost", "given-up"] {
+        let drive = format!("--spill-dir spill-{kind} --spill-codec raw --commit-every 0 --restarts 0");
+        let mut run = work.command(TRAIN, &format!("scene --out {kind} --quiet {of_run} {drive}"));
+        let output = run.env("GSSCALE_GPU_FAULT", format!("{kind}@150")).output().unwrap();
+        assert!(stderr(&output).contains("the device was lost"), "{}", stderr(&output));
+        let steps = work.count(kind, "steps");
+        assert!(steps > 10 && steps < 60, "{steps} steps before the loss");
+        work.train(&format!("--resume {kind} --log-every 1"));
+        let first = work.logged(kind, "step").into_iter().filter(|&step| step > steps).min();
+        assert_eq!(first, Some(steps + 1), "steps before the loss were trained again, or the run began anew");
+        assert!(work.ply(kind) == work.ply("alone"), "the resumed run gives another scene");
+    }
 }
 
 /// A library between programs and the driver that has faults of drivers of hardware (tests/support/device_faults.c).

@@ -1,0 +1,43 @@
+//! Proof that the device has done what it was given: a count on the device to which every submission adds one, and which every read-back takes
+//! with it.
+//!
+//! Metal gives up a command buffer that took too long or faulted, and says so in a status that wgpu 30 does not read: the submission looks
+//! done, and its read-backs hold what their memory held before. With the count such a read-back is the loss of the device. Vulkan and DX12
+//! report the loss by themselves, so no other device counts.
+//!
+//! Invariants: 1. a read-back is right only if all submissions before its own were finished, and its own copies were made; 2. a count that
+//! is behind stays behind, so the next read-back finds the loss.
+
+use super::buffers::{Buffer, BufferView};
+use super::shader::Pipeline;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+/// What a read-back reports whose count is behind.
+pub(super) const BEHIND: &str = "the device gave up work without an error, as Metal does with work that takes too long";
+
+/// The count on the device and the one it must have reached.
+#[derive(Debug)]
+pub(super) struct SubmissionCount {
+    finished: Buffer,
+    pipeline: Arc<Pipeline>,
+    submitted: AtomicU32,
+}
+
+impl SubmissionCount {
+    /// Counts submissions from now on with a pipeline of `progress.wgsl`; `finished` is zero.
+    pub(super) fn new(pipeline: Arc<Pipeline>, finished: Buffer) -> SubmissionCount {
+        SubmissionCount { finished, pipeline, submitted: AtomicU32::new(0) }
+    }
+
+    /// The count on the device, and its value behind all submissions so far.
+    pub(super) fn expected(&self) -> (BufferView, u32) {
+        (self.finished.view(), self.submitted.load(Ordering::Relaxed))
+    }
+
+    /// The dispatch that ends the next submission.
+    pub(super) fn next(&self) -> (Arc<Pipeline>, BufferView) {
+        self.submitted.fetch_add(1, Ordering::Relaxed);
+        (Arc::clone(&self.pipeline), self.finished.view())
+    }
+}
