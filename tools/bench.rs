@@ -1,6 +1,8 @@
 //! `gsscale-bench`: measures training and prints the figures. The first argument names the measurement; without a
 //! name it is `run`. Parses, calls, prints. (Measurements of the program's own parts are benchmarks: `benches/`.)
 
+#[path = "bench/city.rs"]
+mod city;
 #[path = "bench/compare.rs"]
 mod compare;
 #[path = "bench/doctor.rs"]
@@ -52,8 +54,8 @@ Measures training.
   gsscale-bench doctor                 checks your GPU against the CPU, and says which flags to use
   gsscale-bench compare A B --out F    shows finished runs side by side on one page
   gsscale-bench sweep LIST SCENE... --out DIR
-                                       trains the runs of a list and compares them: pareto, ladder, ladder-gpu, speed,
-                                       stability, or a file
+                                       trains the runs of a list and compares them: cells, pareto, ladder, ladder-gpu,
+                                       speed, stability, or a file
 
 Each command has --help with examples: gsscale-bench run --help, gsscale-bench run rubble --help.
 Published scenes: ";

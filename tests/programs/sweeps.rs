@@ -180,6 +180,9 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses_list(&with("{ name = \"a\", set = { stepz = 3 } }"), "stepz");
     refuses_list(&with("{ name = \"a\", times = { optimizer = 2.0 } }"), "optimizer is no number");
     refuses_list(&with("{ name = \"a\", set = { data-factor = 0.5 } }"), "data-factor");
+    let in_cells =
+        with("{ name = \"a\", city = { cells = 2 } }").replace("name = \"\"", "name = \"\"\ndisturb = \"nothing\"");
+    refuses_list(&in_cells, "disturbed scene");
     refuses_list(
         &list.replace(", RUN", "").replace("seeds = [1]", "seeds = [1]\nshare = 50"),
         "nothing would leave memory",
@@ -221,4 +224,34 @@ fn faults_of_a_capture_are_charted_and_their_scenes_are_removed() {
     check_page(&work, "out/scene/sweep.html", &parts);
     // Other photos are other scenes.
     assert_eq!(lines(&work, &format!("{flags} --max-resolution 40 --max-runs 1")).len(), 1);
+}
+
+#[test]
+fn cities_in_cells_are_compared_with_the_reference_at_their_borders() {
+    let work = Workdir::wide_city(3000);
+    let city = |name: &str, keys: &str| format!("{{ name = \"{name}\", city = {{ cells = {keys} }} }}");
+    work.write(
+        "cells.toml",
+        format!(
+            "seeds = [1]\n[base]\nsteps = 120\nmax-gaussians = 4000\npage-rows = 32\nview-order = \"shuffle\"\n\
+             [view]\ntitle = \"cells\"\nreference = \"one run\"\nfigures = [\"psnr\", \"band-loss\", \"trained-gaussians\"]\n\
+             charts = [{{ figure = \"band-loss\" }}]\n[[group]]\nname = \"\"\n\
+             runs = [{{ name = \"one run\" }}, {}, {}]\n",
+            city("two", "2"),
+            city("wide", "2, margin = 1.0, view-share = 0.05")
+        ),
+    );
+    let flags = "sweep cells.toml scene --out out --device cpu --pace-steps 0";
+    let records = lines(&work, flags);
+    let [whole, two, wide] = ["one run", "two", "wide"].map(|name| of(&records, name, 1));
+    assert!(records.len() == 3 && records.iter().all(|record| record["problem"].is_null()), "{records:?}");
+    for city in [two, wide] {
+        assert!(number(city, "border_loss").is_finite() && number(city, "band_loss").is_finite());
+        assert!(number(city, "trained_gaussians") > number(city, "gaussians"), "margins are dropped at the merge");
+    }
+    assert!(number(wide, "trained_gaussians") > number(two, "trained_gaussians") && two["ply"] != wide["ply"]);
+    assert!(whole["band_loss"].is_null() && number(whole, "gaussians") > 1000.0);
+    assert!(names(&work, "out/scene/runs").iter().all(|name| !name.contains(".part")), "cities are removed");
+    check_page(&work, "out/scene/sweep.html", &["lost in bands along borders, dB", "wide", "two"]);
+    assert!(lines(&work, flags).is_empty(), "all are done");
 }

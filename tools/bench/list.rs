@@ -6,6 +6,7 @@
 //! none of them gives follow the length of the run, as in any other run; 2. no two planned runs are the same; 3. a run that needs
 //! fewer frames than pages is left out, with a warning, if a view needs all pages, unless it is the reference.
 
+use super::city::CityCut;
 use super::facts::Facts;
 use super::record::RunRecord;
 use super::runs::{MadeScene, Place, Planned, Surroundings, use_drive};
@@ -25,7 +26,8 @@ use std::path::Path;
 use toml::{Table, Value};
 
 /// The lists of this project, by name.
-pub const BUILT_IN: [(&str, &str); 5] = [
+pub const BUILT_IN: [(&str, &str); 6] = [
+    ("cells", include_str!("../../configs/sweeps/cells.toml")),
     ("pareto", include_str!("../../configs/sweeps/pareto.toml")),
     ("ladder", include_str!("../../configs/sweeps/ladder.toml")),
     ("ladder-gpu", include_str!("../../configs/sweeps/ladder-gpu.toml")),
@@ -100,6 +102,8 @@ struct Entry {
     /// Runs of one class and seed must end with the same bits.
     #[serde(default)]
     bits: String,
+    /// Train the scene in cells.
+    city: Option<CityCut>,
 }
 
 /// The runs of a scene.
@@ -116,7 +120,11 @@ impl List {
     pub fn read(path: &Path) -> InputResult<List> {
         let text = match BUILT_IN.iter().find(|(name, _)| path.as_os_str() == *name) {
             Some((_, text)) => (*text).to_string(),
-            None => read_text(path, FILE_BYTES_MAX, "give a file, or pareto, ladder, ladder-gpu, speed or stability")?,
+            None => read_text(
+                path,
+                FILE_BYTES_MAX,
+                "give a file, or cells, pareto, ladder, ladder-gpu, speed or stability",
+            )?,
         };
         let refused = |problem: String| InputError::new(path, problem, "see \"Sweeps\" in configs/README.md");
         let list: List = toml::from_str(&text).map_err(|e| refused(e.to_string()))?;
@@ -176,6 +184,12 @@ impl List {
             true => Some(gsscale::train::start::first_scene::prepare(&place.scene, &base)?.dataset),
             false => None,
         };
+        if let Some((group, entry)) =
+            self.entries().find(|(group, entry)| entry.city.is_some() && group.disturb.is_some())
+        {
+            let problem = "a group of a disturbed scene has a run in cells";
+            return Err(InputError::new(name_of(group, entry), problem, "give the run a group without disturb").into());
+        }
         let mut planner = Planner { list: self, place, given, base, dataset, facts: BTreeMap::new() };
         let is_reference = |(group, entry): &(&Group, &Entry)| name_of(group, entry) == self.view.reference;
         let mut planned = Vec::new();
@@ -256,7 +270,8 @@ impl Planner<'_> {
         (config.seed, config.spill_dir, config.frames) = (seed, String::new(), 0);
         let scene = self.disturbed(group, &mut config)?;
         config.check()?;
-        let share = entry.share.unwrap_or(self.list.share);
+        // A run in cells keeps all pages in memory.
+        let share = if entry.city.is_some() { 0.0 } else { entry.share.unwrap_or(self.list.share) };
         if share > 0.0 {
             let facts = match self.facts.remove(&config.page_rows) {
                 Some(facts) => facts,
@@ -269,8 +284,10 @@ impl Planner<'_> {
                 Err(problem) => return Ok(Err(problem)),
             }
         }
-        let (environment, bits) = (entry.environment.clone(), entry.bits.clone());
-        Ok(Ok(Planned { name, config, scene, environment, bits }))
+        let (environment, bits, city) = (entry.environment.clone(), entry.bits.clone(), entry.city.clone());
+        // Cities are compared with the reference at their borders.
+        let keeps_ply = name == self.list.view.reference && self.list.entries().any(|(_, entry)| entry.city.is_some());
+        Ok(Ok(Planned { name, config, scene, environment, bits, city, keeps_ply }))
     }
 
     /// The scene of a group, and the keys that suit it: its photos have training size and their own split.

@@ -81,6 +81,14 @@ pub struct RunRecord {
     pub device_bytes_peak: u64,
     /// Bytes of the files of the pages.
     pub drive_bytes_peak: u64,
+    /// What the reference has more in held-out photos that show a border of cells, and in the bands along borders, dB.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub border_loss: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub band_loss: Option<f64>,
+    /// Gaussians that the cells have trained, with their margins.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trained_gaussians: Option<u64>,
     /// Digest of the PLY: equal digests mean equal bits.
     pub ply: String,
     /// The order of views that the run used, after `auto` was resolved.
@@ -150,7 +158,7 @@ const fn figure(
     Figure { name, title, digits, of }
 }
 
-const FIGURES: [Figure; 16] = [
+const FIGURES: [Figure; 19] = [
     figure("psnr", "PSNR, dB", Some(2), |r| r.psnr),
     figure("ssim", "SSIM", Some(4), |r| r.ssim),
     figure("cc-psnr", "PSNR after colour correction, dB", Some(2), |r| r.cc_psnr),
@@ -166,6 +174,11 @@ const FIGURES: [Figure; 16] = [
     figure("device-bytes-peak", "device peak", None, |r| Some(r.device_bytes_peak as f64)),
     figure("drive-bytes-peak", "drive peak", None, |r| Some(r.drive_bytes_peak as f64)),
     figure("gaussians", "Gaussians", Some(0), |r| Some(r.gaussians as f64)),
+    figure("trained-gaussians", "Gaussians trained, with margins", Some(0), |r| {
+        Some(r.trained_gaussians.unwrap_or(r.gaussians) as f64)
+    }),
+    figure("border-loss", "lost in photos with a border, dB", Some(2), |r| r.border_loss),
+    figure("band-loss", "lost in bands along borders, dB", Some(2), |r| r.band_loss),
     figure("frames", "frames", Some(0), |r| Some(r.frames as f64)),
 ];
 

@@ -5,12 +5,14 @@
 //! 3. a failed run is logged and the sweep continues; an interrupted run ends the sweep; 4. a file in use is never
 //! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
+use super::city::{CityCut, CityPlace, borders};
 use super::read_json;
 use super::record::{Pace, RunRecord, convert_to_one_pace};
 use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
+use gsscale::cells::work::status;
 use gsscale::config::file::TrainConfig;
 use gsscale::config::values::{ByteSize, Choice};
 use gsscale::dataset::disturb::Disturbance;
@@ -19,7 +21,7 @@ use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE,
 use gsscale::train::log::report::Summary;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -79,6 +81,10 @@ pub struct Planned {
     pub environment: BTreeMap<String, String>,
     /// Runs of one class and seed must end with the same bits; empty = this is not known.
     pub bits: String,
+    /// The scene is trained in cells.
+    pub city: Option<CityCut>,
+    /// The run's folder keeps its PLY.
+    pub keeps_ply: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -121,7 +127,9 @@ impl Planned {
         let settings = toml::to_string(&self.config).unwrap_or_default();
         let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
         let environment: String = self.environment.iter().map(|(name, value)| format!("\n{name}={value}")).collect();
-        let all = format!("{}\n{settings}{how}{environment}", surroundings.text);
+        let city = self.city.as_ref().map_or(String::new(), |city| format!("\n{city:?}"));
+        let kept = if self.keeps_ply { "\nwith its PLY" } else { "" };
+        let all = format!("{}\n{settings}{how}{environment}{city}{kept}", surroundings.text);
         format!("{:016x}", xxh3_64(all.as_bytes()))
     }
 
@@ -171,9 +179,14 @@ impl Sweep {
         (records, times)
     }
 
-    /// Trains a run and logs its result. Prints the result as JSON if that was asked for; warns if the run failed.
+    /// Trains a run and logs its result; `reference` is the run with which a city is compared. Prints the result as JSON if that was asked for; warns if the run failed.
     /// Errors: the program is missing or was interrupted, or results cannot be written. A failed run is a result.
-    pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<()> {
+    pub fn run(
+        &mut self,
+        planned: &Planned,
+        reference: Option<&Planned>,
+        print: &mut dyn FnMut(&Value),
+    ) -> InputResult<()> {
         let key = planned.key(&self.surroundings);
         if self.pace_after_last_run.is_none() {
             // The first training also brings the photos into memory.
@@ -181,7 +194,10 @@ impl Sweep {
             self.pace_after_last_run = self.measure_pace()?;
         }
         let before = self.pace_after_last_run.take();
-        let mut record = self.train(planned, &key)?;
+        let mut record = match &planned.city {
+            Some(city) => self.train_city(planned, city, &key, reference)?,
+            None => self.train(planned, &key)?,
+        };
         let after = self.measure_pace();
         // An interrupted pace does not take the run with it.
         record.pace = before.zip(after.as_ref().ok().cloned().flatten()).map(|(before, after)| mean(&before, &after));
@@ -203,7 +219,7 @@ impl Sweep {
         }
         let config = TrainConfig { steps: self.pace_steps, ..self.base.clone() };
         let (name, environment, bits) = (String::from("pace"), BTreeMap::new(), String::new());
-        let planned = Planned { name, config, scene: None, environment, bits };
+        let planned = Planned { name, config, scene: None, environment, bits, city: None, keeps_ply: false };
         let key = planned.key(&self.surroundings);
         let record = self.train(&planned, &key)?;
         remove(&self.out.join("runs").join(planned.folder(&key)))?;
@@ -227,19 +243,7 @@ impl Sweep {
             make_folder(&self.spill)?;
             config.spill_dir = spill.display().to_string();
         }
-        let mut record = RunRecord {
-            key: key.to_string(),
-            scene: self.scene.display().to_string(),
-            name: planned.name.clone(),
-            settings: changes(&self.base, &planned.config),
-            seed: planned.config.seed,
-            steps: planned.config.steps,
-            version: env!("CARGO_PKG_VERSION").to_string(),
-            threads: rayon::current_num_threads() as u64,
-            cpu: cpu_model(),
-            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
-            ..RunRecord::default()
-        };
+        let mut record = self.record(planned, key);
         let file = self.out.join("runs").join(format!("{name}.part.toml"));
         write_config(&file, &config)?;
         let began = Instant::now();
@@ -252,23 +256,47 @@ impl Sweep {
             record.problem = Some(problem(&output)?);
         } else {
             self.read_figures(&mut record, &config, &part)?;
+            if record.problem.is_none() && !planned.keeps_ply {
+                remove(&part.join(PLY_FILE))?;
+            }
         }
         remove(&spill)?;
         remove(&file)?;
-        let folder = self.out.join("runs").join(name);
-        remove(&folder)?;
-        match record.problem {
-            Some(_) => remove(&part)?,
-            None => std::fs::rename(&part, &folder).map_err(|e| InputError::io(&folder, "naming the run", &e))?,
-        }
+        self.finish(&name, &part, &record)?;
         Ok(record)
     }
 
-    /// Reads the figures from the run's folder and removes the PLY, which is large.
+    /// The record of a run without its figures.
+    fn record(&self, planned: &Planned, key: &str) -> RunRecord {
+        RunRecord {
+            key: key.to_string(),
+            scene: self.scene.display().to_string(),
+            name: planned.name.clone(),
+            settings: changes(&self.base, &planned.config),
+            seed: planned.config.seed,
+            steps: planned.config.steps,
+            version: env!("CARGO_PKG_VERSION").to_string(),
+            threads: rayon::current_num_threads() as u64,
+            cpu: cpu_model(),
+            wrong_views: planned.scene.as_ref().map_or(Vec::new(), |scene| scene.wrong.clone()),
+            ..RunRecord::default()
+        }
+    }
+
+    /// Gives the folder of a run its final name, or removes it if the run failed.
+    fn finish(&self, name: &str, part: &Path, record: &RunRecord) -> InputResult<()> {
+        let folder = self.out.join("runs").join(name);
+        remove(&folder)?;
+        match record.problem {
+            Some(_) => remove(part),
+            None => std::fs::rename(part, &folder).map_err(|e| InputError::io(&folder, "naming the run", &e)),
+        }
+    }
+
+    /// Reads the figures from the run's folder.
     fn read_figures(&self, record: &mut RunRecord, config: &TrainConfig, folder: &Path) -> InputResult<()> {
         let summary: Summary = read_json(&folder.join(SUMMARY_FILE), AGAIN)?;
-        let ply = folder.join(PLY_FILE);
-        record.ply = digest(&ply)?;
+        record.ply = digest(&folder.join(PLY_FILE))?;
         (record.psnr, record.ssim) = (summary.test.map(|t| t.psnr), summary.test.map(|t| t.ssim));
         record.predicted_psnr = summary.test.and_then(|t| t.predicted).map(|p| p.predicted_psnr);
         record.cc_psnr = summary.test.and_then(|t| t.color_corrected).map(|c| c.cc_psnr);
@@ -287,19 +315,73 @@ impl Sweep {
         let photos = |c: &TrainConfig| (c.data_factor, c.max_resolution);
         if photos(config) != photos(&self.base) {
             // Smaller photos raise PSNR, so every run is evaluated on the photos of the reference.
-            let file = folder.join(EVALUATED_AS_FILE);
-            write_config(&file, &self.base)?;
-            let json = folder.join(EVALUATED_FILE);
-            let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
-            let output = self.spawn("gsscale-eval", &arguments, &BTreeMap::new())?;
-            if !output.status.success() {
-                record.problem = Some(problem(&output)?);
-                return Ok(());
-            }
-            let report: Value = read_json(&json, AGAIN)?;
-            (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
+            self.evaluate(record, folder)?;
         }
-        remove(&ply)
+        Ok(())
+    }
+
+    /// Evaluates the PLY in a folder on the photos of the sweep's base.
+    fn evaluate(&self, record: &mut RunRecord, folder: &Path) -> InputResult<()> {
+        let [ply, file, json] = [PLY_FILE, EVALUATED_AS_FILE, EVALUATED_FILE].map(|name| folder.join(name));
+        write_config(&file, &self.base)?;
+        let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
+        let output = self.spawn("gsscale-eval", &arguments, &BTreeMap::new())?;
+        if !output.status.success() {
+            record.problem = Some(problem(&output)?);
+            return Ok(());
+        }
+        let report: Value = read_json(&json, AGAIN)?;
+        (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
+        record.gaussians = report["gaussians"].as_u64().unwrap_or(record.gaussians);
+        Ok(())
+    }
+
+    /// Trains a scene in cells and compares its borders with those of `reference`, whose folder has its PLY.
+    fn train_city(
+        &self,
+        planned: &Planned,
+        cut: &CityCut,
+        key: &str,
+        reference: Option<&Planned>,
+    ) -> InputResult<RunRecord> {
+        let (name, runs) = (planned.folder(key), self.out.join("runs"));
+        let at = |end: &str| runs.join(format!("{name}{end}"));
+        let (part, city, file) = (at(".part"), at(".city.part"), at(".part.toml"));
+        let mut record = self.record(planned, key);
+        write_config(&file, &planned.config)?;
+        let began = Instant::now();
+        let cells = |arguments: &[OsString]| {
+            let arguments: Vec<&Path> = arguments.iter().map(Path::new).collect();
+            self.spawn("gsscale-cells", &arguments, &planned.environment)
+        };
+        let place = CityPlace { scene: &self.scene, config: &file, city: &city, merged: &part };
+        record.problem = cut.train(&place, &cells)?;
+        record.wall_seconds = began.elapsed().as_secs_f64();
+        record.seconds = record.wall_seconds;
+        if record.problem.is_none() {
+            record.ply = digest(&part.join(PLY_FILE))?;
+            self.evaluate(&mut record, &part)?;
+        }
+        if let (None, Some(reference)) = (&record.problem, reference) {
+            let of_reference = runs.join(reference.folder(&reference.key(&self.surroundings)));
+            match (borders(&city, &of_reference, &cells)?, borders(&city, &part, &cells)?) {
+                (Ok(reference), Ok(own)) => {
+                    let lost = |a: Option<f64>, b: Option<f64>| Some(a? - b?);
+                    record.border_loss = lost(reference.crossing_psnr, own.crossing_psnr);
+                    record.band_loss = lost(reference.band_psnr, own.band_psnr);
+                }
+                (Err(problem), _) | (_, Err(problem)) => record.problem = Some(problem),
+            }
+        }
+        if record.problem.is_none() {
+            let (_, cells) = status(&city)?;
+            record.trained_gaussians = cells.iter().map(|cell| Some(cell.done.as_ref()?.gaussians)).sum();
+            remove(&part.join(PLY_FILE))?;
+        }
+        remove(&city)?;
+        remove(&file)?;
+        self.finish(&name, &part, &record)?;
+        Ok(record)
     }
 
     /// Runs a program that is part of this program, or lies in its folder, to its end. The program's standard input is the lock file, so the
@@ -313,7 +395,7 @@ impl Sweep {
             .args(arguments)
             .envs(environment)
             .stdin(Stdio::from(held))
-            .stdout(Stdio::null())
+            .stdout(Stdio::piped())
             .stderr(Stdio::piped());
         if program == "gsscale-train" {
             started.arg("--quiet");
@@ -380,11 +462,16 @@ fn lock(out: &Path) -> InputResult<File> {
 
 /// The last error message of a failed program, or its exit status.
 /// Errors: the program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
-fn problem(output: &Output) -> InputResult<String> {
-    if let Some(130 | 143) = output.status.code() {
+pub fn problem(output: &Output) -> InputResult<String> {
+    let said = String::from_utf8_lossy(&output.stderr);
+    // A cell that a signal has stopped ends with 75; so does one that lacks something, with an error.
+    let is_interrupted = match output.status.code() {
+        Some(75) => !said.contains("error: "),
+        code => matches!(code, Some(130 | 143)),
+    };
+    if is_interrupted {
         return Err(InputError::new("the sweep", "was interrupted", "start it again to continue"));
     }
-    let said = String::from_utf8_lossy(&output.stderr);
     let errors = said.rfind("error: ").map_or(said.trim(), |at| said[at..].trim());
     let text = if errors.is_empty() { output.status.to_string() } else { errors.replace('\n', " ") };
     Ok(text.chars().take(PROBLEM_MAX).collect())

@@ -28,6 +28,7 @@ Lists:
   pareto      one change of a setting at a time, and a few together: cost in accuracy, savings in time, bytes, Gaussians
   ladder      the ideas of out-of-core training, added one by one
   ladder-gpu  the same on a GPU; needs --device gpu --device-mem SIZE
+  cells       a city in cells: margins, and which photos a cell takes
   speed       what few and many steps and Gaussians reach, beside other programs
   stability   faults of photos, poses and points, and remedies
 \"Sweeps\" in configs/README.md says how to write another one.
@@ -39,7 +40,7 @@ a table. A sweep that stopped continues when started again.";
 #[derive(Parser)]
 #[command(name = "gsscale-bench sweep", version, after_help = EXAMPLES)]
 pub struct Args {
-    /// pareto, ladder, ladder-gpu, speed, stability, or a TOML file
+    /// cells, pareto, ladder, ladder-gpu, speed, stability, or a TOML file
     list: PathBuf,
     /// Scenes: COLMAP folders (images/, sparse/), with transforms.json, or in Mega-NeRF's layout
     #[arg(required = true)]
@@ -158,7 +159,8 @@ fn sweep_scene(
             }
             made = folder;
         }
-        sweep.run(run, print)?;
+        let is_reference = |other: &&Planned| other.name == list.view.reference && other.config.seed == run.config.seed;
+        sweep.run(run, plan.runs.iter().find(is_reference), print)?;
         write_page(&sweep)?;
     }
     made.iter().try_for_each(|folder| remove(folder))?;

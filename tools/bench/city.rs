@@ -1,0 +1,87 @@
+//! The training of a run whose scene is cut into cells: the programs of a user, one after the other on this machine.
+//!
+//! Not here: when a run is trained, its folder and its log ([`super::runs`]).
+
+use super::runs::problem;
+use gsscale::base::error::InputResult;
+use gsscale::cells::City;
+use gsscale::cells::plan::CityPlan;
+use serde::Deserialize;
+use serde_json::Value;
+use std::ffi::OsString;
+use std::path::Path;
+use std::process::Output;
+
+/// How a scene is cut into cells. `None` stands for the default of `gsscale-cells cut`.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields, rename_all = "kebab-case")]
+pub struct CityCut {
+    cells: usize,
+    /// Width of the margin, as a share of a cell's.
+    margin: Option<f64>,
+    /// The share of a photo's blending weight for which a cell takes the photo.
+    view_share: Option<f64>,
+}
+
+/// The folders of a city and of its scenes.
+pub struct CityPlace<'a> {
+    pub scene: &'a Path,
+    pub config: &'a Path,
+    pub city: &'a Path,
+    pub merged: &'a Path,
+}
+
+/// What a scene lacks beside borders.
+#[derive(Debug, Clone, Copy)]
+pub struct Borders {
+    /// PSNR of the held-out views that show a border, and of the bands along borders, dB.
+    pub crossing_psnr: Option<f64>,
+    pub band_psnr: Option<f64>,
+}
+
+/// What starts `gsscale-cells` with such arguments.
+pub type Cells<'a> = dyn Fn(&[OsString]) -> InputResult<Output> + 'a;
+
+impl CityCut {
+    /// Trains the city and merges it. Returns the message of a step that failed. Errors: a program cannot be started, or was interrupted.
+    pub fn train(&self, place: &CityPlace, cells: &Cells) -> InputResult<Option<String>> {
+        let path = |path: &Path| path.as_os_str().to_os_string();
+        let (city, scene) = (path(place.city), path(place.scene));
+        let words = |words: &[&str]| words.iter().map(OsString::from).collect::<Vec<_>>();
+        let mut cut = words(&["cut", "--quiet", "--cells", &self.cells.to_string()]);
+        for (flag, value) in [("--margin", self.margin), ("--view-share", self.view_share)] {
+            cut.extend(value.iter().flat_map(|value| words(&[flag, &value.to_string()])));
+        }
+        cut.extend([scene.clone(), "--out".into(), city.clone()]);
+        let prior = ["prior".into(), "--quiet".into(), scene, "--out".into(), city.clone()];
+        let prior = [&prior[..], &["--config".into(), path(place.config)]].concat();
+        let run = |cell: usize| [words(&["run", "--quiet", "--cell", &cell.to_string()]), vec![city.clone()]].concat();
+        let merge = vec!["merge".into(), city.clone(), "--out".into(), path(place.merged)];
+        let failed = |steps: Vec<Vec<OsString>>| -> InputResult<Option<String>> {
+            for arguments in steps {
+                let output = cells(&arguments)?;
+                if !output.status.success() {
+                    return problem(&output).map(Some);
+                }
+            }
+            Ok(None)
+        };
+        if let Some(problem) = failed(vec![prior, cut])? {
+            return Ok(Some(problem));
+        }
+        // Cells of few photos were joined to others.
+        let count = CityPlan::read(&City(place.city.to_path_buf()))?.cells.len();
+        failed((0..count).map(run).chain([merge]).collect())
+    }
+}
+
+/// What the scene in the folder `model` has beside the borders of a city; the message of a measurement that failed.
+pub fn borders(city: &Path, model: &Path, cells: &Cells) -> InputResult<Result<Borders, String>> {
+    let output = cells(&["seam".into(), city.into(), model.into()])?;
+    if !output.status.success() {
+        return Ok(Err(problem(&output)?));
+    }
+    let report: Value = serde_json::from_slice(&output.stdout).unwrap_or_default();
+    let number = |name: &str| report[name].as_f64();
+    Ok(Ok(Borders { crossing_psnr: number("crossing_psnr"), band_psnr: number("band_psnr") }))
+}
