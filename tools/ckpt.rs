@@ -457,7 +457,7 @@ Examples:
   gsscale-ckpt export runs/city --out city.ply --host-mem 256MiB
 
 Pages are read one by one: --host-mem bounds the memory for a scene of any size. Without --max-gaussians, --crop
-and --sh-degree the file is the one that gsscale-train would have written after that step.";
+and --sh-degree the file is the one that gsscale-train --export-clean=off would have written after that step.";
 
 #[derive(clap::Args)]
 #[command(after_help = EXPORT_EXAMPLES)]
@@ -504,6 +504,7 @@ fn run_export(args: &Export) -> Result<ExitCode, TrainError> {
         sh_degree: args.sh_degree,
     };
     let done = export(&find_store(&args.dir)?, &request)?;
+    done.warnings.iter().for_each(|warning| gsscale::tell!("warning: {warning}"));
     print(args.json, &done, || {
         let mut text = format!(
             "{}: {} Gaussians as of generation {} (step {}), {}; {} of pages read, at most {} of memory used\n",

@@ -4,15 +4,19 @@
 //!
 //! Invariants: 1. the target holds either its old bytes or all new ones, whenever the process or the machine stops;
 //! 2. content and name are durable when a write returns, as far as the file system can do that; 3. a write that fails
-//! leaves no temporary file.
+//! leaves no temporary file; 4. one writer at a time has the temporary file of a target, as far as the file system has locks.
 
 use super::error::{InputError, InputResult};
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::io::{self, BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// Bytes gathered before they are written.
 const BUFFER_BYTES: usize = 1 << 20;
+/// How long a writer waits for another one of the same file. Small files are written within milliseconds.
+const WAIT: Duration = Duration::from_secs(5);
+const BETWEEN_TRIES: Duration = Duration::from_millis(20);
 
 /// A file under way. Dropping it removes the temporary file.
 #[derive(Debug)]
@@ -22,20 +26,14 @@ pub struct PartFile {
 }
 
 impl PartFile {
-    /// Begins to write the file `target`: creates `.NAME.part` beside it, to be given back to [`PartFile::finish`].
-    /// Errors: the folder cannot be written, or `target` names no file.
+    /// Begins to write the file `target`: creates `.NAME.part` beside it, to be written and read, and given back to
+    /// [`PartFile::finish`].
+    /// Errors: the folder cannot be written, `target` names no file, or another process writes this file.
     pub fn create(target: &Path) -> InputResult<(PartFile, File)> {
         let no_name = || InputError::new(target, "this path has no file name", "give a file name");
-        let part = PartFile { path: part_path(target).ok_or_else(no_name)?, target: target.to_path_buf() };
-        let file = File::create(&part.path).map_err(|e| InputError::io(target, "creating the file", &e))?;
-        Ok((part, file))
-    }
-
-    /// The temporary file again, to be written and read: for bytes that are never to get the name.
-    /// Errors: the file cannot be opened.
-    pub fn reopen(&self) -> InputResult<File> {
-        let opened = File::options().read(true).write(true).open(&self.path);
-        opened.map_err(|e| InputError::io(&self.target, "opening the temporary file", &e))
+        let path = part_path(target).ok_or_else(no_name)?;
+        let file = open_alone(&path, target)?;
+        Ok((PartFile { path, target: target.to_path_buf() }, file))
     }
 
     /// Makes the bytes durable, and gives the file its name.
@@ -43,7 +41,8 @@ impl PartFile {
     pub fn finish(self, file: File) -> InputResult<()> {
         let target = &self.target;
         file.sync_all().map_err(|e| InputError::io(target, "flushing to the disk", &e))?;
-        drop(file);
+        // Its lock keeps the next writer away until it has its name. Windows renames no open file.
+        let _locked = if cfg!(windows) { None } else { Some(file) };
         std::fs::rename(&self.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
         match sync_folder(folder_of(target)) {
             Err(e) if !is_sync_unsupported(&e) => Err(InputError::io(target, "flushing the folder to the disk", &e)),
@@ -57,6 +56,40 @@ impl Drop for PartFile {
         // After the rename the file no longer exists, and this call fails as expected.
         let _ = std::fs::remove_file(&self.path);
     }
+}
+
+/// The empty temporary file of a target, locked.
+fn open_alone(path: &Path, target: &Path) -> InputResult<File> {
+    let io = |e: io::Error| InputError::io(target, "creating the file", &e);
+    let began = Instant::now();
+    loop {
+        let file = File::options().read(true).write(true).create(true).truncate(false).open(path).map_err(io)?;
+        let is_held = matches!(file.try_lock(), Err(TryLockError::WouldBlock));
+        // The writer before may have renamed or removed the file since it was opened here.
+        if !is_held && is_same_file(path, &file) {
+            file.set_len(0).map_err(io)?;
+            return Ok(file);
+        }
+        if began.elapsed() > WAIT {
+            let remedy = "wait for its end, or name another file";
+            return Err(InputError::new(target, "another process is writing this file", remedy));
+        }
+        std::thread::sleep(BETWEEN_TRIES);
+    }
+}
+
+/// Whether the open `file` is the one that `path` names.
+#[cfg(unix)]
+pub fn is_same_file(path: &Path, file: &File) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
+    matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
+}
+
+#[cfg(not(unix))]
+pub fn is_same_file(_path: &Path, _file: &File) -> bool {
+    // These systems do not let anyone remove an open file.
+    true
 }
 
 /// The temporary file `.NAME.part` of a target, which a process that is killed leaves; `None` if the target names no file.
@@ -127,6 +160,12 @@ mod tests {
         write_whole(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file is left");
+        let (part, mut file) = PartFile::create(&path).unwrap();
+        file.write_all(b"third").unwrap();
+        // As another process would: what is under way stays.
+        assert!(write_whole(&path, b"fourth").unwrap_err().problem.contains("another process is writing"));
+        part.finish(file).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"third");
         assert!(write_whole(Path::new("/"), b"").unwrap_err().problem.contains("no file name"));
     }
 }

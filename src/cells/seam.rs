@@ -18,6 +18,7 @@ use crate::scene::image::Target;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
 use crate::train::log::report::json_psnr;
+use crate::train::memory::host_budget;
 use crate::train::run::eval_file::{Evaluator, Model};
 use crate::train::step::pages::WorkingSet;
 use crate::train::step::view::{SceneNow, draw};
@@ -72,7 +73,7 @@ pub fn seam(city: &Path, model: &Path, scene: Option<&Path>, band: f64) -> Resul
     let config = TrainConfig { views_file: String::new(), ..TrainConfig::read(&model.join(CONFIG_FILE))? };
     machine::set_up(&config)?;
     let file = model.join(PLY_FILE);
-    let Model::Ply(read) = Model::open(&file)? else {
+    let Model::Ply(read) = Model::open(&file, host_budget(config.host_mem.0))? else {
         return Err(InputError::new(&file, "it is no PLY", "name the folder of a merge or a run").into());
     };
     let scene = match scene {

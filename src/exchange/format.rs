@@ -3,14 +3,17 @@
 //! Invariant: everything that follows from a format is a `match` in this file, so that the compiler lists what a new format needs.
 
 use super::meta::{ExportFrame, SceneMeta};
-use super::ply::PlyWriter;
+use super::ply::{PlyWriter, holds_gaussians};
 use super::sink::GaussianSink;
 use super::sog::{SogWriter, TREE_FILE, folder_of_tree, is_of_sog, is_tree, memory_bytes};
 use super::spz::{SPZ_UP, SpzWriter};
-use super::transform::{transform_path, write_transform};
+use super::transform::{is_transform, transform_path, write_transform};
 use crate::base::error::{InputError, InputResult};
+use crate::base::whole_file::check_replaceable;
 use crate::base::whole_folder::{check_ours, remove_ours};
 use crate::scene::rotation::VIEWER_UP;
+use std::fs::File;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,6 +98,19 @@ impl ExportFormat {
         }
     }
 
+    /// Checks that an export for a user may write `file` and its transform: a slip in a command must not cost a scan or a model.
+    /// Errors: as [`ExportFormat::check_removable`], or one of the two exists and no export writes such a file.
+    pub fn check_replaceable(self, flag: &str, file: &Path) -> InputResult<()> {
+        self.check_removable(file)?;
+        match self {
+            // Points that somebody has scanned are PLY files, too.
+            ExportFormat::Ply => check_replaceable(flag, file, |file| holds_gaussians(file).unwrap_or(false))?,
+            ExportFormat::Spz => check_replaceable(flag, file, is_gzip)?,
+            ExportFormat::Sog => return Ok(()),
+        }
+        check_replaceable(flag, &transform_path(file), is_transform)
+    }
+
     /// Removes the export `file` and its transform, if they exist.
     /// Errors: as [`ExportFormat::check_removable`], or the drive fails.
     pub fn remove(self, file: &Path) -> InputResult<()> {
@@ -137,4 +153,10 @@ impl ExportFormat {
             ExportFormat::Spz => write_transform(path, &SpzWriter::spz_meta(meta), frame, meta.upright.map(|_| SPZ_UP)),
         }
     }
+}
+
+/// Whether a file begins as gzip does.
+fn is_gzip(file: &Path) -> bool {
+    let mut magic = [0; 2];
+    File::open(file).and_then(|mut file| file.read_exact(&mut magic)).is_ok() && magic == [0x1f, 0x8b]
 }

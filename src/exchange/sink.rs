@@ -20,7 +20,7 @@ pub struct LevelCounts {
     pub always_shown: u64,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Written {
     /// `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
     pub frame: ExportFrame,
@@ -30,6 +30,8 @@ pub struct Written {
     pub bytes: u64,
     /// Rows by level, if the format has levels.
     pub levels: Option<LevelCounts>,
+    /// What the format changes of these rows. Tell the user.
+    pub warnings: Vec<String>,
 }
 
 impl std::fmt::Display for LevelCounts {
@@ -60,6 +62,11 @@ pub(super) trait Format {
 
     /// Completes the file of `rows` rows, at least one; returns its bytes, and the rows of its levels.
     fn complete(self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)>;
+
+    /// What the format changes of the rows that it was given, for people.
+    fn warnings(&self) -> Vec<String> {
+        Vec::new()
+    }
 
     /// The error, if the format could hold none of the `given` rows.
     fn holds_none(&self, _given: u64) -> Option<InputError> {
@@ -105,7 +112,8 @@ impl<F: Format> GaussianSink for FormatSink<F> {
                 InputError::new(path, problem, "the training diverged or lost all Gaussians: leave out flags of rates")
             }));
         }
+        let warnings = format.warnings().into_iter().map(|problem| format!("{}: {problem}", path.display())).collect();
         let (bytes, levels) = format.complete(rows)?;
-        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels })
+        Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels, warnings })
     }
 }

@@ -13,7 +13,7 @@
 //! Invariants: 1. the bytes depend on the rows, their order and the metadata alone; 2. the target is replaced as a whole or
 //! not at all; 3. memory beyond the given rows is a few buffers of 1 MiB; 4. the temporary file is removed, also after errors;
 //! 5. a row with a value that is not finite, or with a coordinate beyond 8 million, is left out and counted; values out of a byte's
-//! range become its nearest end.
+//! range become its nearest end, which is told where it shows: Gaussians that become smaller, positions that become coarse.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::math::sigmoid;
@@ -44,6 +44,14 @@ const POSITION_BYTES: usize = 9;
 const FIXED_MAX: f64 = 8_388_607.0;
 /// Most fractional bits of a coordinate. f32 holds no more of values beyond 1/2.
 const FRACTION_BITS_MAX: u8 = 22;
+/// Largest log sigma of a byte: sigmas beyond 380 units become that.
+const LOG_SCALE_MAX: f32 = 255.0 / 16.0 - 10.0;
+/// A few far rows are told if they cost the others this many bits, 64 times the precision.
+const BITS_TOLD: u8 = 6;
+/// The part of the rows that counts as few.
+const FAR_SHARE: f64 = 1e-3;
+/// Most Gaussians that the format's own reader opens.
+const READERS_MOST: u64 = 10_000_000;
 /// Colours: a constant band of 0 is mid grey, and this much of it is the whole range.
 const COLOR_SCALE: f32 = 0.15;
 /// Largest magnitude of the small components of a quaternion, in 9 bits.
@@ -61,6 +69,10 @@ pub struct SpzWriter {
     reach: f32,
     /// Rows left out because a coordinate is too large for the format.
     far: u64,
+    /// Rows by the fractional bits that their position allows.
+    rows_of_bits: [u64; FRACTION_BITS_MAX as usize + 1],
+    /// Rows with a sigma beyond the format's.
+    large: u64,
 }
 
 impl SpzWriter {
@@ -76,9 +88,6 @@ impl SpzWriter {
         let (part, out) = PartFile::create(path)?;
         let rows_path = path.with_extension("spz.rows");
         let (rows_part, rows_file) = PartFile::create(&rows_path)?;
-        // Read again at the end.
-        drop(rows_file);
-        let rows_file = rows_part.reopen()?;
         let writer = SpzWriter {
             path: path.to_path_buf(),
             part,
@@ -90,6 +99,8 @@ impl SpzWriter {
             rows: 0,
             reach: 0.0,
             far: 0,
+            rows_of_bits: [0; FRACTION_BITS_MAX as usize + 1],
+            large: 0,
         };
         Ok(FormatSink::new(path, sh_degree, ExportRows::new(&Self::spz_meta(meta)), writer))
     }
@@ -128,6 +139,8 @@ impl Format for SpzWriter {
             return Ok(false);
         }
         self.reach = self.reach.max(reach);
+        self.rows_of_bits[usize::from(fraction_bits(reach))] += 1;
+        self.large += u64::from(row.log_scales.iter().any(|&s| s > LOG_SCALE_MAX));
         let mut bytes: Vec<u8> = row.position.iter().flat_map(|x| x.to_le_bytes()).collect();
         push_attributes(&ExportRow { quat: half_turn_of_own_axes(row.quat), ..*row }, self.sh_degree, &mut bytes);
         self.rows_file.write_all(&bytes).map_err(|e| InputError::io(&self.rows_path, "writing", &e))?;
@@ -144,6 +157,39 @@ impl Format for SpzWriter {
         self.part.finish(self.out)?;
         drop(self.rows_part);
         Ok((bytes, None))
+    }
+
+    fn warnings(&self) -> Vec<String> {
+        let mut told = Vec::new();
+        let local = "use --export-frame local, or a PLY or SOG";
+        if self.large > 0 {
+            let most = f64::from(LOG_SCALE_MAX).exp();
+            told.push(format!(
+                "{} Gaussians are larger than the {most:.0} units of this format, and become that: {local}",
+                self.large
+            ));
+        }
+        let few = (FAR_SHARE * self.rows as f64) as u64;
+        let (bits, mut far) = (fraction_bits(self.reach), 0);
+        for most in bits..=FRACTION_BITS_MAX {
+            far += self.rows_of_bits[usize::from(most)];
+            if far > few {
+                if most >= bits + BITS_TOLD {
+                    let (step, few) = (0.5f64.powi(i32::from(bits)), far - self.rows_of_bits[usize::from(most)]);
+                    told.push(format!(
+                        "{few} far Gaussians make this format round all positions to {step} units: {local}"
+                    ));
+                }
+                break;
+            }
+        }
+        if self.rows > READERS_MOST {
+            told.push(format!(
+                "{} Gaussians are more than the {READERS_MOST} that the format's own reader opens: export fewer (--max-gaussians), or a SOG",
+                self.rows
+            ));
+        }
+        told
     }
 
     fn holds_none(&self, given: u64) -> Option<InputError> {

@@ -51,6 +51,11 @@ impl Transform {
     }
 }
 
+/// Whether a file is a transform as this program writes it.
+pub fn is_transform(path: &Path) -> bool {
+    read(path).is_ok()
+}
+
 /// Frame and axes of a PLY that does not state them, from the transform file beside it; `None` without one. An editor may have
 /// saved the PLY under another name: then the transform of the only other PLY in the folder counts.
 /// Errors: the file cannot be read, or is not what this program writes.

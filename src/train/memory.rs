@@ -20,7 +20,7 @@ use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::HEADER_BYTES;
 use crate::render::lpips::Network;
 use crate::render::view_sizes::ViewSizes;
-use crate::scene::columns::Columns;
+use crate::scene::columns::{Column, Columns};
 use crate::scene::state::row_bytes;
 use crate::train::step::pages::{PAGES_PER_BATCH, PagedScene};
 use std::path::Path;
@@ -162,6 +162,24 @@ const RENDERER_ROW_BYTES: u64 = 320;
 /// Bytes of a renderer for a pixel: colour and coverage of the picture, and colour, transmittance and last splat of its tile.
 const PIXEL_BYTES: u64 = 36;
 
+/// Memory of Gaussians that are evaluated, bytes: `columns` of all values, their pages, and the renderer's.
+fn bytes_of_evaluated(rows: u64, sh_degree: u8, columns: u64) -> u64 {
+    columns + frames_in_memory(rows, sh_degree, false) + rows * RENDERER_ROW_BYTES
+}
+
+/// Checks that the Gaussians that the header of `file` states can be evaluated, before they are read.
+/// Errors: they alone exceed the budget.
+pub(crate) fn check_gaussians_alone_fit(file: &Path, rows: u64, sh_degree: u8, budget: u64) -> InputResult<()> {
+    let values = 4 * Column::ALL.iter().map(|column| column.width(sh_degree) as u64).sum::<u64>();
+    let needed = BASE_BYTES + bytes_of_evaluated(rows, sh_degree, rows * values);
+    if needed <= budget {
+        return Ok(());
+    }
+    let (rows, needed, most) = (format_grouped(rows), format_bytes_up(needed + needed / 50), format_bytes(budget));
+    let problem = format!("evaluating {rows} Gaussians takes at least {needed}, without photos, more than {most}");
+    Err(InputError::new(file, problem, format!("give more than {needed} with --host-mem")))
+}
+
 /// Refuses an evaluation of these Gaussians on the held-out photos of a scene that may take more than `budget` bytes, with a cache of
 /// `image_cache` bytes for photos.
 /// Errors: the memory is too little; the error names `file`.
@@ -181,8 +199,7 @@ pub(crate) fn check_evaluation_fits(
         return Ok(());
     };
     let rows = columns.rows() as u64;
-    let gaussians =
-        columns.bytes() as u64 + frames_in_memory(rows, columns.sh_degree, false) + rows * RENDERER_ROW_BYTES;
+    let gaussians = bytes_of_evaluated(rows, columns.sh_degree, columns.bytes() as u64);
     let features = lpips.map_or(0, |network| network.bytes([largest.width, largest.height]));
     let needed = BASE_BYTES + photos + gaussians + features + largest.pixels() as u64 * PIXEL_BYTES;
     if needed <= budget {

@@ -165,3 +165,34 @@ fn rows_that_no_spz_file_can_hold_are_left_out_and_counted() {
     assert!(ExportFormat::of_path(Path::new("a.splat")).unwrap_err().to_string().contains(".spz"));
     assert_eq!(ExportFormat::of_path(Path::new("A.SPZ")).unwrap(), ExportFormat::Spz);
 }
+
+#[test]
+fn what_the_format_cannot_hold_is_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let told = |columns: &Columns| {
+        let path = folder.path().join("a.spz");
+        let mut sink = ExportFormat::Spz.create(&path, columns.sh_degree, 2000, &SceneMeta::default()).unwrap();
+        sink.write(columns).unwrap();
+        sink.finish().unwrap().warnings
+    };
+    let plain = scene(2000, 0);
+    assert!(told(&plain).is_empty(), "{:?}", told(&plain));
+    // A sigma of 403 units, and one of 364.
+    let mut large = plain.clone();
+    (large.scales[0], large.scales[3]) = (6.0, 5.9);
+    let of_large = told(&large);
+    assert!(
+        of_large.len() == 1 && of_large[0].contains("a.spz: 1 Gaussians are larger than the 379 units"),
+        "{of_large:?}"
+    );
+    // Two rows of 2000 are few, three are a part of the scene.
+    let mut far = plain;
+    (far.means[0], far.means[3]) = (3e6, -3e6);
+    let of_far = told(&far);
+    assert!(
+        of_far.len() == 1 && of_far[0].contains("2 far Gaussians make this format round all positions to 0.5 units"),
+        "{of_far:?}"
+    );
+    far.means[6] = 3e6;
+    assert!(told(&far).is_empty(), "{:?}", told(&far));
+}

@@ -146,3 +146,32 @@ fn clean_results_and_the_start_view_are_those_of_any_budget() {
     let seen = view.pose.rotation * target + view.pose.translation;
     assert!(seen.x.abs() + seen.y.abs() < 10.0 * off && seen.z > 0.0, "the target is before the photo: {seen}");
 }
+
+/// Of one training photo, no Gaussian is seen by two.
+#[test]
+fn a_clean_result_that_would_be_empty_is_whole() {
+    let work = Workdir::city(2, 96, 64, 300);
+    let output =
+        work.output(TRAIN, "scene --out out --steps 20 --test-every 2 --export-clean on --export spz --device cpu");
+    says(&stderr(&output), &["fewer than two photos see each of the", "all are kept"]);
+    assert!(output.status.success());
+    let rows = work.gaussians("out/point_cloud.ply").0.rows() as u64;
+    assert_eq!((rows, work.count("out", "gaussians_left_out")), (work.count("out", "gaussians"), 0));
+}
+
+#[test]
+fn exports_of_an_earlier_step_and_exports_that_come_too_late_are_told() {
+    let work = Workdir::city(4, 96, 64, 300);
+    work.run("out", "--steps 10 --export spz --keep-checkpoint --device cpu");
+    let told = |flags: &str| {
+        let output = work.output(TRAIN, flags);
+        assert!(output.status.success());
+        stderr(&output)
+    };
+    assert!(!told("--resume out").contains("no effect"));
+    let late = told("--resume out --export spz,sog");
+    says(&late, &["files of a finished run are not written again", "gsscale-ckpt import out/point_cloud.ply"]);
+    let before = work.bytes("out/point_cloud.spz");
+    says(&told("--resume out --steps 20 --export ply"), &["out/point_cloud.spz is of an earlier step"]);
+    assert!(work.bytes("out/point_cloud.spz") == before);
+}

@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::host_name;
 use crate::base::say::shell_word;
-use crate::base::whole_file::{folder_of, sync_folder};
+use crate::base::whole_file::{folder_of, is_same_file, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
@@ -434,20 +434,6 @@ fn sign_lock(folder: &Path, mut lock: &File) -> InputResult<()> {
     let content = format!("{LOCK_MAGIC}process {}\nhost {}\n", std::process::id(), host_name());
     let write = lock.rewind().and_then(|()| lock.set_len(0)).and_then(|()| lock.write_all(content.as_bytes()));
     write.map_err(|e| InputError::io(folder.join(LOCK), "locking the spill directory", &e))
-}
-
-/// Whether the open `file` is the one that `path` names.
-#[cfg(unix)]
-pub fn is_same_file(path: &Path, file: &File) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
-    matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
-}
-
-#[cfg(not(unix))]
-pub fn is_same_file(_path: &Path, _file: &File) -> bool {
-    // These systems do not let anyone remove an open file.
-    true
 }
 
 /// Content of the FORMAT file; `None` if there is none.

@@ -166,8 +166,9 @@ pub fn save(trainer: &mut Trainer, dataset: &Dataset, path: &Path) -> Result<Wri
     Ok(export(trainer, dataset, path, ExportFormat::Ply, &ExportChoice::default())?.0)
 }
 
-/// Like [`save`], in any format and without the rows that `choice` leaves out; returns also how many these are.
-/// Errors: as [`save`]; or `choice` leaves out all.
+/// Like [`save`], in any format and without the rows that `choice` leaves out; returns also how many these are. Where `choice` leaves out all,
+/// all are written, with a warning.
+/// Errors: as [`save`].
 pub(crate) fn export(
     trainer: &mut Trainer,
     dataset: &Dataset,
@@ -187,9 +188,13 @@ pub(crate) fn export(
         left_out += kept.retain_rows(|_, row| counts[row] >= *required);
         Ok(sink.write(&kept)?)
     })?;
-    if given == left_out {
-        let problem = format!("fewer than two photos see each of the {given} Gaussians");
-        return Err(InputError::new(path, problem, "use --export-clean off").into());
+    if given == left_out && left_out > 0 {
+        crate::tell!(
+            "warning: {}: fewer than two photos see each of the {given} Gaussians, so all are kept",
+            path.display()
+        );
+        drop(sink);
+        return export(trainer, dataset, path, format, &ExportChoice::default());
     }
     Ok((sink.finish()?, left_out))
 }

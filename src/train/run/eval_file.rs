@@ -13,7 +13,7 @@ use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::SceneMeta;
-use crate::exchange::ply::{PlyContent, read_ply};
+use crate::exchange::ply::{PlyContent, gaussians_header, read_ply, stated_rows};
 use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::photos::exposure::{AppearanceMode, read_values};
@@ -27,7 +27,7 @@ use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::{PositionSample, file_warnings};
 use crate::train::inputs::machine::{self, OpenedDevice};
 use crate::train::log::report::TestMetrics;
-use crate::train::memory::{check_evaluation_fits, check_photos_fit, host_budget};
+use crate::train::memory::{check_evaluation_fits, check_gaussians_alone_fit, check_photos_fit, host_budget};
 use crate::train::state::eval::{EvalRequest, evaluate};
 use crate::train::step::pages::{PagedScene, WorkingSet};
 use crate::train::step::view::SceneNow;
@@ -114,7 +114,7 @@ pub fn evaluate_file(
         Some((weights, range)) => Some((read_lpips(weights, limits::simd_path(config))?, range)),
     };
     // The file is opened before the photos, so that an unusable file is reported at once.
-    let model = Model::open(file)?;
+    let model = Model::open(file, host_budget(config.host_mem.0))?;
     let mut evaluator = Evaluator::open(scene, config, lpips.as_ref().map(|(lpips, range)| (lpips, *range)))?;
     if let Some(values) = extras.appearance {
         evaluator.take_exposures(values)?;
@@ -147,10 +147,13 @@ pub(crate) enum Model {
 }
 
 impl Model {
-    /// Errors: the file cannot be read, or holds points.
-    pub fn open(file: &Path) -> InputResult<Model> {
+    /// Errors: the file cannot be read, holds points, or holds more Gaussians than can be evaluated in `budget` bytes.
+    pub fn open(file: &Path, budget: Option<u64>) -> InputResult<Model> {
         if is_tree(file) {
             return Ok(Model::Sog(Box::new(SogReader::open(file)?)));
+        }
+        if let (Some(budget), Ok((_, sh_degree))) = (budget, gaussians_header(file)) {
+            check_gaussians_alone_fit(file, stated_rows(file)?, sh_degree, budget)?;
         }
         match read_ply(file)? {
             PlyContent::Gaussians { columns, meta, .. } => Ok(Model::Ply(Box::new((columns, meta)))),

@@ -15,13 +15,13 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
-use crate::base::whole_file::{folder_of, part_path, sync_folder, write_whole};
+use crate::base::whole_file::{folder_of, is_same_file, part_path, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::dataset::loader::Dataset;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::tensorboard::is_event_file;
-use crate::page::folder::spill_dir::{SpillDir, is_same_file};
+use crate::page::folder::spill_dir::SpillDir;
 use crate::page::tool::reading::Access;
 use crate::photos;
 use crate::report::run_files::{

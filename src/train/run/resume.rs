@@ -384,6 +384,15 @@ fn finished_outcome(
         let _ = std::fs::remove_dir(checkpoint_folder(&request.out));
     }
     write_run_report(&request.out, &|_, _| {})?;
+    let then = &earlier.config;
+    let exports = |config: &TrainConfig| (config.export, config.export_frame, config.export_clean, config.up);
+    if exports(config) != exports(then) {
+        crate::tell!(
+            "warning: the files of a finished run are not written again, so --export, --export-frame, --export-clean and --up have no effect. \
+             Other formats: gsscale-ckpt import {ply} --out STORE, then gsscale-ckpt export STORE --out FILE.spz",
+            ply = shell_word(Trainer::ply_path(&request.out))
+        );
+    }
     if !request.quiet {
         let more = if is_kept { "" } else { " from its PLY" };
         let (out, steps) = (request.out.display(), summary.steps);

@@ -13,13 +13,11 @@ use crate::base::machine::host_bytes_peak;
 use crate::base::math::exp32;
 use crate::base::text::read_text;
 use crate::base::units::format_bytes;
-use crate::base::whole_file::check_replaceable;
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::exchange::format::ExportFormat;
 use crate::exchange::frames::to_local;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
-use crate::exchange::ply::holds_gaussians;
 use crate::exchange::sink::LEVELS_MAX;
 use crate::optim::drift::STEP_BYTES;
 use crate::page::tool::reading::{Access, StoreReader};
@@ -82,6 +80,8 @@ pub struct Exported {
     pub always_shown: u64,
     /// Whether the file holds local coordinates because f32 cannot hold the dataset's.
     pub is_local: bool,
+    /// What the format changes of the Gaussians.
+    pub warnings: Vec<String>,
     pub bytes_read: u64,
     /// Peak memory of the process, bytes.
     pub host_bytes_peak: u64,
@@ -92,10 +92,7 @@ pub struct Exported {
 /// be written.
 pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
     let format = ExportFormat::of_path(&request.out)?;
-    if format == ExportFormat::Ply {
-        // Points that somebody has scanned are PLY files, too.
-        check_replaceable("--out", &request.out, |file| holds_gaussians(file).unwrap_or(false))?;
-    }
+    format.check_replaceable("--out", &request.out)?;
     let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
@@ -132,6 +129,7 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
         levels: written.levels.map(|levels| levels.rows),
         always_shown: written.levels.map_or(0, |levels| levels.always_shown),
         is_local: written.frame == ExportFrame::Local,
+        warnings: written.warnings,
         bytes_read: scene.pager.stats().bytes_read,
         host_bytes_peak: host_bytes_peak().unwrap_or(0),
     })

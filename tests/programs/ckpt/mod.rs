@@ -102,6 +102,15 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
 
     bench.fails("export out --out x.ply --crop 1e8,1e8,1e8,2e8,2e8,2e8", &["no Gaussian lies in this box"]);
     bench.fails("export out --out x.ply --crop 1,2,3", &["is not a box"]);
+    // Files of others stay.
+    for (other, out) in
+        [("mine.spz", "mine.spz"), ("mine.transform.json", "mine.ply"), ("mine.spz.transform.json", "mine.spz")]
+    {
+        bench.write(other, "{\"mine\": 1}");
+        bench.fails(&format!("export out --out {out}"), &[other, "writes no such file"]);
+        assert_eq!(bench.text(other), "{\"mine\": 1}");
+        std::fs::remove_file(bench.path(other)).unwrap();
+    }
     bench.fails("export out --out no/folder.ply", &["no/folder.ply"]);
 }
 
