@@ -147,7 +147,7 @@ config_keys! {
         /// Start from these pages of the store of --init-ply only: a file with a page on each line, as `12`, or `12 frozen` for a
         /// page that is rendered and never changes. Empty = all pages, none frozen
         pages_file: String = String::new() => Derived hidden;
-        /// Random points in the views' frusta when the dataset has none; 0 = refuse such a dataset
+        /// Random points in the views' frusta when the dataset has none and --sweep-points finds too few; 0 = refuse such a dataset
         init_points: u32 = 100_000 => Numbers;
     }
     "Training" {

@@ -111,7 +111,8 @@ impl RunOptions {
                 // Drawn when a run begins.
                 landmarks: Vec::new(),
                 refine_poses: config.refine_poses.is_on(),
-                steps: config.steps,
+                // A run with more steps than at first keeps the phases of its kinds.
+                steps: config.steps.min(schedule_steps(config)),
                 scene_scale,
             },
             export_frame: config.export_frame,

@@ -232,6 +232,7 @@ pub fn adapt_to_photos(config: &mut TrainConfig, asked: &Remedies) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::limits::RunOptions;
 
     fn of_flags(keys: &TrainOverrides) -> TrainConfig {
         of_new_run(None, keys).unwrap_or_default()
@@ -279,6 +280,7 @@ mod tests {
         let short = with_lengths(&TrainConfig::default(), 4200);
         assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
+        assert_eq!(RunOptions::new(&config, 1.0).photos.steps, 4200, "what is known of photos keeps its phases, too");
         assert_eq!(config.others_lr_final, 0.01);
         // Few photos and poor points: both factors of the rate of positions hold.
         let poor = TrainOverrides { poor_points: Some(Chosen::ON), ..TrainOverrides::default() };

@@ -65,7 +65,7 @@ pub fn color_corrected_psnr(image: &Image, target: &Target, fit: ColorCorrect) -
     let pair = Pair { image, target };
     match fit {
         ColorCorrect::Affine => {
-            let fits = [0, 1, 2].map(|c| pair.affine(c));
+            let fits = [0, 1, 2].map(|c| pair.affine(c, |render, photo| (photo, render)));
             pair.psnr(|render| affine_inverse(&fits, render))
         }
         ColorCorrect::Quadratic => {
@@ -73,6 +73,19 @@ pub fn color_corrected_psnr(image: &Image, target: &Target, fit: ColorCorrect) -
             pair.psnr(|render| after_rounds(&rounds, render))
         }
     }
+}
+
+/// PSNR of the render after the slope and offset of each channel that bring it closest to the photo, dB: for comparing pictures of scenes whose
+/// photos have exposures of their own. Unlike [`ColorCorrect::Affine`], which fits the other way round, it is at least the PSNR as it is (but
+/// for clamping), whatever the render resembles. Infinity and NaN as in [`color_corrected_psnr`].
+///
+/// # Panics
+/// When picture and target differ in size.
+pub fn exposure_fitted_psnr(image: &Image, target: &Target) -> f64 {
+    assert_eq!((image.width, image.height), (target.width, target.height), "picture and photo differ in size");
+    let pair = Pair { image, target };
+    let fits = [0, 1, 2].map(|c| pair.affine(c, |render, photo| (render, photo)));
+    pair.psnr(|render| std::array::from_fn(|c| (fits[c].0 * render[c] + fits[c].1).clamp(0.0, 1.0)))
 }
 
 /// A render and its photo.
@@ -113,17 +126,20 @@ impl Pair<'_> {
         if mse == 0.0 { f64::INFINITY } else { -10.0 * libm::log10(mse) }
     }
 
-    /// Slope and offset of a channel.
-    fn affine(&self, c: usize) -> (f64, f64) {
-        let [n, photo, render] = self.sum(|r, p| [1.0, p[c], r[c]]);
-        let (photo, render) = (photo / n, render / n);
+    /// Slope and offset that map the first value of a channel to the second with the least squares; `of` takes them from render and photo.
+    fn affine(&self, c: usize, of: impl Fn(f64, f64) -> (f64, f64) + Sync) -> (f64, f64) {
+        let [n, from, to] = self.sum(|r, p| {
+            let (from, to) = of(r[c], p[c]);
+            [1.0, from, to]
+        });
+        let (from, to) = (from / n, to / n);
         // Centred on the means, which avoids cancellation.
         let [square, product] = self.sum(|r, p| {
-            let p = p[c] - photo;
-            [p * p, p * (r[c] - render)]
+            let (x, y) = of(r[c], p[c]);
+            [(x - from) * (x - from), (x - from) * (y - to)]
         });
         let slope = product / n / (square / n).max(DIVISOR_MIN);
-        (slope, render - slope * photo)
+        (slope, to - slope * from)
     }
 
     /// The polynomials of all rounds.

@@ -1,6 +1,6 @@
 //! Colour-corrected PSNR against least squares in f64 by a second method, and its edge cases.
 
-use gsscale::render::color_correct::{ColorCorrect, color_corrected_psnr};
+use gsscale::render::color_correct::{ColorCorrect, color_corrected_psnr, exposure_fitted_psnr};
 use gsscale::render::metrics::psnr;
 use gsscale::scene::image::{Image, Target};
 
@@ -81,6 +81,18 @@ fn affine64(pixels: &[([f64; 3], [f64; 3])]) -> f64 {
     psnr_of(&pixels.iter().map(fit).collect::<Vec<_>>(), pixels)
 }
 
+fn forward64(pixels: &[([f64; 3], [f64; 3])]) -> f64 {
+    let fit = |c: usize| {
+        let a = pixels.iter().map(|(render, _)| vec![render[c], 1.0]).collect();
+        least_squares(a, pixels.iter().map(|(_, photo)| photo[c]).collect())
+    };
+    let fits = [fit(0), fit(1), fit(2)];
+    let fitted = |(render, _): &([f64; 3], [f64; 3])| -> [f64; 3] {
+        std::array::from_fn(|c| (fits[c][0] * render[c] + fits[c][1]).clamp(0.0, 1.0))
+    };
+    psnr_of(&pixels.iter().map(fitted).collect::<Vec<_>>(), pixels)
+}
+
 fn terms(x: &[f64; 3]) -> Vec<f64> {
     let [r, g, b] = *x;
     vec![r * r, r * g, r * b, g * g, g * b, b * b, r, g, b, 1.0]
@@ -123,6 +135,12 @@ fn both_fits_are_least_squares() {
         assert!((quadratic - quadratic64(&pixels)).abs() < 1e-8, "{quadratic} {}", quadratic64(&pixels));
         let plain = psnr(&image, &target);
         assert!(affine > plain + 3.0 && quadratic > affine, "{plain} {affine} {quadratic}");
+        let forward = exposure_fitted_psnr(&image, &target);
+        assert!(
+            (forward - forward64(&pixels)).abs() < 1e-8 && forward > plain + 3.0,
+            "{forward} {}",
+            forward64(&pixels)
+        );
     }
 }
 
@@ -139,6 +157,22 @@ fn another_exposure_of_the_photo_is_no_error() {
     // f32 renders: 6e-8 over the slope, 140 dB. The quadratic leaves saturated pixels out and has a few more roundings.
     assert!(color_corrected_psnr(&image, &target, ColorCorrect::Affine) > 130.0);
     assert!(color_corrected_psnr(&image, &target, ColorCorrect::Quadratic) > 120.0);
+    assert!(exposure_fitted_psnr(&image, &target) > 120.0);
+}
+
+/// The fit that the field reports magnifies the errors of a render with little of its photo in it; the one that judges growth does not.
+#[test]
+fn a_render_that_hardly_resembles_its_photo_is_not_judged_worse_than_it_is() {
+    let (mut image, target) = pair();
+    let n = image.rgb.len() as u32;
+    image
+        .rgb
+        .iter_mut()
+        .zip(0u32..)
+        .for_each(|(x, i)| *x = 0.1 * *x + 0.4 + 0.3 * ((i * 7919 % n) as f32 / n as f32 - 0.5));
+    let plain = psnr(&image, &target);
+    assert!(color_corrected_psnr(&image, &target, ColorCorrect::Affine) < plain - 1.0);
+    assert!(exposure_fitted_psnr(&image, &target) >= plain);
 }
 
 #[test]

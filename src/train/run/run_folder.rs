@@ -44,6 +44,7 @@ use crate::train::preflight::forecast::Forecast;
 use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
+use crate::train::step::soundness::check_that_photos_count;
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -155,6 +156,8 @@ pub(super) fn train_into(
     forecast: &Forecast,
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
+    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
+    check_that_photos_count(dataset, &targets)?;
     let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
     remove_mark(out);
     let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;
@@ -166,7 +169,6 @@ pub(super) fn train_into(
             committed.or_else(|why| checkpoint.make_space(&mut trainer, &mut metrics, stop, why))?;
         }
     }
-    let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
     warn_of_held_out(dataset, &targets);
     let live = request.live.clone().map(|live| {
         live.set_metrics(out.join(METRICS_FILE));
@@ -207,6 +209,12 @@ pub(super) fn train_into(
     let (looped, saved) = match (looped, saved) {
         (Err(error), Err(other)) => {
             crate::tell!("warning: {} cannot be written: {other}", ply.display());
+            return Err(error);
+        }
+        (Ok(()), Err(error)) => {
+            if let Err(other) = results.commit() {
+                crate::tell!("warning: the last steps are not committed: {other}");
+            }
             return Err(error);
         }
         (looped, saved) => (looped, saved?),
@@ -325,6 +333,11 @@ fn export_all(
         results.write(|results| export_beside(request, dataset, results.trainer, format, &file, saved))
     });
     let exported: Result<_, _> = exported.collect();
+    let is_asked = |format: ExportFormat| request.config.export.formats().any(|asked| asked == format);
+    let others = ExportFormat::ALL.into_iter().filter(|format| !is_asked(*format)).filter_map(|f| f.beside(ply));
+    for old in others.filter(|old| old.exists()) {
+        crate::tell!("warning: {} is of an earlier step: --export writes it again", old.display());
+    }
     if exported.is_err() {
         crate::tell!(
             "warning: the file for viewers could not be written; evaluation and report follow, then the reason"
@@ -344,6 +357,7 @@ fn export_beside(
 ) -> Result<ExportFacts, TrainError> {
     let (exported, _) = export(trainer, dataset, other, format, &saved.choice)?;
     format.write_transform(other, &scene_meta(trainer, dataset), exported.frame)?;
+    exported.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let left_out = saved.written.rows.saturating_sub(exported.rows);
     if left_out > 0 {
         crate::tell!(

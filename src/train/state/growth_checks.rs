@@ -7,7 +7,7 @@
 
 use crate::dataset::target_cache::TargetCache;
 use crate::render::RenderOptions;
-use crate::render::color_correct::{ColorCorrect, color_corrected_psnr};
+use crate::render::color_correct::exposure_fitted_psnr;
 use crate::render::metrics::psnr;
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
@@ -20,8 +20,8 @@ pub(super) struct Comparing<'a> {
     pub targets: &'a TargetCache,
     pub render: &'a RenderOptions,
     pub pages_most: usize,
-    /// A correction of the pictures before they are compared.
-    pub correct: Option<ColorCorrect>,
+    /// Fit the exposures of pictures before they are compared.
+    pub fits_exposures: bool,
 }
 
 /// Mean PSNR of views, as indices in `dataset.views` with their cameras, dB; `None` if all of them are masked as a whole.
@@ -53,9 +53,9 @@ fn view_psnr(
     pass.rows_in(now, |_| {})?;
     now.renderer.picture()?;
     let image = now.renderer.image()?;
-    Ok(json_psnr(match comparing.correct {
-        Some(how) => color_corrected_psnr(image, target, how),
-        None => psnr(image, target),
+    Ok(json_psnr(match comparing.fits_exposures {
+        true => exposure_fitted_psnr(image, target),
+        false => psnr(image, target),
     }))
 }
 
@@ -98,7 +98,7 @@ mod tests {
         let render = RenderOptions { sh_degree: scene.rules.sh_degree, ..options.render };
         let targets = TargetCache::new(&[], 0, 1).unwrap();
         let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| {
-            let comparing = Comparing { targets: &targets, render: &render, pages_most, correct: None };
+            let comparing = Comparing { targets: &targets, render: &render, pages_most, fits_exposures: false };
             let (working, renderer) = (&mut WorkingSet::default(), &mut CpuRenderer::new());
             let mut now = SceneNow { scene: &mut scene, step: 0, working, renderer };
             view_psnr(&mut now, &comparing, &camera, &target).unwrap()

@@ -23,7 +23,6 @@ use crate::optim::method::{Method, OptimizerPlace};
 use crate::paging::pager::{Pager, PagerConfig};
 use crate::photos::parameter::{PhotoOutcome, PhotoStep, steps_after_reset};
 use crate::photos::{self, PhotoParameters, first_parameters};
-use crate::render::color_correct::ColorCorrect;
 use crate::render::view_sizes::ViewSizes;
 use crate::render::{RenderOptions, Renderer};
 use crate::report::run_files::PLY_FILE;
@@ -591,7 +590,7 @@ impl Trainer {
             render: &self.render_options(),
             pages_most: self.memory.pages_most,
             // A photo that was never trained on has no exposure yet. All checks of a run use one measure, also after exposures were dropped.
-            correct: self.options.photos.appearance.is_on().then_some(ColorCorrect::Affine),
+            fits_exposures: self.options.photos.appearance.is_on(),
         };
         // Without a view that counts the count stays as it is, too.
         let measured = [&held_out, &trained].map(|views| mean_psnr(&mut self.now(), &compared, views));

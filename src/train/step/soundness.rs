@@ -7,9 +7,10 @@
 //! is the unsound one unless that was skipped.
 
 use super::train_step::{Skipped, StepOutcome};
-use crate::base::error::InputError;
+use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::{IdleSteps, TrainerState};
 use crate::dataset::loader::Dataset;
+use crate::dataset::target_cache::TargetCache;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
 
@@ -110,13 +111,8 @@ pub(crate) fn note_idle(
     if u64::from(idle.steps) < most {
         return Ok(());
     }
-    let fail = |problem: String, remedy: &str| {
-        Err(InputError::new(&dataset.image_folder, problem, remedy).at(place.as_str()).into())
-    };
     if idle.masked == idle.steps {
-        let problem = format!("the masks of all {views} training views exclude every pixel: nothing is trained");
-        let remedy = "white in masks/ and opaque in photos means keep: see --invert-masks, or use --masks=false";
-        return fail(problem, remedy);
+        return Err(all_masked(dataset).at(place).into());
     }
     if idle.with_rows == 0 {
         return Err(no_view_sees(dataset, gaussians).at(place).into());
@@ -124,12 +120,30 @@ pub(crate) fn note_idle(
     if idle.with_drawn == 0 {
         let problem = format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
         let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
-        return fail(problem, remedy);
+        return Err(InputError::new(&dataset.image_folder, problem, remedy).at(place).into());
     }
     if u64::from(idle.steps) == most {
         crate::tell!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
     }
     Ok(())
+}
+
+/// Refuses a run whose training photos are all masked, before it spends its time. Decodes photos up to the first that counts.
+/// Errors: no training photo has a pixel that counts.
+pub fn check_that_photos_count(dataset: &Dataset, targets: &TargetCache) -> InputResult<()> {
+    let views = dataset.train_views();
+    // A photo that cannot be read is an error of its step.
+    if views.is_empty() || views.iter().any(|&view| targets.get(view).map_or(true, |target| target.counts())) {
+        return Ok(());
+    }
+    Err(all_masked(dataset))
+}
+
+fn all_masked(dataset: &Dataset) -> InputError {
+    let views = dataset.train_views().len();
+    let problem = format!("the masks of all {views} training views exclude every pixel: nothing is trained");
+    let remedy = "white in masks/ and opaque in photos means keep: see --invert-masks, or use --masks=false";
+    InputError::new(&dataset.image_folder, problem, remedy)
 }
 
 /// What is wrong with an unsound step.
