@@ -32,7 +32,7 @@
 //! | [`optim`] | learning rates as a function of the step; dense Adam (oracle) and deferred Adam |
 //! | [`densify`] | what changes the number of Gaussians: strategies, the statistics they decide by, the events they log, applying these |
 //! | [`photos`] | what a run learns of each photo: exposure and colours, where its camera really stands, what on it contradicts the rest of the scene; the one list of kinds: how each acts on a step, is saved, and what a report says about it |
-//! | [`exchange`] | PLY in and out, SPZ out, SOG out and in for evaluation; what TensorBoard reads |
+//! | [`exchange`] | PLY in and out, SPZ out, SOG out and in; what TensorBoard reads |
 //! | [`config`] | what the user wrote, parsed once into the types of the rooms above, and what follows from it |
 //! | [`report`] | pages for people: charts and pictures of what a run left behind |
 //! | [`train`] | the only place where all of it meets: one step, the loop, evaluation, commits and `--resume`, what tools do with checkpoints |
@@ -58,7 +58,7 @@
 //! # Ok::<(), gsscale::train::error::TrainError>(())
 //! ```
 //!
-//! The programs are in `tools/`, one file each, with a folder where a program has several commands: they parse, call, print.
+//! The programs are in `tools/`, one file each, `bench` and `plan` with a folder of parts: they parse, call, print.
 //! `tools/gsscale.rs` holds all of them as commands.
 //!
 //! One word, one thing: a *row* is one Gaussian inside a working set, a *column* one attribute of all of them, a

@@ -68,7 +68,7 @@ impl<E: Into<TrainError>> From<E> for WorkError {
 }
 
 impl WorkError {
-    /// Of a run, which may lack what this machine lacks: its drive, its memory, the photos. Only one that diverges will do so again.
+    /// The error of a run. A machine may lack its drive, its memory or the photos, so another attempt can succeed, unless the run diverged.
     fn of_run(error: TrainError) -> WorkError {
         let code = if matches!(error, TrainError::NonFinite { .. }) { NEVER } else { AGAIN };
         WorkError { error, code }
@@ -115,13 +115,13 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let folder = city.cell(request.cell);
     let place = WorkPlace::of(request, &plan, &city)?;
     let is_done = || done_of(&plan, &city, request.cell).map(|done| done.is_some());
-    let leave_done = || {
+    let report_done = || {
         crate::say!("cell {} is done", request.cell);
         // A process that was killed behind its last word left them.
         place.clear_all(&folder).map_err(WorkError::of_run).map(|()| 0)
     };
     if is_done()? {
-        return leave_done();
+        return report_done();
     }
     let memory = host_budget(request.keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
     check_prior(&plan, &city, memory)?;
@@ -134,7 +134,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     };
     // The owner before may have ended in the meantime.
     if is_done()? {
-        return leave_done();
+        return report_done();
     }
     let scene = request.scene.clone().map_or_else(|| city.scene(), Ok)?;
     let keys = place.keys(&city, &folder, &request.keys);
@@ -220,8 +220,8 @@ fn listed(folder: &Path) -> InputResult<Vec<PathBuf>> {
     }
 }
 
-/// Whether the name of a path begins so.
-fn has_name_of(path: &Path, beginning: &str) -> bool {
+/// Whether the last part of a path begins with `beginning`.
+fn name_begins_with(path: &Path, beginning: &str) -> bool {
     path.file_name().is_some_and(|name| name.to_string_lossy().starts_with(beginning))
 }
 
@@ -337,7 +337,7 @@ impl WorkPlace {
 
     /// As [`WorkPlace::clear`], and removes pages that workers of the cell in `folder` left in the city. Pages in use stay.
     fn clear_all(&self, folder: &Path) -> Result<(), TrainError> {
-        for run in listed(folder)?.iter().filter(|path| has_name_of(path, RUN)) {
+        for run in listed(folder)?.iter().filter(|path| name_begins_with(path, RUN)) {
             drop(remove_store(&run.join("checkpoint")));
         }
         self.clear()
@@ -353,7 +353,7 @@ fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, Tr
     let copies = folder.join("copy");
     std::fs::create_dir_all(&copies).map_err(|e| InputError::io(&copies, "making the folder of copies", &e))?;
     // What others left that were killed, or were taken for lost. One that still writes has it in use.
-    listed(&copies)?.iter().filter(|path| has_name_of(path, UNNAMED)).for_each(|path| drop(remove_store(path)));
+    listed(&copies)?.iter().filter(|path| name_begins_with(path, UNNAMED)).for_each(|path| drop(remove_store(path)));
     let before = copies_of(folder)?;
     let number = before.first().map_or(0, |(number, _)| number + 1);
     let (made, copy) = (copies.join(format!("{UNNAMED}{:032x}", draw_identity())), copy_of(folder, number));

@@ -73,7 +73,7 @@ or, with one model for all of them, sparse/0/ in <folder> instead of the two"
   train/rgbs/                photos of the same names
   val/metadata/*.pt          the same for the held-out photos
   val/rgbs/
-  points.ply                 optional: points in the frame of the poses, metres; without, random ones are drawn"
+  points.ply                 optional: points in the frame of the poses, metres; without, some are found where photos agree"
             }
             Layout::MatrixCity => {
                 "\

@@ -503,7 +503,8 @@ fn check_photos(
     Ok(photos)
 }
 
-/// Photos whose shape differs from their camera's by more than rounding, as those do that were undistorted or cropped after the model was made.
+/// Warns of photos whose shape differs from their camera's by more than rounding. Photos that were undistorted or cropped after the model was
+/// made have such shapes.
 fn warn_about_shapes(views: &[(RawView, Split)], photos: &[PhotoSource], warnings: &mut Vec<String>) {
     let sizes = |view: &RawView, photo: &PhotoSource| {
         [(photo.header.width, photo.header.height), (view.intrinsics.width, view.intrinsics.height)]
@@ -513,8 +514,8 @@ fn warn_about_shapes(views: &[(RawView, Split)], photos: &[PhotoSource], warning
     if let Some((view, [photo, stated])) = odd.next() {
         let have = counted(1 + odd.count() as u64, "photo");
         warnings.push(format!(
-            "{have} of another shape than the camera, such as {} ({} x {}, its camera {} x {}): if the photos were undistorted or cropped \
-             after the model was made, its poses are not theirs",
+            "{have} of another shape than the camera, such as {} ({} x {}, its camera {} x {}): a model of other photos, for instance from \
+             before undistortion or cropping, gives wrong pictures",
             view.name, photo.0, photo.1, stated.0, stated.1
         ));
     }

@@ -1,7 +1,7 @@
 //! Reads the CSV that RealityCapture and RealityScan export as "Internal/External camera parameters":
 //! `#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2`, a line for each photo. The photos lie in `images/`
 //! beside the CSV or in its folder. It holds no points: `points.ply` beside it, in the same coordinates, is read where it
-//! exists; otherwise give points with `--init-ply`, or random ones are drawn.
+//! exists; otherwise give points with `--init-ply`, or some are found by a sweep.
 //!
 //! Conventions: `x, y, alt` is the place of the camera, in axes east-north-up. With all angles 0 it looks down, north on
 //! top. Roll turns about its y axis first, pitch about x then, heading clockwise about the vertical last; degrees. `f` is

@@ -7,7 +7,7 @@
 //! A kind that is off is not in the list of a run. The kinds that judge photos are always in it.
 //!
 //! Not here: evaluation, which fits exposures without a run (`train::state::eval`), and which optimizer a kind needs
-//! (`config::check`).
+//! (`TrainConfig::check`).
 //!
 //! Invariants: 1. a step that was skipped teaches nothing but the error of its view; 2. what is known after a step is a function of
 //! steps and photos alone, and lies in the saved values, so a resumed run knows the same; 3. all corrections of a picture come

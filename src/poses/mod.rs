@@ -562,20 +562,20 @@ pub fn check_found(named: &Path) -> InputResult<()> {
     let Some(state) = SearchState::read(&scene.join(WORK_FOLDER)) else { return Ok(()) };
     let (photos, _) = list_photos(&folder, &scene)?;
     let (place, sparse) = (shell_word(&scene), scene.join(SPARSE));
-    let ways = format!(
+    let remedy = format!(
         "to search again, rename {} and give the command again; to train with these: gsscale-train {place}",
         sparse.display()
     );
     let searched: BTreeSet<(&str, u64)> = state.photos.iter().map(|of| (of.name.as_str(), of.bytes)).collect();
     let new = photos.iter().filter(|photo| !searched.contains(&(photo.name.as_str(), photo.bytes))).count();
     if new > 0 {
-        let problem = format!("the poses there are from a search without {}", counted(new as u64, "photo"));
-        return Err(InputError::new(named, problem, ways));
+        let problem = format!("{} came after the search for poses, and have none", counted(new as u64, "photo"));
+        return Err(InputError::new(named, problem, remedy));
     }
     let registered = read_scene(&scene, &ReadOptions { allow_missing: true, ..ReadOptions::default() })?.views.len();
     if 2 * registered < photos.len() {
         let problem = format!("only {registered} of {} photos have poses", photos.len());
-        return Err(InputError::new(named, problem, format!("{MORE_OVERLAP}; {ways}")));
+        return Err(InputError::new(named, problem, format!("{MORE_OVERLAP}; {remedy}")));
     }
     Ok(())
 }

@@ -86,7 +86,8 @@ pub(super) fn modified_at(file: &Metadata) -> u64 {
     since.map_or(0, |since| since.as_nanos() as u64)
 }
 
-/// Refuses photos in the folder of the scene, among those that are searched. Its links of an earlier search are none.
+/// Refuses a folder of the scene that lies among the searched photos and holds photos of its own. Links that an earlier search has put
+/// there do not count.
 fn refuse_photos_in(scene: &Path) -> InputResult<()> {
     let mut names = Vec::new();
     if !scene.join(SEARCH_FOLDER).join(SEARCH_STATE).is_file() {

@@ -9,7 +9,7 @@
 //! Poses are camera to world, with the camera's axes right-up-back (as OpenGL's) and the world's axes down-right-back.
 //! Positions are `(metres - origin_drb) / pose_scale_factor`; this is undone here, so that a scene has its real size.
 //! The layout has no points: if a `points.ply` in metres and in the world's axes exists beside `coordinates.pt`, it is
-//! read; otherwise give points with `--init-ply`, or random ones are drawn.
+//! read; otherwise give points with `--init-ply`, or some are found by a sweep.
 //!
 //! Invariants: 1. for any file content the result is a scene or an [`InputError`] that names file and key; 2. names
 //! come from the folder's listing, so none leaves the folder.
