@@ -13,6 +13,8 @@ mod facts;
 mod front;
 #[path = "bench/list.rs"]
 mod list;
+#[path = "bench/programs.rs"]
+mod programs;
 #[path = "bench/published.rs"]
 mod published;
 #[path = "bench/published_table.rs"]

@@ -17,64 +17,87 @@ const BUFFER_BYTES: usize = 1 << 20;
 /// How long a writer waits for another one of the same file. Small files are written within milliseconds.
 const WAIT: Duration = Duration::from_secs(5);
 const BETWEEN_TRIES: Duration = Duration::from_millis(20);
+/// How often a file is opened anew that another writer has renamed or removed meanwhile.
+const TRIES: u32 = 16;
+
+/// A hidden file that one process at a time has, as far as the file system has locks. Dropping it removes the file before the lock goes,
+/// unless the file has got another name.
+#[derive(Debug)]
+pub(super) struct LockedFile {
+    path: PathBuf,
+    file: File,
+    is_renamed: bool,
+}
+
+impl LockedFile {
+    /// Opens or creates the file `path` beside `target`, which errors name.
+    /// Errors: the file cannot be opened, or another process has it for longer than `wait`.
+    pub(super) fn open(path: PathBuf, target: &Path, wait: Duration) -> InputResult<LockedFile> {
+        let io = |e: io::Error| InputError::io(target, "creating the file", &e);
+        let (began, mut tries) = (Instant::now(), 0);
+        loop {
+            if std::fs::symlink_metadata(&path).is_ok_and(|found| found.is_symlink()) {
+                std::fs::remove_file(&path).map_err(io)?;
+            }
+            let file = File::options().read(true).write(true).create(true).truncate(false).open(&path).map_err(io)?;
+            if !matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
+                tries += 1;
+                // Some network drives number a file anew each time it is opened: then the lock alone counts.
+                if is_same_file(&path, &file) || tries == TRIES {
+                    return Ok(LockedFile { path, file, is_renamed: false });
+                }
+            } else if began.elapsed() >= wait {
+                let remedy = "wait for its end, or give another name";
+                return Err(InputError::new(target, "another process is writing this", remedy));
+            } else {
+                std::thread::sleep(BETWEEN_TRIES);
+            }
+        }
+    }
+}
+
+impl Drop for LockedFile {
+    fn drop(&mut self) {
+        if !self.is_renamed {
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
 
 /// A file under way. Dropping it removes the temporary file.
 #[derive(Debug)]
 pub struct PartFile {
-    path: PathBuf,
+    part: LockedFile,
     target: PathBuf,
 }
 
 impl PartFile {
-    /// Begins to write the file `target`: creates `.NAME.part` beside it, to be written and read, and given back to
+    /// Begins to write the file `target`: creates `.NAME.part` beside it. The returned file is to be written and read, and given back to
     /// [`PartFile::finish`].
     /// Errors: the folder cannot be written, `target` names no file, or another process writes this file.
     pub fn create(target: &Path) -> InputResult<(PartFile, File)> {
+        PartFile::create_within(target, WAIT)
+    }
+
+    fn create_within(target: &Path, wait: Duration) -> InputResult<(PartFile, File)> {
         let no_name = || InputError::new(target, "this path has no file name", "give a file name");
-        let path = part_path(target).ok_or_else(no_name)?;
-        let file = open_alone(&path, target)?;
-        Ok((PartFile { path, target: target.to_path_buf() }, file))
+        let part = LockedFile::open(part_path(target).ok_or_else(no_name)?, target, wait)?;
+        let file = part.file.set_len(0).and_then(|()| part.file.try_clone());
+        let file = file.map_err(|e| InputError::io(target, "creating the file", &e))?;
+        Ok((PartFile { part, target: target.to_path_buf() }, file))
     }
 
     /// Makes the bytes durable, and gives the file its name.
     /// Errors: the drive fails. The target is unchanged, unless only its name could not be made durable.
-    pub fn finish(self, file: File) -> InputResult<()> {
+    pub fn finish(mut self, file: File) -> InputResult<()> {
         let target = &self.target;
         file.sync_all().map_err(|e| InputError::io(target, "flushing to the disk", &e))?;
-        // Its lock keeps the next writer away until it has its name. Windows renames no open file.
-        let _locked = if cfg!(windows) { None } else { Some(file) };
-        std::fs::rename(&self.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
+        std::fs::rename(&self.part.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
+        self.part.is_renamed = true;
         match sync_folder(folder_of(target)) {
             Err(e) if !is_sync_unsupported(&e) => Err(InputError::io(target, "flushing the folder to the disk", &e)),
             _ => Ok(()),
         }
-    }
-}
-
-impl Drop for PartFile {
-    fn drop(&mut self) {
-        // After the rename the file no longer exists, and this call fails as expected.
-        let _ = std::fs::remove_file(&self.path);
-    }
-}
-
-/// The empty temporary file of a target, locked.
-fn open_alone(path: &Path, target: &Path) -> InputResult<File> {
-    let io = |e: io::Error| InputError::io(target, "creating the file", &e);
-    let began = Instant::now();
-    loop {
-        let file = File::options().read(true).write(true).create(true).truncate(false).open(path).map_err(io)?;
-        let is_held = matches!(file.try_lock(), Err(TryLockError::WouldBlock));
-        // The writer before may have renamed or removed the file since it was opened here.
-        if !is_held && is_same_file(path, &file) {
-            file.set_len(0).map_err(io)?;
-            return Ok(file);
-        }
-        if began.elapsed() > WAIT {
-            let remedy = "wait for its end, or name another file";
-            return Err(InputError::new(target, "another process is writing this file", remedy));
-        }
-        std::thread::sleep(BETWEEN_TRIES);
     }
 }
 
@@ -87,9 +110,9 @@ pub fn is_same_file(path: &Path, file: &File) -> bool {
 }
 
 #[cfg(not(unix))]
-pub fn is_same_file(_path: &Path, _file: &File) -> bool {
-    // These systems do not let anyone remove an open file.
-    true
+pub fn is_same_file(path: &Path, _file: &File) -> bool {
+    // A file that was renamed or removed has left its name.
+    std::fs::symlink_metadata(path).is_ok()
 }
 
 /// The temporary file `.NAME.part` of a target, which a process that is killed leaves; `None` if the target names no file.
@@ -163,9 +186,36 @@ mod tests {
         let (part, mut file) = PartFile::create(&path).unwrap();
         file.write_all(b"third").unwrap();
         // As another process would: what is under way stays.
-        assert!(write_whole(&path, b"fourth").unwrap_err().problem.contains("another process is writing"));
+        let refused = PartFile::create_within(&path, Duration::ZERO).unwrap_err();
+        assert!(refused.problem.contains("another process is writing"), "{refused}");
         part.finish(file).unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"third");
         assert!(write_whole(Path::new("/"), b"").unwrap_err().problem.contains("no file name"));
+    }
+
+    /// Every writer succeeds, and every reader finds a whole file.
+    #[test]
+    fn writers_of_one_file_take_turns() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.txt");
+        let texts = [b'a', b'b', b'c'].map(|letter| vec![letter; 100_000]);
+        let write = |text: &[u8]| {
+            // Longer than any drive takes.
+            let (part, mut file) = PartFile::create_within(&path, Duration::from_secs(3600)).unwrap();
+            file.write_all(text).unwrap();
+            part.finish(file).unwrap();
+        };
+        std::thread::scope(|scope| {
+            for text in &texts {
+                scope.spawn(|| (0..20).for_each(|_| write(text)));
+            }
+            scope.spawn(|| {
+                for _ in 0..200 {
+                    let found = std::fs::read(&path);
+                    assert!(found.is_err() || texts.contains(found.as_ref().unwrap()), "a part of a file");
+                }
+            });
+        });
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file is left");
     }
 }

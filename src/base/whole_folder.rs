@@ -4,14 +4,15 @@
 //!
 //! Invariants: 1. the target holds either its old files or all new ones; between two renames it is missing for a moment, and its
 //! old files then stand beside it; 2. a folder with a file that `is_ours` rejects is neither replaced nor removed;
-//! 3. files are durable before the folder gets its name; 4. dropping a folder that is being written removes it; 5. on Unix one writer at a
-//! time has the temporary folder of a target, as far as the file system has locks.
+//! 3. files are durable before the folder gets its name; 4. dropping a folder that is being written removes it; 5. one writer at a time has
+//! the temporary folder of a target, as far as the file system has locks: `.NAME.lock` beside it.
 
 use super::error::{InputError, InputResult};
-use super::whole_file::{folder_of, hidden_beside, sync_folder};
-use std::fs::{File, TryLockError};
+use super::whole_file::{LockedFile, folder_of, hidden_beside, sync_folder};
+use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Whether the writer of a folder makes a file of this path inside the folder. Such a file is called ours; every other one is foreign.
 pub type IsOurs = fn(&Path) -> bool;
@@ -23,7 +24,7 @@ pub struct PartFolder {
     target: PathBuf,
     is_ours: IsOurs,
     bytes: u64,
-    _lock: Option<File>,
+    _lock: LockedFile,
 }
 
 impl PartFolder {
@@ -35,15 +36,13 @@ impl PartFolder {
         let beside = |ending: &str| hidden_beside(target, ending).ok_or_else(no_name);
         let (path, old) = (beside(".part")?, beside(".old")?);
         check_ours(target, is_ours)?;
-        let left = lock(&path, target)?;
+        let lock = LockedFile::open(beside(".lock")?, target, Duration::ZERO)?;
         // A process that was killed between the two renames left `.old`; one that was killed earlier left `.part`.
         if old.is_dir() && !target.exists() {
             std::fs::rename(&old, target).map_err(|e| InputError::io(target, "restoring the older folder", &e))?;
         }
         remove_ours(&path, is_ours)?;
-        drop(left);
         std::fs::create_dir(&path).map_err(|e| InputError::io(target, "creating the folder", &e))?;
-        let lock = lock(&path, target)?;
         Ok(PartFolder { path, old, target: target.to_path_buf(), is_ours, bytes: 0, _lock: lock })
     }
 
@@ -98,19 +97,6 @@ impl Drop for PartFolder {
     fn drop(&mut self) {
         // After the rename the folder no longer exists.
         let _ = remove_ours(&self.path, self.is_ours);
-    }
-}
-
-/// The lock of a temporary folder; `None` where there is no such folder, or folders have no locks.
-/// Errors: another process has the lock.
-fn lock(path: &Path, target: &Path) -> InputResult<Option<File>> {
-    let Some(folder) = cfg!(unix).then(|| File::open(path).ok()).flatten() else { return Ok(None) };
-    match folder.try_lock() {
-        Err(TryLockError::WouldBlock) => {
-            let remedy = "wait for its end, or name another folder";
-            Err(InputError::new(target, "another process is writing this folder", remedy))
-        }
-        Ok(()) | Err(TryLockError::Error(_)) => Ok(Some(folder)),
     }
 }
 
@@ -186,11 +172,9 @@ mod tests {
         std::fs::write(root.path().join(".a.part/d.txt"), b"left").unwrap();
         let part = begin("new");
         assert_eq!(content(), "old");
-        if cfg!(unix) {
-            // As another process would: the folder under way stays.
-            let refused = PartFolder::create(&target, is_text).unwrap_err();
-            assert!(refused.problem.contains("another process is writing") && part.path().join("b/c.txt").exists());
-        }
+        // As another process would: the folder under way stays.
+        let refused = PartFolder::create(&target, is_text).unwrap_err();
+        assert!(refused.problem.contains("another process is writing") && part.path().join("b/c.txt").exists());
         part.finish().unwrap();
         assert_eq!(content(), "new");
         assert!(!target.join("d.txt").exists());

@@ -6,7 +6,7 @@
 
 use super::costs::{AsIf, Basis, PhaseCost};
 use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
-use super::prior::{GAUSSIANS_SHARE, SWEEP_POINTS};
+use super::prior::{GAUSSIANS_SHARE, KEY_OF_FIRST_POINTS};
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
 use super::{City, check_machine_keys, check_range, config_of, toml_of};
@@ -86,7 +86,7 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
     keys.extend(remedies_of_prior(&city)?);
     // The rows of the prior are no poor points.
     keys.entry("poor-points").or_insert_with(|| "off".into());
-    keys.remove(SWEEP_POINTS);
+    keys.remove(KEY_OF_FIRST_POINTS);
     // What `auto` stands for depends on the memory of a machine.
     if keys.get("view-order").is_none_or(|order| order.as_str() == Some("auto")) {
         keys.insert("view-order".into(), "shuffle".into());

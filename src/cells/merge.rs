@@ -12,7 +12,7 @@
 use super::costs::POLISH_SHARE;
 use super::cut::remedies_of_prior;
 use super::plan::{CityPlan, LIST_BYTES_MAX};
-use super::prior::SWEEP_POINTS;
+use super::prior::KEY_OF_FIRST_POINTS;
 use super::work::{check_prior, copy_of, done_of};
 use super::{City, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
@@ -275,7 +275,7 @@ fn write_polish(plan: &CityPlan, city: &City, out: &Path, folder: &mut PartFolde
     let ended = config_of(&city.cell(0), of_cell, &TrainOverrides::default())?;
     keys.extend(remedies_of_prior(city)?);
     keys.remove("max-gaussians");
-    keys.remove(SWEEP_POINTS);
+    keys.remove(KEY_OF_FIRST_POINTS);
     keys.insert("steps".into(), i64::from((whole.steps / POLISH_SHARE).max(1)).into());
     // Most Gaussians are on few of these photos, or on none.
     for (key, word) in [("strategy", "none"), ("schedule", "classic"), ("export-clean", "off")] {

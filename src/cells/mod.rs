@@ -94,6 +94,15 @@ pub(crate) fn is_of_machine(key: &ConfigKey) -> bool {
     is_listed && key.class.is_free()
 }
 
+/// The keys that may differ from machine to machine, as flags.
+pub fn machine_flags(keys: &toml::Table) -> Vec<String> {
+    let flag = |(name, value): (&String, &toml::Value)| {
+        let is_listed = KEYS.iter().any(|key| key.name() == *name && is_of_machine(key));
+        is_listed.then(|| format!("--{name}={}", value.as_str().map_or_else(|| value.to_string(), str::to_string)))
+    };
+    keys.iter().filter_map(flag).collect()
+}
+
 /// The flags that may differ from machine to machine.
 pub(crate) fn machine_keys(keys: &TrainOverrides) -> TrainOverrides {
     keys.clone().only(|field| KEYS.iter().any(|key| key.field == field && is_of_machine(key)))

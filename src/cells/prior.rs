@@ -22,7 +22,7 @@ use std::path::PathBuf;
 pub(crate) const STEPS_SHARE: u32 = 4;
 pub(crate) const GAUSSIANS_SHARE: u64 = 5;
 /// A key that has no meaning for cells, which begin from Gaussians.
-pub(crate) const SWEEP_POINTS: &str = "sweep-points";
+pub(crate) const KEY_OF_FIRST_POINTS: &str = "sweep-points";
 /// Longest side of its photos, pixels.
 const RESOLUTION_MOST: u32 = 800;
 const SH_DEGREE_MOST: u8 = 1;
@@ -80,7 +80,7 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
 
 /// Errors: every cell would refuse a key.
 fn check_keys_of_cells(city: &City, mut keys: toml::Table) -> InputResult<()> {
-    keys.remove(SWEEP_POINTS);
+    keys.remove(KEY_OF_FIRST_POINTS);
     for path in ["init-ply", "views-file", "pages-file"] {
         keys.insert(path.into(), path.into());
     }

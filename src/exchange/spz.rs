@@ -17,9 +17,10 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::math::sigmoid;
+use crate::base::units::counted;
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
-use crate::exchange::meta::SceneMeta;
+use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::{Format, FormatSink, LevelCounts};
 use crate::scene::rotation::{Rotation, VIEWER_UP};
 use flate2::Compression;
@@ -44,7 +45,7 @@ const POSITION_BYTES: usize = 9;
 const FIXED_MAX: f64 = 8_388_607.0;
 /// Most fractional bits of a coordinate. f32 holds no more of values beyond 1/2.
 const FRACTION_BITS_MAX: u8 = 22;
-/// Largest log sigma of a byte: sigmas beyond 380 units become that.
+/// Largest log sigma of a byte: of 379 units.
 const LOG_SCALE_MAX: f32 = 255.0 / 16.0 - 10.0;
 /// A few far rows are told if they cost the others this many bits, 64 times the precision.
 const BITS_TOLD: u8 = 6;
@@ -73,6 +74,7 @@ pub struct SpzWriter {
     rows_of_bits: [u64; FRACTION_BITS_MAX as usize + 1],
     /// Rows with a sigma beyond the format's.
     large: u64,
+    is_local: bool,
 }
 
 impl SpzWriter {
@@ -85,6 +87,7 @@ impl SpzWriter {
     /// Starts a file of rows with the bands of `sh_degree`, beside its target. `meta` is that of a PLY of the same rows.
     /// Errors: the disk fails, or `path` names no file.
     pub fn create(path: &Path, sh_degree: u8, meta: &SceneMeta) -> InputResult<FormatSink<SpzWriter>> {
+        let to_file = ExportRows::new(&Self::spz_meta(meta));
         let (part, out) = PartFile::create(path)?;
         let rows_path = path.with_extension("spz.rows");
         let (rows_part, rows_file) = PartFile::create(&rows_path)?;
@@ -101,8 +104,9 @@ impl SpzWriter {
             far: 0,
             rows_of_bits: [0; FRACTION_BITS_MAX as usize + 1],
             large: 0,
+            is_local: to_file.frame() == ExportFrame::Local,
         };
-        Ok(FormatSink::new(path, sh_degree, ExportRows::new(&Self::spz_meta(meta)), writer))
+        Ok(FormatSink::new(path, sh_degree, to_file, writer))
     }
 
     /// Writes header and arrays as one gzip stream; returns its length.
@@ -161,27 +165,26 @@ impl Format for SpzWriter {
 
     fn warnings(&self) -> Vec<String> {
         let mut told = Vec::new();
-        let local = "use --export-frame local, or a PLY or SOG";
+        let remedy = if self.is_local { "use a PLY or SOG" } else { "use --export-frame local, or a PLY or SOG" };
+        let gaussians = |rows: u64| counted(rows, "Gaussian");
         if self.large > 0 {
-            let most = f64::from(LOG_SCALE_MAX).exp();
+            let (large, most) = (gaussians(self.large), f64::from(LOG_SCALE_MAX).exp());
             told.push(format!(
-                "{} Gaussians are larger than the {most:.0} units of this format, and become that: {local}",
-                self.large
+                "{large} with a sigma above {most:.0} units, the most that SPZ holds, cut to that: {remedy}"
             ));
         }
         let few = (FAR_SHARE * self.rows as f64) as u64;
         let (bits, mut far) = (fraction_bits(self.reach), 0);
         for most in bits..=FRACTION_BITS_MAX {
-            far += self.rows_of_bits[usize::from(most)];
-            if far > few {
+            let rows = self.rows_of_bits[usize::from(most)];
+            if far + rows > few {
                 if most >= bits + BITS_TOLD {
-                    let (step, few) = (0.5f64.powi(i32::from(bits)), far - self.rows_of_bits[usize::from(most)]);
-                    told.push(format!(
-                        "{few} far Gaussians make this format round all positions to {step} units: {local}"
-                    ));
+                    let (far, step) = (gaussians(far), 0.5f64.powi(i32::from(bits)));
+                    told.push(format!("{far} so far out that SPZ rounds all positions to {step} units: {remedy}"));
                 }
                 break;
             }
+            far += rows;
         }
         if self.rows > READERS_MOST {
             told.push(format!(

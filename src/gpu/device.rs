@@ -102,6 +102,8 @@ pub struct GpuOptions {
     /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit. From 128 MiB on the limit holds for the memory
     /// blocks of the API, below for the buffers in them.
     pub budget: Option<u64>,
+    /// Proves by every read-back that the work before it was done, also where the driver reports work that it gives up.
+    pub counts_submissions: bool,
     /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
     /// Whether shaders read uniforms as uniform blocks (`Some(true)`) or as storage; `None`: as storage on software adapters. An adapter that
@@ -125,7 +127,7 @@ pub struct Gpu {
     pub(super) profiler: Mutex<Profiler>,
     pub(super) injector: Injector,
     /// `None` where the driver reports work that it gives up.
-    pub(super) progress: Option<SubmissionCount>,
+    pub(super) submission_count: Option<SubmissionCount>,
     pub(super) uploaded: AtomicU64,
     pub(super) work: Mutex<Work>,
     /// Every open recording holds a reference.
@@ -164,14 +166,16 @@ impl Gpu {
         let gpu = open(if in_order { defines } else { Vec::new() })?;
         let fault = options.fault.or_else(InjectedFault::from_environment);
         let gives_up_silently = gpu.summary.backend.starts_with("Metal");
-        let counts = gives_up_silently || fault.is_some_and(|fault| fault.kind == FaultKind::GivenUp);
-        let progress = if counts { Some(gpu.count_submissions()?) } else { None };
-        Ok(Gpu { injector: Injector::new(fault), progress, ..gpu })
+        let counts = gives_up_silently
+            || options.counts_submissions
+            || fault.is_some_and(|fault| fault.kind == FaultKind::GivenUp);
+        let submission_count = if counts { Some(gpu.count_submissions()?) } else { None };
+        Ok(Gpu { injector: Injector::new(fault), submission_count, ..gpu })
     }
 
     fn count_submissions(&self) -> GpuResult<SubmissionCount> {
-        let pipeline = self.pipeline("progress.wgsl", "count", &[])?;
-        let mut recorder = self.begin("progress");
+        let pipeline = self.pipeline("submission_count.wgsl", "count", &[])?;
+        let mut recorder = self.begin("submission count");
         let finished = recorder.buffer_zeroed("finished submissions", 4)?;
         let submission = self.submit(recorder)?;
         self.wait(&submission)?;
@@ -202,7 +206,7 @@ impl Gpu {
             uniforms: Mutex::new(UniformRing::new(Arc::clone(&driver), Arc::clone(&pool), u64::from(alignment))),
             profiler: Mutex::new(profiler),
             injector: Injector::default(),
-            progress: None,
+            submission_count: None,
             uploaded: AtomicU64::new(0),
             work: Mutex::default(),
             recordings: Arc::default(),

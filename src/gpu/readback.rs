@@ -44,7 +44,7 @@ impl Staging {
         let mut to = self.pool.take("read-back staging", mapped, Purpose::ReadBack)?;
         to.set_reusable(false); // until the host has read and unmapped it
         encoder.copy_buffer_to_buffer(&view.raw, view.offset, to.raw(), 0, size);
-        let finished = count.map(|(count, expected)| {
+        let expected = count.map(|(count, expected)| {
             encoder.copy_buffer_to_buffer(&count.raw, count.offset, to.raw(), size, COUNT_BYTES);
             expected
         });
@@ -52,7 +52,7 @@ impl Staging {
         let state = SharedState::new(MapState::Recorded);
         let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, mapped, &state);
         let ticket = ticket.clone();
-        Ok((Readback { buffer: to, size, finished, stage, state, ticket, staging: Arc::clone(self) }, mapping))
+        Ok((Readback { buffer: to, size, expected, stage, state, ticket, staging: Arc::clone(self) }, mapping))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
@@ -82,7 +82,7 @@ pub struct Readback {
     /// Bytes without the count.
     size: u64,
     /// The count of finished submissions that must follow them.
-    finished: Option<u32>,
+    expected: Option<u32>,
     stage: &'static str,
     state: SharedState,
     ticket: Ticket,
@@ -106,7 +106,7 @@ impl Readback {
         let mapped = self.buffer.size();
         let view = self.buffer.raw().get_mapped_range(..mapped).map_err(|e| GpuError::validation(self.stage, e))?;
         let bytes = size as usize; // as many as are mapped
-        if let Some(expected) = self.finished
+        if let Some(expected) = self.expected
             && view[bytes..] != expected.to_le_bytes()
         {
             self.staging.driver.faults.lost(BEHIND.to_string());

@@ -85,15 +85,7 @@ impl Gpu {
     /// Submits without waiting, unless [`super::GpuOptions::serial`] is set.
     /// Errors: the API refused the commands, the device was lost or ran out of memory, or two recorders were open at once.
     pub fn submit(&self, mut recorder: Recorder<'_>) -> GpuResult<Submission> {
-        // One reference is the device's own, one that of `recorder`.
-        if Arc::strong_count(&self.recordings) > 2 {
-            return Err(GpuError::bindings(recorder.work.name, "two recorders are open at once"));
-        }
-        let submission = recorder.flush()?;
-        if self.serial {
-            self.wait(&submission)?;
-        }
-        Ok(submission)
+        recorder.flush()
     }
 
     /// Waits until the device has finished a submission.
@@ -205,7 +197,7 @@ impl Recorder<'_> {
         self.work.pass = None;
         self.gpu.driver.faults.set_stage(stage);
         // No other recorder is submitted before this one.
-        let count = self.gpu.progress.as_ref().map(SubmissionCount::expected);
+        let count = self.gpu.submission_count.as_ref().map(SubmissionCount::expected);
         let (encoder, ticket) = (&mut self.work.encoder, &self.work.ticket);
         let (readback, pending) = self.gpu.staging.record(encoder, stage, view, ticket, count)?;
         self.work.readbacks.push(pending);
@@ -356,9 +348,13 @@ impl Recorder<'_> {
     /// Submits the commands recorded so far and continues with an empty encoder.
     fn flush(&mut self) -> GpuResult<Submission> {
         let gpu = self.gpu;
+        // One reference is the device's own, one that of this recorder.
+        if Arc::strong_count(&gpu.recordings) > 2 {
+            return Err(GpuError::bindings(self.work.name, "two recorders are open at once"));
+        }
         let _span = trace::span("submit").of("what", self.work.name);
-        if let Some((pipeline, finished)) = gpu.progress.as_ref().map(SubmissionCount::next) {
-            self.dispatch("progress", &pipeline, &[finished], [1; 3])?;
+        if let Some((pipeline, finished)) = gpu.submission_count.as_ref().map(SubmissionCount::last_dispatch) {
+            self.dispatch("submission count", &pipeline, &[finished], [1; 3])?;
         }
         self.work.pass = None;
         let mut profiler = lock(&gpu.profiler);
@@ -377,6 +373,7 @@ impl Recorder<'_> {
         let mut mappings = std::mem::take(&mut self.work.readbacks);
         lock(&gpu.belt).submit_staged(&ticket, &mut mappings);
         mappings.iter().for_each(Mapping::set_pending);
+        gpu.submission_count.iter().for_each(SubmissionCount::note_submission);
         let submitted = gpu
             .driver
             .submitter
@@ -384,7 +381,11 @@ impl Recorder<'_> {
         gpu.driver.check()?;
         submitted?;
         lock(&gpu.profiler).collect(4)?;
-        Ok(Submission { ticket, name: self.work.name })
+        let submission = Submission { ticket, name: self.work.name };
+        if gpu.serial {
+            gpu.wait(&submission)?;
+        }
+        Ok(submission)
     }
 }
 

@@ -25,7 +25,7 @@ pub(super) struct SubmissionCount {
 }
 
 impl SubmissionCount {
-    /// Counts submissions from now on with a pipeline of `progress.wgsl`; `finished` is zero.
+    /// Counts submissions from now on with a pipeline of `submission_count.wgsl`; `finished` is zero.
     pub(super) fn new(pipeline: Arc<Pipeline>, finished: Buffer) -> SubmissionCount {
         SubmissionCount { finished, pipeline, submitted: AtomicU32::new(0) }
     }
@@ -35,9 +35,13 @@ impl SubmissionCount {
         (self.finished.view(), self.submitted.load(Ordering::Relaxed))
     }
 
-    /// The dispatch that ends the next submission.
-    pub(super) fn next(&self) -> (Arc<Pipeline>, BufferView) {
-        self.submitted.fetch_add(1, Ordering::Relaxed);
+    /// The dispatch that ends a submission.
+    pub(super) fn last_dispatch(&self) -> (Arc<Pipeline>, BufferView) {
         (Arc::clone(&self.pipeline), self.finished.view())
+    }
+
+    /// Notes that a submission is made now. One that an error prevented does not count.
+    pub(super) fn note_submission(&self) {
+        self.submitted.fetch_add(1, Ordering::Relaxed);
     }
 }

@@ -569,7 +569,7 @@ pub fn check_found(named: &Path) -> InputResult<()> {
     let searched: BTreeSet<(&str, u64)> = state.photos.iter().map(|of| (of.name.as_str(), of.bytes)).collect();
     let new = photos.iter().filter(|photo| !searched.contains(&(photo.name.as_str(), photo.bytes))).count();
     if new > 0 {
-        let problem = format!("{} came after the search for poses, and have none", counted(new as u64, "photo"));
+        let problem = format!("{} new or changed since the search for poses", counted(new as u64, "photo"));
         return Err(InputError::new(named, problem, remedy));
     }
     let registered = read_scene(&scene, &ReadOptions { allow_missing: true, ..ReadOptions::default() })?.views.len();

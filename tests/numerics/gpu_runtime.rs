@@ -186,6 +186,17 @@ fn work_that_the_device_gives_up_without_an_error_is_found() {
     }
 }
 
+/// A submission that an error prevented does not count.
+#[test]
+fn a_device_that_counts_its_submissions_goes_on_after_an_error() {
+    let fault = Some(InjectedFault { kind: FaultKind::OutOfMemory, submission: 2 });
+    let Some(gpu) = open(&GpuOptions { counts_submissions: true, fault, ..GpuOptions::default() }) else { return };
+    let run = || run_add(&gpu, &[1, 2, 3], 7, &[]);
+    assert_eq!(run().unwrap(), [8, 9, 10]);
+    assert!(run().is_err_and(|error| error.is_out_of_memory()));
+    assert_eq!(run().unwrap(), [8, 9, 10]);
+}
+
 #[test]
 fn the_budget_is_kept_and_an_excess_names_need_and_budget() {
     let budget = 3 << 20;

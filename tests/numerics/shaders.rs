@@ -32,7 +32,7 @@ const LAYOUTS: &[&[StructLayout]] = &[
 
 /// Entry points whose workgroups are not 256 invocations in one dimension: file, entry point, size, and why.
 const OTHER_WORKGROUPS: &[(&str, &str, [u32; 3], &str)] = &[
-    ("progress.wgsl", "count", [1, 1, 1], "a count"),
+    ("submission_count.wgsl", "count", [1, 1, 1], "a count"),
     ("radix_sort.wgsl", "radix_histogram", [128, 1, 1], "the sort's"),
     (
         "radix_sort.wgsl",
@@ -189,7 +189,7 @@ fn every_shader_file_is_in_the_table_and_stages_have_their_twins() {
     assert_eq!(files, table, "files under shaders/ and the table in src/gpu/sources.rs");
     assert_eq!(table.len(), SOURCES.len(), "a name stands twice in the table");
     // The count of submissions is no stage.
-    for name in table.iter().filter(|n| !n.contains('/') && *n != "progress.wgsl") {
+    for name in table.iter().filter(|n| !n.contains('/') && *n != "submission_count.wgsl") {
         let twin = Path::new(name).with_extension("rs");
         let is_there = |folder: &str| root.join(folder).join(&twin).is_file();
         assert!(is_there("src/kernels") || is_there("tests/numerics/twins"), "shaders/{name} has no CPU twin");

@@ -172,6 +172,6 @@ fn exports_of_an_earlier_step_and_exports_that_come_too_late_are_told() {
     let late = told("--resume out --export spz,sog");
     says(&late, &["files of a finished run are not written again", "gsscale-ckpt import out/point_cloud.ply"]);
     let before = work.bytes("out/point_cloud.spz");
-    says(&told("--resume out --steps 20 --export ply"), &["out/point_cloud.spz is of an earlier step"]);
+    says(&told("--resume out --steps 20 --export ply"), &["out/point_cloud.spz shows an earlier step"]);
     assert!(work.bytes("out/point_cloud.spz") == before);
 }

@@ -182,7 +182,8 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses_list(&with("{ name = \"a\", set = { data-factor = 0.5 } }"), "data-factor");
     let in_cells =
         with("{ name = \"a\", city = { cells = 2 } }").replace("name = \"\"", "name = \"\"\ndisturb = \"nothing\"");
-    refuses_list(&in_cells, "disturbed scene");
+    refuses_list(&in_cells, "cannot have a disturbed scene");
+    refuses_list(&with("{ name = \"a\", share = 50, city = { cells = 2 } }"), "cannot have a share");
     refuses_list(
         &list.replace(", RUN", "").replace("seeds = [1]", "seeds = [1]\nshare = 50"),
         "nothing would leave memory",
@@ -250,8 +251,14 @@ fn cities_in_cells_are_compared_with_the_reference_at_their_borders() {
         assert!(number(city, "trained_gaussians") > number(city, "gaussians"), "margins are dropped at the merge");
     }
     assert!(number(wide, "trained_gaussians") > number(two, "trained_gaussians") && two["ply"] != wide["ply"]);
+    // Cells derive their growth from their own steps.
+    assert!(number(two, "gaussians") > 0.8 * number(whole, "gaussians"), "{two} {whole}");
     assert!(whole["band_loss"].is_null() && number(whole, "gaussians") > 1000.0);
     assert!(names(&work, "out/scene/runs").iter().all(|name| !name.contains(".part")), "cities are removed");
     check_page(&work, "out/scene/sweep.html", &["lost in bands along borders, dB", "wide", "two"]);
     assert!(lines(&work, flags).is_empty(), "all are done");
+    // Without the PLY of the reference no other city could be compared.
+    let reference = names(&work, "out/scene/runs").into_iter().find(|name| name.starts_with("one-run")).unwrap();
+    std::fs::remove_file(work.path(&format!("out/scene/runs/{reference}/point_cloud.ply"))).unwrap();
+    assert_eq!(lines(&work, flags)[0]["name"], "one run");
 }

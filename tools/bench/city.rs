@@ -2,7 +2,7 @@
 //!
 //! Not here: when a run is trained, its folder and its log ([`super::runs`]).
 
-use super::runs::problem;
+use super::programs::problem;
 use gsscale::base::error::InputResult;
 use gsscale::cells::City;
 use gsscale::cells::plan::CityPlan;
@@ -31,7 +31,7 @@ pub struct CityPlace<'a> {
     pub merged: &'a Path,
 }
 
-/// What a scene lacks beside borders.
+/// How well a scene is drawn beside the borders of cells.
 #[derive(Debug, Clone, Copy)]
 pub struct Borders {
     /// PSNR of the held-out views that show a border, and of the bands along borders, dB.
@@ -43,8 +43,9 @@ pub struct Borders {
 pub type Cells<'a> = dyn Fn(&[OsString]) -> InputResult<Output> + 'a;
 
 impl CityCut {
-    /// Trains the city and merges it. Returns the message of a step that failed. Errors: a program cannot be started, or was interrupted.
-    pub fn train(&self, place: &CityPlace, cells: &Cells) -> InputResult<Option<String>> {
+    /// Trains the city and merges it; `machine` are flags for the cells. Returns the message of a step that failed.
+    /// Errors: a program cannot be started, or was interrupted.
+    pub fn train(&self, place: &CityPlace, machine: &[String], cells: &Cells) -> InputResult<Option<String>> {
         let path = |path: &Path| path.as_os_str().to_os_string();
         let (city, scene) = (path(place.city), path(place.scene));
         let words = |words: &[&str]| words.iter().map(OsString::from).collect::<Vec<_>>();
@@ -52,10 +53,14 @@ impl CityCut {
         for (flag, value) in [("--margin", self.margin), ("--view-share", self.view_share)] {
             cut.extend(value.iter().flat_map(|value| words(&[flag, &value.to_string()])));
         }
-        cut.extend([scene.clone(), "--out".into(), city.clone()]);
+        let machine = machine.iter().map(OsString::from);
+        cut.extend([scene.clone(), "--out".into(), city.clone()].into_iter().chain(machine.clone()));
         let prior = ["prior".into(), "--quiet".into(), scene, "--out".into(), city.clone()];
         let prior = [&prior[..], &["--config".into(), path(place.config)]].concat();
-        let run = |cell: usize| [words(&["run", "--quiet", "--cell", &cell.to_string()]), vec![city.clone()]].concat();
+        let run = |cell: usize| {
+            let words = words(&["run", "--quiet", "--cell", &cell.to_string()]);
+            words.into_iter().chain([city.clone()]).chain(machine.clone()).collect()
+        };
         let merge = vec!["merge".into(), city.clone(), "--out".into(), path(place.merged)];
         let failed = |steps: Vec<Vec<OsString>>| -> InputResult<Option<String>> {
             for arguments in steps {
@@ -75,7 +80,8 @@ impl CityCut {
     }
 }
 
-/// What the scene in the folder `model` has beside the borders of a city; the message of a measurement that failed.
+/// Measures the scene in the folder `model` beside the borders of a city. Returns the message of a measurement that failed.
+/// Errors: the program cannot be started, or was interrupted.
 pub fn borders(city: &Path, model: &Path, cells: &Cells) -> InputResult<Result<Borders, String>> {
     let output = cells(&["seam".into(), city.into(), model.into()])?;
     if !output.status.success() {

@@ -9,7 +9,7 @@
 use super::city::CityCut;
 use super::facts::Facts;
 use super::record::RunRecord;
-use super::runs::{MadeScene, Place, Planned, Surroundings, use_drive};
+use super::runs::{MadeScene, Place, Planned, PlannedCity, Surroundings, use_drive};
 use super::sweep_page::View;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::text::read_text;
@@ -134,6 +134,17 @@ impl List {
             if let Some(variable) = entry.environment.keys().find(|v| !v.starts_with(OWN_VARIABLES)) {
                 return Err(refused(format!("{name} sets {variable}, which does not begin with {OWN_VARIABLES}")));
             }
+            if entry.city.is_some() {
+                let refused_with = match () {
+                    () if group.disturb.is_some() => Some("a disturbed scene"),
+                    () if entry.share.is_some() => Some("a share"),
+                    () if name == list.view.reference => Some("the place of the reference"),
+                    () => None,
+                };
+                if let Some(what) = refused_with {
+                    return Err(refused(format!("{name} is a city in cells, which cannot have {what}")));
+                }
+            }
             if !names.insert(name.clone()) {
                 return Err(refused(format!("the list has two runs {name}")));
             }
@@ -184,18 +195,15 @@ impl List {
             true => Some(gsscale::train::start::first_scene::prepare(&place.scene, &base)?.dataset),
             false => None,
         };
-        if let Some((group, entry)) =
-            self.entries().find(|(group, entry)| entry.city.is_some() && group.disturb.is_some())
-        {
-            let problem = "a group of a disturbed scene has a run in cells";
-            return Err(InputError::new(name_of(group, entry), problem, "give the run a group without disturb").into());
-        }
-        let mut planner = Planner { list: self, place, given, base, dataset, facts: BTreeMap::new() };
+        let mut planner =
+            Planner { list: self, place, given, base, dataset, facts: BTreeMap::new(), references: Vec::new() };
         let is_reference = |(group, entry): &(&Group, &Entry)| name_of(group, entry) == self.view.reference;
         let mut planned = Vec::new();
         for seed in &self.seeds {
             for (group, entry) in self.entries().filter(is_reference) {
-                planned.push(planner.run(group, entry, *seed)?.map_err(|e| InputError::new(&place.scene, e, SMALLER))?);
+                let run = planner.run(group, entry, *seed)?.map_err(|e| InputError::new(&place.scene, e, SMALLER))?;
+                planner.references.push(run.clone());
+                planned.push(run);
             }
         }
         for seed in self.seeds.iter().take(self.other_seeds.unwrap_or(usize::MAX)) {
@@ -253,6 +261,8 @@ struct Planner<'a> {
     dataset: Option<Dataset>,
     /// Facts of the scene by rows of a page.
     facts: BTreeMap<u32, Facts>,
+    /// The runs of the reference so far, one for each seed.
+    references: Vec<Planned>,
 }
 
 impl Planner<'_> {
@@ -266,7 +276,8 @@ impl Planner<'_> {
             let problem = || InputError::new(&name, format!("{key} is no number"), "give times keys that are numbers");
             keys.insert(key.clone(), value.ok_or_else(problem)?);
         }
-        let mut config = config_of(&name, keys)?;
+        keys.insert("seed".into(), Value::Integer(seed as i64));
+        let mut config = config_of(&name, keys.clone())?;
         (config.seed, config.spill_dir, config.frames) = (seed, String::new(), 0);
         let scene = self.disturbed(group, &mut config)?;
         config.check()?;
@@ -284,7 +295,14 @@ impl Planner<'_> {
                 Err(problem) => return Ok(Err(problem)),
             }
         }
-        let (environment, bits, city) = (entry.environment.clone(), entry.bits.clone(), entry.city.clone());
+        let (environment, bits) = (entry.environment.clone(), entry.bits.clone());
+        keys.retain(|key, _| key != "spill-dir" && key != "frames");
+        let reference = self.references.iter().find(|run| run.config.seed == seed);
+        let city = entry.city.clone().zip(reference).map(|(cut, reference)| PlannedCity {
+            cut,
+            keys,
+            reference: Box::new(reference.clone()),
+        });
         // Cities are compared with the reference at their borders.
         let keeps_ply = name == self.list.view.reference && self.list.entries().any(|(_, entry)| entry.city.is_some());
         Ok(Ok(Planned { name, config, scene, environment, bits, city, keeps_ply }))

@@ -103,6 +103,11 @@ impl RunRecord {
     pub fn group(&self) -> &str {
         self.name.split('/').next().unwrap_or_default()
     }
+
+    /// A figure that a city in cells, which is several runs, has not.
+    fn of_one_run(&self, value: f64) -> Option<f64> {
+        self.trained_gaussians.is_none().then_some(value)
+    }
 }
 
 /// Converts `seconds` and `cpu_seconds` of all runs to the median of their paces, in place. Times stay as measured unless every run that
@@ -164,22 +169,24 @@ const FIGURES: [Figure; 19] = [
     figure("cc-psnr", "PSNR after colour correction, dB", Some(2), |r| r.cc_psnr),
     figure("predicted-psnr", "PSNR with predicted exposures, dB", Some(2), |r| r.predicted_psnr),
     figure("seconds", "seconds of training", Some(1), |r| Some(r.seconds)),
-    figure("step-ms", "ms a step", Some(1), |r| Some(1e3 * r.seconds / f64::from(r.steps.max(1)))),
+    figure("step-ms", "ms a step", Some(1), |r| r.of_one_run(1e3 * r.seconds / f64::from(r.steps.max(1)))),
     figure("cpu-seconds", "CPU seconds", Some(1), |r| r.cpu_seconds),
-    figure("stall-seconds", "seconds waiting for the drive", Some(1), |r| Some(r.stall_seconds)),
-    figure("bytes-read", "read", None, |r| Some(r.bytes_read as f64)),
-    figure("bytes-written", "written", None, |r| Some(r.bytes_written as f64)),
-    figure("bytes-moved", "read and written", None, |r| Some(r.bytes_read.saturating_add(r.bytes_written) as f64)),
-    figure("host-bytes-peak", "host peak", None, |r| Some(r.host_bytes_peak as f64)),
-    figure("device-bytes-peak", "device peak", None, |r| Some(r.device_bytes_peak as f64)),
-    figure("drive-bytes-peak", "drive peak", None, |r| Some(r.drive_bytes_peak as f64)),
+    figure("stall-seconds", "seconds waiting for the drive", Some(1), |r| r.of_one_run(r.stall_seconds)),
+    figure("bytes-read", "read", None, |r| r.of_one_run(r.bytes_read as f64)),
+    figure("bytes-written", "written", None, |r| r.of_one_run(r.bytes_written as f64)),
+    figure("bytes-moved", "read and written", None, |r| {
+        r.of_one_run(r.bytes_read.saturating_add(r.bytes_written) as f64)
+    }),
+    figure("host-bytes-peak", "host peak", None, |r| r.of_one_run(r.host_bytes_peak as f64)),
+    figure("device-bytes-peak", "device peak", None, |r| r.of_one_run(r.device_bytes_peak as f64)),
+    figure("drive-bytes-peak", "drive peak", None, |r| r.of_one_run(r.drive_bytes_peak as f64)),
     figure("gaussians", "Gaussians", Some(0), |r| Some(r.gaussians as f64)),
     figure("trained-gaussians", "Gaussians trained, with margins", Some(0), |r| {
         Some(r.trained_gaussians.unwrap_or(r.gaussians) as f64)
     }),
     figure("border-loss", "lost in photos with a border, dB", Some(2), |r| r.border_loss),
     figure("band-loss", "lost in bands along borders, dB", Some(2), |r| r.band_loss),
-    figure("frames", "frames", Some(0), |r| Some(r.frames as f64)),
+    figure("frames", "frames", Some(0), |r| r.of_one_run(r.frames as f64)),
 ];
 
 impl<'de> Deserialize<'de> for Figure {

@@ -6,13 +6,15 @@
 //! removed: each run holds the lock of the sweep while the run lives, even if the sweep itself was killed.
 
 use super::city::{CityCut, CityPlace, borders};
+use super::programs::{beside, problem, start};
 use super::read_json;
 use super::record::{Pace, RunRecord, convert_to_one_pace};
 use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
 use gsscale::base::whole_file::write_whole;
-use gsscale::cells::work::status;
+use gsscale::cells::work::{Done, status};
+use gsscale::cells::{City, machine_flags};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::values::{ByteSize, Choice};
 use gsscale::dataset::disturb::Disturbance;
@@ -21,18 +23,15 @@ use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE,
 use gsscale::train::log::report::Summary;
 use serde_json::Value;
 use std::collections::BTreeMap;
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Read;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
 use std::time::Instant;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
 
 /// Stands for a run's own spill directory in the config of a planned run.
 const SPILL_PLACEHOLDER: &str = "spill";
-/// Longest message of a failed run, characters.
-const PROBLEM_MAX: usize = 600;
 /// File in the output folder that the sweep and its current run lock.
 const LOCK: &str = "sweep.lock";
 const AGAIN: &str = "start the sweep again";
@@ -82,9 +81,18 @@ pub struct Planned {
     /// Runs of one class and seed must end with the same bits; empty = this is not known.
     pub bits: String,
     /// The scene is trained in cells.
-    pub city: Option<CityCut>,
-    /// The run's folder keeps its PLY.
+    pub city: Option<PlannedCity>,
+    /// The run's folder keeps its PLY, with which cities are compared.
     pub keeps_ply: bool,
+}
+
+#[derive(Debug, Clone)]
+pub struct PlannedCity {
+    pub cut: CityCut,
+    /// The keys of the run that the list, a config file or flags give. The prior and each cell derive the others from their own lengths.
+    pub keys: toml::Table,
+    /// The run with which the city is compared.
+    pub reference: Box<Planned>,
 }
 
 #[derive(Debug, Clone)]
@@ -127,9 +135,10 @@ impl Planned {
         let settings = toml::to_string(&self.config).unwrap_or_default();
         let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
         let environment: String = self.environment.iter().map(|(name, value)| format!("\n{name}={value}")).collect();
-        let city = self.city.as_ref().map_or(String::new(), |city| format!("\n{city:?}"));
-        let kept = if self.keeps_ply { "\nwith its PLY" } else { "" };
-        let all = format!("{}\n{settings}{how}{environment}{city}{kept}", surroundings.text);
+        let city = self.city.as_ref().map_or(String::new(), |city| {
+            format!("\n{:?}\n{}\n{}", city.cut, city.keys, city.reference.key(surroundings))
+        });
+        let all = format!("{}\n{settings}{how}{environment}{city}", surroundings.text);
         format!("{:016x}", xxh3_64(all.as_bytes()))
     }
 
@@ -162,7 +171,11 @@ impl Sweep {
 
     /// The planned runs that have no result yet.
     pub fn open_runs<'a>(&self, runs: &'a [Planned]) -> Vec<&'a Planned> {
-        let is_open = |run: &&Planned| successful_run(self.log.records(), &run.key(&self.surroundings)).is_none();
+        let is_open = |run: &&Planned| {
+            let key = run.key(&self.surroundings);
+            let has_ply = || self.out.join("runs").join(run.folder(&key)).join(PLY_FILE).is_file();
+            successful_run(self.log.records(), &key).is_none() || run.keeps_ply && !has_ply()
+        };
         runs.iter().filter(is_open).collect()
     }
 
@@ -179,14 +192,9 @@ impl Sweep {
         (records, times)
     }
 
-    /// Trains a run and logs its result; `reference` is the run with which a city is compared. Prints the result as JSON if that was asked for; warns if the run failed.
+    /// Trains a run and logs its result. Prints the result as JSON if that was asked for; warns if the run failed.
     /// Errors: the program is missing or was interrupted, or results cannot be written. A failed run is a result.
-    pub fn run(
-        &mut self,
-        planned: &Planned,
-        reference: Option<&Planned>,
-        print: &mut dyn FnMut(&Value),
-    ) -> InputResult<()> {
+    pub fn run(&mut self, planned: &Planned, print: &mut dyn FnMut(&Value)) -> InputResult<()> {
         let key = planned.key(&self.surroundings);
         if self.pace_after_last_run.is_none() {
             // The first training also brings the photos into memory.
@@ -195,7 +203,7 @@ impl Sweep {
         }
         let before = self.pace_after_last_run.take();
         let mut record = match &planned.city {
-            Some(city) => self.train_city(planned, city, &key, reference)?,
+            Some(city) => self.train_city(planned, city, &key)?,
             None => self.train(planned, &key)?,
         };
         let after = self.measure_pace();
@@ -249,7 +257,7 @@ impl Sweep {
         let began = Instant::now();
         let scene = planned.scene.as_ref().map_or(&self.scene, |scene| &scene.folder);
         let arguments = [scene, Path::new("--out"), &part, Path::new("--config"), &file];
-        let output = self.spawn("gsscale-train", &arguments, &planned.environment)?;
+        let output = start("gsscale-train", &arguments, &planned.environment, &self.lock)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
         if !output.status.success() {
             // Before the folders are removed: an interrupted run keeps its checkpoint.
@@ -320,51 +328,47 @@ impl Sweep {
         Ok(())
     }
 
-    /// Evaluates the PLY in a folder on the photos of the sweep's base.
-    fn evaluate(&self, record: &mut RunRecord, folder: &Path) -> InputResult<()> {
+    /// Evaluates the PLY in a folder on the photos of the sweep's base. Returns the report; null of an evaluation that failed.
+    fn evaluate(&self, record: &mut RunRecord, folder: &Path) -> InputResult<Value> {
         let [ply, file, json] = [PLY_FILE, EVALUATED_AS_FILE, EVALUATED_FILE].map(|name| folder.join(name));
         write_config(&file, &self.base)?;
         let arguments = [&ply, self.scene.as_path(), Path::new("--config"), &file, Path::new("--json"), &json];
-        let output = self.spawn("gsscale-eval", &arguments, &BTreeMap::new())?;
+        let output = start("gsscale-eval", &arguments, &BTreeMap::new(), &self.lock)?;
         if !output.status.success() {
             record.problem = Some(problem(&output)?);
-            return Ok(());
+            return Ok(Value::Null);
         }
         let report: Value = read_json(&json, AGAIN)?;
         (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
-        record.gaussians = report["gaussians"].as_u64().unwrap_or(record.gaussians);
-        Ok(())
+        Ok(report)
     }
 
-    /// Trains a scene in cells and compares its borders with those of `reference`, whose folder has its PLY.
-    fn train_city(
-        &self,
-        planned: &Planned,
-        cut: &CityCut,
-        key: &str,
-        reference: Option<&Planned>,
-    ) -> InputResult<RunRecord> {
+    /// Trains a scene in cells and compares its borders with those of the reference, if that has its PLY.
+    fn train_city(&self, planned: &Planned, city: &PlannedCity, key: &str) -> InputResult<RunRecord> {
         let (name, runs) = (planned.folder(key), self.out.join("runs"));
         let at = |end: &str| runs.join(format!("{name}{end}"));
-        let (part, city, file) = (at(".part"), at(".city.part"), at(".part.toml"));
+        let (part, folder, file) = (at(".part"), at(".city.part"), at(".part.toml"));
         let mut record = self.record(planned, key);
-        write_config(&file, &planned.config)?;
+        let keys =
+            toml::to_string(&city.keys).map_err(|e| InputError::new(&file, e.to_string(), "report this as a bug"))?;
+        write_whole(&file, keys.as_bytes())?;
         let began = Instant::now();
-        let cells = |arguments: &[OsString]| {
-            let arguments: Vec<&Path> = arguments.iter().map(Path::new).collect();
-            self.spawn("gsscale-cells", &arguments, &planned.environment)
-        };
-        let place = CityPlace { scene: &self.scene, config: &file, city: &city, merged: &part };
-        record.problem = cut.train(&place, &cells)?;
+        let cells = |arguments: &[OsString]| start("gsscale-cells", arguments, &planned.environment, &self.lock);
+        let place = CityPlace { scene: &self.scene, config: &file, city: &folder, merged: &part };
+        record.problem = city.cut.train(&place, &machine_flags(&city.keys), &cells)?;
         record.wall_seconds = began.elapsed().as_secs_f64();
-        record.seconds = record.wall_seconds;
         if record.problem.is_none() {
             record.ply = digest(&part.join(PLY_FILE))?;
-            self.evaluate(&mut record, &part)?;
+            let report = self.evaluate(&mut record, &part)?;
+            record.gaussians = report["gaussians"].as_u64().unwrap_or_default();
+            let prior: Summary = read_json(&City(folder.clone()).prior_run().join(SUMMARY_FILE), AGAIN)?;
+            let done: Vec<Done> = status(&folder)?.1.into_iter().filter_map(|cell| cell.done).collect();
+            record.seconds = prior.train_seconds + done.iter().map(|cell| cell.seconds).sum::<f64>();
+            record.trained_gaussians = Some(done.iter().map(|cell| cell.gaussians).sum());
         }
-        if let (None, Some(reference)) = (&record.problem, reference) {
-            let of_reference = runs.join(reference.folder(&reference.key(&self.surroundings)));
-            match (borders(&city, &of_reference, &cells)?, borders(&city, &part, &cells)?) {
+        let reference = runs.join(city.reference.folder(&city.reference.key(&self.surroundings)));
+        if record.problem.is_none() && reference.join(PLY_FILE).is_file() {
+            match (borders(&folder, &reference, &cells)?, borders(&folder, &part, &cells)?) {
                 (Ok(reference), Ok(own)) => {
                     let lost = |a: Option<f64>, b: Option<f64>| Some(a? - b?);
                     record.border_loss = lost(reference.crossing_psnr, own.crossing_psnr);
@@ -373,34 +377,11 @@ impl Sweep {
                 (Err(problem), _) | (_, Err(problem)) => record.problem = Some(problem),
             }
         }
-        if record.problem.is_none() {
-            let (_, cells) = status(&city)?;
-            record.trained_gaussians = cells.iter().map(|cell| Some(cell.done.as_ref()?.gaussians)).sum();
-            remove(&part.join(PLY_FILE))?;
-        }
-        remove(&city)?;
+        remove(&part.join(PLY_FILE))?;
+        remove(&folder)?;
         remove(&file)?;
         self.finish(&name, &part, &record)?;
         Ok(record)
-    }
-
-    /// Runs a program that is part of this program, or lies in its folder, to its end. The program's standard input is the lock file, so the
-    /// lock stays held while the program lives.
-    fn spawn(&self, program: &str, arguments: &[&Path], environment: &BTreeMap<String, String>) -> InputResult<Output> {
-        let (path, command) = beside(program)?;
-        let held = self.lock.try_clone().map_err(|e| InputError::io(&self.out, "handing on the lock", &e))?;
-        let mut started = Command::new(&path);
-        started
-            .args(command)
-            .args(arguments)
-            .envs(environment)
-            .stdin(Stdio::from(held))
-            .stdout(Stdio::piped())
-            .stderr(Stdio::piped());
-        if program == "gsscale-train" {
-            started.arg("--quiet");
-        }
-        started.output().map_err(|e| InputError::io(&path, "starting the program", &e))
     }
 }
 
@@ -431,21 +412,6 @@ fn resolved(path: &Path) -> PathBuf {
     path.ancestors().find_map(of).unwrap_or_else(|| path.clone())
 }
 
-/// Path of a program and its first argument: this program with a command if it is `gsscale`, else one in the same folder.
-fn beside(program: &str) -> InputResult<(PathBuf, Option<&str>)> {
-    let own = std::env::current_exe().map_err(|e| InputError::io(program, "finding this program", &e))?;
-    if let (Some("gsscale"), Some(command)) =
-        (own.file_stem().and_then(OsStr::to_str), program.strip_prefix("gsscale-"))
-    {
-        return Ok((own, Some(command)));
-    }
-    let path = own.with_file_name(format!("{program}{}", std::env::consts::EXE_SUFFIX));
-    match path.is_file() {
-        true => Ok((path, None)),
-        false => Err(InputError::new(&path, "is missing", "build all programs: cargo build --release")),
-    }
-}
-
 fn lock(out: &Path) -> InputResult<File> {
     let path = out.join(LOCK);
     let io = |e: std::io::Error| InputError::io(&path, "opening the lock", &e);
@@ -458,23 +424,6 @@ fn lock(out: &Path) -> InputResult<File> {
         // Without lock support of the file system, the user keeps to one sweep.
         Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
     }
-}
-
-/// The last error message of a failed program, or its exit status.
-/// Errors: the program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
-pub fn problem(output: &Output) -> InputResult<String> {
-    let said = String::from_utf8_lossy(&output.stderr);
-    // A cell that a signal has stopped ends with 75; so does one that lacks something, with an error.
-    let is_interrupted = match output.status.code() {
-        Some(75) => !said.contains("error: "),
-        code => matches!(code, Some(130 | 143)),
-    };
-    if is_interrupted {
-        return Err(InputError::new("the sweep", "was interrupted", "start it again to continue"));
-    }
-    let errors = said.rfind("error: ").map_or(said.trim(), |at| said[at..].trim());
-    let text = if errors.is_empty() { output.status.to_string() } else { errors.replace('\n', " ") };
-    Ok(text.chars().take(PROBLEM_MAX).collect())
 }
 
 fn digest(path: &Path) -> InputResult<String> {

@@ -159,8 +159,7 @@ fn sweep_scene(
             }
             made = folder;
         }
-        let is_reference = |other: &&Planned| other.name == list.view.reference && other.config.seed == run.config.seed;
-        sweep.run(run, plan.runs.iter().find(is_reference), print)?;
+        sweep.run(run, print)?;
         write_page(&sweep)?;
     }
     made.iter().try_for_each(|folder| remove(folder))?;

@@ -163,18 +163,18 @@ impl Results<'_> {
 /// Writes all rows at the current step as a PLY; returns what was written and in which coordinates.
 /// Errors: the folder cannot be written, pages could not be pinned, or a failed step left pages of two steps.
 pub fn save(trainer: &mut Trainer, dataset: &Dataset, path: &Path) -> Result<Written, TrainError> {
-    Ok(export(trainer, dataset, path, ExportFormat::Ply, &ExportChoice::default())?.0)
+    Ok(export(trainer, dataset, path, ExportFormat::Ply, &mut ExportChoice::default())?.0)
 }
 
-/// Like [`save`], in any format and without the rows that `choice` leaves out; returns also how many these are. Where `choice` leaves out all,
-/// all are written, with a warning.
+/// Like [`save`], in any format and without the rows that `choice` leaves out; returns also how many these are. A choice that
+/// would leave out all leaves out none from then on, with a warning.
 /// Errors: as [`save`].
 pub(crate) fn export(
     trainer: &mut Trainer,
     dataset: &Dataset,
     path: &Path,
     format: ExportFormat,
-    choice: &ExportChoice,
+    choice: &mut ExportChoice,
 ) -> Result<(Written, u64), TrainError> {
     settle(trainer, path)?;
     let meta = scene_meta(trainer, dataset);
@@ -194,7 +194,8 @@ pub(crate) fn export(
             path.display()
         );
         drop(sink);
-        return export(trainer, dataset, path, format, &ExportChoice::default());
+        choice.required = None;
+        return export(trainer, dataset, path, format, choice);
     }
     Ok((sink.finish()?, left_out))
 }

@@ -206,7 +206,7 @@ pub(super) fn train_into(
     let ply = Trainer::ply_path(out);
     let saved = save_result(dataset, &mut results, &ply);
     // Return the error that ended the run; a failure to write its last rows is an additional warning.
-    let (looped, saved) = match (looped, saved) {
+    let (looped, mut saved) = match (looped, saved) {
         (Err(error), Err(other)) => {
             crate::tell!("warning: {} cannot be written: {other}", ply.display());
             return Err(error);
@@ -220,7 +220,7 @@ pub(super) fn train_into(
         (looped, saved) => (looped, saved?),
     };
     warn_of_ply(config, &saved.written, &ply);
-    let summary = write_results(request, dataset, &targets, results, looped, &saved, step_costs)?;
+    let summary = write_results(request, dataset, &targets, results, looped, &mut saved, step_costs)?;
     tiers.is_done = summary.finished;
     let is_late = summary.steps < config.steps;
     Ok(RunOutcome {
@@ -240,7 +240,7 @@ fn write_results(
     targets: &TargetCache,
     mut results: Results<'_>,
     looped: Result<(), TrainError>,
-    saved: &SavedPly,
+    saved: &mut SavedPly,
     costs: StepCosts,
 ) -> Result<Summary, TrainError> {
     let (config, out) = (&request.config, &request.out);
@@ -307,8 +307,8 @@ struct SavedPly {
 /// Writes the Gaussians at the current step as a PLY, its transform to the dataset's coordinates, and the settings of viewers.
 fn save_result(dataset: &Dataset, results: &mut Results<'_>, ply: &Path) -> Result<SavedPly, TrainError> {
     let saved = results.write(|results| {
-        let choice = ExportChoice::of_rows(results.trainer, dataset, ply)?;
-        let (written, left_out) = export(results.trainer, dataset, ply, ExportFormat::Ply, &choice)?;
+        let mut choice = ExportChoice::of_rows(results.trainer, dataset, ply)?;
+        let (written, left_out) = export(results.trainer, dataset, ply, ExportFormat::Ply, &mut choice)?;
         Ok(SavedPly { written, left_out, choice })
     })?;
     results.has_ply = true;
@@ -326,7 +326,7 @@ fn export_all(
     dataset: &Dataset,
     results: &mut Results<'_>,
     ply: &Path,
-    saved: &SavedPly,
+    saved: &mut SavedPly,
 ) -> Result<Vec<ExportFacts>, TrainError> {
     let formats = request.config.export.formats().filter_map(|format| Some((format, format.beside(ply)?)));
     let exported = formats.map(|(format, file)| {
@@ -336,7 +336,10 @@ fn export_all(
     let is_asked = |format: ExportFormat| request.config.export.formats().any(|asked| asked == format);
     let others = ExportFormat::ALL.into_iter().filter(|format| !is_asked(*format)).filter_map(|f| f.beside(ply));
     for old in others.filter(|old| old.exists()) {
-        crate::tell!("warning: {} is of an earlier step: --export writes it again", old.display());
+        crate::tell!(
+            "warning: {} shows an earlier step; give --export with its format to write it again",
+            old.display()
+        );
     }
     if exported.is_err() {
         crate::tell!(
@@ -353,9 +356,9 @@ fn export_beside(
     trainer: &mut Trainer,
     format: ExportFormat,
     other: &Path,
-    saved: &SavedPly,
+    saved: &mut SavedPly,
 ) -> Result<ExportFacts, TrainError> {
-    let (exported, _) = export(trainer, dataset, other, format, &saved.choice)?;
+    let (exported, _) = export(trainer, dataset, other, format, &mut saved.choice)?;
     format.write_transform(other, &scene_meta(trainer, dataset), exported.frame)?;
     exported.warnings.iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let left_out = saved.written.rows.saturating_sub(exported.rows);
