@@ -128,8 +128,8 @@ impl<'a> Life<'a> {
         let frames =
             *self.dice.pick(&[0, alone.pages, alone.pinned, alone.pinned * 2 / 3, (alone.pinned / 3).max(2), 2]);
         let threads = 1 + self.dice.below(3);
-        // A run that begins with frames and without a drive makes no commits.
-        match self.spill.is_some() || self.store().is_some() {
+        // A run that begins with frames and without a drive makes no commits, also where it begins again.
+        match self.spill.is_some() || self.store().is_some() && !self.generations().is_empty() {
             true => format!("--threads {threads} --frames {frames}"),
             false => format!("--threads {threads}"),
         }
@@ -274,6 +274,11 @@ impl<'a> Life<'a> {
         let work = &self.world.world.work;
         // Without a config, the next process begins the run again, where it was to begin.
         let Some(store) = self.store().filter(|_| self.path(&self.out).join("config.toml").exists()) else { return };
+        // A process that was killed at its very end may have begun to remove the store.
+        let summary = std::fs::read(self.path(&self.out).join("summary.json")).unwrap_or_default();
+        if serde_json::from_slice(&summary).is_ok_and(|summary: Value| summary["finished"] == true) {
+            return;
+        }
         let generations = self.generations();
         match self.dice.below(8) {
             0 if self.spill.is_some() => {
