@@ -323,6 +323,9 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
                 );
             }
         }
+        if std::env::var_os("CARGO").is_some() {
+            gsscale::tell!("  commands    cargo install --path . puts them on the PATH");
+        }
     }
     ExitCode::from(outcome.exit_code as u8)
 }

@@ -17,10 +17,10 @@ const BUFFER_BYTES: usize = 1 << 20;
 /// How long a writer waits for another one of the same file. Small files are written within milliseconds.
 const WAIT: Duration = Duration::from_secs(5);
 const BETWEEN_TRIES: Duration = Duration::from_millis(20);
-/// How often a file is opened anew that another writer has renamed or removed meanwhile.
+/// How often a file is opened anew that another process has renamed or removed meanwhile.
 const TRIES: u32 = 16;
 
-/// A hidden file that one process at a time has, as far as the file system has locks. Dropping it removes the file before the lock goes,
+/// A hidden file that one process holds at a time, as far as the file system has locks. Dropping it removes the file before the lock goes,
 /// unless the file has got another name.
 #[derive(Debug)]
 pub(super) struct LockedFile {
@@ -34,25 +34,39 @@ impl LockedFile {
     /// Errors: the file cannot be opened, or another process has it for longer than `wait`.
     pub(super) fn open(path: PathBuf, target: &Path, wait: Duration) -> InputResult<LockedFile> {
         let io = |e: io::Error| InputError::io(target, "creating the file", &e);
-        let (began, mut tries) = (Instant::now(), 0);
+        let began = Instant::now();
         loop {
             if std::fs::symlink_metadata(&path).is_ok_and(|found| found.is_symlink()) {
                 std::fs::remove_file(&path).map_err(io)?;
             }
-            let file = File::options().read(true).write(true).create(true).truncate(false).open(&path).map_err(io)?;
-            if !matches!(file.try_lock(), Err(TryLockError::WouldBlock)) {
-                tries += 1;
-                // Some network drives number a file anew each time it is opened: then the lock alone counts.
-                if is_same_file(&path, &file) || tries == TRIES {
-                    return Ok(LockedFile { path, file, is_renamed: false });
+            match open_locked(&path).map_err(io)? {
+                Some(file) => return Ok(LockedFile { path, file, is_renamed: false }),
+                None if began.elapsed() < wait => std::thread::sleep(BETWEEN_TRIES),
+                None => {
+                    let remedy = "wait for its end, or give another name";
+                    return Err(InputError::new(target, "another process is writing this", remedy));
                 }
-            } else if began.elapsed() >= wait {
-                let remedy = "wait for its end, or give another name";
-                return Err(InputError::new(target, "another process is writing this", remedy));
-            } else {
-                std::thread::sleep(BETWEEN_TRIES);
             }
         }
+    }
+}
+
+/// Opens or creates the file `path` and locks it for as long as it is open; `None` if another process has the lock. On file systems without
+/// locks this only opens the file.
+/// Errors: the file cannot be opened.
+pub fn open_locked(path: &Path) -> io::Result<Option<File>> {
+    let mut tries = 1;
+    loop {
+        let file = File::options().read(true).write(true).create(true).truncate(false).open(path)?;
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+            return Ok(None);
+        }
+        // The process that had the lock may have renamed or removed the file meanwhile. Some network drives number a file anew each time it is
+        // opened: then the lock alone counts.
+        if is_same_file(path, &file) || tries == TRIES {
+            return Ok(Some(file));
+        }
+        tries += 1;
     }
 }
 

@@ -111,7 +111,7 @@ impl RunOptions {
                 // Drawn when a run begins.
                 landmarks: Vec::new(),
                 refine_poses: config.refine_poses.is_on(),
-                // A run with more steps than at first keeps the phases of its kinds.
+                // A resume with more steps leaves the phases of refined poses and masks as they were.
                 steps: config.steps.min(schedule_steps(config)),
                 scene_scale,
             },

@@ -17,7 +17,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::math::sigmoid;
-use crate::base::units::counted;
+use crate::base::units::counted_are;
 use crate::base::whole_file::PartFile;
 use crate::exchange::frames::{ExportRow, ExportRows};
 use crate::exchange::meta::{ExportFrame, SceneMeta};
@@ -47,12 +47,12 @@ const FIXED_MAX: f64 = 8_388_607.0;
 const FRACTION_BITS_MAX: u8 = 22;
 /// Largest log sigma of a byte: of 379 units.
 const LOG_SCALE_MAX: f32 = 255.0 / 16.0 - 10.0;
-/// A few far rows are told if they cost the others this many bits, 64 times the precision.
-const BITS_TOLD: u8 = 6;
+/// A warning names the far rows that cost all positions so many fractional bits, 64 times the precision.
+const BITS_LOST: u8 = 6;
 /// The part of the rows that counts as few.
 const FAR_SHARE: f64 = 1e-3;
 /// Most Gaussians that the format's own reader opens.
-const READERS_MOST: u64 = 10_000_000;
+const READER_ROWS_MAX: u64 = 10_000_000;
 /// Colours: a constant band of 0 is mid grey, and this much of it is the whole range.
 const COLOR_SCALE: f32 = 0.15;
 /// Largest magnitude of the small components of a quaternion, in 9 bits.
@@ -71,7 +71,7 @@ pub struct SpzWriter {
     /// Rows left out because a coordinate is too large for the format.
     far: u64,
     /// Rows by the fractional bits that their position allows.
-    rows_of_bits: [u64; FRACTION_BITS_MAX as usize + 1],
+    rows_by_bits: [u64; FRACTION_BITS_MAX as usize + 1],
     /// Rows with a sigma beyond the format's.
     large: u64,
     is_local: bool,
@@ -102,7 +102,7 @@ impl SpzWriter {
             rows: 0,
             reach: 0.0,
             far: 0,
-            rows_of_bits: [0; FRACTION_BITS_MAX as usize + 1],
+            rows_by_bits: [0; FRACTION_BITS_MAX as usize + 1],
             large: 0,
             is_local: to_file.frame() == ExportFrame::Local,
         };
@@ -143,7 +143,7 @@ impl Format for SpzWriter {
             return Ok(false);
         }
         self.reach = self.reach.max(reach);
-        self.rows_of_bits[usize::from(fraction_bits(reach))] += 1;
+        self.rows_by_bits[usize::from(fraction_bits(reach))] += 1;
         self.large += u64::from(row.log_scales.iter().any(|&s| s > LOG_SCALE_MAX));
         let mut bytes: Vec<u8> = row.position.iter().flat_map(|x| x.to_le_bytes()).collect();
         push_attributes(&ExportRow { quat: half_turn_of_own_axes(row.quat), ..*row }, self.sh_degree, &mut bytes);
@@ -166,29 +166,29 @@ impl Format for SpzWriter {
     fn warnings(&self) -> Vec<String> {
         let mut told = Vec::new();
         let remedy = if self.is_local { "use a PLY or SOG" } else { "use --export-frame local, or a PLY or SOG" };
-        let gaussians = |rows: u64| counted(rows, "Gaussian");
+        let gaussians_are = |rows: u64| counted_are(rows, "Gaussian");
         if self.large > 0 {
-            let (large, most) = (gaussians(self.large), f64::from(LOG_SCALE_MAX).exp());
+            let (large, most) = (gaussians_are(self.large), f64::from(LOG_SCALE_MAX).exp());
             told.push(format!(
-                "{large} with a sigma above {most:.0} units, the most that SPZ holds, cut to that: {remedy}"
+                "{large} larger than a sigma of {most:.0} units, the most that SPZ holds, and cut to that: {remedy}"
             ));
         }
         let few = (FAR_SHARE * self.rows as f64) as u64;
         let (bits, mut far) = (fraction_bits(self.reach), 0);
         for most in bits..=FRACTION_BITS_MAX {
-            let rows = self.rows_of_bits[usize::from(most)];
+            let rows = self.rows_by_bits[usize::from(most)];
             if far + rows > few {
-                if most >= bits + BITS_TOLD {
-                    let (far, step) = (gaussians(far), 0.5f64.powi(i32::from(bits)));
+                if most >= bits + BITS_LOST {
+                    let (far, step) = (gaussians_are(far), 0.5f64.powi(i32::from(bits)));
                     told.push(format!("{far} so far out that SPZ rounds all positions to {step} units: {remedy}"));
                 }
                 break;
             }
             far += rows;
         }
-        if self.rows > READERS_MOST {
+        if self.rows > READER_ROWS_MAX {
             told.push(format!(
-                "{} Gaussians are more than the {READERS_MOST} that the format's own reader opens: export fewer (--max-gaussians), or a SOG",
+                "{} Gaussians are more than the {READER_ROWS_MAX} that the format's own reader opens: export fewer (--max-gaussians), or a SOG",
                 self.rows
             ));
         }

@@ -102,7 +102,7 @@ pub struct GpuOptions {
     /// Most device memory to allocate, bytes (`--device-mem`); `None`: no limit. From 128 MiB on the limit holds for the memory
     /// blocks of the API, below for the buffers in them.
     pub budget: Option<u64>,
-    /// Proves by every read-back that the work before it was done, also where the driver reports work that it gives up.
+    /// Counts submissions on the device, so that every read-back proves that the work before it was done. Devices of Metal always do.
     pub counts_submissions: bool,
     /// Measures the time of every stage, if the adapter can.
     pub profile: bool,
@@ -126,7 +126,7 @@ pub struct Gpu {
     pub(super) uniforms: Mutex<UniformRing>,
     pub(super) profiler: Mutex<Profiler>,
     pub(super) injector: Injector,
-    /// `None` where the driver reports work that it gives up.
+    /// `None` where the driver reports work that the device skipped.
     pub(super) submission_count: Option<SubmissionCount>,
     pub(super) uploaded: AtomicU64,
     pub(super) work: Mutex<Work>,
@@ -176,7 +176,7 @@ impl Gpu {
     fn count_submissions(&self) -> GpuResult<SubmissionCount> {
         let pipeline = self.pipeline("submission_count.wgsl", "count", &[])?;
         let mut recorder = self.begin("submission count");
-        let finished = recorder.buffer_zeroed("finished submissions", 4)?;
+        let finished = recorder.buffer_with("finished submissions", &[1u32])?;
         let submission = self.submit(recorder)?;
         self.wait(&submission)?;
         Ok(SubmissionCount::new(pipeline, finished))

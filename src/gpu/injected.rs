@@ -14,7 +14,7 @@ const FILL_BUFFERS: usize = 8192;
 pub enum FaultKind {
     /// The device is destroyed, as if unplugged or reset.
     Lost,
-    /// The commands are not run, and nothing reports that.
+    /// The device skips the commands without an error.
     GivenUp,
     /// A command is recorded that the graphics API refuses.
     Validation,

@@ -40,19 +40,21 @@ impl Staging {
         count: Option<(BufferView, u32)>,
     ) -> GpuResult<(Readback, Mapping)> {
         let size = view.size;
-        let mapped = size + if count.is_some() { COUNT_BYTES } else { 0 };
-        let mut to = self.pool.take("read-back staging", mapped, Purpose::ReadBack)?;
+        let with_count = size + if count.is_some() { COUNT_BYTES } else { 0 };
+        let mut to = self.pool.take("read-back staging", with_count, Purpose::ReadBack)?;
+        // At the end of the memory, where no read-back of another length has left other bytes.
+        let mapped = if count.is_some() { to.raw().size() } else { size };
         to.set_reusable(false); // until the host has read and unmapped it
         encoder.copy_buffer_to_buffer(&view.raw, view.offset, to.raw(), 0, size);
         let expected = count.map(|(count, expected)| {
-            encoder.copy_buffer_to_buffer(&count.raw, count.offset, to.raw(), size, COUNT_BYTES);
+            encoder.copy_buffer_to_buffer(&count.raw, count.offset, to.raw(), mapped - COUNT_BYTES, COUNT_BYTES);
             expected
         });
         self.read.fetch_add(size, Ordering::Relaxed);
         let state = SharedState::new(MapState::Recorded);
         let mapping = Mapping::new(to.raw(), wgpu::MapMode::Read, mapped, &state);
         let ticket = ticket.clone();
-        Ok((Readback { buffer: to, size, expected, stage, state, ticket, staging: Arc::clone(self) }, mapping))
+        Ok((Readback { buffer: to, size, mapped, expected, stage, state, ticket, staging: Arc::clone(self) }, mapping))
     }
 
     pub(super) fn bytes_read(&self) -> u64 {
@@ -60,7 +62,7 @@ impl Staging {
     }
 }
 
-/// Bytes of a count of submissions, which follows the bytes of a read-back.
+/// Bytes of a count of submissions, the last ones of a read-back's memory.
 const COUNT_BYTES: u64 = 4;
 
 /// Copies mapped bytes to host memory of the same length.
@@ -79,9 +81,11 @@ fn empty(mapped: &[u8], out: &mut [u8]) {
 #[must_use]
 pub struct Readback {
     buffer: Buffer,
-    /// Bytes without the count.
+    /// Bytes of the results.
     size: u64,
-    /// The count of finished submissions that must follow them.
+    /// Bytes that are mapped.
+    mapped: u64,
+    /// The count of finished submissions that must be the last of them.
     expected: Option<u32>,
     stage: &'static str,
     state: SharedState,
@@ -103,16 +107,15 @@ impl Readback {
     pub fn copy_to<T: bytemuck::Pod>(mut self, out: &mut [T]) -> GpuResult<()> {
         self.wait()?;
         let (out, size) = (bytemuck::cast_slice_mut::<T, u8>(out), self.size);
-        let mapped = self.buffer.size();
-        let view = self.buffer.raw().get_mapped_range(..mapped).map_err(|e| GpuError::validation(self.stage, e))?;
-        let bytes = size as usize; // as many as are mapped
+        let mapped = self.buffer.raw().get_mapped_range(..self.mapped);
+        let view = mapped.map_err(|e| GpuError::validation(self.stage, e))?;
         if let Some(expected) = self.expected
-            && view[bytes..] != expected.to_le_bytes()
+            && !view.ends_with(&expected.to_le_bytes())
         {
             self.staging.driver.faults.lost(BEHIND.to_string());
             return self.staging.driver.faults.check();
         }
-        let n = out.len().min(bytes);
+        let n = out.len().min(size as usize);
         let span = trace::span("read back").of("what", self.stage).with("bytes", size);
         self.staging.driver.cross(size, || empty(&view[..n], &mut out[..n]));
         drop(span);

@@ -353,7 +353,7 @@ impl Recorder<'_> {
             return Err(GpuError::bindings(self.work.name, "two recorders are open at once"));
         }
         let _span = trace::span("submit").of("what", self.work.name);
-        if let Some((pipeline, finished)) = gpu.submission_count.as_ref().map(SubmissionCount::last_dispatch) {
+        if let Some((pipeline, finished)) = gpu.submission_count.as_ref().map(SubmissionCount::counting_dispatch) {
             self.dispatch("submission count", &pipeline, &[finished], [1; 3])?;
         }
         self.work.pass = None;

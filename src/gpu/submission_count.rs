@@ -25,18 +25,18 @@ pub(super) struct SubmissionCount {
 }
 
 impl SubmissionCount {
-    /// Counts submissions from now on with a pipeline of `submission_count.wgsl`; `finished` is zero.
+    /// Counts submissions from now on with a pipeline of `submission_count.wgsl`; `finished`, a u32, is 1: memory that was never written is 0.
     pub(super) fn new(pipeline: Arc<Pipeline>, finished: Buffer) -> SubmissionCount {
-        SubmissionCount { finished, pipeline, submitted: AtomicU32::new(0) }
+        SubmissionCount { finished, pipeline, submitted: AtomicU32::new(1) }
     }
 
-    /// The count on the device, and its value behind all submissions so far.
+    /// The count on the device, and its value once all submissions so far are finished.
     pub(super) fn expected(&self) -> (BufferView, u32) {
         (self.finished.view(), self.submitted.load(Ordering::Relaxed))
     }
 
-    /// The dispatch that ends a submission.
-    pub(super) fn last_dispatch(&self) -> (Arc<Pipeline>, BufferView) {
+    /// The last dispatch of a submission, which counts it.
+    pub(super) fn counting_dispatch(&self) -> (Arc<Pipeline>, BufferView) {
         (Arc::clone(&self.pipeline), self.finished.view())
     }
 

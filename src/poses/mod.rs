@@ -21,7 +21,7 @@ pub mod similar;
 use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
-use crate::base::units::{counted, format_grouped, format_seconds};
+use crate::base::units::{counted_are, format_grouped, format_seconds};
 use crate::base::whole_file::write_whole;
 use crate::base::whole_folder::remove_ours;
 use crate::dataset::colmap::looks_like_colmap;
@@ -569,7 +569,7 @@ pub fn check_found(named: &Path) -> InputResult<()> {
     let searched: BTreeSet<(&str, u64)> = state.photos.iter().map(|of| (of.name.as_str(), of.bytes)).collect();
     let new = photos.iter().filter(|photo| !searched.contains(&(photo.name.as_str(), photo.bytes))).count();
     if new > 0 {
-        let problem = format!("{} new or changed since the search for poses", counted(new as u64, "photo"));
+        let problem = format!("{} new or changed since the search for poses", counted_are(new as u64, "photo"));
         return Err(InputError::new(named, problem, remedy));
     }
     let registered = read_scene(&scene, &ReadOptions { allow_missing: true, ..ReadOptions::default() })?.views.len();

@@ -182,7 +182,7 @@ fn what_the_format_cannot_hold_is_told() {
     (large.scales[0], large.scales[3]) = (6.0, 5.9);
     let of_large = told(&large);
     assert!(
-        of_large.len() == 1 && of_large[0].contains("a.spz: 1 Gaussian with a sigma above 379 units"),
+        of_large.len() == 1 && of_large[0].contains("a.spz: 1 Gaussian is larger than a sigma of 379 units"),
         "{of_large:?}"
     );
     // Two rows of 2000 are few, three are a part of the scene.
@@ -190,7 +190,8 @@ fn what_the_format_cannot_hold_is_told() {
     (far.means[0], far.means[3]) = (3e6, -3e6);
     let of_far = told(&far);
     assert!(
-        of_far.len() == 1 && of_far[0].contains("2 Gaussians so far out that SPZ rounds all positions to 0.5 units"),
+        of_far.len() == 1
+            && of_far[0].contains("2 Gaussians are so far out that SPZ rounds all positions to 0.5 units"),
         "{of_far:?}"
     );
     far.means[6] = 3e6;

@@ -184,6 +184,20 @@ fn work_that_the_device_gives_up_without_an_error_is_found() {
         assert!(run_add(&gpu, &values, 7, &[]).is_err_and(|error| lost(&error)), "submission {submission}");
         assert!(run_add(&gpu, &values, 7, &[]).is_err_and(|error| lost(&error)), "a lost device stays lost");
     }
+    // The first one, whose read-back finds memory that was never written.
+    let Some(gpu) = opened(1) else { return };
+    assert!(matches!(run_add(&gpu, &values, 7, &[]), Err(GpuError::DeviceLost { .. })));
+}
+
+/// The memory of read-backs is reused by ones of other lengths.
+#[test]
+fn read_backs_of_any_length_are_told_from_what_their_memory_held() {
+    let fault = Some(InjectedFault { kind: FaultKind::GivenUp, submission: 3 });
+    let Some(gpu) = open(&GpuOptions { fault, ..GpuOptions::default() }) else { return };
+    // Each result is the count that the third submission expects, in the place behind the results of a shorter read-back.
+    assert_eq!(run_add(&gpu, &[3; 60], 0, &[]).unwrap(), [3; 60]);
+    assert_eq!(run_add(&gpu, &[3; 60], 0, &[]).unwrap(), [3; 60]);
+    assert!(matches!(run_add(&gpu, &[5; 40], 0, &[]), Err(GpuError::DeviceLost { .. })));
 }
 
 /// A submission that an error prevented does not count.

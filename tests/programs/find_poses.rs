@@ -109,7 +109,7 @@ fn photos_with_gps_become_a_scene_in_metres_by_pycolmap() {
     // A photo that came later has no pose: whoever asks for poses is told.
     work.succeeds(TRAIN, "scan --out out --dry-run --poses auto");
     std::fs::copy(work.path("scan/images/photo 0018.JPG"), work.path("scan/images/later.jpg")).unwrap();
-    work.refuses("scan --dry-run --poses auto", &["1 photo new or changed since the search", "rename scan/sparse"]);
+    work.refuses("scan --dry-run --poses auto", &["1 photo is new or changed since the search", "rename scan/sparse"]);
     std::fs::remove_file(work.path("scan/images/later.jpg")).unwrap();
 
     // Finished phases are not done again: without a model in the scene it is written again from what is there.

@@ -49,8 +49,10 @@ fn a_run_needs_no_folder_and_says_where_everything_is() {
     assert!(stderr(&again).is_empty() && work.exists("scene/runs/scene/point_cloud.ply"), "{}", stderr(&again));
     work.train(&format!("{} {quiet}", text(&work.scene())));
     assert!(work.exists("runs/scene-2/point_cloud.ply"));
+    let by_cargo = work.command(TRAIN, "scene --steps 2 --device cpu").env("CARGO", "cargo").output().unwrap();
+    assert!(stderr(&by_cargo).contains("cargo install --path . puts them on the PATH"), "{}", stderr(&by_cargo));
     let said = stderr(&work.output(TRAIN, "scene --dry-run"));
-    assert!(said.contains("runs/scene is taken: results go to runs/scene-3; "), "{said}");
+    assert!(said.contains("runs/scene is taken: results go to runs/scene-4; "), "{said}");
 }
 
 /// A command that is said for a folder with a space and a quote in its name works in a shell.

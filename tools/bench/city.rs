@@ -40,12 +40,12 @@ pub struct Borders {
 }
 
 /// What starts `gsscale-cells` with such arguments.
-pub type Cells<'a> = dyn Fn(&[OsString]) -> InputResult<Output> + 'a;
+pub type StartCells<'a> = dyn Fn(&[OsString]) -> InputResult<Output> + 'a;
 
 impl CityCut {
     /// Trains the city and merges it; `machine` are flags for the cells. Returns the message of a step that failed.
     /// Errors: a program cannot be started, or was interrupted.
-    pub fn train(&self, place: &CityPlace, machine: &[String], cells: &Cells) -> InputResult<Option<String>> {
+    pub fn train(&self, place: &CityPlace, machine: &[String], cells: &StartCells) -> InputResult<Option<String>> {
         let path = |path: &Path| path.as_os_str().to_os_string();
         let (city, scene) = (path(place.city), path(place.scene));
         let words = |words: &[&str]| words.iter().map(OsString::from).collect::<Vec<_>>();
@@ -62,7 +62,7 @@ impl CityCut {
             words.into_iter().chain([city.clone()]).chain(machine.clone()).collect()
         };
         let merge = vec!["merge".into(), city.clone(), "--out".into(), path(place.merged)];
-        let failed = |steps: Vec<Vec<OsString>>| -> InputResult<Option<String>> {
+        let first_failure = |steps: Vec<Vec<OsString>>| -> InputResult<Option<String>> {
             for arguments in steps {
                 let output = cells(&arguments)?;
                 if !output.status.success() {
@@ -71,18 +71,18 @@ impl CityCut {
             }
             Ok(None)
         };
-        if let Some(problem) = failed(vec![prior, cut])? {
+        if let Some(problem) = first_failure(vec![prior, cut])? {
             return Ok(Some(problem));
         }
         // Cells of few photos were joined to others.
         let count = CityPlan::read(&City(place.city.to_path_buf()))?.cells.len();
-        failed((0..count).map(run).chain([merge]).collect())
+        first_failure((0..count).map(run).chain([merge]).collect())
     }
 }
 
 /// Measures the scene in the folder `model` beside the borders of a city. Returns the message of a measurement that failed.
 /// Errors: the program cannot be started, or was interrupted.
-pub fn borders(city: &Path, model: &Path, cells: &Cells) -> InputResult<Result<Borders, String>> {
+pub fn borders(city: &Path, model: &Path, cells: &StartCells) -> InputResult<Result<Borders, String>> {
     let output = cells(&["seam".into(), city.into(), model.into()])?;
     if !output.status.success() {
         return Ok(Err(problem(&output)?));

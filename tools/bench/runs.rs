@@ -12,7 +12,7 @@ use super::record::{Pace, RunRecord, convert_to_one_pace};
 use super::results_log::{ResultsLog, successful_run};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::cpu_model;
-use gsscale::base::whole_file::write_whole;
+use gsscale::base::whole_file::{open_locked, write_whole};
 use gsscale::cells::work::{Done, status};
 use gsscale::cells::{City, machine_flags};
 use gsscale::config::file::TrainConfig;
@@ -24,7 +24,7 @@ use gsscale::train::log::report::Summary;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::ffi::OsString;
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -414,16 +414,10 @@ fn resolved(path: &Path) -> PathBuf {
 
 fn lock(out: &Path) -> InputResult<File> {
     let path = out.join(LOCK);
-    let io = |e: std::io::Error| InputError::io(&path, "opening the lock", &e);
-    let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path).map_err(io)?;
-    match file.try_lock() {
-        Err(TryLockError::WouldBlock) => {
-            let problem = "in use by another sweep, or by a run that a killed sweep left behind";
-            Err(InputError::new(out, problem, "wait for its end, or choose another --out"))
-        }
-        // Without lock support of the file system, the user keeps to one sweep.
-        Ok(()) | Err(TryLockError::Error(_)) => Ok(file),
-    }
+    open_locked(&path).map_err(|e| InputError::io(&path, "opening the lock", &e))?.ok_or_else(|| {
+        let problem = "in use by another sweep, or by a run that a killed sweep left behind";
+        InputError::new(out, problem, "wait for its end, or choose another --out")
+    })
 }
 
 fn digest(path: &Path) -> InputResult<String> {

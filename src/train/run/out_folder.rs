@@ -15,7 +15,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
-use crate::base::whole_file::{folder_of, is_same_file, part_path, sync_folder, write_whole};
+use crate::base::whole_file::{folder_of, open_locked, part_path, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::dataset::loader::Dataset;
@@ -33,14 +33,11 @@ use crate::train::log::report::StepLine;
 use crate::train::stores::ownership::{check_removable, last_state, remove_checkpoint_in};
 use serde::{Deserialize, Serialize};
 use std::ffi::OsStr;
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 
 /// Lock file of an output folder; it stays there, empty.
 const LOCK: &str = ".gsscale-lock";
-
-/// How often a lock file is opened that another process removes meanwhile.
-const LOCK_TRIES: u32 = 16;
 
 /// File that shows that an output folder can be written; removed at once.
 const PROBE: &str = ".gsscale-probe";
@@ -48,21 +45,14 @@ const PROBE: &str = ".gsscale-probe";
 /// Locks an existing output folder for as long as the file is open. On file systems without locks this does nothing.
 /// Errors: another process trains into the folder.
 pub(crate) fn lock(out: &Path) -> InputResult<Option<File>> {
-    let path = out.join(LOCK);
-    for _ in 0..LOCK_TRIES {
-        let file = OpenOptions::new().write(true).create(true).truncate(false).open(&path);
-        let Ok(file) = file else { return Ok(None) };
-        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+    match open_locked(&out.join(LOCK)) {
+        Ok(None) => {
             let remedy = "wait for it to end, stop it (Ctrl-C commits first), or choose another --out";
-            return Err(InputError::new(out, "another process trains into this folder", remedy));
+            Err(InputError::new(out, "another process trains into this folder", remedy))
         }
-        // A run that was refused may have removed the file between the two calls.
-        if is_same_file(&path, &file) {
-            return Ok(Some(file));
-        }
+        // A folder that cannot be written is an error of whoever writes there.
+        opened => Ok(opened.unwrap_or(None)),
     }
-    // Some network drives number a file anew each time it is opened.
-    Ok(None)
 }
 
 /// Refuses an output folder in use, without making its lock file.

@@ -26,7 +26,7 @@ use crate::config::values::{Chosen, checkpoint_folder};
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
-use crate::page::tool::uncommitted::is_uncommitted;
+use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::live::Live;
@@ -375,6 +375,11 @@ fn finished_outcome(
     };
     if stored.as_ref().is_some_and(|stored| stored.run_state.trainer.step < config.steps && stored.is_whole()) {
         return Ok(None);
+    }
+    // A process that was killed while it removed the store may have left the files that show one.
+    if stored.is_none() && is_its_place && !config.keep_checkpoint && remove_uncommitted(&folder)? {
+        let has_made_it = earlier.file.as_ref().is_some_and(|(_, facts)| facts.made_spill_dir);
+        let _ = if has_made_it { std::fs::remove_dir(&folder) } else { Ok(()) };
     }
     let is_kept = config.keep_checkpoint && stored.is_some();
     let is_its_own = |stored: &Stored| earlier.run.is_known() && stored.run_state.origin.run.id == earlier.run;

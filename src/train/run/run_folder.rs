@@ -44,7 +44,7 @@ use crate::train::preflight::forecast::Forecast;
 use crate::train::start::tiers::{Tiers, commit_options};
 use crate::train::state::eval::warn_of_held_out;
 use crate::train::state::trainer::Trainer;
-use crate::train::step::soundness::check_that_photos_count;
+use crate::train::step::soundness::refuse_all_masked;
 use std::cell::OnceCell;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -157,7 +157,7 @@ pub(super) fn train_into(
 ) -> Result<RunOutcome, TrainError> {
     let (config, out) = (&request.config, &request.out);
     let targets = TargetCache::new(&dataset.views, config.image_cache.0, rayon::current_num_threads())?;
-    check_that_photos_count(dataset, &targets)?;
+    refuse_all_masked(dataset, &targets)?;
     let origin = begin_files(request, dataset, &trainer, &begun, tiers.made_spill_dir())?;
     remove_mark(out);
     let mut metrics = open_metrics(config.log, out, begun.past.as_ref())?;

@@ -97,12 +97,15 @@ mod tests {
         assert!(pages > 2 * 48, "{pages} pages");
         let render = RenderOptions { sh_degree: scene.rules.sh_degree, ..options.render };
         let targets = TargetCache::new(&[], 0, 1).unwrap();
-        let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| {
-            let comparing = Comparing { targets: &targets, render: &render, pages_most, fits_exposures: false };
+        let mut compared = |pages_most, fits_exposures| {
+            let comparing = Comparing { targets: &targets, render: &render, pages_most, fits_exposures };
             let (working, renderer) = (&mut WorkingSet::default(), &mut CpuRenderer::new());
             let mut now = SceneNow { scene: &mut scene, step: 0, working, renderer };
             view_psnr(&mut now, &comparing, &camera, &target).unwrap()
-        });
+        };
+        let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| compared(pages_most, false));
         assert!(whole == few && few == parts && parts == all, "{whole:?} {few:?} {parts:?} {all:?}");
+        // The picture has nothing of this photo: a fit of the photo to the picture would magnify that.
+        assert!(compared(48, true) >= whole, "a check with exposures is not below one without");
     }
 }

@@ -130,7 +130,7 @@ pub(crate) fn note_idle(
 
 /// Refuses a run whose training photos are all masked, before it spends its time. Decodes photos up to the first that counts.
 /// Errors: no training photo has a pixel that counts.
-pub fn check_that_photos_count(dataset: &Dataset, targets: &TargetCache) -> InputResult<()> {
+pub fn refuse_all_masked(dataset: &Dataset, targets: &TargetCache) -> InputResult<()> {
     let views = dataset.train_views();
     // A photo that cannot be read is an error of its step.
     if views.is_empty() || views.iter().any(|&view| targets.get(view).map_or(true, |target| target.counts())) {

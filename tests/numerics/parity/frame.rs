@@ -234,6 +234,22 @@ fn tiles_in_bands_change_no_bit() {
     // A dispatch for each row of tiles.
     gpu.set_dispatch_pairs(1);
     assert!(bits(&results(&mut gpu, &view, &options, &target)) == want);
+    // And a submission: a whole view has five of them, so that the sixth is of the next view.
+    let fault = Some(InjectedFault { kind: FaultKind::OutOfMemory, submission: 6 });
+    let fails = |pairs: Option<u64>| {
+        let mut gpu = renderer(&GpuOptions { fault, ..GpuOptions::default() }).unwrap();
+        pairs.iter().for_each(|&pairs| gpu.set_dispatch_pairs(pairs));
+        let mut grads = Gradients::default();
+        let (rows, camera) = &view;
+        gpu.begin_view(camera, &options, RowBatches::One)
+            .and_then(|()| gpu.rows_in(rows).map(|_| ()))
+            .and_then(|()| gpu.picture().map(|_| ()))
+            .and_then(|()| gpu.loss(&target, &LossOptions::default()).map(|_| ()))
+            .and_then(|()| gpu.picture_back().map(|_| ()))
+            .and_then(|()| gpu.rows_out(0, rows, &mut grads).map(|_| ()))
+            .is_err()
+    };
+    assert_eq!([fails(None), fails(Some(1))], [false, true]);
 }
 
 #[test]

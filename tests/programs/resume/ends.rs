@@ -1,7 +1,7 @@
 //! kill -9 before the first step and after the last one: while the scene is read, before config.toml is there, and while each result is
 //! written. A resume begins the run again or writes its results, and ends with the same bytes.
 
-use crate::support::workdir::{TRAIN, Workdir};
+use crate::support::workdir::{TRAIN, Workdir, copy_folder};
 
 const FLAGS: &str = "scene --steps 20 --page-rows 64 --max-gaussians 3000 --test-every 4 --device cpu --quiet --export spz --threads 2 \
     --schedule run-length --strategy long-axis";
@@ -159,4 +159,38 @@ fn a_resume_writes_nothing_into_a_folder_that_is_no_run() {
         std::fs::copy(&photo, work.path("card/DCIM").join(photo.file_name().unwrap())).unwrap();
     }
     work.refuses("card --out card_run", &["gsscale-poses card --out FOLDER"]);
+}
+
+/// Segments go first, then the map, then what shows that the folder holds a store.
+#[test]
+fn what_a_killed_removal_leaves_of_a_store_goes_with_the_next_resume() {
+    let work = scene();
+    work.run("out", "--steps 12 --spill-dir spill --keep-checkpoint --device cpu");
+    copy_folder(&work.path("spill"), &work.path("kept"));
+    for left in [&["FORMAT", "LOCK", "witness", "map.redb"][..], &["FORMAT", "LOCK", "witness"], &["FORMAT"]] {
+        work.remove("spill");
+        std::fs::create_dir(work.path("spill")).unwrap();
+        left.iter().for_each(|name| {
+            std::fs::copy(work.path("kept").join(name), work.path("spill").join(name)).unwrap();
+        });
+        work.train("--resume out --keep-checkpoint=false --quiet");
+        assert!(!work.exists("spill"), "{left:?}");
+    }
+}
+
+/// The last steps of a run whose result cannot be written are committed.
+#[test]
+fn a_result_that_cannot_be_written_costs_no_step() {
+    let work = scene();
+    let flags = "--spill-dir spill --keep-checkpoint --commit-every 0 --log-every 1 --device cpu";
+    work.run("out", &format!("--steps 20 {flags}"));
+    // A folder in the place of the result's temporary file, which a resume meets at its end.
+    let part = work.path("out/.point_cloud.ply.part");
+    std::fs::create_dir(&part).unwrap();
+    work.refuses("--resume out --steps 40 --quiet", &["point_cloud.ply"]);
+    let trained = work.lines("out");
+    assert!(trained >= 40, "{trained} lines: the steps were not trained");
+    std::fs::remove_dir(&part).unwrap();
+    work.train("--resume out --quiet");
+    assert!(work.lines("out") <= trained + 1 && work.summary("out")["finished"] == true, "steps were trained again");
 }

@@ -134,7 +134,8 @@ impl Workdir {
 
     pub fn command(&self, program: &str, flags: &str) -> Command {
         let (mut command, flags) = (Command::new(program), words(flags));
-        command.args(&flags).current_dir(self.0.path());
+        // A program that Cargo has started says how to install the others.
+        command.args(&flags).current_dir(self.0.path()).env_remove("CARGO");
         if program == TRAIN {
             command.args(classic(&flags));
         }
