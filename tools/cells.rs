@@ -3,7 +3,7 @@
 use clap::{Parser, Subcommand};
 use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
-use gsscale::base::units::{format_bytes, format_grouped, format_seconds, parse_count};
+use gsscale::base::units::{format_bytes, format_grouped, format_seconds, parse_count, parse_seconds};
 use gsscale::cells::costs::{AsIf, PhaseCost};
 use gsscale::cells::cut::{CutRequest, cut};
 use gsscale::cells::merge::{MergeRequest, merge};
@@ -144,8 +144,8 @@ struct RunArgs {
     /// The scene with the photos, if this machine has it elsewhere
     #[arg(long)]
     scene: Option<PathBuf>,
-    /// Seconds between copies of the cell's commits into the folder of the city
-    #[arg(long, default_value_t = COPY_EVERY)]
+    /// Time between copies of the cell's commits into the folder of the city (900, 15min), seconds by default
+    #[arg(long, default_value_t = COPY_EVERY, value_parser = parse_seconds)]
     copy_every: f64,
     /// Print only warnings and errors
     #[arg(long, short)]

@@ -83,6 +83,24 @@ pub fn parse_count32(text: &str) -> Result<u32, String> {
     u32::try_from(parse_count(text)?).map_err(too_large)
 }
 
+/// Parses a time in seconds: a number from 0 on, then `s` (or no unit), `min`, `h` or `d`.
+/// Errors: the text is no such time.
+pub fn parse_seconds(text: &str) -> Result<f64, String> {
+    let wrong = || format!("'{text}' is not a time; write for example 90 (seconds), 90s, 5min or 2h");
+    let plain = text.trim();
+    let split = plain.find(|c: char| c.is_ascii_alphabetic() || c.is_whitespace()).unwrap_or(plain.len());
+    let (number, unit) = plain.split_at(split);
+    let factor = match unit.trim() {
+        "" | "s" | "sec" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        "d" => 86400.0,
+        _ => return Err(wrong()),
+    };
+    let seconds = number.parse::<f64>().map_err(|_| wrong())? * factor;
+    if seconds.is_finite() && seconds >= 0.0 { Ok(seconds) } else { Err(wrong()) }
+}
+
 /// Formats a count with up to three digits and `k` or `M`.
 pub fn format_count(n: u64) -> String {
     let short = |value: f64, unit: &str| match value {
@@ -147,6 +165,18 @@ mod tests {
         assert_eq!(counts.map(format_count), ["7", "999", "1.00k", "15.9k", "792k", "1.00M", "1.25M", "4295M"]);
         assert_eq!([5, 1234, 1_234_567].map(format_grouped), ["5", "1,234", "1,234,567"]);
         assert_eq!([0, 1, 1234].map(|n| counted_are(n, "photo")), ["0 photos are", "1 photo is", "1,234 photos are"]);
+    }
+
+    #[test]
+    fn times_parse() {
+        for (text, want) in
+            [("0", 0.0), ("90", 90.0), ("1.5s", 1.5), (" 5 min ", 300.0), ("2h", 7200.0), ("1d", 86400.0)]
+        {
+            assert_eq!(parse_seconds(text), Ok(want), "{text}");
+        }
+        for wrong in ["", "s", "-1", "inf", "nan", "5 weeks", "1e300d1", "9e307h"] {
+            assert!(parse_seconds(wrong).is_err(), "{wrong}");
+        }
     }
 
     #[test]

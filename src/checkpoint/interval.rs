@@ -8,7 +8,7 @@
 //! Invariants: 1. this file reads no clock; callers pass elapsed times; 2. the interval is a function of the sequence
 //! of costs; 3. no result of a run depends on it.
 
-use crate::base::units::GIB;
+use crate::base::units::{GIB, parse_seconds};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use std::fmt;
 use std::str::FromStr;
@@ -45,8 +45,7 @@ impl FromStr for CommitEvery {
         if text == "auto" {
             return Ok(CommitEvery::Auto);
         }
-        let seconds = text.parse().map_err(|_| format!("'{text}' is neither auto nor a number of seconds"))?;
-        Ok(CommitEvery::Seconds(seconds))
+        Ok(CommitEvery::Seconds(parse_seconds(text).map_err(|e| format!("{e}, or auto"))?))
     }
 }
 

@@ -12,7 +12,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::base::text::{has_raw_bytes, read_text, shown};
-use crate::base::units::{parse_count, parse_count32};
+use crate::base::units::{parse_count, parse_count32, parse_seconds};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
 use crate::config::habits::ALIASES;
@@ -121,9 +121,9 @@ config_keys! {
         /// Reduce photos by this factor (may be fractional: 3.4175)
         data_factor: f64 = 1.0 => Numbers;
         /// Longest side of a photo in pixels after --data-factor; 0 = no limit
-        max_resolution: u32 = 0 => Numbers common;
+        [value_parser = parse_count32] max_resolution: u32 = 0 => Numbers common;
         /// Hold out every N-th photo, names in sorted order (index % N == 0); 0 = none
-        test_every: u32 = 8 => Numbers;
+        [value_parser = parse_count32] test_every: u32 = 8 => Numbers;
         /// Hold out every photo whose index is greater than N, instead of --test-every; -1 = off
         test_after: i64 = -1 => Numbers hidden;
         /// Use only the photos that this file lists, a name on each line. The frame of the scene, and which photos are held out,
@@ -148,7 +148,7 @@ config_keys! {
         /// page that is rendered and never changes. Empty = all pages, none frozen
         pages_file: String = String::new() => Derived hidden;
         /// Random points in the views' frusta when the dataset has none and --sweep-points finds too few; 0 = refuse such a dataset
-        init_points: u32 = 100_000 => Numbers;
+        [value_parser = parse_count32] init_points: u32 = 100_000 => Numbers;
     }
     "Training" {
         /// Total number of steps; --resume can raise it (see --keep-checkpoint)
@@ -166,14 +166,14 @@ config_keys! {
         /// Highest degree of spherical harmonics (SH), 0 to 3
         sh_degree: u8 = 3 => Layout;
         /// Raise the SH degree every N steps; 0 = full degree from the start
-        sh_every: u32 = 1000 => Numbers hidden;
+        [value_parser = parse_count32] sh_every: u32 = 1000 => Numbers hidden;
         /// SH degree of the first step
         sh_start: u8 = 0 => Numbers hidden;
         /// Order of the photos: auto, shuffle, groups:N (N spatial groups, shuffled within) or tour (a path through
         /// all). auto is shuffle if the scene fits in memory or reads are few, else groups
         view_order: Chosen<Order> = Chosen(None) => Numbers;
         /// Capacity of a page, Gaussians. Fixed for a run, because it changes the rounding
-        page_rows: u32 = 1024 => Layout hidden;
+        [value_parser = parse_count32] page_rows: u32 = 1024 => Layout hidden;
         /// Weight of 1 - SSIM in the loss; the rest is L1
         ssim_lambda: f64 = 0.2 => Numbers;
         /// Pixels of the SSIM in the loss: valid (windows inside the image) or same (zero padded)
@@ -269,15 +269,15 @@ config_keys! {
         /// Largest number of Gaussians; 0 = no cap (with --strategy long-axis: --quality decides)
         [value_parser = parse_count] max_gaussians: u64 = 0 => Numbers common;
         /// Step after which densification rounds begin
-        refine_start: u32 = 500 => Numbers;
+        [value_parser = parse_count32] refine_start: u32 = 500 => Numbers;
         /// Step at which densification rounds and opacity resets end
-        refine_stop: u32 = 15_000 => Numbers;
+        [value_parser = parse_count32] refine_stop: u32 = 15_000 => Numbers;
         /// Steps between densification rounds. With --strategy long-axis and --view-order groups:N or tour, a round comes after
         /// each pass over the photos if a pass has more steps
-        refine_every: u32 = 100 => Numbers;
+        [value_parser = parse_count32] refine_every: u32 = 100 => Numbers;
         /// Steps between opacity resets (to twice --prune-opa); 0 = never. No reset comes in the last steps of the planned run
         /// (a third of this number, at most 1,000), because opacities need steps to recover
-        reset_every: u32 = 3000 => Numbers hidden;
+        [value_parser = parse_count32] reset_every: u32 = 3000 => Numbers hidden;
         /// Grow Gaussians whose mean screen-space gradient exceeds this
         grow_grad2d: f64 = 2e-4 => Numbers hidden;
         /// Growing Gaussians up to this size (times the scene scale) are cloned, larger ones split
@@ -332,13 +332,13 @@ config_keys! {
         /// Codec of stored pages. auto = halves for --moments bf16, else raw; gsscale-iotune advises zstd:LEVEL for slow
         /// drives. Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
-        /// Seconds between commits, which is the most that a killed run loses. 0 = only on a stop request and after the
+        /// Time between commits (90, 90s, 5min), which is the most that a killed run loses. 0 = only on a stop request and after the
         /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
         /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
         /// without commits if its results have room
-        disk_full_wait: f64 = 600.0 => Free hidden;
+        [value_parser = parse_seconds] disk_full_wait: f64 = 600.0 => Free hidden;
         /// Which page to evict: belady (farthest next use) or lru. Never changes results
         evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free hidden;
         /// When pages move: overlap (during steps), ahead (prefetched between steps, which wait) or demand (when a step
@@ -349,7 +349,7 @@ config_keys! {
     }
     "Machine" {
         /// Worker threads; 0 = one per core. Never changes results
-        threads: u32 = 0 => Free;
+        [value_parser = parse_count32] threads: u32 = 0 => Free;
         /// Instruction path: auto, avx512, avx2 or baseline. Each path always gives the same bits
         simd: Chosen<SimdPath> = Chosen(None) => Instructions hidden;
         /// Renderer: auto (a hardware GPU, else the CPU), gpu (also a software adapter), cpu, or a number (#2) or part of a
@@ -390,26 +390,24 @@ impl TrainConfig {
         for name in TABLES {
             table.remove(name);
         }
-        for (key, value) in &table {
-            TrainConfig::check_key(key, value).map_err(|problem| {
-                let name =
-                    |line: &str| line.split('=').next().unwrap_or("").trim().trim_matches(['"', '\'']).to_string();
-                let line = text.lines().position(|line| name(line) == *key);
-                line.map_or(String::new(), |at| format!("line {}: ", at + 1)) + &problem
-            })?;
-        }
+        let place = |key: &str| {
+            let name = |line: &str| line.split('=').next().unwrap_or("").trim().trim_matches(['"', '\'']).to_string();
+            let line = text.lines().position(|line| name(line) == key);
+            line.map_or(String::new(), |at| format!("line {}: ", at + 1))
+        };
         let given = table.keys().map(|key| key.replace('-', "_")).collect();
-        Ok((TrainConfig::deserialize(table).map_err(|e| e.to_string())?, given))
+        Ok((TrainConfig::from_table(table, place)?, given))
     }
 
-    /// Errors: there is no such key (the error has the most similar one), or the key takes no such value.
-    pub fn check_key(key: &str, value: &toml::Value) -> Result<(), String> {
-        if let Some(known) = KEYS.iter().find(|known| known.name() == key) {
-            let alone = toml::Table::from_iter([(known.name(), value.clone())]);
-            return TrainConfig::deserialize(alone).map(|_| ()).map_err(|e| format!("{key}: {}", e.message()));
-        }
-        let tip = similar_key(key).map_or(String::new(), |similar| format!("; perhaps {similar} is meant"));
-        Err(format!("there is no key {key}{tip}"))
+    /// The values of a table over the defaults. A count may be a text, as its flag takes it: `"2M"`.
+    /// Errors: begin with the `place` of the key that does not exist or takes no such value.
+    pub fn from_table(table: toml::Table, place: impl Fn(&str) -> String) -> Result<TrainConfig, String> {
+        let read = |(key, value): (String, toml::Value)| {
+            let value = value_of_key(&key, value).map_err(|problem| place(&key) + &problem)?;
+            Ok((key, value))
+        };
+        let table = table.into_iter().map(read).collect::<Result<toml::Table, String>>()?;
+        TrainConfig::deserialize(table).map_err(|e| e.to_string())
     }
 
     /// Checks ranges and relations between keys. Not here: whether files exist and whether a run fits.
@@ -542,6 +540,20 @@ impl ConfigKey {
     pub fn name(&self) -> String {
         self.field.replace('_', "-")
     }
+}
+
+/// The value that a table gives a key, a count as a number.
+/// Errors: there is no such key (the error has the most similar one), or the key takes no such value.
+fn value_of_key(key: &str, value: toml::Value) -> Result<toml::Value, String> {
+    if !KEYS.iter().any(|known| known.name() == key) {
+        let tip = similar_key(key).map_or(String::new(), |similar| format!("; perhaps {similar} is meant"));
+        return Err(format!("there is no key {key}{tip}"));
+    }
+    let check =
+        |value: &toml::Value| TrainConfig::deserialize(toml::Table::from_iter([(key.to_string(), value.clone())]));
+    let Err(error) = check(&value) else { return Ok(value) };
+    let count = value.as_str().and_then(|text| i64::try_from(parse_count(text).ok()?).ok()).map(toml::Value::Integer);
+    count.filter(|count| check(count).is_ok()).ok_or_else(|| format!("{key}: {}", error.message()))
 }
 
 /// The key that other programs call by this name, or that the name resembles most.
@@ -706,11 +718,21 @@ mod tests {
             ("max-gausians = 5", "line 1: there is no key max-gausians; perhaps max-gaussians is meant"),
             ("iterations = 5", "line 1: there is no key iterations; perhaps steps is meant"),
             ("qq = 1", "line 1: there is no key qq"),
-            ("max-gaussians = \"2M\"", "line 1: max-gaussians: invalid type: string \"2M\", expected u64"),
+            ("max-gaussians = \"many\"", "line 1: max-gaussians: invalid type: string \"many\", expected u64"),
+            ("threads = \"5000M\"", "line 1: threads: invalid type: string \"5000M\", expected u32"),
         ];
         for (text, want) in refusals {
             assert_eq!(TrainConfig::parse(text).unwrap_err(), want);
         }
+    }
+
+    #[test]
+    fn counts_and_times_in_a_file_are_read_as_those_of_flags() {
+        let text =
+            "max-gaussians = \"2M\"\nsteps = \"7k\"\nhost-mem = \"4GiB\"\ncommit-every = \"5min\"\ndisk-full-wait = 30";
+        let config = TrainConfig::parse(text).unwrap();
+        assert_eq!((config.max_gaussians, config.steps), (2_000_000, 7000));
+        assert_eq!((config.commit_every, config.disk_full_wait), (CommitEvery::Seconds(300.0), 30.0));
     }
 
     #[test]

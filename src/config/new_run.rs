@@ -82,9 +82,8 @@ pub fn of_new_run(file: Option<&Path>, keys: &TrainOverrides) -> InputResult<Tra
 
 /// As [`of_new_run`], of the given keys. Errors: a key or a word is unknown.
 pub fn of_given(keys: toml::Table) -> Result<TrainConfig, String> {
-    keys.iter().try_for_each(|(key, value)| TrainConfig::check_key(key, value))?;
     let given = keys.keys().map(|key| key.replace('-', "_")).collect();
-    let mut config: TrainConfig = keys.try_into().map_err(|e: toml::de::Error| e.to_string())?;
+    let mut config = TrainConfig::from_table(keys, |_| String::new())?;
     set_open_keys(&mut config, &given);
     Ok(config)
 }
