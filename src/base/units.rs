@@ -88,16 +88,15 @@ pub fn parse_count32(text: &str) -> Result<u32, String> {
 pub fn parse_seconds(text: &str) -> Result<f64, String> {
     let wrong = || format!("'{text}' is not a time; write for example 90 (seconds), 90s, 5min or 2h");
     let plain = text.trim();
-    let split = plain.find(|c: char| c.is_ascii_alphabetic() || c.is_whitespace()).unwrap_or(plain.len());
-    let (number, unit) = plain.split_at(split);
-    let factor = match unit.trim() {
+    let number = plain.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let factor = match &plain[number.len()..] {
         "" | "s" | "sec" => 1.0,
         "m" | "min" => 60.0,
         "h" => 3600.0,
         "d" => 86400.0,
         _ => return Err(wrong()),
     };
-    let seconds = number.parse::<f64>().map_err(|_| wrong())? * factor;
+    let seconds = number.trim().parse::<f64>().map_err(|_| wrong())? * factor;
     if seconds.is_finite() && seconds >= 0.0 { Ok(seconds) } else { Err(wrong()) }
 }
 
@@ -169,12 +168,18 @@ mod tests {
 
     #[test]
     fn times_parse() {
-        for (text, want) in
-            [("0", 0.0), ("90", 90.0), ("1.5s", 1.5), (" 5 min ", 300.0), ("2h", 7200.0), ("1d", 86400.0)]
-        {
+        for (text, want) in [
+            ("0", 0.0),
+            ("90", 90.0),
+            ("1.5s", 1.5),
+            (" 5 min ", 300.0),
+            ("1e2", 100.0),
+            ("2h", 7200.0),
+            ("1d", 86400.0),
+        ] {
             assert_eq!(parse_seconds(text), Ok(want), "{text}");
         }
-        for wrong in ["", "s", "-1", "inf", "nan", "5 weeks", "1e300d1", "9e307h"] {
+        for wrong in ["", "s", "-1", "inf", "nan", "5 weeks", "1d1", "9e307h"] {
             assert!(parse_seconds(wrong).is_err(), "{wrong}");
         }
     }

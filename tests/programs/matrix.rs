@@ -128,7 +128,7 @@ features! {
             work
         },
         "--schedule run-length --strategy long-axis --steps 200 --page-rows 128 --view-order shuffle --test-every 0 --simd baseline \
-         --log-every 1 --seed 1 --prune-scale3d 0.1 --quality archive",
+         --log-every 1 --seed 1 --prune-scale3d 0.1 --quality archive --sh-every 1 --shn-lr 0.05 --sh0-lr 0.02 --opacities-lr 0.2",
         without [],
         shows |work| {
             let (allowed, rows): (Vec<u64>, _) = (growth(work).iter().map(|c| c[1]).collect(), work.logged("alone", "gaussians"));

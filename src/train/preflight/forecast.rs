@@ -93,7 +93,7 @@ pub enum Reach {
     Kept,
     /// The most that usual runs decide as they train ([`crate::densify::growth`]).
     Decided,
-    /// As [`Reach::Decided`], where photos overlap little: the number at the start.
+    /// As [`Reach::Decided`], where photos overlap little: what the first check allows.
     Sparse,
 }
 
@@ -108,7 +108,7 @@ pub struct TrainingPhotos {
 }
 
 impl TrainingPhotos {
-    /// Whether so few photos see a page that more Gaussians do not pay. In a scene of few photos, it is enough if nearly all see the page.
+    /// Whether so few photos see a page that few doublings pay. In a scene of few photos, it is enough if nearly all see the page.
     fn overlap_little(&self) -> bool {
         self.per_page < PHOTOS_PER_PAGE_LEAST.min(SHARE_OF_PHOTOS * self.count as f64)
     }
@@ -116,8 +116,8 @@ impl TrainingPhotos {
 
 /// The number of Gaussians that a run with `rows` Gaussians after `steps_done` steps will reach, and how that is known. A guess is at most one
 /// Gaussian for each of the `pixels` of the training photos: a Gaussian without a pixel of its own soon has no gradient that splits it.
-/// A run that decides its count rarely changes it after the first of its `checks`. Before the first check, the forecast is the first
-/// allowed number if few photos see each place and the run is long enough to find that out, and otherwise a doubling at every check.
+/// Before the first of the `checks` of a run that decides its count, the forecast is what that check will allow if few photos see each place
+/// and the run is long enough to find that out, and otherwise a doubling at every check.
 pub fn reach(
     config: &TrainConfig,
     rows: u64,
@@ -140,7 +140,7 @@ pub fn reach(
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess(rows, rounds.count() as u32, every).min(pixels[0].max(rows)), Reach::Guess),
         (Some(rule), None) if photos.overlap_little() && rule.is_of_measured_length() => {
-            (rule.first(rows, pixels[1]), Reach::Sparse)
+            (rule.after_first_check(rows, pixels[1]), Reach::Sparse)
         }
         (Some(rule), None) => (rule.reachable(rows, pixels[1], rounds.map(|round| round * every)), Reach::Decided),
         (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
@@ -742,7 +742,7 @@ mod tests {
             "no fewer than at first"
         );
         let hardly_seen = TrainingPhotos { pixels: [9_600_000; 2], count: 100, per_page: PHOTOS_PER_PAGE_LEAST - 1.0 };
-        assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (41_321, Reach::Sparse));
+        assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (82_642, Reach::Sparse));
         // The checks of a short run hold no scene back.
         let short = TrainConfig { steps: 500, refine_start: 83, refine_every: 16, refine_stop: 400, ..decides.clone() };
         assert_eq!(reach(&short, 41_321, hardly_seen, 0, &[]), (300_000, Reach::Decided));
@@ -751,6 +751,8 @@ mod tests {
             gaussians: 41_000,
             psnr: 20.0,
             trained_psnr: 20.0,
+            ssim: 0.5,
+            trained_ssim: 0.5,
             decision: GrowthDecision::Doubles,
             allowed: 165_284,
         };

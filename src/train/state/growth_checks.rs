@@ -6,9 +6,10 @@
 //! that of one batch of rows.
 
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::growth::Likeness;
 use crate::render::RenderOptions;
 use crate::render::color_correct::exposure_fitted_psnr;
-use crate::render::metrics::psnr;
+use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::scene::camera::Camera;
 use crate::scene::image::Target;
 use crate::train::error::TrainError;
@@ -20,43 +21,46 @@ pub(super) struct Comparing<'a> {
     pub targets: &'a TargetCache,
     pub render: &'a RenderOptions,
     pub pages_most: usize,
-    /// Fit the exposures of pictures before they are compared.
+    /// Fit the exposures of pictures before their PSNR is measured. SSIM depends little on them.
     pub fits_exposures: bool,
 }
 
-/// Mean PSNR of views, as indices in `dataset.views` with their cameras, dB; `None` if all of them are masked as a whole.
+/// How well views are drawn, as indices in `dataset.views` with their cameras; `None` if all of them are masked as a whole.
 /// Errors: a photo cannot be decoded, pages could not be had, or the renderer failed.
-pub(super) fn mean_psnr(
+pub(super) fn measure(
     now: &mut SceneNow<'_>,
     comparing: &Comparing<'_>,
     views: &[(usize, Camera)],
-) -> Result<Option<f64>, TrainError> {
-    let mut values: Vec<f64> = Vec::with_capacity(views.len());
+) -> Result<Option<Likeness>, TrainError> {
+    let (mut psnrs, mut ssims) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
     for (i, (view, camera)) in views.iter().enumerate() {
         comparing.targets.prefetch(&views[i..views.len().min(i + 2)].iter().map(|(view, _)| *view).collect::<Vec<_>>());
         let target = comparing.targets.get(*view)?;
         if target.counts() {
-            values.push(view_psnr(now, comparing, camera, &target)?);
+            let Likeness { psnr, ssim } = measure_view(now, comparing, camera, &target)?;
+            psnrs.push(psnr);
+            ssims.push(ssim);
         }
     }
-    Ok((!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64))
+    Ok((!psnrs.is_empty()).then(|| Likeness { psnr: mean(&psnrs), ssim: mean(&ssims) }))
 }
 
 /// Draws a view, its pages in batches, and compares it with its photo.
-fn view_psnr(
+fn measure_view(
     now: &mut SceneNow<'_>,
     comparing: &Comparing<'_>,
     camera: &Camera,
     target: &Target,
-) -> Result<f64, TrainError> {
+) -> Result<Likeness, TrainError> {
     let pass = ViewPass::new(now.scene, camera, comparing.render, comparing.pages_most);
     pass.rows_in(now, |_| {})?;
     now.renderer.picture()?;
     let image = now.renderer.image()?;
-    Ok(json_psnr(match comparing.fits_exposures {
+    let psnr = match comparing.fits_exposures {
         true => exposure_fitted_psnr(image, target),
         false => psnr(image, target),
-    }))
+    };
+    Ok(Likeness { psnr: json_psnr(psnr), ssim: ssim(image, target, SsimVariant::Same, comparing.render.simd) })
 }
 
 #[cfg(test)]
@@ -101,11 +105,12 @@ mod tests {
             let comparing = Comparing { targets: &targets, render: &render, pages_most, fits_exposures };
             let (working, renderer) = (&mut WorkingSet::default(), &mut CpuRenderer::new());
             let mut now = SceneNow { scene: &mut scene, step: 0, working, renderer };
-            view_psnr(&mut now, &comparing, &camera, &target).unwrap()
+            measure_view(&mut now, &comparing, &camera, &target).unwrap()
         };
         let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| compared(pages_most, false));
         assert!(whole == few && few == parts && parts == all, "{whole:?} {few:?} {parts:?} {all:?}");
         // The picture has nothing of this photo: a fit of the photo to the picture would magnify that.
-        assert!(compared(48, true) >= whole, "a check with exposures is not below one without");
+        assert!(compared(48, true).psnr >= whole.psnr, "a check with exposures is not below one without");
+        assert!((0.0..1.0).contains(&whole.ssim));
     }
 }

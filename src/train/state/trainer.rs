@@ -9,7 +9,7 @@
 //! the run with the result of the last good step; 3. the events of a step are logged once.
 
 use super::eval::{EvalRequest, evaluate};
-use super::growth_checks::{Comparing, mean_psnr};
+use super::growth_checks::{Comparing, measure};
 use super::run_memory::{MemoryState, RunMemory};
 use super::turns::Turns;
 use crate::base::trace;
@@ -593,11 +593,11 @@ impl Trainer {
             fits_exposures: self.options.photos.appearance.is_on(),
         };
         // Without a view that counts the count stays as it is, too.
-        let measured = [&held_out, &trained].map(|views| mean_psnr(&mut self.now(), &compared, views));
+        let measured = [&held_out, &trained].map(|views| measure(&mut self.now(), &compared, views));
         let [held_out, trained] = measured;
-        if let (Some(psnr), Some(trained_psnr)) = (held_out?, trained?) {
+        if let (Some(held_out), Some(trained)) = (held_out?, trained?) {
             let counts = [self.scene.rows_bound(), self.turns.pixels(dataset)];
-            let check = rule.check(step, counts, [psnr, trained_psnr], &self.state.growth);
+            let check = rule.check(step, counts, [held_out, trained], &self.state.growth);
             self.state.growth.checks.push(check);
         }
         self.state.train_seconds += started.elapsed().as_secs_f64();

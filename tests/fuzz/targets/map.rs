@@ -237,6 +237,8 @@ fn sample() -> RunState {
         gaussians,
         psnr: 20.0,
         trained_psnr: 20.0,
+        ssim: 0.5,
+        trained_ssim: 0.5,
         decision,
         allowed: 10,
     };
