@@ -12,7 +12,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::simd::SimdPath;
 use crate::base::text::{has_raw_bytes, read_text, shown};
-use crate::base::units::{parse_count, parse_count32, parse_seconds};
+use crate::base::units::{parse_count, parse_count32};
 use crate::base::whole_file::write_whole;
 use crate::checkpoint::interval::CommitEvery;
 use crate::config::habits::ALIASES;
@@ -333,12 +333,12 @@ config_keys! {
         /// drives. Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Time between commits (90, 90s, 5min), which is the most that a killed run loses. 0 = only on a stop request and after the
-        /// last step. auto = 10 to 60, so that commits delay training by less than 1 %; longer if commits would write
+        /// last step. auto = 10 to 60 s, so that commits delay training by less than 1 %; longer if commits would write
         /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
         /// without commits if its results have room
-        [value_parser = parse_seconds] disk_full_wait: f64 = 600.0 => Free hidden;
+        disk_full_wait: f64 = 600.0 => Free hidden;
         /// Which page to evict: belady (farthest next use) or lru. Never changes results
         evict: EvictPolicy = EvictPolicy::FarthestNextUse => Free hidden;
         /// When pages move: overlap (during steps), ahead (prefetched between steps, which wait) or demand (when a step

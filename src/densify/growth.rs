@@ -117,11 +117,12 @@ pub enum GrowthDecision {
     Undoes,
 }
 
-/// How well views are drawn: means over the views.
+/// How like their photos views are drawn: means over the views.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Likeness {
+pub struct ViewMetrics {
     /// dB.
     pub psnr: f64,
+    /// 0 to 1.
     pub ssim: f64,
 }
 
@@ -190,7 +191,7 @@ impl GrowthState {
 /// One line of a terminal.
 impl fmt::Display for GrowthCheck {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let GrowthCheck { step, psnr, trained_psnr, decision, allowed, .. } = self;
+        let GrowthCheck { step, psnr, trained_psnr, ssim, trained_ssim, decision, allowed, .. } = self;
         let what = match decision {
             GrowthDecision::Doubles => "up to",
             GrowthDecision::Waits => "for now stay at",
@@ -198,10 +199,12 @@ impl fmt::Display for GrowthCheck {
             GrowthDecision::Undoes => "back to",
         };
         let allowed = format_grouped(*allowed);
-        write!(
-            f,
-            "step {step}: Gaussians {what} {allowed}: PSNR {psnr:.2} dB of held-out photos, {trained_psnr:.2} of others"
-        )
+        write!(f, "step {step}: Gaussians {what} {allowed}: ")?;
+        // A doubling is undone for its SSIM.
+        match decision {
+            GrowthDecision::Undoes => write!(f, "SSIM {ssim:.3} of held-out photos, {trained_ssim:.3} of others"),
+            _ => write!(f, "PSNR {psnr:.2} dB of held-out photos, {trained_psnr:.2} of others"),
+        }
     }
 }
 
@@ -282,45 +285,39 @@ impl GrowthRule {
         &self,
         step: u32,
         [gaussians, pixels]: [u64; 2],
-        [held_out, trained]: [Likeness; 2],
+        [held_out, trained]: [ViewMetrics; 2],
         before: &GrowthState,
     ) -> GrowthCheck {
-        let (Likeness { psnr, ssim }, Likeness { psnr: trained_psnr, ssim: trained_ssim }) = (held_out, trained);
+        let (ViewMetrics { psnr, ssim }, ViewMetrics { psnr: trained_psnr, ssim: trained_ssim }) = (held_out, trained);
         let DoublingDemand { gain: gain_least, share: share_least, .. } = self.quality.demand();
         let more = self.more(before.allowed(), pixels);
         let has_room = more as f64 >= LEAST_STAGE * before.allowed() as f64;
         let is_last = self.is_past(LAST_PART, step);
-        let doubled = before.open_doubling();
         let gap = trained_psnr - psnr;
         let is_close = gap < GAP_MOST;
         let has_grown = gaussians as f64 >= GROWN * before.allowed() as f64;
-        let decision = match before.checks.last() {
-            None if is_last || !has_room => GrowthDecision::Ends,
-            None => GrowthDecision::Doubles,
-            Some(last) => {
+        let (decision, allowed) = match before.open_doubling() {
+            None if is_last || !has_room => (GrowthDecision::Ends, before.allowed()),
+            None => (GrowthDecision::Doubles, more),
+            Some((checks, allowed_before)) => {
                 // Gains count from the doubling that the check judges, since noise may be fitted slowly.
-                let since = doubled.map_or(last, |(checks, _)| &checks[0]);
+                let (since, last) = (&checks[0], &checks[checks.len() - 1]);
                 let (gain, trained_gain) = (psnr - since.psnr, trained_psnr - since.trained_psnr);
-                // Differences of less are the noise of single steps.
-                let lags = gap >= GAP_OF_A_LAG && trained_gain - gain >= LAG_LEAST;
-                let lags = lags && gain < share_least * trained_gain.max(0.0);
-                let is_early = doubled.is_some_and(|(checks, _)| checks.len() < PATIENCE);
-                let is_fruitless = doubled.is_some() && ssim <= since.ssim && trained_ssim > since.trained_ssim;
-                if is_fruitless && !is_early {
-                    GrowthDecision::Undoes
-                } else if is_last || !has_room || (lags && !is_early) {
-                    GrowthDecision::Ends
+                let lags = gap >= GAP_OF_A_LAG
+                    && trained_gain - gain >= LAG_LEAST
+                    && gain < share_least * trained_gain.max(0.0);
+                let fits_noise = ssim <= since.ssim && trained_ssim > since.trained_ssim;
+                let is_judged = checks.len() >= PATIENCE;
+                if is_judged && fits_noise {
+                    (GrowthDecision::Undoes, allowed_before)
+                } else if is_last || !has_room || (is_judged && lags) {
+                    (GrowthDecision::Ends, before.allowed())
                 } else if is_close && has_grown && !lags && (psnr - last.psnr).min(gain) >= gain_least {
-                    GrowthDecision::Doubles
+                    (GrowthDecision::Doubles, more)
                 } else {
-                    GrowthDecision::Waits
+                    (GrowthDecision::Waits, before.allowed())
                 }
             }
-        };
-        let allowed = match (decision, doubled) {
-            (GrowthDecision::Doubles, _) => more,
-            (GrowthDecision::Undoes, Some((_, allowed))) => allowed,
-            _ => before.allowed(),
         };
         GrowthCheck { step: step + 1, gaussians, psnr, trained_psnr, ssim, trained_ssim, decision, allowed }
     }
@@ -357,7 +354,7 @@ mod tests {
     /// What the checks of a run of 3,000 steps allow and decide: of PSNR of held-out and of trained views, in a scene that has grown to
     /// `grown` of what it was allowed. SSIM rises and falls with PSNR.
     fn decisions(quality: Quality, first: u64, grown: f64, of_checks: &[[f64; 2]]) -> Vec<(u64, GrowthDecision)> {
-        let with_ssim = |psnrs: &[f64; 2]| psnrs.map(|psnr| Likeness { psnr, ssim: psnr / 40.0 });
+        let with_ssim = |psnrs: &[f64; 2]| psnrs.map(|psnr| ViewMetrics { psnr, ssim: psnr / 40.0 });
         decisions_of(quality, first, grown, &of_checks.iter().map(with_ssim).collect::<Vec<_>>())
     }
 
@@ -366,7 +363,7 @@ mod tests {
         quality: Quality,
         first: u64,
         grown: f64,
-        of_checks: &[[Likeness; 2]],
+        of_checks: &[[ViewMetrics; 2]],
     ) -> Vec<(u64, GrowthDecision)> {
         let rule = GrowthRule::new(quality, 3000);
         let mut state = GrowthState { first, checks: Vec::new() };
@@ -427,9 +424,9 @@ mod tests {
         assert_eq!(decisions(Quality::Normal, 200_000, 0.97, &few[..3]), [(most, Doubles), (most, Ends)]);
         assert_eq!(decisions(Quality::Normal, 250_000, 0.97, &few[..3]), [(250_000, Ends)]);
         // Scenes whose photos do not match to the pixel, as measured: SSIM gains by the first doubling, and PSNR goes apart.
-        let drawn = |values: &[[f64; 4]]| -> Vec<[Likeness; 2]> {
+        let drawn = |values: &[[f64; 4]]| -> Vec<[ViewMetrics; 2]> {
             let of = |&[psnr, trained_psnr, ssim, trained_ssim]: &[f64; 4]| {
-                [Likeness { psnr, ssim }, Likeness { psnr: trained_psnr, ssim: trained_ssim }]
+                [ViewMetrics { psnr, ssim }, ViewMetrics { psnr: trained_psnr, ssim: trained_ssim }]
             };
             values.iter().map(of).collect()
         };

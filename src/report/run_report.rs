@@ -265,10 +265,11 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let checks = summary["growth"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
     page.heading("Number of Gaussians");
-    let undone = " More Gaussians fitted noise: the run undid the last doubling.";
+    let undone =
+        " More Gaussians fitted noise, since the SSIM of these photos did not rise: the run undid the last doubling.";
     page.paragraph(&format!(
-        "The run decided that up to {} Gaussians pay (--quality). It held some training photos out. The scene doubled as long as they \
-         gained a good share of what the photos gained that it trained on.{}",
+        "The run decided that up to {} Gaussians pay (--quality). It held some training photos out. The scene doubled once, and again as long \
+         as these photos gained a good share of what the photos gained that it trained on.{}",
         short(allowed),
         if checks.iter().any(|check| check["decision"] == "undoes") { undone } else { "" }
     ));
@@ -276,8 +277,10 @@ fn add_growth(page: &mut Page, summary: &Value) {
     let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
     let psnr = Chart::new("PSNR of training photos", "step", "dB").with("held out", of("psnr"), Mark::LineAndDots);
     let psnr = psnr.with("trained on", of("trained_psnr"), Mark::LineAndDots);
-    let measured = (psnr.svg(), "Means over as many photos of each kind at each check.".to_string());
-    page.charts(&[measured, (rows.svg(), "What each check allowed.".to_string())]);
+    let ssim = Chart::new("SSIM of training photos", "step", "").with("held out", of("ssim"), Mark::LineAndDots);
+    let ssim = ssim.with("trained on", of("trained_ssim"), Mark::LineAndDots);
+    let measured = |chart: Chart| (chart.svg(), "Means over as many photos of each kind at each check.".to_string());
+    page.charts(&[measured(psnr), measured(ssim), (rows.svg(), "What each check allowed.".to_string())]);
 }
 
 /// What lies in a file for viewers.

@@ -6,12 +6,12 @@
 //! that of one batch of rows.
 
 use crate::dataset::target_cache::TargetCache;
-use crate::densify::growth::Likeness;
+use crate::densify::growth::ViewMetrics;
 use crate::render::RenderOptions;
 use crate::render::color_correct::exposure_fitted_psnr;
 use crate::render::metrics::{SsimVariant, mean, psnr, ssim};
 use crate::scene::camera::Camera;
-use crate::scene::image::Target;
+use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
 use crate::train::log::report::json_psnr;
 use crate::train::step::view::{SceneNow, ViewPass};
@@ -21,7 +21,8 @@ pub(super) struct Comparing<'a> {
     pub targets: &'a TargetCache,
     pub render: &'a RenderOptions,
     pub pages_most: usize,
-    /// Fit the exposures of pictures before their PSNR is measured. SSIM depends little on them.
+    /// Fit the exposures of pictures before their PSNR is measured. SSIM is that of the pictures as they are: it is compared with the
+    /// SSIM of the same views at other checks.
     pub fits_exposures: bool,
 }
 
@@ -31,18 +32,18 @@ pub(super) fn measure(
     now: &mut SceneNow<'_>,
     comparing: &Comparing<'_>,
     views: &[(usize, Camera)],
-) -> Result<Option<Likeness>, TrainError> {
+) -> Result<Option<ViewMetrics>, TrainError> {
     let (mut psnrs, mut ssims) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
     for (i, (view, camera)) in views.iter().enumerate() {
         comparing.targets.prefetch(&views[i..views.len().min(i + 2)].iter().map(|(view, _)| *view).collect::<Vec<_>>());
         let target = comparing.targets.get(*view)?;
         if target.counts() {
-            let Likeness { psnr, ssim } = measure_view(now, comparing, camera, &target)?;
+            let ViewMetrics { psnr, ssim } = measure_view(now, comparing, camera, &target)?;
             psnrs.push(psnr);
             ssims.push(ssim);
         }
     }
-    Ok((!psnrs.is_empty()).then(|| Likeness { psnr: mean(&psnrs), ssim: mean(&ssims) }))
+    Ok((!psnrs.is_empty()).then(|| ViewMetrics { psnr: mean(&psnrs), ssim: mean(&ssims) }))
 }
 
 /// Draws a view, its pages in batches, and compares it with its photo.
@@ -51,16 +52,21 @@ fn measure_view(
     comparing: &Comparing<'_>,
     camera: &Camera,
     target: &Target,
-) -> Result<Likeness, TrainError> {
+) -> Result<ViewMetrics, TrainError> {
     let pass = ViewPass::new(now.scene, camera, comparing.render, comparing.pages_most);
     pass.rows_in(now, |_| {})?;
     now.renderer.picture()?;
-    let image = now.renderer.image()?;
+    Ok(metrics_of(now.renderer.image()?, target, comparing))
+}
+
+/// A broken picture has the worst values: what a commit holds is finite.
+fn metrics_of(image: &Image, target: &Target, comparing: &Comparing<'_>) -> ViewMetrics {
     let psnr = match comparing.fits_exposures {
         true => exposure_fitted_psnr(image, target),
         false => psnr(image, target),
     };
-    Ok(Likeness { psnr: json_psnr(psnr), ssim: ssim(image, target, SsimVariant::Same, comparing.render.simd) })
+    let ssim = ssim(image, target, SsimVariant::Same, comparing.render.simd);
+    ViewMetrics { psnr: json_psnr(psnr), ssim: if ssim.is_nan() { 0.0 } else { ssim } }
 }
 
 #[cfg(test)]
@@ -110,7 +116,10 @@ mod tests {
         let [whole, few, parts, all] = [1, 16, 48, usize::MAX].map(|pages_most| compared(pages_most, false));
         assert!(whole == few && few == parts && parts == all, "{whole:?} {few:?} {parts:?} {all:?}");
         // The picture has nothing of this photo: a fit of the photo to the picture would magnify that.
-        assert!(compared(48, true).psnr >= whole.psnr, "a check with exposures is not below one without");
+        assert!(compared(48, true).psnr > whole.psnr, "a check with exposures is above one without");
         assert!((0.0..1.0).contains(&whole.ssim));
+        let broken = Image { width: camera.width, height: camera.height, rgb: vec![f32::NAN; 3 * camera.pixels()] };
+        let comparing = Comparing { targets: &targets, render: &render, pages_most: 1, fits_exposures: false };
+        assert_eq!(metrics_of(&broken, &target, &comparing), ViewMetrics { psnr: 0.0, ssim: 0.0 });
     }
 }
