@@ -25,6 +25,7 @@ use std::ffi::OsString;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use tempfile::TempDir;
 
 /// Help with the examples before the flags.
 const HELP: &str = "{about-with-newline}\n{before-help}{usage-heading} {usage}\n\n{all-args}{after-help}";
@@ -207,7 +208,7 @@ fn start(args: Args) -> Result<RunOutcome, TrainError> {
             }
             scene
         }
-        None if args.dry_run => make_city(&scratch.insert(Scratch::new()?).folder, &config, args.quiet)?,
+        None if args.dry_run => make_city(scratch.insert(scratch_folder()?).path(), &config, args.quiet)?,
         None => demo_scene(&out, &config, args.quiet)?,
     };
     let (dry_run, quiet) = (args.dry_run, args.quiet);
@@ -263,25 +264,10 @@ fn make_city(scene: &Path, config: &TrainConfig, quiet: bool) -> Result<PathBuf,
     Ok(scene.to_path_buf())
 }
 
-/// Scratch folder of a dry run, for files needed to compute its requirements; removed when the program ends.
-struct Scratch {
-    /// Inside the system's temporary folder.
-    folder: PathBuf,
-}
-
-impl Scratch {
-    fn new() -> InputResult<Self> {
-        let folder = std::env::temp_dir().join(format!("gsscale-dry-{}", std::process::id()));
-        std::fs::create_dir(&folder).map_err(|e| InputError::io(&folder, "creating a scratch folder", &e))?;
-        Ok(Scratch { folder })
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        // The system clears its temporary folder of anything left.
-        let _ = std::fs::remove_dir_all(&self.folder);
-    }
+/// Of a dry run, for files needed to compute its requirements; removed when dropped.
+fn scratch_folder() -> InputResult<TempDir> {
+    let at = std::env::temp_dir();
+    TempDir::with_prefix_in("gsscale-dry-", &at).map_err(|e| InputError::io(&at, "creating a scratch folder", &e))
 }
 
 fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {

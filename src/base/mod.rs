@@ -10,6 +10,7 @@ pub mod identity;
 pub mod ids;
 pub mod machine;
 pub mod math;
+pub mod names;
 pub mod png_pixels;
 pub mod png_rows;
 pub mod rng;

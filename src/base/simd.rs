@@ -9,6 +9,7 @@
 //! The `unsafe` of the crate's compute half is confined to this file.
 #![allow(unsafe_code)] // calling a function compiled for a detected instruction set
 
+use super::names::names;
 use std::sync::OnceLock;
 
 /// Width of inner loops: one tile row, one AVX-512 register, two AVX2 registers.
@@ -40,23 +41,10 @@ pub enum SimdPath {
     Baseline,
 }
 
+// Best first.
+names!(SimdPath { Avx512 = "avx512", Avx2 = "avx2", Baseline = "baseline" });
+
 impl SimdPath {
-    /// All paths, best first.
-    pub const ALL: [SimdPath; 3] = [SimdPath::Avx512, SimdPath::Avx2, SimdPath::Baseline];
-
-    /// The name on the command line and in config.toml.
-    pub fn name(self) -> &'static str {
-        match self {
-            SimdPath::Avx512 => "avx512",
-            SimdPath::Avx2 => "avx2",
-            SimdPath::Baseline => "baseline",
-        }
-    }
-
-    pub fn from_name(name: &str) -> Option<SimdPath> {
-        SimdPath::ALL.into_iter().find(|p| p.name() == name)
-    }
-
     /// The class of paths that give the same bits as this one.
     pub fn bits_class(self) -> BitsClass {
         match self {

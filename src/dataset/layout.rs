@@ -7,6 +7,7 @@ use super::colmap::{self, parts};
 use super::mega_nerf::looks_like_mega_nerf;
 use super::transforms::{looks_like_matrix_city, looks_like_transforms};
 use crate::base::error::{InputError, InputResult};
+use crate::base::names::names;
 use std::path::{Path, PathBuf};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,22 +27,17 @@ pub enum Layout {
     Transforms,
 }
 
+// In the order of preference for a folder that has several.
+names!(Layout {
+    Colmap = "colmap",
+    Gauu = "gauu",
+    ColmapMerged = "colmap-merged",
+    Transforms = "transforms",
+    MatrixCity = "matrixcity",
+    MegaNerf = "mega-nerf",
+});
+
 impl Layout {
-    /// All layouts, in the order of preference for a folder that has several.
-    pub const ALL: [Layout; 6] =
-        [Layout::Colmap, Layout::Gauu, Layout::ColmapMerged, Layout::Transforms, Layout::MatrixCity, Layout::MegaNerf];
-
-    pub fn name(self) -> &'static str {
-        match self {
-            Layout::Colmap => "colmap",
-            Layout::ColmapMerged => "colmap-merged",
-            Layout::MegaNerf => "mega-nerf",
-            Layout::Gauu => "gauu",
-            Layout::MatrixCity => "matrixcity",
-            Layout::Transforms => "transforms",
-        }
-    }
-
     pub fn tree(self) -> &'static str {
         match self {
             Layout::Colmap => {
@@ -141,9 +137,8 @@ impl std::str::FromStr for Layout {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Layout, String> {
-        let names: Vec<&str> = Layout::ALL.iter().map(|l| l.name()).collect();
-        let found = Layout::ALL.into_iter().find(|l| l.name() == text);
-        found.ok_or_else(|| format!("unknown layout '{text}'; use one of {}", names.join(", ")))
+        let names = || Layout::ALL.map(Layout::name).join(", ");
+        Layout::from_name(text).ok_or_else(|| format!("unknown layout '{text}'; use one of {}", names()))
     }
 }
 

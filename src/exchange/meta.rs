@@ -6,6 +6,7 @@
 //! file holds either frame, with origin and scale, so that each frame can be derived from the other. A file may also be
 //! turned so that viewers show it upright ([`SceneMeta::upright`]).
 
+use crate::base::names::names;
 use crate::scene::rotation::Rotation;
 use std::path::PathBuf;
 
@@ -22,18 +23,9 @@ pub enum ExportFrame {
     Local,
 }
 
+names!(ExportFrame { Dataset = "dataset", Local = "local" });
+
 impl ExportFrame {
-    pub fn name(self) -> &'static str {
-        match self {
-            ExportFrame::Dataset => "dataset",
-            ExportFrame::Local => "local",
-        }
-    }
-
-    pub fn from_name(name: &str) -> Option<ExportFrame> {
-        [ExportFrame::Dataset, ExportFrame::Local].into_iter().find(|f| f.name() == name)
-    }
-
     /// The frame that f32 can hold: `Local` if `origin` is more than [`MAX_OFFSET_RADII`] times `scene_radius` (dataset
     /// units) from zero, otherwise the requested one.
     #[must_use]

@@ -2,8 +2,8 @@
 //!
 //! Not here: the comparison itself (`image_loss`, `ssim_band`).
 
+use crate::base::names::names;
 use crate::scene::image::{Image, Target};
-use std::fmt;
 use std::ops::Range;
 
 /// Side of the SSIM window, pixels.
@@ -23,19 +23,9 @@ pub enum SsimVariant {
     Reflect,
 }
 
+names!(SsimVariant { Same = "same", Valid = "valid", Reflect = "reflect" });
+
 impl SsimVariant {
-    /// All variants, the default first.
-    pub const ALL: [SsimVariant; 3] = [SsimVariant::Same, SsimVariant::Valid, SsimVariant::Reflect];
-
-    /// The name on the command line, in config files and in reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            SsimVariant::Same => "same",
-            SsimVariant::Valid => "valid",
-            SsimVariant::Reflect => "reflect",
-        }
-    }
-
     /// Positions along a side of the picture that the map covers.
     pub(super) fn domain(self, side: usize) -> Range<usize> {
         match self {
@@ -47,12 +37,6 @@ impl SsimVariant {
     /// The variant that is possible at this size.
     pub(super) fn possible(self, width: usize, height: usize) -> SsimVariant {
         if width.min(height) < WINDOW && self == SsimVariant::Valid { SsimVariant::Same } else { self }
-    }
-}
-
-impl fmt::Display for SsimVariant {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
     }
 }
 

@@ -1,5 +1,7 @@
 //! The three ways of handling optimizer steps without a gradient, and where the optimizer runs.
 
+use crate::base::names::names;
+
 /// How a step treats rows without a gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Method {
@@ -23,16 +25,4 @@ pub enum OptimizerPlace {
     Device,
 }
 
-impl OptimizerPlace {
-    /// The name on the command line and in config.toml.
-    pub fn name(self) -> &'static str {
-        match self {
-            OptimizerPlace::Host => "host",
-            OptimizerPlace::Device => "device",
-        }
-    }
-
-    pub fn from_name(name: &str) -> Option<OptimizerPlace> {
-        [OptimizerPlace::Host, OptimizerPlace::Device].into_iter().find(|place| place.name() == name)
-    }
-}
+names!(OptimizerPlace { Host = "host", Device = "device" });

@@ -14,6 +14,7 @@
 //! in row order, so the bits are the same for any number of threads; 4. NaN at an unmasked pixel gives NaN; 5. nothing of a
 //! pixel is stored: memory grows with the rows of a photo, not with its pixels.
 
+use crate::base::names::names;
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -39,19 +40,7 @@ pub enum ColorCorrect {
     Quadratic,
 }
 
-impl ColorCorrect {
-    /// The name in reports and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            ColorCorrect::Affine => "affine",
-            ColorCorrect::Quadratic => "quadratic",
-        }
-    }
-
-    pub fn from_name(name: &str) -> Option<ColorCorrect> {
-        [ColorCorrect::Affine, ColorCorrect::Quadratic].into_iter().find(|c| c.name() == name)
-    }
-}
+names!(ColorCorrect { Affine = "affine", Quadratic = "quadratic" });
 
 type Rgb = [f64; 3];
 

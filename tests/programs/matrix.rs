@@ -10,7 +10,7 @@ use crate::support::scenes::{TextModel, stderr};
 use crate::support::workdir::{Running, TRAIN, Workdir, least_memory, send};
 use glam::{DQuat, DVec3};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
-use gsscale::page::engine::open::open_engine;
+use gsscale::page::engine::open::{IoEngine, open_engine};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -468,7 +468,7 @@ fn ends_early(mut run: Running, signal: &str) -> bool {
 /// The engine, if it works here: containers often forbid io_uring.
 pub fn engine(name: &'static str) -> &'static str {
     let folder = tempfile::tempdir().unwrap();
-    if open_engine(name.parse().unwrap(), folder.path(), 4).is_ok() {
+    if open_engine(IoEngine::from_name(name).unwrap(), folder.path(), 4).is_ok() {
         return name;
     }
     println!("SKIPPED: {name} does not work here; pread takes its place");

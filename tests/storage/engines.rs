@@ -430,7 +430,7 @@ fn auto_takes_what_works_and_says_what_does_not() {
     assert!(["uring", "pread"].contains(&opened.store.name()));
     assert_eq!(opened.store.name() == "pread", !opened.notes.is_empty());
     opened.store.create_segment(0, SEGMENT).unwrap();
-    for engine in [IoEngine::Pread, IoEngine::Mmap, IoEngine::Memory] {
+    for engine in [IoEngine::Pread, IoEngine::Mmap] {
         let opened = open_engine(engine, folder.path(), 8).unwrap();
         assert_eq!(opened.store.name(), engine.name());
     }

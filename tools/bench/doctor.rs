@@ -35,6 +35,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use tempfile::TempDir;
 
 const EXAMPLES: &str = "\
 Examples:
@@ -303,7 +304,7 @@ impl Doctor<'_> {
     }
 
     fn steps_of(&self, rows: usize) -> Result<Value, String> {
-        let folder = Scratch::new()?;
+        let folder = scratch_folder()?;
         let city = CityOptions { views: 8, width: 640, height: 480, points: rows as u32, ..CityOptions::default() };
         let config = TrainConfig {
             strategy: StrategyName::None,
@@ -312,7 +313,7 @@ impl Doctor<'_> {
             steps: 10_000,
             ..TrainConfig::default()
         };
-        let scene = CityScene::new(&folder.0, &city, config)?;
+        let scene = CityScene::new(folder.path(), &city, config)?;
         let cpu = scene.step_seconds(Box::new(CpuRenderer::new()), OptimizerPlace::Host)?;
         let host = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Host)?;
         let on_device = scene.step_seconds(Box::new(self.renderer(false)?), OptimizerPlace::Device);
@@ -327,10 +328,10 @@ impl Doctor<'_> {
     }
 
     fn training(&self) -> Result<(String, Value), String> {
-        let folder = Scratch::new()?;
+        let folder = scratch_folder()?;
         let city = CityOptions { views: 24, width: 160, height: 112, points: 6000, ..CityOptions::default() };
         let config = TrainConfig { steps: STEPS, ..TrainConfig::default() };
-        let scene = CityScene::new(&folder.0, &city, config)?;
+        let scene = CityScene::new(folder.path(), &city, config)?;
         let cpu = scene.psnr(Box::new(CpuRenderer::new()))?;
         let gpu = scene.psnr(Box::new(self.renderer(false)?))?;
         let figures = json!({ "steps": STEPS, "cpu_psnr": cpu, "gpu_psnr": gpu });
@@ -412,24 +413,10 @@ fn bits(view: &View) -> Vec<u32> {
     floats.map(|x| x.to_bits()).chain([loss as u32, (loss >> 32) as u32]).collect()
 }
 
-/// A folder for a scene; removed when dropped.
-struct Scratch(PathBuf);
-
-impl Scratch {
-    fn new() -> Result<Scratch, String> {
-        // A process that was killed may have left folders of the same number.
-        let folders = (0..100).map(|n| std::env::temp_dir().join(format!("gsscale-doctor-{}-{n}", std::process::id())));
-        let made = folders.map(|folder| (std::fs::create_dir(&folder), folder)).find(|(made, _)| made.is_ok());
-        let nowhere = || format!("no folder can be made in {}: set TMPDIR to one", std::env::temp_dir().display());
-        made.map(|(_, folder)| Scratch(folder)).ok_or_else(nowhere)
-    }
-}
-
-impl Drop for Scratch {
-    fn drop(&mut self) {
-        // Made by this process, under a name of its own.
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
+/// For a scene; removed when dropped.
+fn scratch_folder() -> Result<TempDir, String> {
+    let nowhere = |e| format!("no folder can be made in {} ({e}): set TMPDIR to one", std::env::temp_dir().display());
+    TempDir::with_prefix("gsscale-doctor-").map_err(nowhere)
 }
 
 /// Writes doctor.json and doctor.html.

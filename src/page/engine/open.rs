@@ -4,12 +4,10 @@
 //! threads. The engine changes no bit of any result, so a run may resume with another.
 
 use crate::base::error::{InputError, InputResult};
-use crate::page::engine::memory::MemoryEngine;
+use crate::base::names::names;
 use crate::page::engine::page_engine::PageEngine;
 use crate::page::engine::threaded::ThreadedEngine;
-use std::fmt;
 use std::path::Path;
-use std::str::FromStr;
 
 /// Queue depth for engines with threads and for measurements. A deeper queue gained nothing on any drive measured.
 pub const DEPTH: usize = 16;
@@ -31,40 +29,9 @@ pub enum IoEngine {
     Mmap,
     /// Plain positioned reads and writes on threads.
     Pread,
-    /// Segments in memory, no files.
-    Memory,
 }
 
-impl IoEngine {
-    /// All values, in the order that `--io` lists them.
-    pub const ALL: [IoEngine; 5] = [IoEngine::Auto, IoEngine::Uring, IoEngine::Mmap, IoEngine::Pread, IoEngine::Memory];
-
-    /// The value as `--io` writes it.
-    pub fn name(self) -> &'static str {
-        match self {
-            IoEngine::Auto => "auto",
-            IoEngine::Uring => "uring",
-            IoEngine::Mmap => "mmap",
-            IoEngine::Pread => "pread",
-            IoEngine::Memory => "memory",
-        }
-    }
-}
-
-impl FromStr for IoEngine {
-    type Err = String;
-    fn from_str(text: &str) -> Result<Self, String> {
-        let names = || IoEngine::ALL.map(IoEngine::name).join(", ");
-        let engine = IoEngine::ALL.into_iter().find(|e| e.name() == text);
-        engine.ok_or_else(|| format!("'{text}' is not an I/O engine; use one of: {}", names()))
-    }
-}
-
-impl fmt::Display for IoEngine {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
+names!(IoEngine { Auto = "auto", Uring = "uring", Mmap = "mmap", Pread = "pread" });
 
 /// An open engine, with notes for the user on how it was chosen.
 pub struct OpenedEngine {
@@ -79,9 +46,6 @@ pub struct OpenedEngine {
 /// Errors: the folder cannot be used; an engine that was asked for by name does not work here (`auto` takes another).
 pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult<OpenedEngine> {
     let mut notes = Vec::new();
-    if engine == IoEngine::Memory {
-        return Ok(OpenedEngine { store: Box::new(MemoryEngine::new()), notes });
-    }
     ignore_file_size_signal();
     // An unusable folder is reported here, so that later failures are the engine's own.
     std::fs::read_dir(folder).map_err(|e| InputError::io(folder, "opening the folder of pages", &e))?;
@@ -89,7 +53,7 @@ pub fn open_engine(engine: IoEngine, folder: &Path, depth: usize) -> InputResult
         IoEngine::Mmap => Box::new(ThreadedEngine::mmap(folder, depth).map_err(|e| not_opened(engine, &e))?),
         IoEngine::Pread => open_pread(folder, depth, &mut notes)?,
         IoEngine::Uring => open_uring(folder, depth, &mut notes).map_err(|e| not_opened(engine, &e))?,
-        _ => match open_uring(folder, depth, &mut notes) {
+        IoEngine::Auto => match open_uring(folder, depth, &mut notes) {
             Ok(store) => store,
             Err(why) => {
                 if why.kind() != std::io::ErrorKind::Unsupported || cfg!(target_os = "linux") {

@@ -9,6 +9,7 @@
 //! are that version of that page.
 
 use crate::base::ids::PageId;
+use crate::base::names::names;
 use crate::page::engine::buffer::ALIGNMENT;
 use crate::page::engine::page_engine::Place;
 use bytemuck::{Pod, Zeroable};
@@ -42,19 +43,8 @@ pub enum StoredAs {
     Halves,
 }
 
-impl StoredAs {
-    /// By number.
-    pub const ALL: [StoredAs; 3] = [StoredAs::Raw, StoredAs::ShuffledZstd, StoredAs::Halves];
-
-    /// The name for people.
-    pub fn name(self) -> &'static str {
-        match self {
-            StoredAs::Raw => "raw",
-            StoredAs::ShuffledZstd => "shuffled zstd",
-            StoredAs::Halves => "halves",
-        }
-    }
-}
+// By number.
+names!(StoredAs { Raw = "raw", ShuffledZstd = "shuffled zstd", Halves = "halves" });
 
 /// A [`SlotRef`] on the drive.
 #[derive(Clone, Copy, Zeroable, Pod)]

@@ -27,6 +27,7 @@ use super::parameter::{
     write_values,
 };
 use crate::base::error::{InputError, InputResult};
+use crate::base::names::names;
 use crate::base::text::read_text;
 use crate::dataset::exif;
 use crate::dataset::loader::Dataset;
@@ -58,26 +59,12 @@ pub enum AppearanceMode {
     Full,
 }
 
+names!(AppearanceMode { Off = "off", Exposure = "exposure", IfNeeded = "if-needed", Full = "full" });
+
 impl AppearanceMode {
     /// Whether anything is corrected.
     pub fn is_on(self) -> bool {
         self != AppearanceMode::Off
-    }
-
-    pub fn from_name(name: &str) -> Option<AppearanceMode> {
-        [AppearanceMode::Off, AppearanceMode::Exposure, AppearanceMode::IfNeeded, AppearanceMode::Full]
-            .into_iter()
-            .find(|mode| mode.name() == name)
-    }
-
-    /// The name in files and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            AppearanceMode::Off => "off",
-            AppearanceMode::Exposure => "exposure",
-            AppearanceMode::IfNeeded => "if-needed",
-            AppearanceMode::Full => "full",
-        }
     }
 
     /// How many of a photo's values are trained, from the first.

@@ -12,6 +12,7 @@
 mod conv;
 pub mod weights;
 
+use crate::base::names::names;
 use crate::base::simd::SimdPath;
 use crate::scene::image::{Image, Target};
 use conv::{Conv, Planes, max_pool};
@@ -25,15 +26,9 @@ pub enum Network {
     Vgg,
 }
 
-impl Network {
-    /// The name in reports and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            Network::Alex => "alex",
-            Network::Vgg => "vgg",
-        }
-    }
+names!(Network { Alex = "alex", Vgg = "vgg" });
 
+impl Network {
     fn layers(self) -> &'static [Layer] {
         match self {
             Network::Alex => &ALEX,
@@ -59,25 +54,13 @@ pub enum InputRange {
     Unit,
 }
 
-impl InputRange {
-    /// The name in reports and on the command line.
-    pub fn name(self) -> &'static str {
-        match self {
-            InputRange::Signed => "signed",
-            InputRange::Unit => "unit",
-        }
-    }
-}
+names!(InputRange { Signed = "signed", Unit = "unit" });
 
 impl std::str::FromStr for InputRange {
     type Err = String;
 
     fn from_str(text: &str) -> Result<InputRange, String> {
-        let ranges = [InputRange::Signed, InputRange::Unit];
-        ranges
-            .into_iter()
-            .find(|r| r.name() == text)
-            .ok_or_else(|| format!("unknown input range '{text}': use signed or unit"))
+        InputRange::from_name(text).ok_or_else(|| format!("unknown input range '{text}': use signed or unit"))
     }
 }
 
