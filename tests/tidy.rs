@@ -28,7 +28,7 @@ const LAYERS: &[(&str, &str)] = &[
         "train",
         "base scene dataset schedule page paging checkpoint kernels optim densify photos gpu render exchange report config",
     ),
-    ("cells", "base scene dataset page paging photos render exchange report config train"),
+    ("cells", "base scene dataset page paging photos densify render exchange report config train"),
 ];
 
 /// For each room of src/train, the rooms that it may name.

@@ -260,13 +260,14 @@ fn show_status(city: &std::path::Path) -> Result<i32, TrainError> {
     let (plan, cells) = status(city)?;
     for (number, (cell, planned)) in cells.iter().zip(&plan.cells).enumerate() {
         let state = match (&cell.done, &cell.owner) {
-            (Some(done), _) => format!("done: {} Gaussians", format_grouped(done.gaussians)),
-            (None, Some(owner)) => format!("running on {owner}"),
-            (None, None) => "waiting".to_string(),
+            (Err(error), _) => error.to_string(),
+            (Ok(Some(done)), _) => format!("done: {} Gaussians", format_grouped(done.gaussians)),
+            (Ok(None), Some(owner)) => format!("running on {owner}"),
+            (Ok(None), None) => "waiting".to_string(),
         };
         gsscale::say!("cell {number}: {} of {} steps copied, {state}", cell.copied, planned.steps);
     }
-    let done = cells.iter().filter(|cell| cell.done.is_some()).count();
+    let done = cells.iter().filter(|cell| matches!(cell.done, Ok(Some(_)))).count();
     gsscale::say!("{done} of {} cells are done", cells.len());
     Ok(0)
 }

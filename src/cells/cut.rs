@@ -5,14 +5,17 @@
 //! views, or there is only one cell; 3. `plan.toml` is written last; a city is cut once.
 
 use super::costs::{AsIf, Basis, PhaseCost};
-use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_digest, prior_digest};
-use super::prior::{GAUSSIANS_SHARE, KEY_OF_FIRST_POINTS};
+use super::plan::{CELL_FILES, CellCount, CellPlan, CityPlan, GroundRect, files_digest, poses_digest, prior_digest};
+use super::prior::KEY_OF_FIRST_POINTS;
 use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
 use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
+use crate::config::limits;
+use crate::dataset::model::ReadOptions;
+use crate::dataset::read::read_scene;
 use crate::photos::outlier::blocks::MASKED_SHARE;
 use crate::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
 use crate::scene::state::row_bytes;
@@ -95,16 +98,21 @@ pub fn cut(request: &CutRequest) -> Result<(CityPlan, Vec<PhaseCost>), TrainErro
     whole.image_cache = request.keys.image_cache.unwrap_or(whole.image_cache);
     let seen = see(&request.scene, &city, &request.keys, request.quiet)?;
     let gaussians: u64 = seen.pages.iter().map(|page| page.rows).sum();
-    let most = if whole.max_gaussians == 0 { GAUSSIANS_SHARE * gaussians } else { whole.max_gaussians };
+    // Without a cap the prior has decided how many pay in its smaller photos.
+    let decided = (gaussians as f64 * seen.detail) as u64;
+    let most = if whole.max_gaussians == 0 { decided } else { whole.max_gaussians };
     let growth = (most as f64 / gaussians as f64).max(1.0);
     let (leaves, drafts) = fitting_cells(&seen, request, growth)?;
     let views = seen.views.iter().filter(|view| view.is_train).count();
     let past = past_of(&city)?;
+    let raw = read_scene(&request.scene, &ReadOptions { points_later: true, ..limits::read_options(&whole) })?;
     let mut cells = Vec::new();
     for (number, draft) in drafts.iter().enumerate() {
         let mut planned = plan_cell(&seen, draft, &whole, growth, views, past);
         if !request.dry_run {
-            planned.files = write_cell(&city, number, &seen, draft, keys.clone(), &planned)?;
+            let names = write_cell(&city, number, &seen, draft, keys.clone(), &planned)?;
+            planned.files = files_digest(&city.cell(number))?;
+            planned.poses = poses_digest(&raw, &names);
         }
         cells.push(planned);
     }
@@ -340,10 +348,11 @@ fn plan_cell(
         // A step draws up to `growth` times the rows of the prior's.
         seconds: f64::from(steps) * step_seconds * (1.0 + growth) / 2.0,
         files: String::new(),
+        poses: String::new(),
     }
 }
 
-/// Writes the files of a cell; returns their digest.
+/// Writes the files of a cell; returns the names of its photos, one a line.
 fn write_cell(
     city: &City,
     number: usize,
@@ -366,5 +375,5 @@ fn write_cell(
     for (name, text) in CELL_FILES.iter().zip([&text, &names, &pages]) {
         write_whole(&folder.join(name), text.as_bytes())?;
     }
-    files_digest(&folder)
+    Ok(names)
 }

@@ -11,9 +11,9 @@
 
 use super::costs::POLISH_SHARE;
 use super::cut::remedies_of_prior;
-use super::plan::{CityPlan, LIST_BYTES_MAX};
+use super::plan::{CityPlan, LIST_BYTES_MAX, hex};
 use super::prior::KEY_OF_FIRST_POINTS;
-use super::work::{check_prior, copy_of, done_of};
+use super::work::{DONE_FILE, check_prior, copy_of, done_of};
 use super::{City, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
@@ -39,6 +39,7 @@ use crate::train::stores::StoredStart;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use xxhash_rust::xxh3::Xxh3;
 
 /// What was merged, from which plan.
 const MERGED_FILE: &str = "merged.toml";
@@ -59,6 +60,9 @@ pub struct MergeRequest {
 pub struct Merged {
     /// Digest of the plan.
     pub plan: String,
+    /// Digest of what is known of the cells when they are done.
+    #[serde(default)]
+    pub cells: String,
     pub gaussians: u64,
     /// Of each cell.
     pub kept: Vec<u64>,
@@ -102,18 +106,14 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     let city = City(request.city.clone());
     let plan = CityPlan::read(&city)?;
     let digest = plan.digest(&city.plan())?;
-    if request.out.exists() {
-        let before = std::fs::read_to_string(request.out.join(MERGED_FILE)).ok();
-        let before =
-            before.and_then(|text| toml::from_str::<Merged>(&text).ok()).filter(|merged| merged.plan == digest);
-        let refused = || InputError::new(&request.out, "exists already", "name a folder that does not exist");
-        return Ok(before.ok_or_else(refused)?);
-    }
-    let (mut open, mut copies) = (Vec::new(), Vec::new());
+    let (mut open, mut copies, mut cells) = (Vec::new(), Vec::new(), Xxh3::new());
     for cell in 0..plan.cells.len() {
         plan.cell(&city, cell)?;
         match done_of(&plan, &city, cell)? {
-            Some(done) => copies.push(copy_of(&city.cell(cell), done.copy)),
+            Some(done) => {
+                copies.push(copy_of(&city.cell(cell), done.copy));
+                cells.update(toml_of(DONE_FILE, &done)?.as_bytes());
+            }
             None => open.push(cell.to_string()),
         }
     }
@@ -123,6 +123,19 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
             _ => format!("cells {} are not done", open.join(", ")),
         };
         return Err(InputError::new(&city.0, problem, "run them: gsscale-cells run CITY --cell K").into());
+    }
+    let cells = hex(cells.digest());
+    if request.out.exists() {
+        let before = std::fs::read_to_string(request.out.join(MERGED_FILE)).ok();
+        let before = before.and_then(|text| toml::from_str::<Merged>(&text).ok());
+        let is_of_plan = before.as_ref().is_some_and(|merged| merged.plan == digest);
+        let is_same = |merged: &Merged| is_of_plan && merged.cells == cells && request.out.join(PLY_FILE).is_file();
+        let problem = match is_of_plan {
+            true => "it is an earlier merge, of cells that were trained again since, or without its PLY",
+            false => "exists already",
+        };
+        let refused = || InputError::new(&request.out, problem, "name a folder that does not exist");
+        return Ok(before.filter(is_same).ok_or_else(refused)?);
     }
     let memory = host_budget(request.host_mem).unwrap_or(1 << 30);
     check_prior(&plan, &city, memory).map_err(|refused| refused.error)?;
@@ -139,15 +152,19 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     let mut prior = StoredStart::open(&city.prior_store(), memory, 2)?;
     let owners = prior.scene().pager.index().iter().map(owner).collect();
     drop(prior);
-    let (kept, done) = (KeptRows::new(plan.gaussians), Merged { plan: digest, ..Merged::default() });
+    let (kept, done) = (KeptRows::new(plan.gaussians), Merged { plan: digest, cells, ..Merged::default() });
     let mut merging = Merging { plan: &plan, owners, kept, done };
     let mut astray = Vec::new();
     for (cell, copy) in copies.iter().enumerate() {
         let owned = merging.owned_pages(&city.cell(cell), cell)?;
-        astray.push(merging.add_cell(cell, &owned, StoredStart::open(copy, memory, 2)?, &mut *sink)?);
+        let added =
+            StoredStart::open(copy, memory, 2).and_then(|copy| merging.add_cell(cell, &owned, copy, &mut *sink));
+        astray.push(added.map_err(|error| of_copy(&city, cell, copy, error))?);
     }
     for (cell, (copy, pages)) in copies.iter().zip(astray).enumerate().filter(|(_, (_, pages))| !pages.is_empty()) {
-        merging.put_back(cell, &pages, StoredStart::open(copy, memory, 2)?, &mut *sink)?;
+        let put_back =
+            StoredStart::open(copy, memory, 2).and_then(|copy| merging.put_back(cell, &pages, copy, &mut *sink));
+        put_back.map_err(|error| of_copy(&city, cell, copy, error))?;
     }
     let written = sink.finish()?;
     ExportFormat::Ply.write_transform(&ply, &meta, written.frame)?;
@@ -158,6 +175,21 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     folder.write(Path::new(MERGED_FILE), toml_of(MERGED_FILE, &merged)?.as_bytes())?;
     folder.finish()?;
     Ok(merged)
+}
+
+/// An error of reading the copy of a cell.
+fn of_copy(city: &City, cell: usize, copy: &Path, error: TrainError) -> TrainError {
+    match error {
+        TrainError::Paging(_) => {
+            let again = city.cell(cell).join(DONE_FILE);
+            let remedy = format!(
+                "try again; if that fails, remove {} and its folder copy, and run the cell again",
+                again.display()
+            );
+            InputError::new(copy, format!("the copy of cell {cell} cannot be read: {error}"), remedy).into()
+        }
+        other => other,
+    }
 }
 
 struct Merging<'a> {

@@ -1,12 +1,15 @@
 //! The plan of a city: its cells and their grounds, with a digest of all of it. Which cell a place lies in.
 //!
-//! Invariants: 1. every place of the ground lies in exactly one leaf; 2. a plan, a list or a prior that was changed after the cut is refused.
+//! Invariants: 1. every place of the ground lies in exactly one leaf; 2. a plan, a list, a prior or poses that were changed after the cut are
+//! refused.
 
 use super::{City, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
+use crate::dataset::model::{Intrinsics, RawScene};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 use std::io::ErrorKind;
 use std::path::Path;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
@@ -74,6 +77,9 @@ pub struct CellPlan {
     pub seconds: f64,
     /// Digest of its files.
     pub files: String,
+    /// Digest of the names, lenses and poses of its photos; empty in the plans of earlier versions.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub poses: String,
 }
 
 /// A rectangle of the ground, half-open, in the directions of the axes; infinite at the edge of the city.
@@ -180,6 +186,21 @@ pub(crate) fn prior_digest(city: &City, rows: u64) -> InputResult<String> {
         read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
     };
     Ok(format!("{}{}", hex(rows), hex(xxh3_64(&found))))
+}
+
+/// Digest of the names, lenses and poses of the photos of a scene that are listed in `names`, one a line.
+pub(crate) fn poses_digest(scene: &RawScene, names: &str) -> String {
+    let listed: BTreeSet<&str> = names.lines().collect();
+    let mut digest = Xxh3::new();
+    for view in scene.views.iter().filter(|view| listed.contains(view.name.as_str())) {
+        let Intrinsics { width, height, fx, fy, cx, cy, lens } = &view.intrinsics;
+        let (rotation, translation) = (view.pose.rotation.to_cols_array(), view.pose.translation.to_array());
+        digest.update(view.name.as_bytes());
+        digest.update(&[width.to_le_bytes(), height.to_le_bytes()].concat());
+        let numbers = [fx, fy, cx, cy].into_iter().chain(lens.coefficients()).chain(&rotation).chain(&translation);
+        numbers.for_each(|number| digest.update(&number.to_bits().to_le_bytes()));
+    }
+    hex(digest.digest())
 }
 
 /// Digest of the files of a cell.

@@ -18,9 +18,9 @@ use crate::train::state::trainer::Trainer;
 use crate::train::stores::{ImportRequest, import};
 use std::path::PathBuf;
 
-/// The prior takes this part of the steps, and of the Gaussians.
+/// The prior takes this part of the steps, and of the Gaussians if they are capped.
 pub(crate) const STEPS_SHARE: u32 = 4;
-pub(crate) const GAUSSIANS_SHARE: u64 = 5;
+const GAUSSIANS_SHARE: u64 = 5;
 /// A key that has no meaning for cells, which begin from Gaussians.
 pub(crate) const KEY_OF_FIRST_POINTS: &str = "sweep-points";
 /// Longest side of its photos, pixels.
@@ -53,7 +53,7 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     check_keys_of_cells(&city, keys.clone())?;
     fix_keys(&city, &keys)?;
     if city.prior_store().is_dir() {
-        crate::say!("the prior in {} is done", city.0.display());
+        crate::say!("the prior in {} is done, of the scene {}", city.0.display(), city.scene()?.display());
         return Ok(0);
     }
     let (out, page_rows) = (city.prior_run(), config.page_rows);

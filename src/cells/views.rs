@@ -15,6 +15,7 @@ use crate::config::limits::RunOptions;
 use crate::config::values::Up;
 use crate::dataset::loader::{View, target_size};
 use crate::dataset::model::Split;
+use crate::densify::growth::counted_pixels;
 use crate::render::RenderOptions;
 use crate::scene::page_meta::PageBounds;
 use crate::scene::rotation::VIEWER_UP;
@@ -40,6 +41,8 @@ pub(crate) struct Seen {
     pub up: [f64; 3],
     pub axes: [[f64; 3]; 2],
     pub photo: PhotoBytes,
+    /// How many times the pixels of the prior that count for a number of Gaussians ([`counted_pixels`]) the whole scene's photos have.
+    pub detail: f64,
     pub sh_degree: u8,
 }
 
@@ -97,16 +100,20 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
     let mut renderer = machine::renderer(&config, machine::DeviceUse::Pictures)?.renderer;
     let (mut views, mut working) = (Vec::new(), WorkingSet::default());
     let mut photo = PhotoBytes { file: 0.0, decoded: 0.0 };
+    let (mut counted, mut counted_of_prior) = (0, 0);
     let share = 1.0 / dataset.views.len() as f64;
     let shown = Count::new("views weighed", dataset.views.len() as u32, quiet);
     let step = store.state().trainer.step;
     for View { name, split, camera, photo: source } in &dataset.views {
         let file = std::fs::metadata(&source.image_path).map_or(0, |of| of.len());
         photo.file += file as f64 * share;
-        let pixels = |(width, height): (u32, u32)| f64::from(width) * f64::from(height);
+        let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
         let limit = Some(whole.max_resolution).filter(|&most| most > 0);
         let of_cell = target_size((source.header.width, source.header.height), whole.data_factor, limit);
-        photo.decoded += source.target_bytes() as f64 * pixels(of_cell) / pixels(source.target) * share;
+        let [of_cell, of_prior] = [of_cell, source.target].map(pixels);
+        photo.decoded += source.target_bytes() as f64 * of_cell as f64 / of_prior as f64 * share;
+        counted += counted_pixels(of_cell);
+        counted_of_prior += counted_pixels(of_prior);
         let mut now = SceneNow { scene: store.scene(), step, working: &mut working, renderer: &mut *renderer };
         let weights = weigh_pages(&mut now, camera, &render)?.into_iter().filter(|(_, weight)| *weight > 0.0);
         let weights = weights.map(|(page, weight)| (place[page.index()], weight)).collect();
@@ -114,7 +121,8 @@ pub(crate) fn see(scene: &Path, city: &City, keys: &TrainOverrides, quiet: bool)
         views.push(SeenView { name, is_train, at, weights });
         shown.show(views.len() as u32);
     }
-    Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes, photo, sh_degree })
+    let detail = (counted as f64 / counted_of_prior as f64).max(1.0);
+    Ok(Seen { digest, pages, views, origin: frame.0, scale: frame.1, up, axes, photo, detail, sh_degree })
 }
 
 /// The configs of the prior's run and of the whole scene, with the keys of this machine.

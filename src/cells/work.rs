@@ -14,15 +14,19 @@
 //! their name in `copy/`; 3. stores are removed by their identity.
 
 use super::lock::{CellLock, owner_of};
-use super::plan::{CityPlan, prior_digest};
+use super::plan::{CellPlan, CityPlan, LIST_BYTES_MAX, poses_digest, prior_digest};
 use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::system_name;
+use crate::base::text::read_text;
 use crate::base::whole_file::{sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides};
+use crate::config::limits;
 use crate::config::new_run;
 use crate::config::values::ByteSize;
+use crate::dataset::model::ReadOptions;
+use crate::dataset::read::read_scene;
 use crate::page::folder::spill_dir::SpillDir;
 use crate::page::tool::new_store::part_of;
 use crate::page::tool::reading::Access;
@@ -46,6 +50,8 @@ pub const AGAIN: i32 = 75;
 /// Exit code: no further attempt will succeed.
 pub const NEVER: i32 = 2;
 
+/// The file that says that a cell is done.
+pub(crate) const DONE_FILE: &str = "done.toml";
 /// Beginnings of the names of a copy that has no number yet, and of the folder of a run in the city.
 const UNNAMED: &str = "of-";
 const RUN: &str = "run-";
@@ -110,10 +116,15 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let city = City(request.city.clone());
     check_machine_keys(&request.keys)?;
     check_range("--copy-every", request.copy_every, 0.0..=1e9)?;
+    let drive = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty());
+    if drive.is_none() && request.keys.frames.is_some_and(|frames| frames > 0) {
+        let problem = "a run in so many frames, but without a drive, makes no commits that could be copied";
+        return Err(InputError::new("--frames", problem, "add --spill-dir, or use --host-mem").into());
+    }
     let plan = CityPlan::read(&city)?;
-    let files = &plan.cell(&city, request.cell)?.files;
+    let planned = plan.cell(&city, request.cell)?;
     let folder = city.cell(request.cell);
-    let place = WorkPlace::of(request, &plan, &city)?;
+    let place = WorkPlace::of(request.cell, drive, &plan, &city)?;
     let is_done = || done_of(&plan, &city, request.cell).map(|done| done.is_some());
     let report_done = || {
         crate::say!("cell {} is done", request.cell);
@@ -125,6 +136,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     }
     let memory = host_budget(request.keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
     check_prior(&plan, &city, memory)?;
+    clear_finished(request.cell, drive, &plan, &city)?;
     let lock = match CellLock::take(&folder)? {
         Ok(lock) => lock,
         Err(owner) => {
@@ -139,6 +151,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let scene = request.scene.clone().map_or_else(|| city.scene(), Ok)?;
     let keys = place.keys(&city, &folder, &request.keys);
     let config = config_of(&folder.join("cell.toml"), keys_of_cell(&folder)?, &keys)?;
+    check_scene(planned, &folder, &scene, &config)?;
     let train = || -> Result<i32, TrainError> {
         let mut has_begun = place.fetch(&folder)?;
         while stop.exit_code().is_none() {
@@ -151,8 +164,8 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
             if let Some(summary) = outcome.summary.filter(|summary| summary.finished) {
                 let psnr = summary.test.map(|test| test.psnr);
                 let (steps, gaussians, seconds) = (summary.steps, summary.gaussians, summary.train_seconds);
-                let (file, done) =
-                    (folder.join("done.toml"), Done { files: files.clone(), copy, steps, gaussians, seconds, psnr });
+                let (file, files) = (folder.join(DONE_FILE), planned.files.clone());
+                let done = Done { files, copy, steps, gaussians, seconds, psnr };
                 write_whole(&file, toml_of(&file, &done)?.as_bytes())?;
                 place.clear_all(&folder)?;
                 return Ok(0);
@@ -181,7 +194,7 @@ pub fn code_of(error: &TrainError) -> i32 {
 /// Errors: it was done under another plan, or the file cannot be read.
 pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<Option<Done>> {
     let folder = city.cell(cell);
-    let file = folder.join("done.toml");
+    let file = folder.join(DONE_FILE);
     let text = match std::fs::read_to_string(&file) {
         Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
         read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
@@ -246,6 +259,30 @@ pub(crate) fn check_prior(plan: &CityPlan, city: &City, memory: u64) -> Result<(
     Err(InputError::new(city.prior_store(), problem, "restore it, or cut again in another folder").into())
 }
 
+/// Compares the photos of a cell with those for which the city was cut.
+/// Errors: other names, lenses or poses, which no further attempt changes; or the scene cannot be read here.
+fn check_scene(planned: &CellPlan, folder: &Path, scene: &Path, config: &TrainConfig) -> Result<(), WorkError> {
+    let options = ReadOptions { points_later: true, ..limits::read_options(config) };
+    let raw = read_scene(scene, &options).map_err(|error| WorkError::of_run(error.into()))?;
+    let names = read_text(&folder.join("views.txt"), LIST_BYTES_MAX, "restore the files of the cell")?;
+    if planned.poses.is_empty() || poses_digest(&raw, &names) == planned.poses {
+        return Ok(());
+    }
+    let problem = "the names, lenses or poses of the cell's photos have changed since the city was cut";
+    Err(InputError::new(scene, problem, "restore them, or begin another city").into())
+}
+
+/// Removes the pages that workers of other cells, which are done by now, left on this drive. Pages in use stay.
+fn clear_finished(cell: usize, drive: Option<&str>, plan: &CityPlan, city: &City) -> InputResult<()> {
+    for other in (0..plan.cells.len()).filter(|&other| drive.is_some() && other != cell) {
+        let store = WorkPlace::of(other, drive, plan, city)?.store();
+        if store.is_dir() && matches!(done_of(plan, city, other), Ok(Some(_))) {
+            drop(remove_store(&store));
+        }
+    }
+    Ok(())
+}
+
 fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
     new_run::given_keys(Some(&folder.join("cell.toml")), &TrainOverrides::default())
 }
@@ -259,12 +296,12 @@ struct WorkPlace {
 
 impl WorkPlace {
     /// Machines that share a folder, and cities that share a drive, have places of their own.
-    fn of(request: &WorkRequest, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
-        let Some(drive) = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty()) else {
-            let out = city.cell(request.cell).join(format!("{RUN}{}", system_name()));
+    fn of(cell: usize, drive: Option<&str>, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
+        let Some(drive) = drive else {
+            let out = city.cell(cell).join(format!("{RUN}{}", system_name()));
             return Ok(WorkPlace { out, pages: None });
         };
-        let own = absolute(Path::new(drive)).join(format!("cell-{}-{}", request.cell, plan.digest(&city.plan())?));
+        let own = absolute(Path::new(drive)).join(format!("cell-{cell}-{}", plan.digest(&city.plan())?));
         Ok(WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) })
     }
 
@@ -314,6 +351,8 @@ impl WorkPlace {
             break;
         }
         if own.is_some() && own >= copy.as_ref().map(|(steps, _)| *steps) {
+            // A run that was killed before its first step began here before the copy came, and would begin again.
+            out_folder::remove_mark(&self.out);
             return Ok(true);
         }
         if let (None, Some(copy)) = (&copy, unreadable) {
@@ -325,6 +364,7 @@ impl WorkPlace {
         if self.out.is_dir() {
             let _lock = out_folder::lock(&self.out)?;
             out_folder::make(&self.out, Existing::Overwrite)?;
+            out_folder::remove_mark(&self.out);
         }
         copy.as_ref().map_or(Ok(()), |(_, copy)| clone_into(copy, &store))?;
         Ok(copy.is_some())
@@ -408,7 +448,8 @@ pub(crate) fn remove_store(store: &Path) -> Result<(), TrainError> {
 /// The state of a cell as the folder of the city tells it.
 #[derive(Debug, Clone)]
 pub struct CellStatus {
-    pub done: Option<Done>,
+    /// An error if what the city says of the cell cannot be read, or is of another plan.
+    pub done: InputResult<Option<Done>>,
     /// Steps that the city has a copy of.
     pub copied: u32,
     /// Who works on it now.
@@ -416,16 +457,16 @@ pub struct CellStatus {
 }
 
 /// The state of every cell.
-/// Errors: there is no plan, or a cell was done under another one.
+/// Errors: there is no plan.
 pub fn status(city: &Path) -> InputResult<(CityPlan, Vec<CellStatus>)> {
     let city = City(city.to_path_buf());
     let plan = CityPlan::read(&city)?;
     let of = |cell: usize| {
-        let done = done_of(&plan, &city, cell)?;
-        let folder = city.cell(cell);
-        let copied = done.as_ref().map(|done| done.steps).or_else(|| copied_steps(&folder)).unwrap_or(0);
-        Ok(CellStatus { done, copied, owner: owner_of(&folder) })
+        let (done, folder) = (done_of(&plan, &city, cell), city.cell(cell));
+        let steps = done.as_ref().ok().and_then(|done| Some(done.as_ref()?.steps));
+        let copied = steps.or_else(|| copied_steps(&folder)).unwrap_or(0);
+        CellStatus { done, copied, owner: owner_of(&folder) }
     };
-    let cells = (0..plan.cells.len()).map(of).collect::<InputResult<_>>()?;
+    let cells = (0..plan.cells.len()).map(of).collect();
     Ok((plan, cells))
 }

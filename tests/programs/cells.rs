@@ -143,7 +143,21 @@ fn one_cell_equals_the_plain_run_from_the_same_prior() {
     std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
     cells.done("run city --cell 0");
     says(&cells.done("status city"), &["1 of 1 cells are done"]);
+    scene_of_other_poses_is_refused(&cells);
     another_prior_is_refused(&cells);
+}
+
+/// The photos have the same names, and one camera stands elsewhere.
+fn scene_of_other_poses_is_refused(cells: &Cells) {
+    std::fs::remove_file(cells.0.path("city/cells/0/done.toml")).unwrap();
+    let (file, at) = ("scene/sparse/0/images.bin", 8 + 4 + 4 * 8);
+    let whole = cells.0.bytes(file);
+    let mut moved = whole.clone();
+    moved[at + 6] ^= 1;
+    cells.0.write(file, moved);
+    cells.refuses("run city --cell 0", &["have changed since the city was cut"]);
+    cells.0.write(file, whole);
+    cells.done("run city --cell 0");
 }
 
 /// A prior of as many rows that differ in one bit is another one.
@@ -207,6 +221,14 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
     assert!(!cells.0.exists("city/cells/1/copy/of-1.part"));
     assert!(cells.0.ply(&run_on("two")) == alone, "the scene is another");
     says(&cells.done("merge city --out again"), &[merged.split(": ").nth(1).unwrap()]);
+    // The merge of before the cell was trained again, and one whose PLY is gone.
+    cells.refuses("merge city --out whole", &["trained again since"]);
+    std::fs::remove_file(cells.0.path("again/point_cloud.ply")).unwrap();
+    cells.refuses("merge city --out again", &["without its PLY"]);
+    pages_of_finished_cells_go(&cells);
+    // Another cell's fault hides no cell.
+    cells.0.write("city/cells/0/done.toml", "junk");
+    says(&cells.done("status city"), &["cell 0:", "done.toml", "cell 1:", "2 of 3 cells are done"]);
     // A run of other photos is not measured at the borders of this city.
     write_city(
         &cells.0.path("other"),
@@ -216,6 +238,23 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
     .unwrap();
     cells.0.train("other --out of-other --steps 4 --quiet --device cpu");
     cells.refuses("seam city of-other", &["it is of", "other", "--scene"]);
+}
+
+/// A worker on a drive that never comes back leaves its pages there until the drive has work again.
+fn pages_of_finished_cells_go(cells: &Cells) {
+    std::fs::remove_file(cells.0.path("city/cells/2/done.toml")).unwrap();
+    let committed = || cells.0.has_committed(&format!("{}/run", cells.place("two", 2)));
+    let begun = || cells.0.path("two").read_dir().unwrap().count() == 2 && committed();
+    cells.0.remove("city/cells/2/copy");
+    let worker = cells.begin("run city --cell 2 --commit-every 0.01 --log-every 1 --spill-dir two");
+    assert!(worker.once(begun).kill());
+    let pages = format!("{}/pages", cells.place("two", 2));
+    assert!(cells.0.exists(&pages));
+    std::fs::remove_file(cells.0.path("city/cells/2/lock")).unwrap();
+    cells.done("run city --cell 2");
+    cells.forget(0);
+    cells.done("run city --cell 0 --spill-dir two");
+    assert!(!cells.0.exists(&pages), "pages of a cell that is done");
 }
 
 /// The rows of the ring are those of the prior, bit for bit.
@@ -344,6 +383,43 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     assert!(code != Some(0) && cells.0.exists(&format!("{store}/FORMAT")), "{code:?}: {said}");
     cells.refuses("cut scene --out city --cells 3", &["the city is cut already"]);
     says(&cells.done("cut scene --out city --cells 2"), &["is cut", "2 cells"]);
+}
+
+/// A worker that is killed before its first step marks its folder. The mark is nothing to go on from once another one has copied a commit.
+#[test]
+fn a_cell_whose_worker_was_killed_before_its_first_step_goes_on_from_the_copy() {
+    let cells = Cells::cut(800, "--cells 1");
+    cells.refuses("run city --cell 0 --frames 100", &["--frames", "--spill-dir"]);
+    ["one", "two"].iter().for_each(|drive| std::fs::create_dir(cells.0.path(drive)).unwrap());
+    let marked = || {
+        cells.0.exists("one")
+            && cells
+                .0
+                .path("one")
+                .read_dir()
+                .unwrap()
+                .next()
+                .is_some_and(|place| place.unwrap().path().join("run/.gsscale-begun.toml").exists())
+    };
+    assert!(cells.begin("run city --cell 0 --spill-dir one").once(marked).kill());
+    let mark = format!("{}/run/.gsscale-begun.toml", cells.place("one", 0));
+    std::fs::remove_file(cells.0.path("city/cells/0/lock")).unwrap();
+    let worker = cells.begin("run city --cell 0 --spill-dir two --threads 1 --copy-every 0");
+    worker.once(|| cells.newest(0).is_some()).signal("TERM").signal("TERM").ends(75);
+    let copied = cells.newest(0);
+    assert!(cells.0.exists(&mark), "the first worker left no mark");
+    let worker = cells.begin("run city --cell 0 --spill-dir one --threads 1 --copy-every 0");
+    worker.once(|| cells.newest(0) > copied).signal("TERM").ends(75);
+    assert!(!cells.0.exists(&mark));
+}
+
+/// Without a cap the prior decides the number, and cells of photos as small as its own add none.
+#[test]
+fn a_city_without_a_cap_has_the_count_of_its_prior() {
+    let cells = Cells(Workdir::wide_city(3000));
+    cells.done("prior scene --out city --steps 160 --page-rows 32");
+    cells.done("cut scene --out city --cells 2");
+    assert_eq!(cells.plan()["growth"].as_float(), Some(1.0));
 }
 
 #[test]

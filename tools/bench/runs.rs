@@ -362,7 +362,7 @@ impl Sweep {
             let report = self.evaluate(&mut record, &part)?;
             record.gaussians = report["gaussians"].as_u64().unwrap_or_default();
             let prior: Summary = read_json(&City(folder.clone()).prior_run().join(SUMMARY_FILE), AGAIN)?;
-            let done: Vec<Done> = status(&folder)?.1.into_iter().filter_map(|cell| cell.done).collect();
+            let done: Vec<Done> = status(&folder)?.1.into_iter().filter_map(|cell| cell.done.ok().flatten()).collect();
             record.seconds = prior.train_seconds + done.iter().map(|cell| cell.seconds).sum::<f64>();
             record.trained_gaussians = Some(done.iter().map(|cell| cell.gaussians).sum());
         }

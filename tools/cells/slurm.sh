@@ -4,11 +4,12 @@
 #   bash slurm.sh city runs/city --mem=24G --cpus-per-task=16        flags after the second folder are those of sbatch
 #
 # GSSCALE_FLAGS holds flags for `gsscale-cells run`, such as "--host-mem 20GiB"; SPILL_DIR a folder on a fast drive of each node.
-# A task that is preempted, or comes to its time limit, commits, copies the commit into the city and is queued again; one whose worker is
-# killed, such as for want of memory, is queued again too, ten times in all. What else a machine lacks is tried a hundred times.
+# A task that is preempted, cancelled or comes to its time limit commits, and copies the commit into the city. Slurm queues a preempted task
+# again, this script one that comes to its limit, a hundred times, as one whose machine lacks something; and one whose worker is killed, such as
+# for want of memory, ten times.
 #SBATCH --job-name=gsscale-cells
 #SBATCH --requeue
-#SBATCH --signal=B:TERM@120
+#SBATCH --signal=B:USR1@120
 #SBATCH --open-mode=append
 set -u
 
@@ -27,14 +28,17 @@ fi
 # shellcheck disable=SC2086
 gsscale-cells run "$CITY" --cell "$SLURM_ARRAY_TASK_ID" --quiet ${SPILL_DIR:+--spill-dir "$SPILL_DIR"} ${GSSCALE_FLAGS:-} &
 worker=$!
-trap 'kill -TERM $worker' TERM
+# Before the time limit the script alone is warned.
+cancelled=
+trap 'kill -TERM $worker' USR1
+trap 'cancelled=1; kill -TERM $worker 2> /dev/null' TERM
+# A wait ends with a signal, the last one with the worker.
+while kill -0 $worker 2> /dev/null; do
+    wait $worker
+done
 wait $worker
 code=$?
-# The first wait ends with the signal, the second with the commit.
-if [ $code -gt 128 ]; then
-    wait $worker
-    code=$?
-fi
+[ -z "$cancelled" ] || exit $code
 attempts=0
 [ $code -eq 75 ] && attempts=100
 [ $code -gt 128 ] && attempts=10

@@ -1,6 +1,7 @@
 #!/bin/bash
 # Runs the cells of a small generated city by the shell loop, on a Ray cluster of two nodes and on a Slurm of two nodes, all in this machine,
-# the last two with a worker that is killed, and compares the merged scenes byte for byte:
+# the last two with a worker that is killed, and compares the merged scenes byte for byte. Then Slurm queues a running task again and cancels
+# another, which must leave a copy of their last step, and no owner:
 #
 #   cargo build --release && PATH="$PWD/target/release:$PATH" bash tools/cells/try_engines.sh
 #
@@ -126,3 +127,30 @@ while [ -n "$(squeue --noheader)" ]; do
     sleep 0.5
 done
 end_engine slurm
+
+# A cell of five times the steps, so that its tasks run when they are signalled.
+gsscale-cells prior scene --out long --steps 3000 --max-gaussians 4000 --page-rows 32 --device cpu --quiet > long-city.log
+gsscale-cells cut scene --out long --cells 2 --device cpu --quiet >> long-city.log
+GSSCALE_FLAGS="--device cpu --threads 1 --commit-every 0.05 --copy-every 1000" SPILL_DIR=$work/slurm-nvme \
+    bash "$tools/slurm.sh" "$work/long" "$work/long-whole" > long.log
+job=$(sed -n 's/^Submitted batch job //p' long.log)
+job=$((job - 1))
+until [ "$(squeue --noheader --states=R | wc -l)" = 2 ] && [ -f long/cells/0/lock ] && [ -f long/cells/1/lock ]; do sleep 0.2; done
+sleep 1
+scontrol requeue "${job}_0"
+scancel "${job}_1"
+until [ "$(squeue --noheader --states=R,CG | wc -l)" = 0 ]; do sleep 0.2; done
+for cell in 0 1; do
+    if [ -f "long/cells/$cell/lock" ] || [ -z "$(ls "long/cells/$cell/copy" 2> /dev/null)" ]; then
+        echo "slurm: the task of cell $cell left an owner, or no copy" >&2
+        gsscale-cells status long >&2
+        exit 1
+    fi
+done
+left=$(squeue --noheader --array --format='%F_%K' | grep "^${job}_" || true)
+if [ "$left" != "${job}_0" ]; then
+    echo "slurm: of the tasks ${job}_0, which is queued again, and ${job}_1, which was cancelled, these are left: $left" >&2
+    exit 1
+fi
+scancel "$job"
+echo "slurm: tasks that are queued again and cancelled leave their copies"

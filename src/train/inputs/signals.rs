@@ -1,5 +1,6 @@
-//! Signals: the first Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) asks the loop to stop after its step, the second ends
-//! the process at once. The flag is one for the whole process: a signal between two runs stops the second. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
+//! Signals: Ctrl-C, SIGTERM or SIGHUP (the terminal is gone) asks the loop to stop after its step. Ctrl-C after that ends the process at
+//! once. Another SIGTERM does not: schedulers send it to a whole job, whose script forwards it. The flag is one for the whole process: a signal
+//! between two runs stops the second. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
 //! size limit) is ignored.
 
 use signal_hook::consts::{SIGINT, SIGTERM};
@@ -26,8 +27,8 @@ pub struct StopFlag {
 }
 
 impl StopFlag {
-    /// The flag of this process; installs the handlers when first called. A second signal ends the process with exit code 129, 130
-    /// or 143.
+    /// The flag of this process; installs the handlers when first called. Ctrl-C behind another signal ends the process with exit
+    /// code 130.
     /// Errors: the system refused a handler.
     pub fn listen() -> std::io::Result<StopFlag> {
         static OF_PROCESS: Mutex<Option<StopFlag>> = Mutex::new(None);
@@ -39,14 +40,14 @@ impl StopFlag {
     fn install() -> std::io::Result<StopFlag> {
         let flag = StopFlag::default();
         #[cfg_attr(not(unix), expect(unused_mut))]
-        let mut signals = vec![(SIGINT, 130), (SIGTERM, 143)];
+        let mut signals = vec![SIGINT, SIGTERM];
         #[cfg(unix)]
         if !is_ignored(signal_hook::consts::SIGHUP) {
-            signals.push((signal_hook::consts::SIGHUP, 129));
+            signals.push(signal_hook::consts::SIGHUP);
         }
-        for (signal, code) in signals {
-            // Register this handler first, so that it sees the flag of an earlier signal, not its own.
-            signal_hook::flag::register_conditional_shutdown(signal, code, Arc::clone(&flag.asked))?;
+        // First, so that the handler sees the flag of an earlier signal, not its own.
+        signal_hook::flag::register_conditional_shutdown(SIGINT, 130, Arc::clone(&flag.asked))?;
+        for signal in signals {
             signal_hook::flag::register(signal, Arc::clone(&flag.asked))?;
             signal_hook::flag::register_usize(signal, Arc::clone(&flag.signal), signal as usize)?;
         }

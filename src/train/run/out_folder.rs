@@ -429,8 +429,8 @@ pub(super) fn write_mark(request: &RunRequest) -> InputResult<()> {
     write_whole(&path, format!("{config}\n{facts}").as_bytes())
 }
 
-/// Removes the mark of a run that has a config.toml now. One that stays is ignored.
-pub(super) fn remove_mark(out: &Path) {
+/// Removes the mark of a run that has a config.toml or a commit now. One that stays is ignored.
+pub(crate) fn remove_mark(out: &Path) {
     let _ = std::fs::remove_file(out.join(BEGUN_FILE));
 }
 
