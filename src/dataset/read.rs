@@ -64,7 +64,13 @@ fn read_kind(path: &Path, is_file: bool, options: &ReadOptions) -> InputResult<R
         };
     }
     if let Some((_, read)) = READERS.iter().find(|(knows, _)| knows(path)) {
-        return read(path, options);
+        let mut scene = read(path, options)?;
+        let is_colmap = colmap::looks_like_colmap(path) || colmap::parts::looks_like_parts(path);
+        if is_colmap && transforms::looks_like_transforms(path) {
+            let what = "transforms.json is not read, nor its split and its masks, because there is a COLMAP model";
+            scene.warnings.push(format!("{}: {what}: name the file itself to train on it", path.display()));
+        }
+        return Ok(scene);
     }
     if let Err(e) = std::fs::metadata(path)
         .and_then(|found| if found.is_dir() { std::fs::read_dir(path).map(|_| ()) } else { Ok(()) })

@@ -9,6 +9,7 @@
 use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::{TextReader, shown};
+use crate::dataset::loose_json::is_no_number;
 use crate::dataset::model::TakePoint;
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
@@ -124,10 +125,18 @@ impl<'a> LineWords<'a> {
         word.parse().map_err(|_| self.lines.error(format!("{what} is {:?}, which is not a valid number", shown(word))))
     }
 
+    /// NaN for what programs write that have no number, such as `-nan(ind)`.
+    fn number_or_none(&mut self, what: &str) -> InputResult<f64> {
+        match self.rest.split_ascii_whitespace().next() {
+            Some(word) if is_no_number(word) => self.next(what).map(|_| f64::NAN),
+            _ => self.number(what),
+        }
+    }
+
     fn numbers<const N: usize>(&mut self, what: &str) -> InputResult<[f64; N]> {
         let mut values = [0.0; N];
         for value in &mut values {
-            *value = self.number(what)?;
+            *value = self.number_or_none(what)?;
         }
         Ok(values)
     }
@@ -209,7 +218,7 @@ pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut Ta
         let _: u64 = words.number("the point's number")?;
         let position = words.numbers("a coordinate")?;
         let color = [words.number("red")?, words.number("green")?, words.number("blue")?];
-        let _: f64 = words.number("the reprojection error")?;
+        words.number_or_none("the reprojection error")?;
         tally.add(position, color, lines.line, take)?;
     }
     lines.finish("points", tally.total, warnings);

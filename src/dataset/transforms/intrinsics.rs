@@ -42,6 +42,12 @@ impl<'a> Levels<'a> {
         Ok(side("w")?.zip(side("h")?))
     }
 
+    /// Whether a focal length or the principal point is in pixels.
+    pub fn has_pixels(&self) -> bool {
+        let keys = ["fl_x", "fl_y", "cx", "cy"];
+        keys.iter().any(|key| self.frame.get(key).is_some() || self.top.get(key).is_some())
+    }
+
     fn focal_at(&self, node: &JsonNode<'_>, focal: &str, angle: &str, side: u64) -> InputResult<Option<f64>> {
         if let Some(f) = node.number(focal)? {
             return Ok(Some(f));

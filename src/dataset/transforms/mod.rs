@@ -171,7 +171,7 @@ impl Reading<'_> {
         };
         let size = match levels.size()? {
             Some(size) => size,
-            None if photo.exists => read_size(&photo.path)?,
+            None if photo.exists => self.size_of_pixels(folder, levels, (key, &stated), &photo.path)?,
             None => {
                 self.gathered.missing.push(photo.name);
                 return Ok(());
@@ -185,6 +185,26 @@ impl Reading<'_> {
         let Photo { name, path: image_path, .. } = photo;
         self.gathered.views.push(RawView { name, image_path, intrinsics, pose, mask_path, split });
         Ok(())
+    }
+
+    /// The size to which the pixels of a frame without `w` and `h` refer: that of the photo that the frame names, though `--images` may
+    /// choose a smaller one (`photo`).
+    /// Errors: the named photo is not there, and its size matters.
+    fn size_of_pixels(
+        &self,
+        folder: &Path,
+        levels: &Levels<'_>,
+        (key, stated): (&str, &str),
+        photo: &Path,
+    ) -> InputResult<(u64, u64)> {
+        let named = file_inside(folder, stated).ok().map(|(_, named)| named).filter(|named| named.is_file());
+        let is_replaced = self.gathered.options.images.as_deref().is_some_and(|images| images != "images");
+        if named.is_none() && is_replaced && levels.has_pixels() {
+            let problem =
+                format!("w and h are missing, and the focal length is in pixels of {stated:?}, which is not here");
+            return Err(levels.frame.error(key, problem, "add w and h, or leave out --images"));
+        }
+        read_size(named.as_deref().unwrap_or(photo))
     }
 }
 
@@ -210,7 +230,7 @@ fn prescribed(json: &JsonFile) -> InputResult<Option<PrescribedNames<'_>>> {
         Names::Bad(problem, remedy) => Err(json.top().error(LISTS[list], problem, remedy)),
     };
     let Some(train) = names(0)? else { return Ok(None) };
-    let held_out = match names(2)? {
+    let held_out = match names(2)?.filter(|test| !test.is_empty()) {
         Some(test) => Some(test),
         None => names(1)?,
     };

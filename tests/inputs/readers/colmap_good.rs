@@ -174,6 +174,30 @@ fn text_files_from_other_systems_are_read() {
     assert_eq!((found.views.len(), found.points.positions.len(), found.warnings.len()), (4, 3, 0));
 }
 
+/// As programs built by Microsoft's compiler write it.
+#[test]
+fn what_is_no_number_in_a_text_file_costs_its_record_alone() {
+    let mut m = model(200);
+    m.points[3].position[1] = f64::NAN;
+    m.images[3].translation[0] = f64::NAN;
+    let (scene, folder) = scene_with(&m, false);
+    let points = m.points_txt().replace("NaN", "-nan(ind)").replacen(" 0.7", " 1.#QNAN", 1);
+    fs::write(folder.join("points3D.txt"), points).unwrap();
+    fs::write(folder.join("images.txt"), m.images_txt().replace("NaN", "-nan(ind)")).unwrap();
+    let found = read(scene.path());
+    assert_eq!((found.views.len(), found.points.positions.len()), (3, 199));
+    warned(&found, &["images.txt", "1 view left out"]);
+}
+
+/// Nerfstudio's folders have both.
+#[test]
+fn a_transforms_json_beside_a_model_is_named() {
+    let (scene, _) = scene_with(&model(2), false);
+    fs::write(scene.path().join("transforms.json"), "{}").unwrap();
+    let found = read_scene(scene.path(), &ReadOptions::default()).unwrap();
+    warned(&found, &["transforms.json is not read", "COLMAP"]);
+}
+
 #[test]
 fn a_text_file_shorter_than_its_comment_says_is_warned_about() {
     let m = model(5);

@@ -145,6 +145,9 @@ fn lists_of_file_names_prescribe_the_split() {
     top.as_object_mut().unwrap().remove("test_filenames");
     let folder = scene(top.clone(), frames.clone());
     assert_eq!(read(folder.path()).views[2].split, test);
+    // An empty list is none.
+    top["test_filenames"] = json!([]);
+    assert_eq!(read(scene(top.clone(), frames.clone()).path()).views[2].split, test);
     top["val_filenames"] = json!(["images/a.png"]);
     let folder = scene(top, frames);
     refused(read_transforms(folder.path(), &ReadOptions::default()), "transforms.json", &["train_filenames", "a.png"]);
@@ -190,6 +193,24 @@ fn photos_are_found_in_another_image_folder() {
     let views = read_transforms(folder.path(), &options).unwrap().views;
     let found: Vec<_> = views.iter().map(|v| (v.name.as_str(), v.intrinsics.width)).collect();
     assert_eq!(found, [("d.png", 8), ("r/c.png", 16)]);
+}
+
+/// Numbers in pixels are of the photo that a frame names, whatever smaller one is trained on.
+#[test]
+fn without_a_stated_size_pixels_are_of_the_named_photo() {
+    let folder = scene(json!({"fl_x": 80.0, "cx": 48.0}), vec![frame("images/a.png")]);
+    png(&folder.path().join("images_2/a.png"), 48, 32);
+    let smaller = ReadOptions { images: Some("images_2".into()), ..ReadOptions::default() };
+    refused(read_transforms(folder.path(), &smaller), "transforms.json", &["a.png", "w and h", "--images"]);
+    png(&folder.path().join("images/a.png"), 96, 64);
+    let found = read_scene(folder.path(), &smaller).unwrap();
+    let k = found.views[0].intrinsics;
+    assert_eq!((k.width, k.height, k.fx, k.cx), (96, 64, 80.0, 48.0));
+    assert_eq!(found.views[0].image_path, folder.path().join("images_2/a.png"));
+    // An angle holds for any size.
+    fs::remove_file(folder.path().join("images/a.png")).unwrap();
+    write(folder.path(), "transforms.json", json!({"camera_angle_x": 1.0}), vec![frame("images/a.png")]);
+    assert_eq!(read_scene(folder.path(), &smaller).unwrap().views[0].intrinsics.width, 48);
 }
 
 #[test]
