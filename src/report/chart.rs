@@ -228,7 +228,8 @@ impl Chart {
             draw_series(&mut chart, series, !self.is_wide)?;
         }
         self.draw_labels(root, &chart)?;
-        if !self.is_wide && self.series.iter().any(|s| !s.name.is_empty()) {
+        // The title tells what a single series is.
+        if !self.is_wide && self.series.iter().filter(|s| !s.name.is_empty()).count() > 1 {
             let mut legend = chart.configure_series_labels();
             legend
                 .position(SeriesLabelPosition::LowerRight)

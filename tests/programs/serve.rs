@@ -144,7 +144,7 @@ fn a_finished_run_is_shown_beside_its_photos() {
     );
     let held_out = work.json_of(EVAL, "out");
     let before = work.files("out");
-    let mut first: Option<image::RgbImage> = None;
+    let (mut first, mut sessions): (Option<image::RgbImage>, _) = (None, std::collections::BTreeSet::new());
     let paged = "out --spill-dir spill --host-mem 200MiB --page-rows 32";
     for flags in ["out", "out/point_cloud_sog/lod-meta.json", "out/checkpoint", paged] {
         let served = serve(&work, VIEW, &format!("{flags} --device cpu"));
@@ -190,6 +190,12 @@ fn a_finished_run_is_shown_beside_its_photos() {
         }
         let heat = served.picture("view=2&turn=40&show=error");
         assert!(heat.dimensions() == differs.dimensions() && heat != differs);
+        // As narrow as was asked for, too.
+        for show in ["photo", "difference", "error"] {
+            assert_eq!(served.picture(&format!("view=2&width=32&show={show}")).dimensions(), (32, 24), "{show}");
+        }
+        let session = served.json("/status")["session"].as_str().unwrap().to_string();
+        assert!(session.len() == 32 && sessions.insert(session), "a session of each server");
         let depth = served.picture("view=2&width=64&show=depth");
         let grey = |pixel: &image::Rgb<u8>| pixel.0.iter().all(|value| value.abs_diff(pixel.0[0]) <= 1);
         assert!(depth.pixels().all(grey) && depth.pixels().any(|pixel| pixel != depth.get_pixel(0, 0)));

@@ -12,6 +12,7 @@
 mod server;
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::draw_identity;
 use serde::{Deserialize, Serialize};
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -95,6 +96,8 @@ impl Orbit {
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct Status {
+    /// Of the program that serves the page; another one may serve the same address later.
+    pub session: String,
     /// Name of the scene.
     pub name: String,
     /// Whether the scene is still trained.
@@ -158,7 +161,8 @@ impl Live {
         let listener = std::net::TcpListener::bind(address).map_err(fail)?;
         listener.set_nonblocking(true).map_err(fail)?;
         let address = listener.local_addr().map_err(fail)?;
-        let live = Live(Arc::new(Shared { address, state: Mutex::default() }));
+        let status = Status { session: format!("{:032x}", draw_identity()), ..Status::default() };
+        let live = Live(Arc::new(Shared { address, state: Mutex::new(State { status, ..State::default() }) }));
         let started = server::spawn(live.clone(), listener);
         started
             .map_err(|e| InputError::new("--serve", format!("the server cannot start: {e}"), "leave --serve out"))?;
@@ -177,8 +181,11 @@ impl Live {
         self.state().metrics = Some(metrics);
     }
 
+    /// The session is this server's own.
     pub fn set_status(&self, status: Status) {
-        self.state().status = status;
+        let mut state = self.state();
+        let session = std::mem::take(&mut state.status.session);
+        state.status = Status { session, ..status };
     }
 
     /// The oldest request that is not answered yet.

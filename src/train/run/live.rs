@@ -55,7 +55,8 @@ impl LivePage {
 
     /// Reports the progress to the page, and draws the picture that the page requests.
     pub(super) fn show(&mut self, trainer: &mut Trainer, dataset: &Dataset, targets: &TargetCache, psnr: f64) {
-        if self.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
+        let is_last = trainer.steps_done() == trainer.options.steps;
+        if is_last || self.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
             self.told = Some(Instant::now());
             let overview = *self.overview.get_or_insert_with(|| overview(&trainer.scene, dataset));
             self.live.set_status(Status {

@@ -6,6 +6,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::png_rows::write_rgb_rows;
 use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
+use crate::dataset::resize::{AreaResizer, Size};
 use crate::dataset::target_cache::TargetCache;
 use crate::report::live::{Orbit, Picture, PictureKind};
 use crate::scene::camera::Camera;
@@ -26,7 +27,7 @@ const HEAT: [[f32; 3]; 5] = [[0.0; 3], [0.1, 0.1, 0.7], [0.85, 0.15, 0.1], [1.0,
 /// Most views that are looked at for an overview.
 const OVERVIEWS_MOST: usize = 64;
 
-/// What an orbit shows of the scene after the last step, as PNG. A photo and its difference have the size of the training photo.
+/// What an orbit shows of the scene after the last step, as PNG, at most as wide as the orbit asks and as the training photo.
 pub(super) fn picture(trainer: &mut Trainer, dataset: &Dataset, targets: &TargetCache, orbit: Orbit) -> Picture {
     let drawn = draw_orbit(trainer, dataset, targets, orbit);
     let image = drawn.map_err(|error| format!("the picture cannot be drawn: {error}"))?;
@@ -43,8 +44,12 @@ fn draw_orbit(
     let views = dataset.train_views();
     let view = views[orbit.view as usize % views.len().max(1)];
     let base = dataset.views[view].camera;
+    let narrow = narrowed(&base, orbit.width);
     let photo = match orbit.show {
-        PictureKind::Photo | PictureKind::Difference | PictureKind::Error => Some(targets.get(view)?),
+        PictureKind::Photo | PictureKind::Difference | PictureKind::Error => {
+            let photo = targets.get(view)?;
+            Some(resized(&photo, (narrow.width, narrow.height)))
+        }
         PictureKind::Scene | PictureKind::Depth => None,
     };
     if let (PictureKind::Photo, Some(photo)) = (orbit.show, &photo) {
@@ -53,7 +58,7 @@ fn draw_orbit(
         return Ok(image);
     }
     let pivot = median_depth(&trainer.scene, &base).unwrap_or(dataset.scene_scale);
-    let camera = if photo.is_some() { base } else { orbit_camera(&base, pivot, trainer.options.up, orbit) };
+    let camera = if photo.is_some() { narrow } else { orbit_camera(&base, pivot, trainer.options.up, orbit) };
     check_picture(trainer, &camera)?;
     trainer.run_memory().fit_frames_to_picture(&camera);
     let render = trainer.render_options();
@@ -158,18 +163,29 @@ fn orbit_camera(base: &Camera, pivot: f32, up: Option<[f64; 3]>, orbit: Orbit) -
     let centre = pivot_point - orbit.distance * pivot * (turn * forward);
     let axes = [right, down, forward].map(|axis| turn * axis);
     let viewmat = axes.map(|axis| [axis.x, axis.y, axis.z, -axis.dot(centre)]);
-    let scale = (orbit.width as f32 / base.width as f32).min(1.0);
+    Camera { viewmat, ..narrowed(base, orbit.width) }
+}
+
+/// The camera with a picture of at most `width` pixels across.
+fn narrowed(camera: &Camera, width: u32) -> Camera {
+    let scale = (width as f32 / camera.width as f32).min(1.0);
     let side = |pixels: u32| ((pixels as f32 * scale).round() as u32).max(1);
     Camera {
-        viewmat,
-        fx: base.fx * scale,
-        fy: base.fy * scale,
-        cx: base.cx * scale,
-        cy: base.cy * scale,
-        width: side(base.width),
-        height: side(base.height),
-        ..*base
+        fx: camera.fx * scale,
+        fy: camera.fy * scale,
+        cx: camera.cx * scale,
+        cy: camera.cy * scale,
+        width: side(camera.width),
+        height: side(camera.height),
+        ..*camera
     }
+}
+
+/// The photo with fewer pixels, without its mask.
+fn resized(photo: &Target, size: Size) -> Target {
+    let mut resizer = AreaResizer::new(3, (photo.width, photo.height), size, 1);
+    photo.rgb.chunks_exact(3 * photo.width as usize).for_each(|row| resizer.push_row(row));
+    Target::new([size.0, size.1], resizer.finish())
 }
 
 fn png(image: &Image) -> std::io::Result<Vec<u8>> {
@@ -234,8 +250,8 @@ mod tests {
         });
         let moved: Vec<f32> = shifted.iter().zip(still_centre).map(|(a, b)| a - b).collect();
         assert!(moved.iter().zip([2.0, 0.0, 4.0]).all(|(is, want)| (is - want).abs() < 1e-4), "{moved:?}");
-        // A turn to the right by a quarter, seen from above: the camera stands left of the pivot and looks along +x.
+        // A quarter turn to the left, seen from above: the camera stands right of the pivot and looks along -x.
         let camera = orbit_camera(&base(), 4.0, Some([0.0, -1.0, 0.0]), Orbit { turn: 90.0, ..still });
-        assert!((camera.viewmat[2][0].abs() - 1.0).abs() < 1e-5, "{camera:?}");
+        assert!((camera.viewmat[2][0] + 1.0).abs() < 1e-5 && camera.centre()[0] > 6.9, "{camera:?}");
     }
 }

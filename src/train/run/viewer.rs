@@ -22,7 +22,7 @@ use crate::optim::method::OptimizerPlace;
 use crate::page::folder::measure::DriveRate;
 use crate::page::tool::uncommitted::check_usable;
 use crate::photos::exposure::AppearanceMode;
-use crate::report::live::{Live, PictureKind, Status};
+use crate::report::live::{Live, PictureKind, Status, WIDTH_MOST};
 use crate::report::run_files::{METRICS_FILE, saved_ply_name, saved_step};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine;
@@ -63,6 +63,8 @@ pub fn config_to_show(config: TrainConfig, gaussians: &Path, spill_dir: Option<S
         steps: 1,
         frames: 0,
         max_gaussians: 0,
+        // No picture is wider.
+        max_resolution: if config.max_resolution == 0 { WIDTH_MOST } else { config.max_resolution.min(WIDTH_MOST) },
         keep_checkpoint: false,
         commit_every: CommitEvery::Seconds(0.0),
         strategy: StrategyName::None,
@@ -166,7 +168,8 @@ pub fn show(request: &ShowRequest) -> Result<(), TrainError> {
             match ShownScene::open(request, orbit.step, true) {
                 Ok(opened) => shown = Some(opened),
                 Err(error) => {
-                    live.show((ticket, orbit), Err(format!("step {} cannot be shown: {error}", orbit.step)));
+                    let what = if orbit.step == 0 { "the result".into() } else { format!("step {}", orbit.step) };
+                    live.show((ticket, orbit), Err(format!("{what} cannot be shown: {error}")));
                     continue;
                 }
             }
