@@ -15,6 +15,7 @@ use gsscale::page::format::slot_header::StoredAs;
 use gsscale::page::map::commit::CommitError;
 use gsscale::page::map::entries::MapError;
 use gsscale::train::error::TrainError;
+use gsscale::train::inputs::machine::absolute;
 use gsscale::train::stores::{
     ExportRequest, GenerationLine, ImportRequest, Inspected, PageInspected, PruneRequest, Pruned, RolledBack,
     SalvageRequest, Salvaged, StoreFault, ValueSpread, Verdict, clone_store, export, find_store, import, inspect,
@@ -322,11 +323,15 @@ fn verify_text(verdict: &Verdict, args: &Verify) -> String {
         0 => format!("intact according to all headers: {what}; --deep reads the pages"),
         n => {
             let dir = shell_word(&args.dir);
-            format!(
-                "{n} faults: {what}\n\
-                 remedy: roll back to a generation without them (gsscale-ckpt rollback {dir} GEN), or recover the intact pages\n\
-                 (gsscale-ckpt salvage {dir} --out TO)"
-            )
+            let salvage = format!("recover the intact pages (gsscale-ckpt salvage {dir} --out TO)");
+            match verdict.faults.iter().any(|fault| fault.kind == "map") {
+                // No generation can be read.
+                true => format!("{n} faults: {what}\nremedy: {salvage}"),
+                false => format!(
+                    "{n} faults: {what}\n\
+                     remedy: roll back to a generation without them (gsscale-ckpt rollback {dir} GEN), or {salvage}"
+                ),
+            }
         }
     };
     text
@@ -616,7 +621,7 @@ fn run_clone(args: &Clone) -> Result<ExitCode, TrainError> {
             done.generations.len(),
             done.versions,
             format_bytes(done.bytes_read),
-            shell_word(&done.to),
+            shell_word(absolute(&done.to)),
         )
     })
 }

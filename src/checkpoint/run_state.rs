@@ -14,9 +14,10 @@ use crate::densify::growth::GrowthState;
 use crate::page::format::encoding::{self, EncodingError};
 use crate::paging::stats::PagerStats;
 use crate::photos;
-use crate::photos::parameter::{SavedValues, ValuesError};
+use crate::photos::parameter::{PastViews, SavedValues, ValuesError};
 use crate::scene::events::{Event, EventKind, EventLog};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// Version of the layout below.
 pub const VERSION: u32 = 12;
@@ -45,6 +46,18 @@ pub struct DatasetPrint {
     pub origin: [f64; 3],
     /// World length of one local unit.
     pub scale: f64,
+}
+
+impl DatasetPrint {
+    /// Where each view lies in the dataset of before: as the view of the same name and pose, or else of the same photo.
+    pub fn past_views(&self, before: &DatasetPrint) -> PastViews {
+        let at = |digest: fn(&ViewPrint) -> u64| -> BTreeMap<u64, usize> {
+            before.views.iter().enumerate().map(|(at, view)| (digest(view), at)).collect()
+        };
+        let (of_pose, of_photo) = (at(|view| view.pose), at(|view| view.photo));
+        let past = |view: &ViewPrint| of_pose.get(&view.pose).or_else(|| of_photo.get(&view.photo)).copied();
+        PastViews(self.views.iter().map(past).collect())
+    }
 }
 
 /// The last evaluation on the held-out views.

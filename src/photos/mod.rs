@@ -21,12 +21,14 @@ pub mod parameter;
 pub mod pose;
 mod visible;
 
+use crate::base::error::{InputError, InputResult};
 use crate::dataset::loader::Dataset;
 use crate::page::format::encoding::EncodingError;
 use crate::scene::camera::Camera;
 use exposure::{AppearanceMode, GivenValues};
 use outlier::blocks::BlockMasks;
-use parameter::{Kind, PhotoParameter, SavedValues, ValuesError};
+use parameter::{Kind, PastViews, PhotoParameter, SavedValues, ValuesError};
+use std::path::Path;
 
 /// What the user asked for, and what the kinds need of the other options of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,10 +70,10 @@ pub fn save(parameters: &PhotoParameters) -> Result<SavedValues, EncodingError> 
     parameters.iter().map(|parameter| Ok((parameter.name().to_string(), parameter.save()?))).collect()
 }
 
-/// Restores saved values. Values that are missing, or of other photos, stay as at a start. Errors: as [`check`].
-pub fn restore(parameters: &mut PhotoParameters, saved: &SavedValues) -> Result<(), ValuesError> {
+/// Restores saved values. Values that are missing stay as at a start, and so do those of photos that are new. Errors: as [`check`].
+pub fn restore(parameters: &mut PhotoParameters, saved: &SavedValues, past: &PastViews) -> Result<(), ValuesError> {
     let saved_of = |name: &str| saved.get(name);
-    parameters.iter_mut().try_for_each(|p| saved_of(p.name()).map_or(Ok(()), |bytes| p.restore(bytes)))
+    parameters.iter_mut().try_for_each(|p| saved_of(p.name()).map_or(Ok(()), |bytes| p.restore(bytes, past)))
 }
 
 /// Checks values from a file.
@@ -81,6 +83,19 @@ pub fn check(saved: &SavedValues) -> Result<(), ValuesError> {
         Some(kind) => (kind.check)(bytes),
         None => Err(ValuesError::Impossible("it has values of photos of a kind that this program does not know")),
     })
+}
+
+/// Writes the values into the folder of a run, for people and other programs. Files of kinds that are off by now are those of earlier steps,
+/// and are removed.
+/// Errors: the folder cannot be written.
+pub fn write_files(parameters: &PhotoParameters, folder: &Path, dataset: &Dataset) -> InputResult<()> {
+    let is_off = |kind: &&Kind| parameters.iter().all(|parameter| parameter.name() != kind.name);
+    for file in KINDS.iter().filter(is_off).filter_map(|kind| kind.file).map(|name| folder.join(name)) {
+        if file.is_file() {
+            std::fs::remove_file(&file).map_err(|e| InputError::io(&file, "removing what earlier steps wrote", &e))?;
+        }
+    }
+    parameters.iter().try_for_each(|parameter| parameter.write_file(folder, dataset))
 }
 
 /// The files that kinds write into the folder of a run.

@@ -125,7 +125,7 @@ pub trait PhotoParameter {
     fn save(&self) -> Result<Encoded, EncodingError>;
 
     /// Restores saved values, unless they are of another number of photos. Errors: no run can have written the values.
-    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError>;
+    fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError>;
 
     /// Sets start values from the dataset, unless values were restored. Returns warnings for the user.
     fn start(&mut self, _: &Dataset) -> Vec<String> {
@@ -279,20 +279,21 @@ impl Encoded {
         check(&values).map_err(ValuesError::Impossible)?;
         Ok(values)
     }
+}
 
-    /// As [`Encoded::decoded`], in place of `values`, unless they are of another number of photos.
-    /// Errors: as [`Encoded::decoded`].
-    pub fn restore<T: DeserializeOwned>(
-        &self,
-        values: &mut T,
-        check: impl Fn(&T) -> Result<(), &'static str>,
-        has_same_counts: impl Fn(&T, &T) -> bool,
-    ) -> Result<(), ValuesError> {
-        let saved = self.decoded(check)?;
-        if has_same_counts(&saved, values) {
-            *values = saved;
-        }
-        Ok(())
+/// Where the values of each photo lie among those that were saved: by view of the dataset now, `None` for a photo that is new.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PastViews(pub Vec<Option<usize>>);
+
+impl PastViews {
+    /// Of photos that are the same as then.
+    pub fn same(views: usize) -> PastViews {
+        PastViews((0..views).map(Some).collect())
+    }
+
+    /// The saved values in the order of the views now; those of a start for photos that are new.
+    pub fn of<T: Clone + Default>(&self, saved: &[T]) -> Vec<T> {
+        self.0.iter().map(|at| at.and_then(|at| saved.get(at)).cloned().unwrap_or_default()).collect()
     }
 }
 

@@ -17,7 +17,8 @@
 
 use super::PhotoOptions;
 use super::parameter::{
-    Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError, views_by_name, write_values,
+    Encoded, Finding, Kind, PastViews, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError, views_by_name,
+    write_values,
 };
 use crate::base::error::InputResult;
 use crate::dataset::loader::Dataset;
@@ -193,7 +194,13 @@ fn bounded(values: [f64; 6]) -> [f64; 6] {
 impl PoseState {
     /// The motions of a run that has seen nothing: none.
     pub fn new(views: usize) -> PoseState {
-        PoseState { views: vec![ViewPose::default(); views], ..PoseState::default() }
+        PoseState::of_views(vec![ViewPose::default(); views])
+    }
+
+    fn of_views(views: Vec<ViewPose>) -> PoseState {
+        let seen = || views.iter().filter(|pose| pose.sightings > 0);
+        let sums = std::array::from_fn(|k| seen().map(|pose| pose.values[k]).sum());
+        PoseState { sums, seen: seen().count() as u32, views }
     }
 
     fn acting(&self, view: usize) -> [f64; 6] {
@@ -247,9 +254,8 @@ impl PoseState {
         if !self.views.iter().all(is_stored) {
             return Err("the motion of a photo is out of bounds");
         }
-        let seen = || self.views.iter().filter(|pose| pose.sightings > 0);
-        let sums: [i64; 6] = std::array::from_fn(|k| seen().map(|pose| pose.values[k]).sum());
-        if self.sums != sums || self.seen as usize != seen().count() {
+        let PoseState { sums, seen, .. } = PoseState::of_views(self.views.clone());
+        if (self.sums, self.seen) != (sums, seen) {
             return Err("the sums of its motions are not those of its photos");
         }
         let is_moment = |pose: &ViewPose| {
@@ -299,8 +305,9 @@ impl PhotoParameter for Poses {
         Encoded::of(&self.state)
     }
 
-    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, PoseState::check, |a, b| a.views.len() == b.views.len())
+    fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError> {
+        self.state = PoseState::of_views(past.of(&saved.decoded(PoseState::check)?.views));
+        Ok(())
     }
 
     fn camera(&self, view: usize, camera: Camera) -> Camera {

@@ -339,7 +339,10 @@ impl Sweep {
             return Ok(Value::Null);
         }
         let report: Value = read_json(&json, AGAIN)?;
-        (record.psnr, record.ssim) = (report["test"]["psnr"].as_f64(), report["test"]["ssim"].as_f64());
+        let test = &report["test"];
+        (record.psnr, record.ssim) = (test["psnr"].as_f64(), test["ssim"].as_f64());
+        record.cc_psnr = test["color_corrected"]["cc_psnr"].as_f64();
+        record.predicted_psnr = test["predicted"]["predicted_psnr"].as_f64();
         Ok(report)
     }
 

@@ -250,7 +250,7 @@ fn in_use(folder: &Path, who: &str) -> InputError {
     InputError::new(
         folder,
         problem,
-        "wait for it to end, or stop it (Ctrl-C commits first); ls and diff work meanwhile",
+        "wait for it to end, or stop it (Ctrl-C commits first); ls and inspect work meanwhile",
     )
 }
 

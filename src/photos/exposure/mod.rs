@@ -23,8 +23,8 @@ pub mod state;
 use super::PhotoOptions;
 use super::outlier::spread;
 use super::parameter::{
-    Correction, Curve, Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError, views_by_name,
-    write_values,
+    Correction, Curve, Encoded, Finding, Kind, PastViews, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
+    views_by_name, write_values,
 };
 use crate::base::error::{InputError, InputResult};
 use crate::base::names::names;
@@ -173,11 +173,13 @@ impl PhotoParameter for Appearance {
         Encoded::of(&(&self.state, self.first_exposures, self.steps))
     }
 
-    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
+    fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError> {
         let (state, first_exposures, steps) = decoded(saved)?;
-        if state.has_same_counts(&self.state) || (self.judged_after.is_some() && state.images.is_empty()) {
-            (self.state, self.first_exposures, self.steps) = (state, first_exposures, steps);
-            self.is_restored = true;
+        // A run that has dropped its exposures has none.
+        let is_dropped = state.images.is_empty();
+        if !is_dropped || self.judged_after.is_some() {
+            self.state = if is_dropped { state } else { state.of_views(past, self.state.cameras.len()) };
+            (self.first_exposures, self.steps, self.is_restored) = (first_exposures, steps, true);
         }
         Ok(())
     }

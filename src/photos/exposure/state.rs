@@ -13,6 +13,7 @@ use super::AppearanceMode;
 use super::fit::{FittedPair, bounded, bounded_channel};
 use super::model::{CHANNEL_VALUES, IMAGE_VALUES};
 use super::picture::{LensPlane, Look};
+use crate::photos::parameter::PastViews;
 use crate::scene::camera::Camera;
 use serde::{Deserialize, Serialize};
 
@@ -100,9 +101,13 @@ impl AppearanceState {
         }
     }
 
-    /// Whether both have the same numbers of photos and cameras.
-    pub fn has_same_counts(&self, other: &AppearanceState) -> bool {
-        (self.images.len(), self.cameras.len()) == (other.images.len(), other.cameras.len())
+    /// The values of the photos that the run has now. Those of cameras begin anew where there are more or fewer of these.
+    pub fn of_views(self, past: &PastViews, cameras: usize) -> AppearanceState {
+        let images: Vec<ImageState> = past.of(&self.images);
+        let seen = || images.iter().filter(|image| image.sightings > 0);
+        let sums = std::array::from_fn(|k| seen().map(|image| i64::from(image.values[k])).sum());
+        let cameras = if self.cameras.len() == cameras { self.cameras } else { vec![CameraState::default(); cameras] };
+        AppearanceState { sums, seen: seen().count() as u32, images, cameras, tied: self.tied }
     }
 
     /// Gives first exposures (a view and stops within the bounds of [`bounded`]) to photos that no step has seen. They

@@ -17,7 +17,9 @@
 //! masks nothing keeps the blocks of an earlier part of the run that did.
 
 use super::super::PhotoOptions;
-use super::super::parameter::{Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError};
+use super::super::parameter::{
+    Encoded, Finding, Kind, PastViews, PhotoOutcome, PhotoParameter, PhotoStep, ValuesError,
+};
 use super::grid::{BlockGrid, NO_PIXELS, PER_UNIT, RESIDUAL_LEAST, contrasts, mask_rims, residuals};
 use super::landmarks::{LANDMARKS_MOST, ViewResiduals, contradicted_share};
 use super::{MAD_OF_NORMAL, median_and_deviation};
@@ -290,11 +292,9 @@ impl PhotoParameter for MaskedBlocks {
         Encoded::of(&self.blocks)
     }
 
-    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
+    fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError> {
         let saved = Blocks::decoded(saved)?;
-        if saved.views.len() == self.blocks.views.len() {
-            self.blocks = saved;
-        }
+        self.blocks = Blocks { views: past.of(&saved.views), ..saved };
         Ok(())
     }
 

@@ -16,7 +16,7 @@
 
 use super::super::PhotoOptions;
 use super::super::parameter::{
-    Encoded, Finding, Kind, PhotoOutcome, PhotoParameter, PhotoStep, STEPS_AFTER_RESET, ValuesError,
+    Encoded, Finding, Kind, PastViews, PhotoOutcome, PhotoParameter, PhotoStep, STEPS_AFTER_RESET, ValuesError,
 };
 use super::{MAD_OF_NORMAL, is_used, median_and_deviation};
 use crate::dataset::loader::Dataset;
@@ -216,7 +216,7 @@ impl ViewOutliers {
 
 /// In summary.json, the views whose photo contradicts the scene: `name`, `unexplained` (share of the photo's variance that its
 /// picture leaves unexplained; above 1 where a grey picture would be closer) and `is_left_out` (whether the run has left it out).
-const FIGURE: &str = "outlier_views";
+pub const OUTLIER_VIEWS: &str = "outlier_views";
 
 pub(in crate::photos) const KIND: Kind = Kind { name: "outliers", file: None, first, check, finding };
 
@@ -269,8 +269,10 @@ impl PhotoParameter for OutlierViews {
         Encoded::of(&self.state)
     }
 
-    fn restore(&mut self, saved: &Encoded) -> Result<(), ValuesError> {
-        saved.restore(&mut self.state, ViewOutliers::check, |a, b| a.views.len() == b.views.len())
+    fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError> {
+        let ViewOutliers { views, recent } = saved.decoded(ViewOutliers::check)?;
+        self.state = ViewOutliers { views: past.of(&views), recent };
+        Ok(())
     }
 
     fn leaves_out(&self, view: usize) -> bool {
@@ -343,7 +345,7 @@ impl PhotoParameter for OutlierViews {
             json!({ "name": name, "unexplained": unexplained, "is_left_out": self.are_left_out })
         };
         let views: Vec<Value> = self.state.named().map(of_view).collect();
-        if views.is_empty() { Vec::new() } else { vec![(FIGURE, views.into())] }
+        if views.is_empty() { Vec::new() } else { vec![(OUTLIER_VIEWS, views.into())] }
     }
 }
 
@@ -368,13 +370,13 @@ impl OutlierViews {
 }
 
 pub fn names_in(summary: &Value) -> Vec<String> {
-    let views = summary[FIGURE].as_array().map_or(&[][..], Vec::as_slice);
+    let views = summary[OUTLIER_VIEWS].as_array().map_or(&[][..], Vec::as_slice);
     views.iter().filter_map(|view| Some(view["name"].as_str()?.to_string())).collect()
 }
 
 /// The training views whose photo contradicts the scene, if there are any.
 fn finding(_: &Value, summary: &Value) -> Option<Finding> {
-    let views = summary[FIGURE].as_array().filter(|views| !views.is_empty())?;
+    let views = summary[OUTLIER_VIEWS].as_array().filter(|views| !views.is_empty())?;
     let state = |view: &Value| if view["is_left_out"] == true { "left out" } else { "trained on" };
     let row = |view: &Value| {
         [view["name"].as_str().unwrap_or_default().into(), view["unexplained"].clone(), state(view).into()]

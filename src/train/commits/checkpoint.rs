@@ -19,7 +19,7 @@
 use crate::base::trace;
 use crate::base::units::format_bytes;
 use crate::checkpoint::interval::{CommitCost, CommitEvery, CommitInterval, CommitReport};
-use crate::checkpoint::run_state::{Origin, RunState};
+use crate::checkpoint::run_state::{DatasetPrint, Origin, RunState};
 use crate::page::engine::open::{DEPTH, IoEngine, open_engine};
 use crate::page::folder::file_system::{free_bytes, is_same_drive};
 use crate::page::folder::protocol_files::DriveFolder;
@@ -527,10 +527,11 @@ fn run_state(trainer: &Trainer, origin: &Origin, metrics_bytes: u64) -> Result<R
 }
 
 /// Restores the trainer's own state and the traffic counters from a run state; the pages must come from the same
-/// commit. A run state without values of photos, or with those of other photos, leaves them as at a start.
+/// commit. The values of photos follow these to their places in the `dataset` of now; photos that are new begin as at a start.
 /// Errors: no run can have written the values of photos; those of a decoded state are checked.
-pub fn restore(trainer: &mut Trainer, state: &RunState) -> Result<(), CommitError> {
-    photos::restore(&mut trainer.photos, &state.photos).map_err(invalid)?;
+pub fn restore(trainer: &mut Trainer, state: &RunState, dataset: &DatasetPrint) -> Result<(), CommitError> {
+    let past = dataset.past_views(&state.origin.dataset);
+    photos::restore(&mut trainer.photos, &state.photos, &past).map_err(invalid)?;
     trainer.state = state.trainer.clone();
     trainer.scene.pager.restore_stats(state.traffic);
     Ok(())

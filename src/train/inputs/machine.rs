@@ -171,7 +171,7 @@ pub(crate) fn drive_of(spill_dir: &Path) -> PathBuf {
     if spill_dir.is_dir() { spill_dir.to_path_buf() } else { folder_beside(spill_dir) }
 }
 
-pub(crate) fn absolute(path: &Path) -> PathBuf {
+pub fn absolute(path: &Path) -> PathBuf {
     std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
 }
 

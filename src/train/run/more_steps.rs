@@ -1,7 +1,7 @@
 //! More steps for a finished run whose checkpoint is gone: the run goes on from its PLY.
 //!
-//! Kept: the Gaussians, the number of steps, and with it the schedule, the metrics and the identity of the run. Lost with the
-//! checkpoint: Adam's moments and the statistics of densification. Adam's first updates without moments are up to three
+//! Kept: the Gaussians, the exposures of photos, the number of steps, and with it the schedule, the metrics and the identity of the run. Lost
+//! with the checkpoint: Adam's moments, the statistics of densification, refined poses, and which photos were left out. Adam's first updates without moments are up to three
 //! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
 //! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]): the steps are those that the run would have done next. With and
 //! without it, the rates stay at the values with which the schedule ended.
@@ -20,8 +20,10 @@ use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
+use crate::photos::exposure::AppearanceMode;
 use crate::photos::outlier::blocks::MASKED_SHARE;
-use crate::photos::pose;
+use crate::photos::outlier::views::OUTLIER_VIEWS;
+use crate::photos::{exposure, pose};
 use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE, saved_ply_name};
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::{self, absolute};
@@ -97,19 +99,29 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     let start = finished.start(&request)?;
     let first_rows = start.rows;
     let host_mem = host_budget(request.config.host_mem.0);
-    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&request, start, host_mem)?;
+    let mut first = request.clone();
+    // The first commit will hold the exposures, so the config does not name their file.
+    if first.config.first_appearance.is_empty()
+        && first.config.appearance.0.is_some_and(AppearanceMode::is_on)
+        && out.join(exposure::FILE).is_file()
+    {
+        first.config.first_appearance = out.join(exposure::FILE).to_string_lossy().into_owned();
+    }
+    let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&first, start, host_mem)?;
     let kept = finished.kept_path(&out);
     let keep_result_as = (!finished.is_kept_in(&out)).then(|| kept.clone());
     let FinishedRun { file, run, summary, changes, .. } = finished;
     for line in &changes.numbers {
         crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
     }
+    let lost =
+        [(out.join(pose::FILE).exists(), "the refined poses"), (has_left_out(&out), "which photos were left out")];
+    let lost: String = lost.iter().filter(|(is_lost, _)| *is_lost).map(|(_, what)| format!(", {what}")).collect();
     crate::tell!(
-        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; Adam's moments{} are \
-         lost, and quality dips for some hundred steps (--keep-checkpoint keeps them)",
+        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; lost are Adam's moments{lost}: \
+         quality dips for some hundred steps (--keep-checkpoint keeps all)",
         out.display(),
         kept.display(),
-        if out.join(pose::FILE).exists() { " and the refined poses" } else { "" }
     );
     if let Some(rates) = text_of_rates(&request.config) {
         crate::tell!("{rates}");
@@ -131,8 +143,20 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
 /// Whether the finished run masked parts of photos. Further steps keep that decision: they begin after the step at which a run decides, when
 /// nothing has been measured.
 fn has_masked(out: &Path) -> bool {
+    figure(out, MASKED_SHARE).is_number()
+}
+
+/// Whether the finished run has left photos out.
+fn has_left_out(out: &Path) -> bool {
+    let is_left_out = |view: &serde_json::Value| view["is_left_out"] == true;
+    figure(out, OUTLIER_VIEWS).as_array().is_some_and(|views| views.iter().any(is_left_out))
+}
+
+/// A figure of the summary; null if there is none.
+fn figure(out: &Path, name: &str) -> serde_json::Value {
     let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
-    serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary[MASKED_SHARE].is_number())
+    let summary: serde_json::Value = serde_json::from_slice(&summary).unwrap_or_default();
+    summary[name].clone()
 }
 
 /// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.

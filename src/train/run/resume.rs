@@ -23,7 +23,7 @@ use crate::checkpoint::run_state::{DatasetPrint, RunState};
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::{Chosen, checkpoint_folder};
-use crate::page::folder::spill_dir::SpillDir;
+use crate::page::folder::spill_dir::{SpillDir, segments_in};
 use crate::page::map::commit::CommitError;
 use crate::page::tool::reading::Access;
 use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
@@ -45,9 +45,11 @@ use crate::train::stores::ownership::{Claim, Stored, last_state, open_own, read_
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-/// Remedy for an unusable config.toml.
-const REMEDY_DAMAGED: &str = "remove the file: gsscale-train --resume restores it from the checkpoint; if the pages \
+/// Remedies for an unusable config.toml, with a checkpoint and without.
+const REMEDY_DAMAGED: &str = "move the file away: gsscale-train --resume restores it from the checkpoint; if the pages \
                               lie in a spill directory, name it with --spill-dir";
+const REMEDY_LOST: &str = "repair it; there is no checkpoint in this folder to restore it from. If the pages lie in a spill directory, move the \
+                           file away and name that with --spill-dir; else begin a new run with --init-ply";
 
 /// The run to resume, and the settings given now.
 #[derive(Debug, Clone)]
@@ -131,7 +133,9 @@ impl Earlier {
     pub fn find(request: &ResumeRequest) -> Result<Earlier, TrainError> {
         let path = request.out.join(CONFIG_FILE);
         if path.exists() {
-            let facts = read_resolved(&path).map_err(|e| InputError { remedy: REMEDY_DAMAGED.to_string(), ..e })?;
+            let is_saved = SpillDir::exists_in(&checkpoint_folder(&request.out));
+            let remedy = if is_saved { REMEDY_DAMAGED } else { REMEDY_LOST };
+            let facts = read_resolved(&path).map_err(|e| InputError { remedy: remedy.to_string(), ..e })?;
             let config = TrainConfig::read(&path)?;
             let scene = request.scene.clone().unwrap_or_else(|| facts.scene.clone());
             return Ok(Earlier { run: facts.run, file: Some((config.clone(), facts)), config, scene, path });
@@ -175,11 +179,23 @@ impl Earlier {
         Ok(Earlier { run: state.origin.run.id, file: None, config, scene, path })
     }
 
-    /// Its config with the flags of the request.
+    /// Its config with the flags of the request. What the run has chosen for `auto` stays: it chose at its start, by all photos.
     /// Errors: they do not fit together.
     fn config_now(&self, request: &ResumeRequest) -> InputResult<TrainConfig> {
         let mut config = self.config.clone();
         request.keys.clone().apply(&mut config);
+        let then = &self.config;
+        config.appearance.0 = config.appearance.0.or(then.appearance.0);
+        config.robust_views.0 = config.robust_views.0.or(then.robust_views.0);
+        config.robust_pixels.0 = config.robust_pixels.0.or(then.robust_pixels.0);
+        config.refine_poses.0 = config.refine_poses.0.or(then.refine_poses.0);
+        config.poor_points.0 = config.poor_points.0.or(then.poor_points.0);
+        config.sweep_points.0 = config.sweep_points.0.or(then.sweep_points.0);
+        // The folder may have been moved, with the Gaussians from which the run went on.
+        let moved = Path::new(&config.init_ply).file_name().map(|name| request.out.join(name));
+        if let Some(moved) = moved.filter(|moved| !Path::new(&config.init_ply).exists() && moved.is_file()) {
+            config.init_ply = absolute(&moved).to_string_lossy().into_owned();
+        }
         config.check()?;
         Ok(config)
     }
@@ -212,9 +228,20 @@ fn result_to_continue(
     folder: &Path,
 ) -> InputResult<Option<FinishedRun>> {
     let summary = read_summary(&request.out).filter(|s| s.finished && config.steps > s.steps);
+    let has_store = SpillDir::exists_in(folder);
+    if summary.is_some() && !has_store && segments_in(folder).is_ok_and(|segments| !segments.is_empty()) {
+        let remedy = format!("recover its pages: gsscale-ckpt salvage {} --out TO", shell_word(folder));
+        return Err(InputError::new(folder, "the checkpoint of this run has lost its file FORMAT", remedy));
+    }
     // An attempt to go on that was killed before its first commit leaves a store without one.
-    let is_gone = !SpillDir::exists_in(folder) || is_uncommitted(folder).is_ok_and(|is_empty| is_empty);
-    let is_kept = earlier.config.keep_checkpoint && earlier.config.residence().spill_dir().is_some();
+    let is_gone = !has_store || is_uncommitted(folder).is_ok_and(|is_empty| is_empty);
+    let own = earlier.config.residence();
+    let own_folder = own.checkpoint_folder(&request.out);
+    if summary.is_some() && !has_store && own_folder != folder && SpillDir::exists_in(&own_folder) {
+        let problem = format!("there is no checkpoint here; that of this run is in {}", own_folder.display());
+        return Err(InputError::new(folder, problem, "leave --spill-dir out, or move the pages: gsscale-ckpt clone"));
+    }
+    let is_kept = earlier.config.keep_checkpoint && own.spill_dir().is_some();
     let (Some(summary), Some(file)) = (summary.filter(|_| is_gone && !is_kept), &earlier.file) else {
         return Ok(None);
     };
@@ -291,7 +318,7 @@ fn resume_from(
         true => pages_with_new_rules(pager, &options, &state)?,
     };
     let mut trainer = Trainer::of_scene(pages, &dataset, renderer, options);
-    restore(&mut trainer, &state)?;
+    restore(&mut trainer, &state, &print)?;
     let past = PastRun {
         config: kept_config(&earlier.path, &earlier.config, &config)?,
         metrics_bytes: state.metrics_bytes,

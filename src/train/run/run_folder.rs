@@ -27,6 +27,7 @@ use crate::exchange::format::ExportFormat;
 use crate::exchange::meta::ExportFrame;
 use crate::exchange::sink::Written;
 use crate::paging::stats::PagerStats;
+use crate::photos;
 use crate::photos::diagnosis::Diagnosis;
 use crate::report::page_map::PageTile;
 use crate::report::run_files::{
@@ -285,7 +286,7 @@ fn write_results(
         let trainer = &*results.trainer;
         // The summary says that all is written, so it comes last but for the report, which shows it and is made again by a resume.
         write_page_map(&out.join(PAGES_FILE), dataset, trainer)?;
-        trainer.photos.iter().try_for_each(|parameter| parameter.write_file(out, dataset))?;
+        photos::write_files(&trainer.photos, out, dataset)?;
         write_summary(&out.join(SUMMARY_FILE), &summary)?;
         let shown = OnceCell::new();
         let count = |all| Count::new("pictures put into the report", all, request.quiet);

@@ -82,7 +82,7 @@ fn target_of<'p>(
 mod tests {
     use super::*;
     use crate::page::format::encoding::EncodingError;
-    use crate::photos::parameter::{Encoded, ValuesError};
+    use crate::photos::parameter::{Encoded, PastViews, ValuesError};
     use crate::render::RenderOptions;
     use crate::render::cpu::CpuRenderer;
     use crate::scene::camera::Camera;
@@ -109,7 +109,7 @@ mod tests {
             Encoded::of(&())
         }
 
-        fn restore(&mut self, _: &Encoded) -> Result<(), ValuesError> {
+        fn restore(&mut self, _: &Encoded, _: &PastViews) -> Result<(), ValuesError> {
             Ok(())
         }
 

@@ -29,7 +29,7 @@ use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::RunOptions;
 use crate::page::folder::spill_dir::segments_in;
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
-use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE, SUMMARY_FILE};
 use crate::train::error::TrainError;
 use crate::train::stores::ownership::check_owner;
 use std::path::{Path, PathBuf};
@@ -97,6 +97,9 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         return Ok(StorePlace { folder, run: Some(dir.to_path_buf()), id });
     }
     let (why, remedy) = match dir.join(PLY_FILE).is_file() {
+        _ if config.residence().spill_dir().is_some() && (config.keep_checkpoint || !is_finished(dir)) => {
+            ("its pages may have been moved", "name their folder instead: gsscale-ckpt ls FOLDER".to_string())
+        }
         true => ("it is removed when a run ends", "its result is point_cloud.ply in the same folder".to_string()),
         false => (
             "the run has not made a commit",
@@ -104,6 +107,12 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         ),
     };
     Err(InputError::new(dir, format!("the checkpoint of this run, {}, is not there: {why}", folder.display()), remedy))
+}
+
+/// Whether the run in a folder has done all of its steps.
+fn is_finished(out: &Path) -> bool {
+    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
+    serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary["finished"] == true)
 }
 
 /// The run state of a generation.

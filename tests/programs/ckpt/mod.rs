@@ -393,7 +393,8 @@ fn a_lost_map_is_rebuilt_from_the_slots() {
     bench.fails("ls out", &["no page map", "salvage"]);
     let output = bench.output(CKPT, "verify out");
     assert_eq!(output.status.code(), Some(1));
-    assert!(String::from_utf8_lossy(&output.stdout).contains("FAULT map"));
+    let verdict = String::from_utf8_lossy(&output.stdout);
+    assert!(verdict.contains("FAULT map") && verdict.contains("salvage") && !verdict.contains("rollback"), "{verdict}");
     let done = bench.ckpt_json("salvage out --out rescued");
     assert!(["step", "pages", "gaussians"].iter().all(|key| done[key] == last[key]), "{done}, {last}");
     assert!(done["has_state"] == false && done["lost"].as_array().unwrap().is_empty(), "{done}");

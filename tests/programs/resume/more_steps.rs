@@ -50,8 +50,28 @@ fn a_kept_checkpoint_that_was_deleted_is_no_obstacle_to_more_steps() {
     let said = work.train("--resume out --steps 20 --device cpu");
     assert!(said.contains("goes on from its Gaussians") && work.summary("out")["steps"] == 20, "{said}");
     assert!(work.exists("out/checkpoint/FORMAT"));
+    // One that lies in its place is not looked for elsewhere, and one that lost a file is not gone.
+    let before = work.files("out");
+    work.refuses("--resume out --steps 30 --spill-dir new", &["out/checkpoint", "leave --spill-dir out"]);
+    let format = work.bytes("out/checkpoint/FORMAT");
+    std::fs::remove_file(work.path("out/checkpoint/FORMAT")).unwrap();
+    work.refuses("--resume out --steps 30", &["has lost its file FORMAT", "gsscale-ckpt salvage"]);
+    work.write("out/checkpoint/FORMAT", format);
+    assert!(work.files("out") == before && !work.exists("new"));
+    // A run that went on from its result goes on when its folder is moved.
+    std::fs::rename(work.path("out"), work.path("moved")).unwrap();
+    work.train("--resume moved --steps 25 --device cpu --quiet");
+    std::fs::rename(work.path("moved"), work.path("out")).unwrap();
+    // Settings that are cut off: the remedy costs nothing.
+    let config = work.text("out/config.toml");
+    work.write("out/config.toml", &config[..config.len() / 2]);
+    work.refuses("--resume out --steps 30", &["move the file away"]);
+    work.remove("out/checkpoint");
+    work.refuses("--resume out --steps 30", &["repair it", "--init-ply"]);
+    work.write("out/config.toml", config);
+    work.train("--resume out --steps 30 --device cpu --quiet");
     let said = work.train("scene --out out --overwrite --steps 5 --device cpu --quiet");
-    assert!(said.contains("--overwrite has removed the checkpoint of 20 steps"), "{said}");
+    assert!(said.contains("--overwrite has removed the checkpoint of 30 steps"), "{said}");
 }
 
 /// More steps than planned: the learning-rate schedule stays the same, whenever the change is given and however the run
@@ -93,7 +113,7 @@ fn more_steps_keep_the_schedule() {
         run.signal("KILL").end();
         assert!(bench.ply("out") == planned && bench.bytes("out/point_cloud_000260.ply") == planned);
         let said = bench.go_on("--steps 300");
-        assert!(said.contains("goes on from its Gaussians") && said.contains("Adam's moments are lost"), "{said}");
+        assert!(said.contains("goes on from its Gaussians") && said.contains("lost are Adam's moments:"), "{said}");
         let done = bench.summary("out");
         assert!(
             done["steps"] == 300 && done["finished"] == true && done["train_seconds"].as_f64() > Some(0.0),
