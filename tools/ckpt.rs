@@ -58,7 +58,7 @@ enum Command {
     Rollback(Rollback),
     /// Removes names of checkpoints, and frees pages that only they kept
     Prune(Prune),
-    /// Writes the Gaussians of a generation as a PLY
+    /// Writes the Gaussians of a generation as a PLY, SPZ or SOG
     Export(Export),
     /// Makes a store from the Gaussians of a PLY
     Import(Import),

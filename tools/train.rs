@@ -95,7 +95,7 @@ pub struct Args {
     /// Print the GPUs available to --device, best first, then stop
     #[arg(long, hide_short_help = true)]
     list_devices: bool,
-    /// Replace the results of an earlier run in --out
+    /// Replace the results of an earlier run in --out; its spill directory must be removed first
     #[arg(long, hide_short_help = true)]
     overwrite: bool,
     /// Print only warnings and errors

@@ -158,8 +158,8 @@ config_keys! {
         [value_parser = parse_count32] schedule_steps: u32 = 0 => Derived hidden;
         /// Values of --sh-every, --refine-start, --refine-every, --refine-stop and --means-lr, with --strategy long-axis
         /// also of --scales-lr, --quats-lr, --shn-lr and --others-lr-final, where they are not given: run-length (by --steps;
-        /// the classic values from 30,000 steps on, except that others-lr-final is 0.1) or classic (their defaults below). A
-        /// resumed run keeps its values
+        /// the classic values from 30,000 steps on, except that others-lr-final is 0.1) or classic (their defaults in
+        /// configs/default.toml). A resumed run keeps its values
         schedule: Schedule = Schedule::RunLength => Free;
         /// Seed of every random draw
         [value_parser = parse_count] seed: u64 = 42 => Numbers;
@@ -211,8 +211,8 @@ config_keys! {
         /// Initial size, times the distance to the three nearest neighbours
         init_scale: f64 = 1.0 => Numbers;
         /// For few or random first points: --growth-score mixed, --recycle 0.05, --init-scale 2 and 6.7 times the --means-lr of
-        /// --schedule, where they are not given. Photos that overlap little lose by it. auto is on where the first points have
-        /// not the colours that photos show there, photos overlap much, and --max-gaussians is given: a count that the run decides
+        /// --schedule, where they are not given. Photos that overlap little lose by it. auto is on where the first points do
+        /// not have the colours that photos show there, photos overlap much, and --max-gaussians is given: a count that the run decides
         /// itself does better without. A resumed run keeps its values
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] poor_points: Chosen<bool> = Chosen(None) => Free hidden;
         /// Begin from points that the photos agree on, found by moving patches of photos through depths (a plane sweep; seconds for 150
@@ -333,7 +333,7 @@ config_keys! {
         /// drives. Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Time between commits (90, 90s, 5min), which is the most that a killed run loses. 0 = only on a stop request and after the
-        /// last step. auto = 10 to 60 s, so that commits delay training by less than 1 %; longer if commits would write
+        /// last step. auto = every 10 s while commits delay training by less than 1 %, else at least every minute; longer only if commits would write
         /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on

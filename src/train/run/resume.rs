@@ -171,7 +171,7 @@ impl Earlier {
         }
         // The leg of a run that came from another machine has none.
         if request.leg.is_none() {
-            crate::tell!("warning: {} is missing: restoring it from the checkpoint", path.display());
+            crate::tell!("warning: {} is missing: its settings come from the checkpoint", path.display());
         }
         // The checkpoint may have moved, and a run that committed to its output folder has no spill directory.
         let config = TrainConfig { spill_dir: named.unwrap_or("").to_string(), ..then };
