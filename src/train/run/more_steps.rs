@@ -1,8 +1,8 @@
 //! More steps for a finished run whose checkpoint is gone: the run goes on from its PLY.
 //!
 //! Kept: the Gaussians, the exposures of photos, the number of steps, and with it the schedule, the metrics and the identity of the run. Lost
-//! with the checkpoint: Adam's moments, the statistics of densification, refined poses, and which photos were left out. Adam's first updates without moments are up to three
-//! times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
+//! with the checkpoint: Adam's moments, the statistics of densification, refined poses, and which photos were left out. Adam's first updates
+//! without moments are up to three times as long as others, so quality dips for some hundred steps; the result is not that of a run planned with
 //! more steps. `--keep-checkpoint` loses nothing ([`super::resume`]): the steps are those that the run would have done next. With and
 //! without it, the rates stay at the values with which the schedule ended.
 //!

@@ -30,7 +30,7 @@ use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::live::Live;
-use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE};
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE, saved_step};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::restore;
 use crate::train::error::TrainError;
@@ -192,7 +192,8 @@ impl Earlier {
         config.poor_points.0 = config.poor_points.0.or(then.poor_points.0);
         config.sweep_points.0 = config.sweep_points.0.or(then.sweep_points.0);
         // The folder may have been moved, with the Gaussians from which the run went on.
-        let moved = Path::new(&config.init_ply).file_name().map(|name| request.out.join(name));
+        let name = Path::new(&config.init_ply).file_name().and_then(|name| name.to_str());
+        let moved = name.filter(|name| saved_step(name).is_some()).map(|name| request.out.join(name));
         if let Some(moved) = moved.filter(|moved| !Path::new(&config.init_ply).exists() && moved.is_file()) {
             config.init_ply = absolute(&moved).to_string_lossy().into_owned();
         }
