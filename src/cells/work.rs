@@ -124,7 +124,8 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let plan = CityPlan::read(&city)?;
     let planned = plan.cell(&city, request.cell)?;
     let folder = city.cell(request.cell);
-    let place = WorkPlace::of(request.cell, drive, &plan, &city)?;
+    let digest = plan.digest(&city.plan())?;
+    let place = WorkPlace::of(request.cell, drive, &digest, &city);
     let is_done = || done_of(&plan, &city, request.cell).map(|done| done.is_some());
     let report_done = || {
         crate::say!("cell {} is done", request.cell);
@@ -136,7 +137,12 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     }
     let memory = host_budget(request.keys.host_mem.unwrap_or(ByteSize(0)).0).unwrap_or(1 << 30);
     check_prior(&plan, &city, memory)?;
-    clear_finished(request.cell, drive, &plan, &city)?;
+    if drive.is_some() {
+        let others = (0..plan.cells.len()).filter(|&other| other != request.cell);
+        let is_done = |&other: &usize| matches!(done_of(&plan, &city, other), Ok(Some(_)));
+        // Pages that their workers left on this drive. Pages in use stay.
+        others.filter(is_done).for_each(|other| drop(WorkPlace::of(other, drive, &digest, &city).clear()));
+    }
     let lock = match CellLock::take(&folder)? {
         Ok(lock) => lock,
         Err(owner) => {
@@ -272,17 +278,6 @@ fn check_scene(planned: &CellPlan, folder: &Path, scene: &Path, config: &TrainCo
     Err(InputError::new(scene, problem, "restore them, or begin another city").into())
 }
 
-/// Removes the pages that workers of other cells, which are done by now, left on this drive. Pages in use stay.
-fn clear_finished(cell: usize, drive: Option<&str>, plan: &CityPlan, city: &City) -> InputResult<()> {
-    for other in (0..plan.cells.len()).filter(|&other| drive.is_some() && other != cell) {
-        let store = WorkPlace::of(other, drive, plan, city)?.store();
-        if store.is_dir() && matches!(done_of(plan, city, other), Ok(Some(_))) {
-            drop(remove_store(&store));
-        }
-    }
-    Ok(())
-}
-
 fn keys_of_cell(folder: &Path) -> InputResult<toml::Table> {
     new_run::given_keys(Some(&folder.join("cell.toml")), &TrainOverrides::default())
 }
@@ -296,13 +291,14 @@ struct WorkPlace {
 
 impl WorkPlace {
     /// Machines that share a folder, and cities that share a drive, have places of their own.
-    fn of(cell: usize, drive: Option<&str>, plan: &CityPlan, city: &City) -> InputResult<WorkPlace> {
+    /// `digest` is that of the plan.
+    fn of(cell: usize, drive: Option<&str>, digest: &str, city: &City) -> WorkPlace {
         let Some(drive) = drive else {
             let out = city.cell(cell).join(format!("{RUN}{}", system_name()));
-            return Ok(WorkPlace { out, pages: None });
+            return WorkPlace { out, pages: None };
         };
-        let own = absolute(Path::new(drive)).join(format!("cell-{cell}-{}", plan.digest(&city.plan())?));
-        Ok(WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) })
+        let own = absolute(Path::new(drive)).join(format!("cell-{cell}-{digest}"));
+        WorkPlace { out: own.join("run"), pages: Some(own.join("pages")) }
     }
 
     fn store(&self) -> PathBuf {

@@ -49,14 +49,18 @@ pub struct DatasetPrint {
 }
 
 impl DatasetPrint {
-    /// Where each view lies in the dataset of before: as the view of the same name and pose, or else of the same photo.
+    /// Where each view lies in the dataset of before: as the view of the same name and pose, or else of the same photo, which stands in
+    /// its place if several are equal.
     pub fn past_views(&self, before: &DatasetPrint) -> PastViews {
         let at = |digest: fn(&ViewPrint) -> u64| -> BTreeMap<u64, usize> {
             before.views.iter().enumerate().map(|(at, view)| (digest(view), at)).collect()
         };
         let (of_pose, of_photo) = (at(|view| view.pose), at(|view| view.photo));
-        let past = |view: &ViewPrint| of_pose.get(&view.pose).or_else(|| of_photo.get(&view.photo)).copied();
-        PastViews(self.views.iter().map(past).collect())
+        let past = |(at, view): (usize, &ViewPrint)| {
+            let in_place = before.views.get(at).filter(|then| then.photo == view.photo).map(|_| at);
+            of_pose.get(&view.pose).copied().or(in_place).or_else(|| of_photo.get(&view.photo).copied())
+        };
+        PastViews(self.views.iter().enumerate().map(past).collect())
     }
 }
 

@@ -333,8 +333,8 @@ config_keys! {
         /// drives. Never changes results
         spill_codec: Chosen<Codec> = Chosen(None) => Free;
         /// Time between commits (90, 90s, 5min), which is the most that a killed run loses. 0 = only on a stop request and after the
-        /// last step. auto = every 10 s while commits delay training by less than 1 %, else at least every minute; longer only if commits would write
-        /// more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
+        /// last step. auto = every 10 s while commits delay training by less than 1 %, else at least every minute; longer only if
+        /// commits would write more than 256 GiB an hour, or in memory 24 times the scene and at least 16 GiB. Never changes results
         commit_every: CommitEvery = CommitEvery::Auto => Free;
         /// Seconds to wait for space on a full drive before the run stops with its last commit; a run in memory goes on
         /// without commits if its results have room

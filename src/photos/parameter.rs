@@ -286,11 +286,6 @@ impl Encoded {
 pub struct PastViews(pub Vec<Option<usize>>);
 
 impl PastViews {
-    /// Of photos that are the same as then.
-    pub fn same(views: usize) -> PastViews {
-        PastViews((0..views).map(Some).collect())
-    }
-
     /// The saved values in the order of the views now; those of a start for photos that are new.
     pub fn of<T: Clone + Default>(&self, saved: &[T]) -> Vec<T> {
         self.0.iter().map(|at| at.and_then(|at| saved.get(at)).cloned().unwrap_or_default()).collect()

@@ -126,7 +126,7 @@ impl<'a> LineWords<'a> {
     }
 
     /// NaN for what programs write that have no number, such as `-nan(ind)`.
-    fn number_or_none(&mut self, what: &str) -> InputResult<f64> {
+    fn number_or_nan(&mut self, what: &str) -> InputResult<f64> {
         match self.rest.split_ascii_whitespace().next() {
             Some(word) if is_no_number(word) => self.next(what).map(|_| f64::NAN),
             _ => self.number(what),
@@ -136,7 +136,7 @@ impl<'a> LineWords<'a> {
     fn numbers<const N: usize>(&mut self, what: &str) -> InputResult<[f64; N]> {
         let mut values = [0.0; N];
         for value in &mut values {
-            *value = self.number_or_none(what)?;
+            *value = self.number_or_nan(what)?;
         }
         Ok(values)
     }
@@ -218,7 +218,7 @@ pub(super) fn read_points(path: &Path, warnings: &mut Vec<String>, take: &mut Ta
         let _: u64 = words.number("the point's number")?;
         let position = words.numbers("a coordinate")?;
         let color = [words.number("red")?, words.number("green")?, words.number("blue")?];
-        words.number_or_none("the reprojection error")?;
+        words.number_or_nan("the reprojection error")?;
         tally.add(position, color, lines.line, take)?;
     }
     lines.finish("points", tally.total, warnings);
