@@ -185,6 +185,8 @@ impl Earlier {
         let mut config = self.config.clone();
         request.keys.clone().apply(&mut config);
         let then = &self.config;
+        config.view_order.0 = config.view_order.0.or(then.view_order.0);
+        config.optimizer_on.0 = config.optimizer_on.0.or(then.optimizer_on.0);
         config.appearance.0 = config.appearance.0.or(then.appearance.0);
         config.robust_views.0 = config.robust_views.0.or(then.robust_views.0);
         config.robust_pixels.0 = config.robust_pixels.0.or(then.robust_pixels.0);
