@@ -131,7 +131,7 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
         let is_of_plan = before.as_ref().is_some_and(|merged| merged.plan == digest);
         let is_same = |merged: &Merged| is_of_plan && merged.cells == cells && request.out.join(PLY_FILE).is_file();
         let problem = match is_of_plan {
-            true => "it is an earlier merge, of cells that were trained again since, or without its PLY",
+            true => "it holds an earlier merge: cells were trained again since, or the PLY is gone",
             false => "exists already",
         };
         let refused = || InputError::new(&request.out, problem, "name a folder that does not exist");

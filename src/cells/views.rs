@@ -41,7 +41,7 @@ pub(crate) struct Seen {
     pub up: [f64; 3],
     pub axes: [[f64; 3]; 2],
     pub photo: PhotoBytes,
-    /// How many times the pixels of the prior that count for a number of Gaussians ([`counted_pixels`]) the whole scene's photos have.
+    /// [`counted_pixels`] of the whole scene's photos, over those of the prior's; 1 at least.
     pub detail: f64,
     pub sh_degree: u8,
 }

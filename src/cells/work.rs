@@ -118,8 +118,9 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     check_range("--copy-every", request.copy_every, 0.0..=1e9)?;
     let drive = request.keys.spill_dir.as_deref().filter(|drive| !drive.is_empty());
     if drive.is_none() && request.keys.frames.is_some_and(|frames| frames > 0) {
-        let problem = "a run in so many frames, but without a drive, makes no commits that could be copied";
-        return Err(InputError::new("--frames", problem, "add --spill-dir, or use --host-mem").into());
+        let problem =
+            "without --spill-dir a run with --frames makes no commits, so nothing of the cell would be copied";
+        return Err(InputError::new("--frames", problem, "add --spill-dir, or limit memory with --host-mem").into());
     }
     let plan = CityPlan::read(&city)?;
     let planned = plan.cell(&city, request.cell)?;

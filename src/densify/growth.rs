@@ -117,7 +117,7 @@ pub enum GrowthDecision {
     Undoes,
 }
 
-/// How like their photos views are drawn: means over the views.
+/// Metrics of drawn views against their photos: means over the views.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViewMetrics {
     /// dB.

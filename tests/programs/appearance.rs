@@ -327,7 +327,7 @@ fn more_steps_keep_exposures() {
     run(&work, "out", "--steps 60 --appearance exposure");
     let before = sightings(&work, "out");
     let said = work.train("--resume out --steps 62 --device cpu");
-    assert!(said.contains("lost are Adam's moments:"), "{said}");
+    assert!(said.contains("lost: Adam's moments;"), "{said}");
     for (name, (exposure, seen)) in sightings(&work, "out") {
         assert!(
             seen >= before[&name].1 && (exposure - before[&name].0).abs() < 0.2,

@@ -224,7 +224,7 @@ fn cells_that_are_killed_and_move_end_with_the_same_bytes_and_merge_by_place() {
     // The merge of before the cell was trained again, and one whose PLY is gone.
     cells.refuses("merge city --out whole", &["trained again since"]);
     std::fs::remove_file(cells.0.path("again/point_cloud.ply")).unwrap();
-    cells.refuses("merge city --out again", &["without its PLY"]);
+    cells.refuses("merge city --out again", &["the PLY is gone"]);
     pages_of_finished_cells_go(&cells);
     // Another cell's fault hides no cell.
     cells.0.write("city/cells/0/done.toml", "junk");

@@ -118,7 +118,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         [(out.join(pose::FILE).exists(), "the refined poses"), (has_left_out(&out), "which photos were left out")];
     let lost: String = lost.iter().filter(|(is_lost, _)| *is_lost).map(|(_, what)| format!(", {what}")).collect();
     crate::tell!(
-        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; lost are Adam's moments{lost}: \
+        "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; lost: Adam's moments{lost}; \
          quality dips for some hundred steps (--keep-checkpoint keeps all)",
         out.display(),
         kept.display(),
