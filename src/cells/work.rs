@@ -348,8 +348,6 @@ impl WorkPlace {
             break;
         }
         if own.is_some() && own >= copy.as_ref().map(|(steps, _)| *steps) {
-            // A run that was killed before its first step began here before the copy came, and would begin again.
-            out_folder::remove_mark(&self.out);
             return Ok(true);
         }
         if let (None, Some(copy)) = (&copy, unreadable) {
@@ -361,6 +359,7 @@ impl WorkPlace {
         if self.out.is_dir() {
             let _lock = out_folder::lock(&self.out)?;
             out_folder::make(&self.out, Existing::Overwrite)?;
+            // A run that was killed before its first step left its mark, and with it the next run would begin again.
             out_folder::remove_mark(&self.out);
         }
         copy.as_ref().map_or(Ok(()), |(_, copy)| clone_into(copy, &store))?;
