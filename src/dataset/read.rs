@@ -163,7 +163,7 @@ pub const SEARCH_STATE: &str = "state.json";
 pub const SEARCH_END: &str = "model";
 /// What to do if photos have no pose.
 pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
-    blurred photos; if all is sharp and overlaps, try gsscale-poses with --max-resolution 2400";
+    blurred photos";
 /// What to do with photos that cannot be read.
 pub const CONVERT_PHOTOS: &str = "convert them to JPEG, for example with ImageMagick: mogrify -format jpg *.HEIC";
 /// Fewest photos for which poses can be found.

@@ -61,13 +61,14 @@ impl Similarity {
 }
 
 /// The similarity that takes `from` to `to`, and the median distance that remains. Positions that disagree with most others hardly
-/// count. `None` for fewer than three positions, if those of `from`, which have little noise, lie on a line, or if what they have across
-/// it is lost in what remains.
-pub fn robust_similarity(from: &[DVec3], to: &[DVec3]) -> Option<(Similarity, f64)> {
+/// count.
+/// Errors: fewer than three positions, or those of `from`, which have little noise, lie on a line; or what they have across it is
+/// lost in what remains, which the error has.
+pub fn robust_similarity(from: &[DVec3], to: &[DVec3]) -> Result<(Similarity, f64), Option<f64>> {
     let mut weights = vec![1.0; from.len()];
     let mut found = None;
     for round in 0..ROUNDS {
-        let similarity = weighted_similarity(from, to, &weights)?;
+        let similarity = weighted_similarity(from, to, &weights).ok_or(None)?;
         let errors: Vec<f64> = from.iter().zip(to).map(|(&x, &y)| similarity.apply(x).distance(y)).collect();
         let mut sorted = errors.clone();
         sorted.sort_by(f64::total_cmp);
@@ -81,9 +82,9 @@ pub fn robust_similarity(from: &[DVec3], to: &[DVec3]) -> Option<(Similarity, f6
         weights = errors.iter().map(|&error| weight(error)).collect();
         found = Some((similarity, median));
     }
-    let (similarity, rest) = found?;
+    let (similarity, rest) = found.ok_or(None)?;
     let [_, across] = spread_of(from, &vec![1.0; from.len()]);
-    (similarity.scale * across > ACROSS_LEAST * rest).then_some((similarity, rest))
+    if similarity.scale * across > ACROSS_LEAST * rest { Ok((similarity, rest)) } else { Err(Some(rest)) }
 }
 
 /// The weighted standard deviations of positions along their main direction and across it.
@@ -218,15 +219,15 @@ mod tests {
             (0..100).map(|i| DVec3::new(2.0 * f64::from(i), 0.2 * f64::from(i).sin(), 0.0)).collect();
         let noise = |i: usize| DVec3::new((i as f64 * 1.3).sin(), (i as f64 * 2.1).cos(), 2.0 * (i as f64 * 0.7).sin());
         let to: Vec<DVec3> = from.iter().enumerate().map(|(i, &x)| x + 3.0 * noise(i)).collect();
-        assert_eq!(robust_similarity(&from, &to), None);
+        assert!(robust_similarity(&from, &to).is_err_and(|rest| rest.is_some_and(|rest| (1.0..10.0).contains(&rest))));
     }
 
     #[test]
     fn positions_on_a_line_or_in_one_place_fix_no_rotation() {
         let line: Vec<DVec3> = (0..9).map(|i| DVec3::new(f64::from(i), 2.0, 1.0)).collect();
-        assert!(robust_similarity(&line, &line).is_none());
-        assert!(robust_similarity(&[DVec3::ONE; 5], &[DVec3::X; 5]).is_none());
-        assert!(robust_similarity(&line[..2], &line[..2]).is_none());
-        assert!(robust_similarity(&[], &[]).is_none());
+        assert_eq!(robust_similarity(&line, &line), Err(None));
+        assert!(robust_similarity(&[DVec3::ONE; 5], &[DVec3::X; 5]).is_err());
+        assert!(robust_similarity(&line[..2], &line[..2]).is_err());
+        assert!(robust_similarity(&[], &[]).is_err());
     }
 }

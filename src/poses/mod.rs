@@ -60,6 +60,8 @@ const COMPARISON_SECONDS: f64 = 0.0007;
 const MODEL_SECONDS: f64 = 0.5;
 /// Photos from which a model takes noticeably longer for each photo.
 const MODEL_GROWTH: f64 = 500.0;
+/// Pixels of the longer side that may find more than the default.
+const LARGER: u32 = 2400;
 /// GPS that disagrees with the model by more than this part of the extent of the places aligns nothing.
 const DISAGREEMENT_MAX: f64 = 0.3;
 
@@ -108,6 +110,8 @@ pub struct FoundPoses {
     pub registered: usize,
     /// Names of photos without a pose.
     pub missing: Vec<String>,
+    /// What to do about these.
+    remedy: String,
     /// Where the model's origin lies, and the median distance of its cameras from their GPS, metres.
     pub aligned: Option<(GpsPlace, f64)>,
     /// Sentences for the user.
@@ -149,9 +153,10 @@ impl PoseSearch {
         let is_empty = |folder: &Path| std::fs::read_dir(folder).is_ok_and(|mut entries| entries.next().is_none());
         if sparse.exists() && !is_empty(&sparse) {
             let remedy = format!(
-                "to train with it: gsscale-train {}; for new poses: rename {} and give the command again, or add --out FOLDER",
+                "to train with it: gsscale-train {}; for new poses: rename {}, remove {} and give the command again, or add --out FOLDER",
                 shell_word(&scene),
-                sparse.display()
+                sparse.display(),
+                scene.join(WORK_FOLDER).display()
             );
             return Err(InputError::new(sparse, "a model is here already", remedy));
         }
@@ -442,7 +447,7 @@ impl PoseSearch {
         let options = ReadOptions { images: Some(PHOTOS.to_string()), points_later: true, ..ReadOptions::default() };
         if !looks_like_colmap(work) {
             let problem = format!("no poses were found: its {} photos show too little in common", self.photos.len());
-            return Err(InputError::new(&self.scene, problem, MORE_OVERLAP));
+            return Err(InputError::new(&self.scene, problem, self.remedy()));
         }
         let raw = read_scene(work, &options)?;
         let index = |name: &str| name.split('.').next()?.parse::<usize>().ok().filter(|&i| i < self.photos.len());
@@ -471,7 +476,19 @@ impl PoseSearch {
         let sparse = self.scene.join(SPARSE);
         std::fs::rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
         let aligned = alignment.map(|(origin, _, rest)| (origin, rest));
-        Ok(FoundPoses { scene: self.scene.clone(), photos: self.photos.len(), registered, missing, aligned, said })
+        let (scene, remedy) = (self.scene.clone(), self.remedy());
+        Ok(FoundPoses { scene, photos: self.photos.len(), registered, missing, remedy, aligned, said })
+    }
+
+    /// What to do if photos have no pose.
+    fn remedy(&self) -> String {
+        let longest = self.photos.iter().map(|photo| photo.header.width.max(photo.header.height)).max().unwrap_or(0);
+        match self.features.max_image_size < LARGER.min(longest) {
+            true => format!(
+                "{MORE_OVERLAP}; if all is sharp and overlaps, try gsscale-poses with --max-resolution {LARGER}"
+            ),
+            false => MORE_OVERLAP.to_string(),
+        }
     }
 
     /// The place in the middle as the origin, the similarity from the model to metres east, north and up of it, and the median distance that
@@ -485,7 +502,12 @@ impl PoseSearch {
         let place = |name: &str| self.photos[index(name)?].place.filter(|place| place.altitude.is_some());
         let with_place = || raw.views.iter().filter_map(|view| Some((view.pose.centre(), place(&view.name)?)));
         // Medians: a place that is far off moves neither.
-        let first = with_place().next()?.1;
+        let Some((_, first)) = with_place().next() else {
+            if self.photos.iter().any(|photo| photo.place.is_some()) {
+                said.push("the photos' GPS has no altitude, so the model has no metres and no north".to_string());
+            }
+            return None;
+        };
         let of_first: Vec<DVec3> = with_place().map(|(_, place)| metres_from(&first, &place)).collect();
         let median_of = |values: &mut dyn Iterator<Item = f64>| {
             let mut values: Vec<f64> = values.collect();
@@ -501,9 +523,11 @@ impl PoseSearch {
         let (centres, metres): (Vec<_>, Vec<_>) =
             with_place().map(|(at, place)| (at, metres_from(&origin, &place))).unzip();
         let why = match robust_similarity(&centres, &metres) {
-            Some((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => return Some((origin, moved, rest)),
-            Some((_, rest)) => &format!("GPS disagrees with the model by {rest:.1} m"),
-            None => "GPS places are too few, too coarse or on a line",
+            Ok((moved, rest)) if rest <= DISAGREEMENT_MAX * extent => return Some((origin, moved, rest)),
+            Ok((_, rest)) | Err(Some(rest)) if rest > DISAGREEMENT_MAX * extent => {
+                &format!("GPS disagrees with the model by {rest:.1} m (one of them is wrong)")
+            }
+            _ => "GPS places are too few, too coarse or on a line",
         };
         said.push(format!("the photos' {why}, so the model has no metres and no north"));
         None
@@ -519,10 +543,13 @@ impl fmt::Display for FoundPoses {
             write!(f, "\nin metres east, north and up of {latitude:.6}, {longitude:.6} ({ORIGIN_FILE}); ")?;
             write!(f, "median distance from GPS {rest:.1} m")?;
         }
-        if self.registered < self.photos * 9 / 10 {
+        if !self.missing.is_empty() {
             let first = self.missing.iter().take(5).map(String::as_str).collect::<Vec<_>>().join(", ");
             let more = if self.missing.len() > 5 { ", ..." } else { "" };
-            write!(f, "\nwithout poses: {first}{more}\n  remedy: {MORE_OVERLAP}")?;
+            write!(f, "\nwithout poses: {first}{more}")?;
+        }
+        if self.registered < self.photos * 9 / 10 {
+            write!(f, "\n  remedy: {}", self.remedy)?;
         }
         Ok(())
     }
@@ -563,8 +590,9 @@ pub fn check_found(named: &Path) -> InputResult<()> {
     let (photos, _) = list_photos(&folder, &scene)?;
     let (place, sparse) = (shell_word(&scene), scene.join(SPARSE));
     let remedy = format!(
-        "to search again, rename {} and give the command again; to train with these: gsscale-train {place}",
-        sparse.display()
+        "to search again, rename {}, remove {} and give the command again; to train with these: gsscale-train {place}",
+        sparse.display(),
+        scene.join(WORK_FOLDER).display()
     );
     let searched: BTreeSet<(&str, u64)> = state.photos.iter().map(|of| (of.name.as_str(), of.bytes)).collect();
     let new = photos.iter().filter(|photo| !searched.contains(&(photo.name.as_str(), photo.bytes))).count();
@@ -721,7 +749,8 @@ mod tests {
         let missing: Vec<String> = (0..7).map(|i| format!("{i}.jpg")).collect();
         let place = GpsPlace { latitude: 43.25, longitude: -87.5, altitude: Some(210.0) };
         let (scene, said) = (PathBuf::from("scan"), Vec::new());
-        let found = FoundPoses { scene, photos: 18, registered: 11, missing, aligned: Some((place, 0.4)), said };
+        let (remedy, aligned) = (MORE_OVERLAP.to_string(), Some((place, 0.4)));
+        let found = FoundPoses { scene, photos: 18, registered: 11, missing, remedy, aligned, said };
         let text = found.to_string();
         let parts = [
             "11 of 18 photos have poses",
