@@ -91,6 +91,7 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
     let mut scratch = ScratchSegments::new(folder, &engines, limits.file_bytes, depth_max)?;
     let failed = |e: io::Error| InputError::io(folder, "measuring the drive", &e);
     scratch.fill(Duration::from_secs_f64(limits.seconds / 2.0)).map_err(failed)?;
+    let filled = scratch.written_bytes;
     let slice = (limits.seconds - begin.elapsed().as_secs_f64()) / (2 * ROUNDS * cases.len().max(1)) as f64;
     let slice = Duration::from_secs_f64(slice.max(0.005));
     let written_max = limits.written_bytes / (ROUNDS * cases.len().max(1)) as u64;
@@ -108,6 +109,11 @@ pub fn sweep(folder: &Path, cases: &[Case], limits: Limits, progress: &mut dyn F
                 let begun = rounds > 0 || turn > 0;
                 if begun && begin.elapsed().as_secs_f64() > limits.seconds {
                     break 'rounds;
+                }
+                // A case writes twice its depth at least.
+                let least = 2 * (case.depth * case.bytes) as u64;
+                if direction == Direction::Write && scratch.written_bytes - filled + least > limits.written_bytes {
+                    continue;
                 }
                 let bytes_max = if direction == Direction::Write { written_max } else { u64::MAX };
                 let rate = scratch.rate(case, direction, slice, bytes_max).map_err(failed)?;
@@ -370,6 +376,18 @@ pub fn codec_for(bytes_per_second: f64) -> Codec {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn no_more_is_written_than_allowed() {
+        let folder = tempfile::tempdir().unwrap();
+        let case = |bytes, depth| Case { engine: IoEngine::Pread, bytes, depth };
+        let limits = Limits { file_bytes: 32 << 20, seconds: 20.0, written_bytes: 3 << 20 };
+        // Twice the depth of the second case is 4 MiB.
+        let swept = sweep(folder.path(), &[case(65_536, 1), case(1 << 20, 2)], limits, &mut |_| ()).unwrap();
+        assert!(swept.written_bytes <= limits.file_bytes + limits.written_bytes, "{swept:?}");
+        assert!(swept.measured[0].write.is_some() && swept.measured[1].write.is_none(), "{swept:?}");
+        assert!(swept.measured.iter().all(|measured| measured.read.is_some()));
+    }
 
     #[test]
     fn too_little_space_is_refused_before_anything_is_made() {
