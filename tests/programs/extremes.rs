@@ -149,6 +149,22 @@ fn a_run_whose_masks_are_all_black_stops() {
         assert!(!work.exists("out/config.toml"));
     }
     done(&work, "inverted", "--steps 60 --invert-masks");
+
+    // Two photos of which nothing counts: they train nothing, and their steps have no PSNR.
+    let views = TextModel::of(&work.scene()).views;
+    for (i, view) in views.iter().enumerate() {
+        let name = Path::new(&view.name).with_extension("png");
+        let white = if [1, 2].contains(&i) { 0 } else { 255 };
+        image::GrayImage::from_pixel(96, 64, image::Luma([white])).save(work.path("scene/masks").join(name)).unwrap();
+    }
+    let said = done(&work, "some", "--steps 60 --log-every 1");
+    let [first, second] = [1, 2].map(|i| views[i].name.as_str());
+    assert!(
+        said.contains(&format!("photos exclude every pixel, so these photos train nothing: {first}, {second};")),
+        "{said}"
+    );
+    let psnrs: Vec<Option<f64>> = work.metrics("some").iter().map(|line| line["psnr"].as_f64()).collect();
+    assert!(psnrs.iter().flatten().all(|psnr| *psnr < 50.0) && psnrs.contains(&None), "{psnrs:?}");
 }
 
 #[test]
@@ -166,6 +182,20 @@ fn a_run_that_sees_loses_or_draws_no_gaussian_stops() {
     // Alpha below 1/255 is not drawn, so no gradient raises it.
     let faint = "--init-opacity 0.001 --strategy none --steps 1000";
     stopped(&work, "faint", faint, &["too transparent", "--init-opacity"]);
+    gaussians(&work, "faint.ply", |columns| columns.opacities.fill(-100.0));
+    let words = ["too transparent", "check opacities and scales in ", "faint.ply"];
+    stopped(&work, "file", "--steps 1000 --init-ply faint.ply --strategy none", &words);
+    // The rate throws all Gaussians out of the pictures.
+    stopped(
+        &work,
+        "thrown",
+        "--steps 1000 --means-lr 1e6 --strategy none",
+        &["training has moved them out", "leave out flags of rates"],
+    );
+    // Positions of no scene are dropped, as points are.
+    gaussians(&work, "absurd.ply", |columns| columns.means[..6].fill(1e30));
+    let said = done(&work, "dropped", "--steps 4 --init-ply absurd.ply");
+    assert!(said.contains("2 Gaussians are too far from this scene"), "{said}");
 }
 
 /// Each is legal where it is read.

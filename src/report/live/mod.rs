@@ -111,8 +111,8 @@ pub struct Status {
     /// Pages of the scene, and those of them that are in memory.
     pub pages: u64,
     pub pages_in_memory: u64,
-    /// PSNR of the last step's view, dB.
-    pub psnr: f64,
+    /// PSNR of the last step's view, dB; `None` if no pixel of its photo counts.
+    pub psnr: Option<f64>,
     /// Training views, for [`Orbit::view`].
     pub views: u32,
     /// Photos that are held out.

@@ -27,8 +27,8 @@ const PSNR_WEIGHT: f64 = 0.05;
 #[derive(Debug, Clone, Copy)]
 pub struct ShownStep {
     pub gaussians: u64,
-    /// PSNR of the step's view, dB.
-    pub psnr: f64,
+    /// PSNR of the step's view, dB; `None` if no pixel of its photo counts.
+    pub psnr: Option<f64>,
 }
 
 /// Progress of a loop over steps.
@@ -61,8 +61,10 @@ impl RunProgress {
 
     /// Shows that `done` steps are done.
     pub fn step(&mut self, done: u32, shown: ShownStep) {
-        let psnr = self.psnr.map_or(shown.psnr, |mean| mean + PSNR_WEIGHT * (shown.psnr - mean));
-        self.psnr = Some(psnr);
+        self.psnr = match (self.psnr, shown.psnr) {
+            (Some(mean), Some(psnr)) => Some(mean + PSNR_WEIGHT * (psnr - mean)),
+            (mean, psnr) => mean.or(psnr),
+        };
         if self.quiet {
             return;
         }
@@ -77,7 +79,7 @@ impl RunProgress {
             return;
         }
         self.last_shown = Instant::now();
-        let words = words(ShownStep { psnr, ..shown }, rate, self.total.saturating_sub(done));
+        let words = words(ShownStep { psnr: self.psnr, ..shown }, rate, self.total.saturating_sub(done));
         match &self.bar {
             Some(bar) => bar.set_message(words),
             None => crate::tell!("step {done}/{}  {words}", self.total),
@@ -114,7 +116,8 @@ fn words(shown: ShownStep, rate: f64, steps_left: u32) -> String {
         steps => format_seconds((f64::from(steps) / rate).min(99.0 * 86400.0)),
     };
     let gaussians = format_count(shown.gaussians);
-    format!("{gaussians} Gaussians  PSNR {:.2}  {rate_text}/s  {left} left", shown.psnr)
+    let psnr = shown.psnr.map_or("-".to_string(), |psnr| format!("{psnr:.2}"));
+    format!("{gaussians} Gaussians  PSNR {psnr}  {rate_text}/s  {left} left")
 }
 
 /// Steps per second over the last [`RECENT`] seconds.
@@ -168,7 +171,7 @@ mod tests {
             for gaussians in [0, 999, 1_250_000, 4_294_967_294] {
                 for (rate, psnr) in [(0.0, 0.0), (0.01, 24.31), (103.4, 100.0), (99_999.0, 9.5)] {
                     for left in [0, 1, total] {
-                        let words = words(ShownStep { gaussians, psnr }, rate, left);
+                        let words = words(ShownStep { gaussians, psnr: Some(psnr) }, rate, left);
                         assert!(words.len() <= WORDS, "{words}");
                         let line = format!("step {total}/{total}  {words}");
                         assert!(line.len() <= COLUMNS, "{line}");
@@ -176,7 +179,7 @@ mod tests {
                 }
             }
         }
-        let words = words(ShownStep { gaussians: 1_250_000, psnr: 24.312 }, 41.7, 30_000);
+        let words = words(ShownStep { gaussians: 1_250_000, psnr: Some(24.312) }, 41.7, 30_000);
         assert_eq!(words, "1.25M Gaussians  PSNR 24.31  42/s  12 min left");
     }
 }

@@ -54,8 +54,8 @@ pub struct StepLine {
     /// What kinds of parameters of photos add to the loss, by their names; values that are not finite are left out.
     #[serde(skip_serializing_if = "BTreeMap::is_empty", default)]
     pub loss_terms: BTreeMap<String, f64>,
-    /// PSNR of the step's view, unclamped, dB.
-    pub psnr: f64,
+    /// PSNR of the step's view, unclamped, dB; `None` if no pixel of its photo counts.
+    pub psnr: Option<f64>,
     /// Gaussians after the step.
     pub gaussians: u64,
     /// Seconds of training so far.
@@ -425,7 +425,6 @@ fn scalars_of_step(line: &StepLine) -> Vec<(&'static str, f64)> {
     let mib = |bytes: u64| bytes as f64 / f64::from(1 << 20);
     let mut scalars = vec![
         ("loss/train", line.loss),
-        ("psnr/train", line.psnr),
         ("gaussians", line.gaussians as f64),
         ("seconds", line.seconds),
         ("host_peak_mib", mib(line.host_bytes_peak)),
@@ -433,6 +432,7 @@ fn scalars_of_step(line: &StepLine) -> Vec<(&'static str, f64)> {
         ("disk/written_mib", mib(line.tiers.stats.bytes_written)),
         ("disk/stall_seconds", line.tiers.stats.stall_seconds),
     ];
+    scalars.extend(line.psnr.map(|psnr| ("psnr/train", psnr)));
     // A skipped step has no loss.
     scalars.retain(|(_, value)| *value < f64::MAX);
     scalars

@@ -54,7 +54,7 @@ impl LivePage {
     }
 
     /// Reports the progress to the page, and draws the picture that the page requests.
-    pub(super) fn show(&mut self, trainer: &mut Trainer, dataset: &Dataset, targets: &TargetCache, psnr: f64) {
+    pub(super) fn show(&mut self, trainer: &mut Trainer, dataset: &Dataset, targets: &TargetCache, psnr: Option<f64>) {
         let is_last = trainer.steps_done() == trainer.options.steps;
         if is_last || self.told.is_none_or(|told| told.elapsed() >= STATUS_EVERY) {
             self.told = Some(Instant::now());

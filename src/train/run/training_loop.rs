@@ -74,7 +74,7 @@ impl TrainingLoop<'_> {
             self.check_statistics()?;
             let done = self.trainer.steps_done();
             let (due, is_last) = (|every: u32| every > 0 && done.is_multiple_of(every), done == steps);
-            let psnr = json_psnr(-10.0 * outcome.loss.mse.log10());
+            let psnr = (!outcome.is_masked).then(|| json_psnr(-10.0 * outcome.loss.mse.log10()));
             let mut test: Option<TestMetrics> = None;
             if due(eval_every) && !is_last {
                 test = self.trainer.evaluate(self.dataset, self.targets, None, &|_| {})?;
@@ -124,7 +124,7 @@ impl TrainingLoop<'_> {
     }
 
     /// The metrics of the last step, without an evaluation.
-    fn step_line(&self, outcome: &StepOutcome, psnr: f64, before: Traffic) -> StepLine {
+    fn step_line(&self, outcome: &StepOutcome, psnr: Option<f64>, before: Traffic) -> StepLine {
         let trainer = &*self.trainer;
         let traffic = trainer.renderer.traffic();
         let terms =

@@ -38,7 +38,7 @@ use crate::train::step::comparison::Comparison;
 use crate::train::step::device_flights::StepToRecord;
 use crate::train::step::device_tier::{DeviceRows, DeviceTier};
 use crate::train::step::pages::{PagedScene, WorkingSet};
-use crate::train::step::soundness::{note_idle, note_soundness};
+use crate::train::step::soundness::{MaskedPhotos, note_idle, note_soundness};
 use crate::train::step::train_step::{StepOutcome, StepView, train_step};
 use crate::train::step::view::{SceneNow, rehearse};
 use std::path::{Path, PathBuf};
@@ -75,7 +75,8 @@ pub struct Trainer {
     pub(crate) is_torn: bool,
     /// The memory budget, and what views have taken so far.
     pub(crate) memory: MemoryState,
-    /// The steps since a row was last rewritten.
+    /// Photos of which no pixel counts.
+    masked: MaskedPhotos,
     /// Steps recorded ahead.
     pub(crate) ahead: Ahead,
 }
@@ -150,6 +151,7 @@ impl Trainer {
             state: TrainerState::default(),
             is_torn: false,
             memory: MemoryState::default(),
+            masked: MaskedPhotos::default(),
             ahead: Ahead::default(),
         }
     }
@@ -295,6 +297,7 @@ impl Trainer {
             }
         };
         let outcome = stepped.map_err(|error| error.with_view_name(&dataset.views[view].name))?;
+        let outcome = StepOutcome { is_masked: !target.counts(), ..outcome };
         self.memory.note_view(outcome.rows, outcome.rows_pinned, outcome.batches == 1);
         self.ahead.note_rows_of(view, outcome.rows);
         let sound = note_soundness(&mut self.state, &outcome, &dataset.views[view].name, &self.options.init_ply);
@@ -302,7 +305,8 @@ impl Trainer {
         if sound.is_err() && outcome.skipped.is_some() {
             return sound.map(|()| outcome);
         }
-        note_idle(&mut self.state, &outcome, self.scene.rows(), &target, dataset)?;
+        note_idle(&mut self.state, &outcome, self.scene.rows(), dataset, &self.options.init_ply)?;
+        self.masked.note(&outcome, view, self.state.step + 1 == self.options.steps, dataset);
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;

@@ -11,9 +11,11 @@ use crate::base::error::{InputError, InputResult};
 use crate::checkpoint::run_state::{IdleSteps, TrainerState};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::scene::image::Target;
 use crate::train::error::TrainError;
+use std::collections::BTreeSet;
 
+/// Photos that a warning names.
+const NAMED: usize = 8;
 /// Consecutive unsound steps that end a run.
 const UNSOUND_STEPS_MAX: u32 = 3;
 
@@ -81,14 +83,15 @@ pub(crate) fn note_soundness(
 }
 
 /// Counts in `state` the steps in a row that changed no row.
+/// `init_ply` is the file from which the run started, or empty.
 /// Errors: no Gaussian is left; or no step changed a row for so long that every view had its turn, because every photo is
 /// masked completely, no view sees a Gaussian, or no Gaussian is opaque enough to be drawn.
 pub(crate) fn note_idle(
     state: &mut TrainerState,
     outcome: &StepOutcome,
     gaussians: u64,
-    target: &Target,
     dataset: &Dataset,
+    init_ply: &str,
 ) -> Result<(), TrainError> {
     let place = format!("step {}", state.step);
     if gaussians == 0 {
@@ -102,7 +105,7 @@ pub(crate) fn note_idle(
         return Ok(());
     }
     idle.steps = idle.steps.saturating_add(1);
-    idle.masked += u32::from(!target.counts());
+    idle.masked += u32::from(outcome.is_masked);
     idle.with_rows += u32::from(outcome.rows > 0);
     idle.with_drawn += u32::from(outcome.drawn > 0);
     let views = dataset.train_views().len();
@@ -114,18 +117,63 @@ pub(crate) fn note_idle(
     if idle.masked == idle.steps {
         return Err(all_masked(dataset).at(place).into());
     }
+    // Whether an earlier step has changed rows: then the poses are not to blame.
+    let has_trained = idle.steps <= state.step;
     if idle.with_rows == 0 {
-        return Err(no_view_sees(dataset, gaussians).at(place).into());
+        let unseen = no_view_sees(dataset, gaussians).at(place);
+        let moved = "training has moved them out of all pictures: leave out flags of rates";
+        return Err(if has_trained { InputError { remedy: moved.to_string(), ..unseen } } else { unseen }.into());
     }
     if idle.with_drawn == 0 {
         let problem = format!("none of the {views} training views draws a Gaussian: all are too transparent or small");
-        let remedy = "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses";
+        let remedy = match init_ply {
+            "" => "leave out flags of rates, of opacity (--init-opacity) and of resets (--reset-every); without any, check the poses"
+                .to_string(),
+            ply => format!("check opacities and scales in {ply}, from which the run started; if they are sound, leave out flags of rates"),
+        };
         return Err(InputError::new(&dataset.image_folder, problem, remedy).at(place).into());
     }
     if u64::from(idle.steps) == most {
-        crate::tell!("warning: up to {place}, no photo differs from its picture: no Gaussian was changed in an epoch");
+        let why = match outcome.loss.loss == 0.0 {
+            true => "no photo differs from its picture",
+            false => {
+                "no photo has a gradient: Gaussians may be black, opaque or hidden, and flags of rates may be the cause"
+            }
+        };
+        crate::tell!("warning: up to {place}, no Gaussian was changed in an epoch: {why}");
     }
     Ok(())
+}
+
+/// The training photos of which no pixel counts, as the steps of a process meet them.
+#[derive(Default)]
+pub(crate) struct MaskedPhotos {
+    steps: usize,
+    views: BTreeSet<usize>,
+}
+
+impl MaskedPhotos {
+    /// Notes the photo of a step, and warns once of all masked ones: after an epoch, or after the last step.
+    pub fn note(&mut self, outcome: &StepOutcome, view: usize, is_last: bool, dataset: &Dataset) {
+        let photos = dataset.train_views().len();
+        if self.steps >= photos {
+            return;
+        }
+        self.steps = if is_last { photos } else { self.steps + 1 };
+        if outcome.is_masked {
+            self.views.insert(view);
+        }
+        if self.steps < photos || self.views.is_empty() {
+            return;
+        }
+        let names: Vec<&str> = self.views.iter().take(NAMED).map(|&view| dataset.views[view].name.as_str()).collect();
+        let (masked, more) = (self.views.len(), if self.views.len() > NAMED { " and others" } else { "" });
+        crate::tell!(
+            "warning: the masks of {masked} of {photos} training photos exclude every pixel, so these photos train nothing: {}{more}; white \
+             means keep (see --invert-masks)",
+            names.join(", ")
+        );
+    }
 }
 
 /// Refuses a run whose training photos are all masked, before it spends its time. Decodes photos up to the first that counts.

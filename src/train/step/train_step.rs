@@ -57,6 +57,8 @@ pub struct StepOutcome {
     pub skipped: Option<Skipped>,
     /// The view was compared with its photo only ([`Comparison::is_left_out`]); nothing was changed.
     pub is_left_out: bool,
+    /// No pixel of the view's photo counts.
+    pub is_masked: bool,
     /// Rows of the view that were drawn; 0 in steps that updated rows.
     pub drawn: u64,
 }
