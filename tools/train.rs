@@ -101,7 +101,7 @@ pub struct Args {
     /// Print only warnings and errors
     #[arg(long, short, hide_short_help = true)]
     quiet: bool,
-    /// If the GPU is lost, go on from the last commit in this process, up to N times
+    /// If the GPU is lost during the steps, go on from the last commit in this process, up to N times
     #[arg(long, value_name = "N", default_value_t = 3, hide_short_help = true)]
     restarts: u32,
     /// Write a trace of the host's work in every step (uploads, submissions, waits, read-backs, pages, events) to this file.

@@ -31,7 +31,9 @@ pub enum GpuError {
     )]
     OutOfBudget { what: String, need: u64, in_use: u64, budget: u64 },
     /// The device itself has no memory left.
-    #[error("{stage}: the device is out of memory ({message})\n  remedy: lower --device-mem")]
+    #[error(
+        "{stage}: the device is out of memory ({message})\n  remedy: set or lower --device-mem, or close other programs that use the device"
+    )]
     OutOfMemory { stage: String, message: String },
     #[error(
         "the device has no memory for {what}: {need} bytes beside the {in_use} in use\n  remedy: close other programs that \

@@ -55,6 +55,7 @@ impl Faults {
     pub(super) fn lost(&self, message: String) {
         let mut state = lock(&self.state);
         let stage = state.doing.clone();
+        let message = if message.trim().is_empty() { "the driver reports no reason".to_string() } else { message };
         state.lost.get_or_insert(GpuError::DeviceLost { stage, message });
     }
 

@@ -130,9 +130,10 @@ impl RenderError {
             RenderError::Device(GpuError::BufferTooLarge { .. } | GpuError::BindingTooLarge { .. }) => {
                 Some("make the photos smaller with --max-resolution or --data-factor, or render with --device cpu")
             }
-            RenderError::Device(GpuError::DeviceLost { .. }) => {
-                Some("update the graphics driver if this happens again, or render with --device cpu")
-            }
+            RenderError::Device(GpuError::DeviceLost { .. }) => Some(
+                "update the graphics driver if this happens again, or render with --device cpu (with --optimizer-on host \
+                     --accept-changes, if the optimizer was on the device)",
+            ),
             RenderError::Device(_) => Some("render with --device cpu, and report a bug"),
             RenderError::NoPages { .. } => Some("train with --optimizer-on host"),
             RenderError::NoSlots { .. } => Some("raise --device-mem, or train with --optimizer-on host"),

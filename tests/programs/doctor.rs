@@ -40,6 +40,12 @@ fn a_sound_device_is_told_from_one_with_too_little_memory() {
     assert_eq!(found["checks"][0]["verdict"], "failed", "{found}");
     assert!(found["checks"][0]["found"].as_str().unwrap().contains("memory"), "{found}");
 
+    assert!(stderr(&poor).contains("did not fit into the memory of the GPU"), "{}", stderr(&poor));
+    let mut lost = Command::new(BENCH);
+    lost.current_dir(work.path("")).args(["doctor", "--quick", "--out", "lost"]).env("GSSCALE_GPU_FAULT", "lost@5");
+    let lost = stderr(&lost.output().unwrap());
+    assert!(lost.contains("was lost during the checks") && !lost.contains("computes something else"), "{lost}");
+
     let none = doctor(&work, &["--device", "no such card"], None);
     assert!(!none.status.success() && stderr(&none).contains("--list-devices"), "{}", stderr(&none));
 }

@@ -166,7 +166,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     }
     let on_device = sweep("ladder-gpu", "--share 70 --device-mem 6MiB --list-runs --device");
     assert_eq!(work.printed(BENCH, &format!("{on_device} gpu")).matches("to do").count(), 6);
-    refuses(&format!("{on_device} cpu"), "use --device auto or gpu");
+    refuses(&format!("{on_device} cpu"), "use --device gpu");
     let list = "seeds = [1]\n[base]\nsteps = 4\n[view]\ntitle = \"own\"\nreference = \"plain\"\nfigures = [\"psnr\"]\n\
                 charts = []\n[[group]]\nname = \"\"\nruns = [{ name = \"plain\" }, RUN]\n";
     let with = |run: &str| list.replace("RUN", run);

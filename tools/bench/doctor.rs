@@ -106,7 +106,10 @@ impl Check {
 /// Errors: there is no such GPU, or the folder cannot be written.
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainError> {
     let doctor = Doctor { args, choice: args.device.clone().map_or(DeviceChoice::Gpu, DeviceChoice::Named) };
-    let gpu = doctor.open(false).map_err(|e| InputError::new("--device", e, "see gsscale-train --list-devices"))?;
+    let gpu = doctor.open(false).map_err(|e| {
+        let problem = e.lines().next().unwrap_or_default().to_string();
+        InputError::new("--device", problem, "choose one of gsscale-train --list-devices")
+    })?;
     let (about, subgroups) = (gpu.summary().clone(), gpu.subgroups());
     drop(gpu);
     gsscale::tell!("examining {about}");
@@ -140,6 +143,16 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
 /// Which flags to use, by what was found.
 fn advice(checks: &[Check], kind: DeviceKind) -> String {
     let failed = |name: &str| checks.iter().any(|c| c.name == name && c.verdict == Verdict::Failed);
+    // Errors of a device are texts here.
+    let says = |words: &str| checks.iter().any(|c| c.verdict == Verdict::Failed && c.found.contains(words));
+    if says("the device was lost") {
+        return "the GPU was lost during the checks (reset by its driver, without power, or unplugged), so they say nothing of what it \
+                computes: give the command again; an update of the driver may help"
+            .into();
+    }
+    if says("device memory") || says("out of memory") {
+        return "the checks did not fit into the memory of the GPU: close other programs that use it, or raise --device-mem".into();
+    }
     if failed("same as the CPU") || failed("same bytes twice") || failed("short training") {
         return "train with --device cpu: this GPU or its driver computes something else; an update of the driver may help".into();
     }

@@ -105,7 +105,11 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, device_use: DeviceUse) ->
         }
         Err(GpuError::NoSuchDevice { wanted, found }) => {
             let problem = format!("no usable GPU matches '{wanted}'; found: {found}");
-            Err(InputError::new("--device", problem, "choose one of --list-devices, or use --device cpu").into())
+            let remedy = match found.as_str() {
+                "none" => "install the Vulkan driver of your GPU, or use --device cpu",
+                _ => "choose one of --list-devices, or use --device cpu",
+            };
+            Err(InputError::new("--device", problem, remedy).into())
         }
         Err(error) => Err(InputError::new("--device", error.to_string(), "use --device cpu").into()),
     }

@@ -121,7 +121,7 @@ pub(crate) fn describe(config: &TrainConfig, memory: &MemoryEstimate) -> String 
     let Some(needs) = needs(config, memory) else { return String::new() };
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let budget = match config.device_mem.0 {
-        0 => String::from("no limit is set (--device-mem)"),
+        0 => String::from("without a limit (--device-mem) about twice that is kept"),
         bytes if bytes_for_buffers(bytes) >= whole_of(config, &needs) => {
             format!("--device-mem allows {}", format_bytes(bytes))
         }
