@@ -362,6 +362,7 @@ fn frames(args: &Args, scene: &Scene) -> InputResult<Vec<usize>> {
                 .map(|s: f64| (s / 100.0 * pages as f64).ceil() as usize),
             None => text.parse().ok(),
         };
+        let count = count.filter(|&count: &usize| count > 0);
         let wrong = || {
             InputError::new(
                 "--compare-frames",

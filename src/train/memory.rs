@@ -300,13 +300,16 @@ impl HostBudget {
 
     /// The frames, and the most pages of a batch, for a view that does not fit in one batch. The renderer holds `rendering` bytes,
     /// and the working set `working_row` bytes for each row of a batch. For each page, a batch takes two frames (the second for the
-    /// next batch and for pages that split), a part of the working set and, in a densification round, a copy of the page.
-    pub(crate) fn batches(&self, scene: &PagedScene, rendering: u64, working_row: usize) -> (usize, usize) {
+    /// next batch and for pages that split), a part of the working set and, in a densification round, a copy of the page. Also the bytes by
+    /// which the smallest batch exceeds the budget.
+    pub(crate) fn batches(&self, scene: &PagedScene, rendering: u64, working_row: usize) -> (usize, usize, u64) {
         let taken = self.bytes_beside_frames(scene, rendering, growth_due(scene)) - self.copies(scene) + self.staging;
         let left = self.bytes.saturating_sub(taken);
         let frame = scene.pager.frame_bytes() as u64;
         let working = (scene.rules.page_rows * working_row) as u64;
-        frames_and_batch(left, frame, working, self.copies_pages)
+        let (frames, pages) = frames_and_batch(left, frame, working, self.copies_pages);
+        let least = 2 * frame + working + if self.copies_pages { frame } else { 0 };
+        (frames, pages, (taken + least).saturating_sub(self.bytes))
     }
 
     fn copies(&self, scene: &PagedScene) -> u64 {

@@ -73,7 +73,10 @@ fn a_scene_that_grows_stays_within_its_memory_and_within_less_than_its_views_tak
     }
     // 92 MiB do not hold the largest view of the grown scene. Its pages move to the drive of its checkpoint; a run whose pages have a
     // drive from the start is that of `a_run_whose_views_outgrow_its_memory_goes_in_batches`.
-    work.train(&format!("{GROWING} --out out --overwrite --host-mem 92MiB"));
+    let said = work.train(&format!("{GROWING} --out out --overwrite --host-mem 92MiB"));
+    // What its steps will write is foreseen.
+    says(&said, &["outgrown 92.0 MiB, --host-mem,", "its pages move to checkpoint/", "to write without commits"]);
+    assert!(work.summary("out")["forecast"]["bytes_written"].as_f64().unwrap() > 0.0);
     same_within(&work, "out", 92.0 * MIB);
     let [pinned, whole] = ["out", "alone"].map(|out| work.count(out, "pages_pinned_max"));
     assert!(work.summary("out")["finished"] == true && pinned < whole, "no view was cut: {pinned} of {whole}");

@@ -37,7 +37,7 @@ pub fn json_of_forecast(forecast: &Forecast) -> Value {
         "frames": forecast.tiers.frames, "drive_bytes": forecast.drive_bytes, "drive_bytes_peak": forecast.drive_bytes_peak,
         "ply_bytes": forecast.ply_bytes, "bytes_written": forecast.bytes_written,
         "if_growth_does_not_pay": forecast.if_kept.as_ref().map(|kept| json_of_forecast(kept)),
-        "commit_bytes_most": forecast.commit_bytes_most, "seconds": forecast.seconds, "drive_seconds": forecast.drive_seconds,
+        "commit_bytes": forecast.commit_bytes, "seconds": forecast.seconds, "drive_seconds": forecast.drive_seconds,
     })
 }
 
@@ -58,7 +58,7 @@ fn text_of_forecast(scene: &Scene) -> String {
         Err(_) if scene.frames_within.is_none() => return String::new(),
         Err(why) => return format!("no forecast of the whole run: {why}\n"),
     };
-    let drive = match forecast.tiers.frames {
+    let drive = match forecast.frames_at_end {
         Some(_) => format!(
             "about {} ({} of pages and their versions of the last commits), about {} to write without commits",
             format_bytes(forecast.drive_bytes_peak),
@@ -69,12 +69,12 @@ fn text_of_forecast(scene: &Scene) -> String {
     };
     format!(
         "the run, as its dry run says it, with {} Gaussians at the end{}:\n  memory  about {} at the peak\n  \
-         drive   {drive}, PLY {}; commits write {} at most\n  time    about {}\n{}",
+         drive   {drive}, PLY {}; commits write about {}\n  time    about {}\n{}",
         format_grouped(forecast.gaussians[1]),
         if matches!(forecast.reach, Reach::Guess | Reach::Decided | Reach::Sparse) { " (a guess)" } else { "" },
         format_bytes(forecast.memory_at_end().total()),
         format_bytes(forecast.ply_bytes),
-        format_bytes(forecast.commit_bytes_most as u64),
+        format_bytes(forecast.commit_bytes as u64),
         format_seconds(forecast.seconds),
         forecast.if_kept.as_deref().map_or(String::new(), text_of_kept),
     )
@@ -136,7 +136,7 @@ pub fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
          \nworst 20 bytes read and written\
          \nwait     for a drive that reads {}/s and writes {}/s,\
          \n         and steps of {:.4} s{}\
-         \ntime     of all {} steps at the Gaussians of now: compares the rows; the run takes the time named at the top\
+         \ntime     of all {} steps at the Gaussians of now: compares the rows{}\
          \nwritten  by import and all steps, without commits; life: share of {}",
         size(scene.drive.read_rate),
         size(scene.drive.write_rate),
@@ -147,6 +147,7 @@ pub fn report(args: &Args, scene: &Scene, rows: &[Row]) -> String {
             (None, None) => " (assumed: no view fits)".to_string(),
         },
         scene.config.steps,
+        if scene.forecast.is_ok() { "; the run takes the time named at the top" } else { "" },
         format_bytes(args.endurance.0),
     );
     for (frames, views, batches) in in_batches(scene, rows) {

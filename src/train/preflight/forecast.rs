@@ -173,7 +173,7 @@ pub struct Forecast {
     pub memory: [MemoryEstimate; 3],
     /// Pages, frames and drive at the start.
     pub tiers: TierPlan,
-    /// Frames at the number of Gaussians that will be reached; `None` for a run in memory.
+    /// Frames at the number of Gaussians that will be reached; `None` for a run that stays in memory.
     pub frames_at_end: Option<u64>,
     /// Memory limit of the run, bytes.
     pub host_mem: Option<u64>,
@@ -183,9 +183,10 @@ pub struct Forecast {
     /// of a run in memory.
     pub drive_bytes_peak: u64,
     pub ply_bytes: u64,
-    /// Bytes that import and steps write to the drive; 0 for a run in memory.
+    /// Bytes that import and steps write to the drive; 0 for a run that stays in memory.
     pub bytes_written: f64,
-    pub commit_bytes_most: f64,
+    /// Bytes that periodic commits write.
+    pub commit_bytes: f64,
     /// Seconds of all steps.
     pub seconds: f64,
     /// Steps and seconds of shorter runs of the same scene, where this one is long.
@@ -211,7 +212,7 @@ struct Measured {
     changed_share: f64,
     /// What steps do with the drive.
     drive: DriveUse,
-    /// Frames with the Gaussians of the end; `None` for a run in memory.
+    /// Frames with the Gaussians of the end; `None` for a run that stays in memory.
     frames_at_end: Option<u64>,
 }
 
@@ -255,7 +256,9 @@ pub(crate) fn plan_run(
     let growth = last as f64 / rows.max(1) as f64;
     let step_seconds = probed.seconds * STEP_OVER_RENDERING;
     let step_seconds = [step_seconds, step_seconds * growth.powf(STEP_GROWTH)];
-    let drive = plan.frames.zip(frames_at_end).map_or(DriveUse::default(), |(now, then)| {
+    let drive = frames_at_end.map_or(DriveUse::default(), |then| {
+        // A run in memory begins with a frame for each page.
+        let now = plan.frames.unwrap_or(plan.pages[0]);
         drive_use(config, dataset, trainer, [now, then], growth, step_seconds, drive_rate)
     });
     let measured = Measured {
@@ -308,11 +311,11 @@ impl Forecast {
         let waits_and_writes = drive.mean_of_steps(&growing, growth);
         let drive_seconds = f64::from(steps) * waits_and_writes.waits;
         let seconds = f64::from(steps) * by_power.min(by_rows) + drive_seconds;
-        let is_in_memory = config.residence() == Residence::Memory;
+        let is_in_memory = config.residence() == Residence::Memory && frames_at_end.is_none();
         let pages_then = (tiers.pages[0] as f64 * growth).ceil() as u64;
         let drive_bytes = pages_then * tiers.frame_bytes;
         let state_bytes = last * row_bytes(config.sh_degree) as u64;
-        let (commits, commit_bytes_most) = commits(config, state_bytes, seconds);
+        let (commits, commit_bytes) = commits(config, state_bytes, seconds);
         // The first commit of a run in memory chooses the segments.
         let segment_bytes = match tiers.segment_bytes {
             0 => SlotLayout::new(tiers.frame_bytes as usize, pages_then).segment_bytes(),
@@ -341,7 +344,7 @@ impl Forecast {
             drive_bytes_peak,
             ply_bytes: ply_bytes(config, last),
             bytes_written: if is_in_memory { 0.0 } else { bytes_of_steps },
-            commit_bytes_most,
+            commit_bytes,
             seconds,
             shorter: Vec::new(),
             drive_seconds,
@@ -470,7 +473,7 @@ fn first_commit_seconds(config: &TrainConfig) -> Option<f64> {
     (every > 0.0 && config.residence() != Residence::Frames).then_some(every)
 }
 
-/// Periodic commits of a run of `seconds`, and the most bytes that commits write.
+/// Periodic commits of a run of about `seconds`, and the bytes that they write where each writes all pages.
 fn commits(config: &TrainConfig, state_bytes: u64, seconds: f64) -> (u64, f64) {
     let Some(every) = first_commit_seconds(config) else { return (0, 0.0) };
     let limit = match (config.residence(), config.commit_every) {

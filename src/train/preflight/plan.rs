@@ -320,7 +320,7 @@ fn shrink_to_budget(config: &TrainConfig, need: &LargestNeed, budget: u64, memor
 }
 
 /// Shrinks the memory of the grown scene to the budget `host_mem`, bytes. `memory` holds three estimates: with `rows` Gaussians, at the cap, and
-/// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run in memory.
+/// with `last` Gaussians; the first stays. Returns the frames at the end; `None` for a run that stays in memory.
 pub(super) fn limit_memory(
     config: &TrainConfig,
     tiers: &TierPlan,
@@ -329,13 +329,25 @@ pub(super) fn limit_memory(
     memory: &mut [MemoryEstimate; 3],
 ) -> Option<u64> {
     let mut frames_at_end = tiers.frames;
-    let Some((budget, now)) = host_mem.filter(|_| config.frames == 0).zip(tiers.frames) else { return frames_at_end };
+    let Some(mut budget) = host_mem.filter(|_| config.frames == 0) else { return frames_at_end };
+    if tiers.frames.is_none() {
+        // A default budget rises; beyond it, the run moves its pages to the drive.
+        let most = if config.host_mem.0 == 0 { obtainable_bytes() } else { None };
+        budget = most.unwrap_or(budget).max(budget);
+        if memory[2].total() <= budget {
+            return None;
+        }
+    }
     // The plan has chosen the frames of the start.
     for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
         let growth = rows_then as f64 / rows.max(1) as f64;
         let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
         let frames = shrink_to_budget(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
-        frames_at_end = Some(if rows_then > rows { frames.min(now) } else { now });
+        frames_at_end = Some(match tiers.frames {
+            None => frames,
+            Some(now) if rows_then > rows => frames.min(now),
+            Some(now) => now,
+        });
     }
     frames_at_end
 }
@@ -470,17 +482,27 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
     );
 }
 
+/// Gaussians that take less memory than this in frames hardly leave any to the rest of a run when they lie on a drive, bytes.
+const SPILL_PAYS: u64 = 64 << 20;
+
 fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>) -> InputResult<()> {
     let Some(budget) = host_mem else { return Ok(()) };
     if start.total() > budget {
         let problem = format!(
             "{} is not enough: the scene needs about {} of memory ({} for Gaussians)",
             format_bytes(budget),
-            format_bytes(start.total()),
+            format_bytes_up(start.total()),
             format_bytes(start.frames)
         );
-        let remedy = "name a folder on a fast drive with --spill-dir, raise --host-mem, or lower --image-cache, \
-                      --sh-degree or the size of the photos";
+        // Pages on a drive take memory for their transfer and for the plan.
+        let spill = match start.frames > SPILL_PAYS {
+            true => "name a folder on a fast drive with --spill-dir, ",
+            false => "",
+        };
+        let remedy = format!(
+            "{spill}give at least {}, or lower --image-cache, --sh-degree or the size of the photos",
+            format_bytes_up(start.total())
+        );
         return Err(InputError::new("--host-mem", problem, remedy));
     }
     if most.total() > budget {

@@ -108,14 +108,14 @@ pub fn describe(
         counted(rayon::current_num_threads() as u64, "thread"),
         limits::simd_path(config).name(),
         trainer.renderer.device(),
-        describe_tiers(forecast, tiers),
+        describe_tiers(forecast, tiers, config.host_mem.0 > 0),
         device_memory::describe(config, forecast.memory_at_end())
     );
     folded(text.trim_end())
 }
 
 /// The lines about pages, memory, drive and time.
-fn describe_tiers(forecast: &Forecast, tiers: &Tiers) -> String {
+fn describe_tiers(forecast: &Forecast, tiers: &Tiers, has_named_limit: bool) -> String {
     let (plan, memory) = (&forecast.tiers, forecast.memory_at_end());
     let part = |name: &str, bytes: u64| format!("    {name:<44} {:>10}\n", format_bytes(bytes));
     let LargestView { pages: largest, mean, .. } = &plan.largest_view;
@@ -147,9 +147,17 @@ fn describe_tiers(forecast: &Forecast, tiers: &Tiers) -> String {
         None => format!(" ({} at the start)", format_bytes(forecast.memory[0].total())),
     };
     text.push_str(&format!("memory  about {} at the peak{at}{start}\n", format_bytes(memory.total())));
-    if let (None, Some(limit)) = (plan.frames, forecast.host_mem.filter(|limit| *limit < memory.total())) {
+    let limit = forecast.host_mem.filter(|_| plan.frames.is_none() && forecast.frames_at_end.is_some());
+    if let Some(limit) = limit {
         text.push_str(&format!(
-            "        more than --host-mem {}: when the scene has grown that far, its pages move to checkpoint/\n",
+            "        when the scene has outgrown {}, {}, its pages move to checkpoint/\n",
+            format_bytes(limit),
+            if has_named_limit { "--host-mem" } else { "the default share of the free memory, and what is free then" }
+        ));
+    }
+    if let Some(limit) = forecast.host_mem.filter(|limit| has_named_limit && *limit < memory.total()) {
+        text.push_str(&format!(
+            "        more than --host-mem {}, since one view of the grown scene takes that: lower --max-gaussians, or make the photos smaller\n",
             format_bytes(limit)
         ));
     }
@@ -225,17 +233,30 @@ fn break_of(line: &str) -> Option<usize> {
     breaks.iter().rfind(|at| !is_inside(at)).or(breaks.last()).copied()
 }
 
+/// What the steps write to the drive.
+fn written_text(forecast: &Forecast) -> String {
+    let (written, life) = (forecast.bytes_written, 100.0 * forecast.bytes_written / ENDURANCE_BYTES);
+    format!(
+        "about {} to write without commits, {life:.2} % of the rated life of a common drive",
+        format_bytes(written as u64)
+    )
+}
+
 /// The lines about drives.
 fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
-    let (plan, commits) = (&forecast.tiers, forecast.commit_bytes_most);
+    let (plan, commits) = (&forecast.tiers, forecast.commit_bytes);
     let kept = forecast.if_kept.as_ref().map_or(String::new(), |kept| or_kept(format_bytes(kept.drive_bytes_peak)));
     let commits = match commits > 0.0 {
-        true => format!("commits write {} at most", format_bytes(commits as u64)),
+        true => format!("commits write about {}", format_bytes(commits as u64)),
         false => String::from("no periodic commits"),
     };
     if !tiers.spills() {
         let [checkpoint, ply] = [forecast.drive_bytes_peak, forecast.ply_bytes].map(format_bytes);
-        return format!("drive   checkpoint about {checkpoint}{kept}, PLY {ply}{at}; {commits}\n");
+        let written = match forecast.bytes_written > 0.0 {
+            true => format!("        {}\n", written_text(forecast)),
+            false => String::new(),
+        };
+        return format!("drive   checkpoint about {checkpoint}{kept}, PLY {ply}{at}; {commits}\n{written}");
     }
     let now = if at.is_empty() {
         String::new()
@@ -248,15 +269,14 @@ fn drive(forecast: &Forecast, tiers: &Tiers, at: &str) -> String {
         "drive   about {} with the versions of the last commits{at}{kept}, {} free\n        \
          one version is {} of pages{now}{by} ({})\n        \
          each new segment file takes {}; a reserve file of {} is given up when the drive is full\n        \
-         about {} to write without commits, {:.2} % of the rated life of a common drive; {commits}\n",
+         {}; {commits}\n",
         format_bytes(forecast.drive_bytes_peak),
         plan.free_bytes.map_or(String::from("unknown"), format_bytes),
         format_bytes(forecast.drive_bytes),
         tiers.codec,
         format_bytes(tiers.segment_bytes),
         format_bytes(reserve_bytes(tiers.segment_bytes)),
-        format_bytes(forecast.bytes_written as u64),
-        100.0 * forecast.bytes_written / ENDURANCE_BYTES
+        written_text(forecast)
     )
 }
 
@@ -275,7 +295,7 @@ pub fn too_large_for_a_dry_run(config: &TrainConfig, start: &Start, host_mem: Op
          pages   about {pages} of up to {}, {} in all; the drive has {} free\n\
          memory  {} in all, fewer than {} at once\n\
          views   unknown: their needs follow from pages on the drive, and a dry run writes none.\n        \
-         The run itself checks them before its first step.",
+         gsscale-plan with the same flags checks them, and so does the run before its first step.",
         start.dataset.train_views().len(),
         start.dataset.test_views().len(),
         start.rows,

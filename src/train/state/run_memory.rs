@@ -37,12 +37,15 @@ pub(crate) struct MemoryState {
     /// need in the renderer.
     rendered_rows: u64,
     row_bytes_due: u64,
+    /// Whether the user knows that a view exceeds the budget.
+    is_exceeded: bool,
 }
 
 impl Default for MemoryState {
     fn default() -> MemoryState {
         let (budget, pages_most, visible_share) = (None, usize::MAX, 0.0);
-        MemoryState { budget, pages_most, visible_share, whole_rows: 0, rendered_rows: 0, row_bytes_due: 0 }
+        let (whole_rows, rendered_rows, row_bytes_due, is_exceeded) = (0, 0, 0, false);
+        MemoryState { budget, pages_most, visible_share, whole_rows, rendered_rows, row_bytes_due, is_exceeded }
     }
 }
 
@@ -164,7 +167,10 @@ impl RunMemory<'_> {
             let row_bytes = WorkingSet::row_bytes(self.sh_degree_last);
             // Between the passes, the batches keep the numbers of their rows in view.
             let numbers = (rows as f64 * self.memory.visible_share) as u64 * size_of::<u32>() as u64;
-            (frames, self.memory.pages_most) = budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
+            let lacking;
+            (frames, self.memory.pages_most, lacking) =
+                budget.batches(self.scene, self.view_bytes()[1] + numbers, row_bytes);
+            self.warn_of_excess(budget, lacking);
             self.shrink_working_set(self.memory.pages_most.saturating_mul(self.scene.rules.page_rows));
         }
         let pager = &mut self.scene.pager;
@@ -177,6 +183,20 @@ impl RunMemory<'_> {
                 return_small_blocks();
             }
         }
+    }
+
+    /// Warns once that a view takes `lacking` bytes more than the budget, however small its batches are.
+    fn warn_of_excess(&mut self, budget: HostBudget, lacking: u64) {
+        if lacking == 0 || std::mem::replace(&mut self.memory.is_exceeded, true) {
+            return;
+        }
+        crate::tell!(
+            "warning: from step {} on one view of the grown scene takes about {} more than {}: the run goes on with the least that it can; \
+             fewer Gaussians (--max-gaussians) or smaller photos need less",
+            self.step,
+            format_bytes(lacking),
+            format_bytes(budget.bytes)
+        );
     }
 
     /// Adds the frames that a step lacked, as `error` reports, if memory is left for them. On true the step can be
