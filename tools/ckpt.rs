@@ -9,13 +9,16 @@ use gsscale::base::units::format_bytes;
 use gsscale::config::command_line::parse_plain;
 use gsscale::config::values::ByteSize;
 use gsscale::exchange::format::ExportFormat;
+use gsscale::exchange::meta::ExportFrame;
 use gsscale::exchange::sink::LevelCounts;
+use gsscale::exchange::transform::transform_path;
 use gsscale::page::format::codec::Codec;
 use gsscale::page::format::slot_header::StoredAs;
 use gsscale::page::map::commit::CommitError;
 use gsscale::page::map::entries::MapError;
 use gsscale::train::error::TrainError;
 use gsscale::train::inputs::machine::absolute;
+use gsscale::train::inputs::signals::StopFlag;
 use gsscale::train::stores::{
     ExportRequest, GenerationLine, ImportRequest, Inspected, PageInspected, PruneRequest, Pruned, RolledBack,
     SalvageRequest, Salvaged, StoreFault, ValueSpread, Verdict, clone_store, export, find_store, import, inspect,
@@ -92,8 +95,16 @@ pub fn run_with(arguments: Vec<OsString>) -> ExitCode {
                 "  remedy: gsscale-ckpt salvage DIR --out TO rebuilds the map from the pages, and never writes to DIR"
             );
         }
-        ExitCode::FAILURE
+        match listen().ok().and_then(|stop| stop.exit_code()) {
+            Some(code) => ExitCode::from(code as u8),
+            None => ExitCode::FAILURE,
+        }
     })
+}
+
+/// The stop request of this process. Errors: the system refused a handler.
+fn listen() -> Result<StopFlag, TrainError> {
+    StopFlag::listen().map_err(|e| InputError::io("signals", "listening for Ctrl-C", &e).into())
 }
 
 fn is_damaged_map(error: &TrainError) -> bool {
@@ -483,6 +494,9 @@ struct Export {
     /// Export only spherical harmonics up to this degree
     #[arg(long, value_name = "0..3", value_parser = clap::value_parser!(u8).range(0..=3))]
     sh_degree: Option<u8>,
+    /// Positions of the file: dataset, or local (near the origin, with a file that leads back) [default: that of the run]
+    #[arg(long, value_name = "FRAME")]
+    export_frame: Option<ExportFrame>,
     /// Most memory to use
     #[arg(long, default_value = "1GiB", value_name = "SIZE")]
     host_mem: ByteSize,
@@ -507,8 +521,9 @@ fn run_export(args: &Export) -> Result<ExitCode, TrainError> {
         max_gaussians: args.max_gaussians,
         crop: args.crop,
         sh_degree: args.sh_degree,
+        frame: args.export_frame,
     };
-    let done = export(&find_store(&args.dir)?, &request)?;
+    let done = export(&find_store(&args.dir)?, &request, &listen()?)?;
     done.warnings.iter().for_each(|warning| gsscale::tell!("warning: {warning}"));
     print(args.json, &done, || {
         let mut text = format!(
@@ -525,7 +540,8 @@ fn run_export(args: &Export) -> Result<ExitCode, TrainError> {
             text += &format!("{}\n", LevelCounts { rows, always_shown: done.always_shown });
         }
         if done.is_local {
-            text += "positions are local: the file transform.json of the export leads back to the dataset's\n";
+            let transform = transform_path(&done.file);
+            text += &format!("positions are local: {} leads back to the dataset's\n", transform.display());
         }
         if done.skipped > 0 {
             text +=
@@ -542,7 +558,7 @@ Examples:
   gsscale-train scans/city --out runs/city --init-ply /mnt/nvme/city --spill-dir /mnt/nvme/pages
   gsscale-ckpt export /mnt/nvme/city --out block.ply --crop 0,0,0,10,10,10
 
-The file may be larger than memory. Its values are kept bit for bit; moments are zero. gsscale-train starts from the
+The file may be larger than memory. Its values of 32 bits are kept bit for bit; moments are zero. gsscale-train starts from the
 store with --init-ply.";
 
 #[derive(clap::Args)]
@@ -569,13 +585,14 @@ struct Import {
 }
 
 fn run_import(args: &Import) -> Result<ExitCode, TrainError> {
-    let done = import(&ImportRequest {
+    let request = ImportRequest {
         file: args.file.clone(),
         out: args.out.clone(),
         host_mem: args.host_mem.0,
         page_rows: args.page_rows,
         codec: args.spill_codec,
-    })?;
+    };
+    let done = import(&request, &listen()?)?;
     print(args.json, &done, || {
         let mut text = format!(
             "{}: {} Gaussians with SH degree {} in {} pages, at most {} of memory used\n",
@@ -612,7 +629,7 @@ struct Clone {
 }
 
 fn run_clone(args: &Clone) -> Result<ExitCode, TrainError> {
-    let done = clone_store(&find_store(&args.dir)?, &args.to)?;
+    let done = clone_store(&find_store(&args.dir)?, &args.to, &listen()?)?;
     print(args.json, &done, || {
         format!(
             "{}: {} generations, {} page versions, {} read and verified\n\
@@ -654,7 +671,7 @@ struct Salvage {
 
 fn run_salvage(args: &Salvage) -> Result<ExitCode, TrainError> {
     let request = SalvageRequest { to: args.out.clone(), config: args.config.clone() };
-    let done = salvage(&find_store(&args.dir)?, &request)?;
+    let done = salvage(&find_store(&args.dir)?, &request, &listen()?)?;
     print(args.json, &done, || salvage_text(&done))
 }
 

@@ -6,9 +6,11 @@ use gsscale::base::allocator::return_freed_blocks;
 use gsscale::base::environment::quiet_wayland;
 use gsscale::base::error::InputError;
 use gsscale::base::say::exit_code;
+use gsscale::base::units::counted;
 use gsscale::base::whole_file::{check_replaceable, folder_of, write_whole};
 use gsscale::config::command_line::parse_arguments;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
+use gsscale::config::values::Chosen;
 use gsscale::exchange::sog::is_tree;
 use gsscale::photos::exposure::FILE as APPEARANCE_FILE;
 use gsscale::render::lpips::InputRange;
@@ -16,7 +18,7 @@ use gsscale::report::chart::{Chart, Mark};
 use gsscale::report::html::{Cell, Page, is_page};
 use gsscale::train::error::TrainError;
 use gsscale::train::run::eval_file::{EvalExtras, EvalReport, LevelReport, evaluate_file};
-use gsscale::train::run::model_of_run::ModelOfRun;
+use gsscale::train::run::model_of_run::{ModelOfRun, gaussians_left_out};
 use std::ffi::OsString;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -83,6 +85,8 @@ fn start(args: Args) -> Result<(), TrainError> {
     let file = args.config.as_deref().or(run_config.as_deref());
     let mut config = file.map_or_else(|| Ok(TrainConfig::default()), TrainConfig::read)?;
     args.keys.apply(&mut config);
+    // An evaluation takes no step, so a run with its optimizer on a device is evaluated on any.
+    config.optimizer_on = Chosen(None);
     config.check()?;
     let extras = EvalExtras {
         pictures: args.renders.as_deref(),
@@ -90,6 +94,13 @@ fn start(args: Args) -> Result<(), TrainError> {
         appearance: values.as_deref().filter(|file| file.is_file()),
     };
     let report = evaluate_file(&ply, &scene, &config, &extras)?;
+    let left_out = run_config.as_deref().map_or(0, |config| gaussians_left_out(folder_of(config)));
+    if left_out > 0 {
+        gsscale::tell!(
+            "the file lacks {} that too few photos see (--export-clean); the figures of the run are of all",
+            counted(left_out, "Gaussian")
+        );
+    }
     let text = serde_json::to_string_pretty(&report)
         .map_err(|e| InputError::new(&ply, format!("writing JSON failed: {e}"), "report this as a bug"))?;
     gsscale::say!("{text}");

@@ -116,8 +116,10 @@ pub fn check_ours(folder: &Path, is_ours: IsOurs) -> InputResult<()> {
     match first_other(folder, Path::new(""), is_ours) {
         Ok(None) => Ok(()),
         Ok(Some(other)) => {
-            let problem =
-                format!("this folder would be replaced, but it holds {}, which gsscale did not write", other.display());
+            let problem = format!(
+                "this folder would be replaced, but it holds {}, which is not part of what is written",
+                other.display()
+            );
             Err(InputError::new(folder, problem, "name a new folder, or move the file away"))
         }
         Err(e) if e.kind() == std::io::ErrorKind::NotFound => Ok(()),

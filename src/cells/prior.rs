@@ -12,6 +12,7 @@ use crate::config::new_run;
 use crate::page::format::codec::Codec;
 use crate::page::tool::new_store::part_of;
 use crate::train::error::TrainError;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::memory::host_budget;
 use crate::train::run::out_folder::{check_apart, is_empty};
 use crate::train::state::trainer::Trainer;
@@ -67,13 +68,14 @@ pub fn prior(request: &PriorRequest) -> Result<i32, TrainError> {
     }
     // What a killed process has left.
     remove_store(&part_of(&city.prior_store()))?;
-    let rows = import(&ImportRequest {
+    let request = ImportRequest {
         file: Trainer::ply_path(&out),
         out: city.prior_store(),
         host_mem: budget.unwrap_or(1 << 30),
         page_rows,
         codec: Codec::Raw,
-    })?;
+    };
+    let rows = import(&request, &StopFlag::default())?;
     crate::say!("the prior in {} is done: {} Gaussians in {} pages", city.0.display(), rows.gaussians, rows.pages);
     Ok(0)
 }

@@ -393,7 +393,8 @@ fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, Tr
     let before = copies_of(folder)?;
     let number = before.first().map_or(0, |(number, _)| number + 1);
     let (made, copy) = (copies.join(format!("{UNNAMED}{:032x}", draw_identity())), copy_of(folder, number));
-    clone_store(&find_store(out)?, &made)?;
+    // A copy is part of what a stopped worker leaves.
+    clone_store(&find_store(out)?, &made, &StopFlag::default())?;
     // Copying takes long. Another owner's copy of this number stays: no folder is renamed over one with files.
     let named = if lock.is_held() { std::fs::rename(&made, &copy) } else { Err(ErrorKind::Other.into()) };
     if let Err(error) = named {
@@ -422,7 +423,7 @@ fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, Tr
 /// Errors: the store is damaged or in use, or `to` cannot be written.
 fn clone_into(from: &Path, to: &Path) -> Result<(), TrainError> {
     remove_store(&part_of(to))?;
-    clone_store(&find_store(from)?, to).map(drop)
+    clone_store(&find_store(from)?, to, &StopFlag::default()).map(drop)
 }
 
 /// Removes a store and its folder, if there is one.

@@ -305,7 +305,7 @@ config_keys! {
         /// bytes, sog a folder with levels of detail, which web viewers load in parts
         export: Exports = Exports { spz: false, sog: false } => Free common;
         /// Leave Gaussians that fewer than two photos see out of the result files (the checkpoint keeps them): auto, on or off.
-        /// Where photos overlap little, auto leaves out only those that no photo sees
+        /// auto leaves out at most .1 %: where more have one photo only those without any, and none where more have no photo
         export_clean: Chosen<bool> = Chosen(None) => Free;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;
@@ -499,7 +499,7 @@ impl TrainConfig {
             return Ok(());
         }
         let needs = [
-            (self.device != Device::Cpu, "it needs a GPU", "use --device auto or gpu"),
+            (self.device != Device::Cpu, "it needs a GPU", "use --device gpu"),
             (self.optimizer == Method::Deferred, "it supports the deferred form only", "use --optimizer deferred"),
             (self.pages_file.is_empty(), "it knows no frozen pages", "leave out --pages-file"),
             (!self.refine_poses.is_on(), "it leaves the gradients of poses on the device", "leave out --refine-poses"),
@@ -507,7 +507,8 @@ impl TrainConfig {
         ];
         match needs.iter().find(|(holds, ..)| !holds) {
             Some((_, problem, remedy)) => {
-                let remedy = format!("{remedy}, or --optimizer-on host");
+                let remedy =
+                    format!("{remedy}, or --optimizer-on host (with --accept-changes for a run that has begun)");
                 Err(InputError::new("--optimizer-on device", *problem, &remedy))
             }
             None => Ok(()),

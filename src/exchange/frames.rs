@@ -9,6 +9,8 @@ use super::meta::{ExportFrame, SceneMeta};
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::rotation::{GaussianRotation, Rotation};
 
+/// Local units beyond which a position in a file is a fault of the file. Half of the cameras are within 1.
+const FAR_MOST: f32 = 1e6;
 /// Most values of the bands above the constant one.
 const BANDS_MAX: usize = 45;
 
@@ -127,6 +129,12 @@ pub fn to_local(columns: &mut Columns, meta: &SceneMeta, origin: [f64; 3], scale
     let is_finite =
         |columns: &Columns, row| Column::ALL.into_iter().all(|c| columns.row(c, row).iter().all(|v| v.is_finite()));
     columns.retain_rows(is_finite)
+}
+
+/// As [`to_local`], for a file of another program: also removes rows more than a million units away.
+pub fn file_to_local(columns: &mut Columns, meta: &SceneMeta, origin: [f64; 3], scale: f64) -> u64 {
+    let overflown = to_local(columns, meta, origin, scale);
+    overflown + columns.retain_rows(|columns, row| columns.row(Column::Means, row).iter().all(|x| x.abs() <= FAR_MOST))
 }
 
 /// Turns the rows of an upright file back to the axes of the dataset, in the file's frame. Leaves other files unchanged, bit

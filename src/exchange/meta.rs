@@ -14,6 +14,9 @@ use std::path::PathBuf;
 /// offset is more than 6e-5 radii, which is pixels in a photo.
 pub const MAX_OFFSET_RADII: f64 = 1000.0;
 
+/// A position that is rounded by more than this share of the largest sigma counts as moved.
+pub const ROUNDING_LEAST: f64 = 0.1;
+
 /// The frame of the Gaussians in a file.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ExportFrame {
@@ -63,6 +66,8 @@ pub struct SceneMeta {
     pub dropped: u64,
     /// When reading: number of infinite opacities (logits of 0 and 1), which are read as logits of 1e-6 and 1 - 1e-6.
     pub opacities_clamped: u64,
+    /// When reading: number of rows that f32 moves by more than [`ROUNDING_LEAST`] of their size, in a file of f64 positions.
+    pub moved: u64,
 }
 
 impl Default for SceneMeta {
@@ -79,6 +84,7 @@ impl Default for SceneMeta {
             transform: None,
             dropped: 0,
             opacities_clamped: 0,
+            moved: 0,
         }
     }
 }

@@ -72,6 +72,8 @@ pub struct SpzWriter {
     far: u64,
     /// Rows by the fractional bits that their position allows.
     rows_by_bits: [u64; FRACTION_BITS_MAX as usize + 1],
+    /// Rows by the fewest fractional bits with which a position moves by less than their largest sigma.
+    rows_by_need: [u64; FRACTION_BITS_MAX as usize + 1],
     /// Rows with a sigma beyond the format's.
     large: u64,
     is_local: bool,
@@ -103,6 +105,7 @@ impl SpzWriter {
             reach: 0.0,
             far: 0,
             rows_by_bits: [0; FRACTION_BITS_MAX as usize + 1],
+            rows_by_need: [0; FRACTION_BITS_MAX as usize + 1],
             large: 0,
             is_local: to_file.frame() == ExportFrame::Local,
         };
@@ -144,6 +147,8 @@ impl Format for SpzWriter {
         }
         self.reach = self.reach.max(reach);
         self.rows_by_bits[usize::from(fraction_bits(reach))] += 1;
+        let need = -row.log_scales.iter().copied().fold(f32::MIN, f32::max) / std::f32::consts::LN_2;
+        self.rows_by_need[need.ceil().clamp(0.0, f32::from(FRACTION_BITS_MAX)) as usize] += 1;
         self.large += u64::from(row.log_scales.iter().any(|&s| s > LOG_SCALE_MAX));
         let mut bytes: Vec<u8> = row.position.iter().flat_map(|x| x.to_le_bytes()).collect();
         push_attributes(&ExportRow { quat: half_turn_of_own_axes(row.quat), ..*row }, self.sh_degree, &mut bytes);
@@ -185,6 +190,11 @@ impl Format for SpzWriter {
                 break;
             }
             far += rows;
+        }
+        let small: u64 = self.rows_by_need[usize::from(bits) + 1..].iter().sum();
+        if told.is_empty() && small > few {
+            let (small, step) = (gaussians_are(small), 0.5f64.powi(i32::from(bits)));
+            told.push(format!("{small} smaller than the {step} units to which SPZ rounds all positions: {remedy}"));
         }
         if self.rows > READER_ROWS_MAX {
             told.push(format!(

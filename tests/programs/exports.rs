@@ -118,7 +118,10 @@ fn clean_results_and_the_start_view_are_those_of_any_budget() {
     for export in [&work.summary("out")["export"], &work.summary("out")["more_exports"][0]] {
         assert_eq!(export["gaussians"].as_u64(), Some(kept.rows() as u64), "{export}");
     }
+    let said = stderr(&work.succeeds(EVAL, "out"));
+    assert!(said.contains(&format!("the file lacks {left_out} Gaussian")), "{said}");
     work.run("whole", "--steps 40 --export-clean off");
+    assert!(!stderr(&work.succeeds(EVAL, "whole")).contains("the file lacks"));
     let whole = work.gaussians("whole/point_cloud.ply").0;
     assert!(left_out > 0 && 2 * left_out < whole.rows() as u64, "{left_out} Gaussians that one of three photos sees");
     assert_eq!(whole.rows() as u64, work.count("whole", "gaussians"));

@@ -11,9 +11,10 @@ use super::PlyContent;
 use super::header::{Element, Header, PropertyKind, Scalar, parse_header, shorten};
 use super::rows::{Body, read_rows};
 use crate::base::error::{InputError, InputResult};
+use crate::base::math::exp32;
 use crate::exchange::foreign::foreign;
 use crate::exchange::frames::unit_quat;
-use crate::exchange::meta::{ExportFrame, SceneMeta};
+use crate::exchange::meta::{ExportFrame, ROUNDING_LEAST, SceneMeta};
 use crate::exchange::transform::meta_beside;
 use crate::scene::columns::{Column, Columns, sh_n_width};
 use crate::scene::rotation::Rotation;
@@ -38,8 +39,8 @@ fn read_transform_beside(path: &Path, meta: &mut SceneMeta) -> InputResult<()> {
         return Ok(());
     }
     if let Some(beside) = meta_beside(path)? {
-        let SceneMeta { antialiased, dropped, opacities_clamped, .. } = *meta;
-        *meta = SceneMeta { antialiased, dropped, opacities_clamped, ..beside };
+        let SceneMeta { antialiased, dropped, opacities_clamped, moved, .. } = *meta;
+        *meta = SceneMeta { antialiased, dropped, opacities_clamped, moved, ..beside };
     }
     Ok(())
 }
@@ -256,8 +257,9 @@ fn stream_gaussian_rows<R: BufRead>(
     names.extend((0..4).map(|i| format!("rot_{i}")));
     names.extend((0..rest).map(|i| format!("f_rest_{i}")));
     let slots = names.iter().map(|n| Ok(scalar_at(path, vertex, n)?.0)).collect::<InputResult<Vec<usize>>>()?;
+    let is_double = scalar_at(path, vertex, "x")?.1.size() == size_of::<f64>();
     let mut meta = meta_from_comments(path, &header.comments)?;
-    let (mut dropped, mut clamped) = (Dropped::default(), 0);
+    let (mut dropped, mut clamped, mut moved) = (Dropped::default(), 0, 0);
     let (mut values, mut out) = (vec![0.0f32; slots.len()], vec![0.0f32; slots.len()]);
     read_rows(body, vertex, &slots, |row, raw| {
         for (value, &r) in values.iter_mut().zip(raw) {
@@ -271,6 +273,11 @@ fn stream_gaussian_rows<R: BufRead>(
             dropped.add(row);
             return Ok(());
         }
+        let rounding = raw[..3].iter().zip(&values).fold(0.0f64, |most, (&r, &v)| most.max((r - f64::from(v)).abs()));
+        if is_double && rounding > 0.0 {
+            let sigma = f64::from(exp32(values[7].max(values[8]).max(values[9])));
+            moved += u64::from(rounding > ROUNDING_LEAST * sigma);
+        }
         out[..10].copy_from_slice(&values[..10]);
         out[10..ROW_HEAD].copy_from_slice(&unit_quat([values[10], values[11], values[12], values[13]]));
         // Channel-major in the file.
@@ -281,7 +288,7 @@ fn stream_gaussian_rows<R: BufRead>(
         take(&out)
     })?;
     dropped.check(path, vertex.count)?;
-    (meta.dropped, meta.opacities_clamped) = (dropped.count, clamped);
+    (meta.dropped, meta.opacities_clamped, meta.moved) = (dropped.count, clamped, moved);
     Ok(meta)
 }
 

@@ -3,8 +3,8 @@
 //! The store is built beside its target under another name and renamed when complete.
 //!
 //! Invariants: 1. the target is a complete store or nothing: a tool that fails or is killed leaves at most a folder
-//! with suffix `PART_SUFFIX`, which the next attempt refuses to overwrite; 2. memory is bounded by sixteen pages, and
-//! by sixteen more if they are encoded.
+//! with suffix `PART_SUFFIX`, which the next attempt removes if it is a store without commits, and else refuses; 2. memory is
+//! bounded by sixteen pages, and by sixteen more if they are encoded.
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
@@ -18,6 +18,7 @@ use crate::page::format::slot_header::{HEADER_BYTES, SlotRef};
 use crate::page::map::commit::{Commits, Cut, PageChange};
 use crate::page::map::opening::Opened;
 use crate::page::tool::reading::{ReadError, commit_config};
+use crate::page::tool::uncommitted::holds_no_commit;
 use crate::page::versions::paged_store::{PageDone, PageMoved, PagedStore};
 use crate::page::versions::slots::SlotLayout;
 use std::collections::BTreeMap;
@@ -50,22 +51,48 @@ pub fn part_of(target: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// The `.part` name for `target`, if neither exists.
+/// The `.part` name for `target`, if neither exists. What an attempt that was killed before its first commit left is removed.
 /// Errors: one of them exists, or `target` lies in a store.
 pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
     let part = part_of(target);
-    for path in [target, &part] {
-        if std::fs::symlink_metadata(path).is_ok() {
-            let remedy = "name a folder that does not exist; its parent must";
-            return Err(InputError::new(path, "exists already", remedy));
+    if std::fs::symlink_metadata(target).is_ok() {
+        return Err(InputError::new(target, "exists already", "name a folder that does not exist; its parent must"));
+    }
+    if SpillDir::exists_in(&part) {
+        let mut spill = SpillDir::open(&part, true)?;
+        if holds_no_commit(&spill)? {
+            // The name says that a store was being built here, in a folder of its own.
+            spill.adopt_folder();
+            spill.remove()?;
         }
     }
-    let whole = std::path::absolute(target).unwrap_or_else(|_| target.to_path_buf());
-    if let Some(store) = whole.ancestors().skip(1).find(|above| above.join(FORMAT).is_file()) {
-        let problem = format!("it would lie in another store, {}", store.display());
-        return Err(InputError::new(target, problem, "name a folder outside of it"));
+    if std::fs::symlink_metadata(&part).is_ok() {
+        let problem = "it is what an earlier attempt left, and is not certain to be worthless";
+        return Err(InputError::new(part, problem, "remove it, or name another folder"));
     }
+    refuse_inside_store(target)?;
     Ok(part)
+}
+
+/// Errors: `target` lies in a store.
+pub fn refuse_inside_store(target: &Path) -> InputResult<()> {
+    let whole = std::path::absolute(target).unwrap_or_else(|_| target.to_path_buf());
+    let store = whole.ancestors().skip(1).find(|above| above.join(FORMAT).is_file());
+    store.map_or(Ok(()), |store| {
+        let problem = format!("it would lie in a store, {}", store.display());
+        Err(InputError::new(target, problem, "name a place outside of it"))
+    })
+}
+
+/// The error of a drive without space, by the name that the user gave; other errors stay.
+fn no_space_for(target: &Path, error: ReadError) -> ReadError {
+    match error {
+        ReadError::Commit(error) if error.is_out_of_space() => {
+            let problem = "there is no space for this store on its drive";
+            InputError::new(target, problem, "free space there, or name a folder on another drive").into()
+        }
+        error => error,
+    }
 }
 
 impl NewStore {
@@ -88,7 +115,7 @@ impl NewStore {
             }
             Err(error) => {
                 let _ = spill.remove();
-                Err(error)
+                Err(no_space_for(target, error))
             }
         }
     }
@@ -106,7 +133,7 @@ impl NewStore {
         }
         self.labels.insert(page, label.to_vec());
         let written = self.store.write(0, page, label, payload.len(), buffer);
-        written.map_err(|(error, _)| ReadError::Commit(error.into()))
+        written.map_err(|(error, _)| no_space_for(&self.target, ReadError::Commit(error.into())))
     }
 
     /// Removes `page` from the next generation.
@@ -130,10 +157,12 @@ impl NewStore {
         let pin = names.first().map(String::as_str);
         let cut = Cut { changes: &changes, run_state, note, pin };
         let mut done = Vec::new();
-        let generation = self.commits.commit(&mut self.store, &mut done, &cut)?;
+        let committed = self.commits.commit(&mut self.store, &mut done, &cut);
+        let generation = committed.map_err(|error| no_space_for(&self.target, error.into()))?;
         let more: Vec<(String, u64)> = names.iter().skip(1).map(|name| (name.clone(), generation)).collect();
         if !more.is_empty() {
-            self.commits.pin(&mut self.store, &more, &[])?;
+            let pinned = self.commits.pin(&mut self.store, &more, &[]);
+            pinned.map_err(|error| no_space_for(&self.target, error.into()))?;
         }
         Ok(generation)
     }
@@ -159,7 +188,8 @@ impl NewStore {
         self.store.complete(true, &mut done);
         for PageDone { page, buffer, result, .. } in done {
             self.free.push(buffer);
-            if let PageMoved::Written(slot) = result.map_err(|e| ReadError::Commit(e.into()))? {
+            let moved = result.map_err(|e| no_space_for(&self.target, ReadError::Commit(e.into())))?;
+            if let PageMoved::Written(slot) = moved {
                 let label = self.labels.remove(&page).unwrap_or_default();
                 self.changes.insert(page, Some((slot, label)));
             }

@@ -10,9 +10,10 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::even_sample::EvenSample;
 use crate::base::ids::PageId;
+use crate::base::units::counted;
 use crate::dataset::import::{Budget, Grown, PageSpace, Spool, SpoolWriter, paginate};
 use crate::dataset::loader::View;
-use crate::exchange::frames::to_local;
+use crate::exchange::frames::file_to_local;
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::ply::{ROW_HEAD, gaussians_header, push_row, stream_gaussians, take_row};
 use crate::scene::columns::{Column, Columns, sh_n_width};
@@ -91,7 +92,7 @@ impl GaussianFile {
     pub fn read(&self, take: &mut dyn FnMut(&Columns) -> InputResult<()>) -> InputResult<GaussiansRead> {
         let (mut far, mut giants) = (0, 0);
         let meta = stream_columns(&self.path, self.sh_degree, &mut |mut columns| {
-            far += to_local(&mut columns, &self.meta, self.origin, self.scale);
+            far += file_to_local(&mut columns, &self.meta, self.origin, self.scale);
             giants += remove_giants(&mut columns, self.log_scales);
             take(&truncate_sh(columns, self.sh_degree_most))
         })?;
@@ -242,6 +243,13 @@ pub fn file_warnings(file: &Path, meta: &SceneMeta, far: u64) -> Vec<String> {
     if meta.opacities_clamped > 0 {
         let (file, count) = (file.display(), meta.opacities_clamped);
         warnings.push(format!("{file}: {count} opacities are exactly 0 or 1, and are read as 1e-6 or 0.999999"));
+    }
+    if meta.moved > 0 {
+        let (file, moved) = (file.display(), counted(meta.moved, "Gaussian"));
+        warnings.push(format!(
+            "{file}: positions are kept with 32 bits, and {moved} moved by more than a tenth of their size: subtract the same offset \
+             from all positions of the file"
+        ));
     }
     if far > 0 {
         warnings.push(format!("{}: {far} Gaussians are too far from this scene and are dropped", file.display()));

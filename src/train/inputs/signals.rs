@@ -3,6 +3,7 @@
 //! between two runs stops the second. SIGHUP is left alone where it was ignored when the process began, as under `nohup`. SIGXFSZ (file
 //! size limit) is ignored.
 
+use crate::base::error::{InputError, InputResult};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -66,6 +67,14 @@ impl StopFlag {
             0 => None,
             signal => Some(128 + signal),
         }
+    }
+
+    /// Errors: somebody has asked the process to stop.
+    pub fn check(&self) -> InputResult<()> {
+        if self.exit_code().is_none() {
+            return Ok(());
+        }
+        Err(InputError::new("signal", "the command was stopped, and has removed what it had written", "give it again"))
     }
 
     /// Whether the deadline has passed. It ends steps alone: what follows the last step is never cut short by it.

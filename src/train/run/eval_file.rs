@@ -11,7 +11,7 @@ use crate::config::limits::{self, RunOptions};
 use crate::dataset::loader::{Dataset, load_dataset};
 use crate::dataset::read::read_scene;
 use crate::dataset::target_cache::TargetCache;
-use crate::exchange::frames::to_local;
+use crate::exchange::frames::file_to_local;
 use crate::exchange::meta::SceneMeta;
 use crate::exchange::ply::{PlyContent, gaussians_header, read_ply, stated_rows};
 use crate::exchange::sog::{SogReader, is_tree};
@@ -249,7 +249,7 @@ impl<'a> Evaluator<'a> {
     /// Errors: none of them lies in it, or they do not fit in memory.
     pub fn placed(&mut self, file: &Path, mut columns: Columns, meta: &SceneMeta) -> Result<Columns, TrainError> {
         let frame = &self.dataset.frame;
-        let far = to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
+        let far = file_to_local(&mut columns, meta, frame.origin.to_array(), frame.scale);
         let mut sample = PositionSample::default();
         sample.add(&columns.means);
         for warning in file_warnings(file, meta, far).into_iter().chain(sample.warning(file, &self.dataset.views)) {

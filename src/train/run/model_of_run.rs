@@ -7,7 +7,8 @@ use crate::config::file::{TrainConfig, read_resolved};
 use crate::exchange::foreign::refuse_folder_of_sogs;
 use crate::exchange::sog::is_tree;
 use crate::page::folder::spill_dir::SpillDir;
-use crate::report::run_files::{CONFIG_FILE, PLY_FILE};
+use crate::report::run_files::{CONFIG_FILE, PLY_FILE, SUMMARY_FILE};
+use crate::train::log::report::Summary;
 use std::path::{Path, PathBuf};
 
 /// What a run, or a file of Gaussians, stands for.
@@ -45,6 +46,16 @@ impl ModelOfRun {
         let (scene, config) = scene_of(program, &file)?;
         Ok(ModelOfRun { file, scene, config: Some(config) })
     }
+}
+
+/// The Gaussians that the files of the run in this folder lack; 0 if its summary cannot be read.
+pub fn gaussians_left_out(run: &Path) -> u64 {
+    read_summary(run).map_or(0, |summary| summary.gaussians_left_out)
+}
+
+/// The summary of the finished run in this folder.
+pub(super) fn read_summary(run: &Path) -> Option<Summary> {
+    serde_json::from_str(&std::fs::read_to_string(run.join(SUMMARY_FILE)).ok()?).ok()
 }
 
 /// The error for the folder of a run that has no result yet.

@@ -30,13 +30,14 @@ use crate::page::tool::uncommitted::{is_uncommitted, remove_uncommitted};
 use crate::paging::pager::Pager;
 use crate::render::Renderer;
 use crate::report::live::Live;
-use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, SUMMARY_FILE, saved_step};
+use crate::report::run_files::{CONFIG_FILE, METRICS_FILE, PLY_FILE, saved_step};
 use crate::report::run_report::write_run_report;
 use crate::train::commits::checkpoint::restore;
 use crate::train::error::TrainError;
 use crate::train::inputs::machine::{self, absolute};
-use crate::train::log::report::{StepLine, Summary};
+use crate::train::log::report::StepLine;
 use crate::train::memory::host_budget;
+use crate::train::run::model_of_run::read_summary;
 use crate::train::start::first_scene::{Start, dataset_print};
 use crate::train::start::tiers::Tiers;
 use crate::train::state::trainer::Trainer;
@@ -253,10 +254,6 @@ fn result_to_continue(
     let changes = Changes::of_config(&earlier.path, &text, &file.1.simd, config)?;
     let accepts_changes = request.accept_changes;
     Ok(Some(FinishedRun { file: file.clone(), run: earlier.run, summary, changes, accepts_changes }))
-}
-
-fn read_summary(out: &Path) -> Option<Summary> {
-    serde_json::from_str(&std::fs::read_to_string(out.join(SUMMARY_FILE)).ok()?).ok()
 }
 
 /// Restarts a run that was cut off before its first commit, from its config.

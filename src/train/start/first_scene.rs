@@ -22,7 +22,7 @@ use crate::dataset::plane_sweep;
 use crate::dataset::read::{ReadOptions, read_scene};
 use crate::dataset::up::estimate_up;
 use crate::exchange::foreign::refuse_folder_of_sogs;
-use crate::exchange::frames::to_local;
+use crate::exchange::frames::file_to_local;
 use crate::exchange::ply::{self, PlyContent, read_ply};
 use crate::exchange::sog::{SogReader, is_tree};
 use crate::paging::pager::Pager;
@@ -460,7 +460,7 @@ fn prepare_silently(scene: &Path, config: &TrainConfig) -> InputResult<Prepared>
     let (columns, sh_degree_start) = match gaussians {
         Some((mut columns, meta, ply)) => {
             from.clone_from(&ply);
-            let far = to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
+            let far = file_to_local(&mut columns, &meta, dataset.frame.origin.to_array(), dataset.frame.scale);
             let giants = remove_giants(&mut columns, LogScaleRange::of_scene(dataset.scene_scale));
             dataset.warnings.extend(file_warnings(&ply, &meta, far));
             dataset.warnings.extend(giants_warning(&ply, giants));

@@ -18,6 +18,7 @@ use crate::page::tool::new_store::{NewStore, refuse_existing};
 use crate::page::tool::reading::{Access, StoreReader, commit_config};
 use crate::page::versions::slots::SlotLayout;
 use crate::train::error::TrainError;
+use crate::train::inputs::signals::StopFlag;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -153,7 +154,7 @@ pub struct ClonedStore {
 /// Copies a store to the folder `to`, which does not exist.
 /// Errors: the store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at
 /// `to` then.
-pub fn clone_store(place: &StorePlace, to: &Path) -> Result<ClonedStore, TrainError> {
+pub fn clone_store(place: &StorePlace, to: &Path, stop: &StopFlag) -> Result<ClonedStore, TrainError> {
     refuse_existing(to)?;
     let store = place.open(Access::Pages)?;
     store.find(None)?;
@@ -174,6 +175,7 @@ pub fn clone_store(place: &StorePlace, to: &Path) -> Result<ClonedStore, TrainEr
             if is_same {
                 continue;
             }
+            stop.check()?;
             let payload = reader.payload(page.page, slot).map_err(|what| damaged(place, page.page, slot, &what))?;
             copy.put(page.page, label, payload)?;
             (versions, bytes_read) = (versions + 1, bytes_read + slot.transfer_bytes() as u64);

@@ -12,7 +12,7 @@ use crate::base::ids::{PageId, PageNo};
 use crate::base::machine::host_bytes_peak;
 use crate::base::math::exp32;
 use crate::base::text::read_text;
-use crate::base::units::format_bytes;
+use crate::base::units::{format_bytes, format_bytes_up};
 use crate::checkpoint::run_state::RunState;
 use crate::config::limits::RunOptions;
 use crate::exchange::format::ExportFormat;
@@ -20,6 +20,7 @@ use crate::exchange::frames::to_local;
 use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::sink::LEVELS_MAX;
 use crate::optim::drift::STEP_BYTES;
+use crate::page::tool::new_store::refuse_inside_store;
 use crate::page::tool::reading::{Access, StoreReader};
 use crate::paging::frames::evict::EvictPolicy;
 use crate::paging::pager::{Pager, PagerConfig};
@@ -31,6 +32,7 @@ use crate::scene::select::RankSearch;
 use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::gaussian_pages::truncate_sh;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::step::catch_up::evaluate_all;
 use crate::train::step::pages::PagedScene;
 use serde::Serialize;
@@ -62,6 +64,8 @@ pub struct ExportRequest {
     pub crop: Option<[f64; 6]>,
     /// Highest SH degree to keep.
     pub sh_degree: Option<u8>,
+    /// The frame of the file; `None` for that of the run.
+    pub frame: Option<ExportFrame>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -88,11 +92,12 @@ pub struct Exported {
 }
 
 /// Exports a generation.
-/// Errors: the store cannot be opened or is damaged, the budget is too small, no Gaussian is left, or the file cannot
-/// be written.
-pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, TrainError> {
+/// Errors: the store cannot be opened or is damaged, the budget is too small, no Gaussian is left, the file cannot
+/// be written, or `stop` was asked for.
+pub fn export(place: &StorePlace, request: &ExportRequest, stop: &StopFlag) -> Result<Exported, TrainError> {
     let format = ExportFormat::of_path(&request.out)?;
     format.check_replaceable("--out", &request.out)?;
+    refuse_inside_store(&request.out)?;
     let store = place.open(Access::Pages)?;
     let generation = store.find(request.generation.as_deref())?;
     let state = run_state_of(&store, generation)?;
@@ -103,10 +108,11 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
     let pages = choice.pages(&scene);
     choice.find_cut(&mut scene, &pages, state.trainer.step)?;
     let sh_degree = request.sh_degree.map_or(options.sh_degree, |degree| degree.min(options.sh_degree));
-    let meta = meta_of(&state, &options);
+    let meta = meta_of(&state, &options, request.frame);
     let mut sink = format.create(&request.out, sh_degree, state.rows_bound, &meta)?;
     let mut given = 0;
     scene.for_rows_of(&pages, state.trainer.step, &mut |rows| {
+        stop.check()?;
         let chosen = choice.chosen(rows, sh_degree);
         given += chosen.rows() as u64;
         Ok::<(), TrainError>(sink.write(&chosen)?)
@@ -136,14 +142,14 @@ pub fn export(place: &StorePlace, request: &ExportRequest) -> Result<Exported, T
 }
 
 /// The PLY comments, as the trainer writes them.
-fn meta_of(state: &RunState, options: &RunOptions) -> SceneMeta {
+fn meta_of(state: &RunState, options: &RunOptions, frame: Option<ExportFrame>) -> SceneMeta {
     let print = &state.origin.dataset;
     SceneMeta {
         step: Some(u64::from(state.trainer.step)),
         origin: print.origin,
         scale: print.scale,
         scene_radius: f64::from(print.scene_scale) * print.scale,
-        frame: options.export_frame,
+        frame: frame.unwrap_or(options.export_frame),
         upright: options.up.and_then(Rotation::upright),
         ..SceneMeta::default()
     }
@@ -164,7 +170,7 @@ pub(super) fn scene_at(
     let fixed = FIXED_BYTES + others + tables + (store.entries() + pages.len()) as u64 * ENTRY_BYTES;
     let frames = (host_mem / share).saturating_sub(fixed) / (frame * COPIES);
     if frames == 0 {
-        let least = format_bytes((fixed + frame * COPIES) * share);
+        let least = format_bytes_up((fixed + frame * COPIES) * share);
         let problem = format!("{} is not enough for this store", format_bytes(host_mem));
         return Err(InputError::new("--host-mem", problem, format!("give at least {least}")).into());
     }

@@ -10,7 +10,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
 use crate::base::machine::host_bytes_peak;
-use crate::base::units::{MIB, format_bytes};
+use crate::base::units::{MIB, format_bytes, format_bytes_up};
 use crate::base::whole_file::folder_of;
 use crate::checkpoint::run_state::{DatasetPrint, Origin, RunIdentity, RunState};
 use crate::config::file::TrainConfig;
@@ -32,6 +32,7 @@ use crate::scene::state::SceneState;
 use crate::train::error::TrainError;
 use crate::train::inputs::dataset_print::GaussiansPrint;
 use crate::train::inputs::gaussian_pages::{GaussianWriter, PositionSample, file_warnings, stream_columns};
+use crate::train::inputs::signals::StopFlag;
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -68,7 +69,7 @@ pub struct Imported {
 /// Imports a PLY.
 /// Errors: the file cannot be read or holds no Gaussians, the budget is too small, or the folder cannot be written. No
 /// store is left then.
-pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
+pub fn import(request: &ImportRequest, stop: &StopFlag) -> Result<Imported, TrainError> {
     refuse_existing(&request.out)?;
     if !holds_gaussians(&request.file)? {
         let remedy = "train on points with gsscale-train --init-ply";
@@ -76,7 +77,7 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
     }
     let budget = Budget { folder: folder_of(&request.out), bytes: memory_for_rows(request)? };
     let mut rows = GaussianWriter::new(&request.file, budget);
-    let (meta, radius, points) = read_rows(&request.file, &mut rows)?;
+    let (meta, radius, points) = read_rows(&request.file, &mut rows, stop)?;
     file_warnings(&request.file, &meta, 0).iter().for_each(|warning| crate::tell!("warning: {warning}"));
     let rows = rows.finish()?;
     let (count, sh_degree) = (rows.rows(), rows.sh_degree);
@@ -91,7 +92,10 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
         failed: None,
     };
     let fill = first_fill(options.page_rows, options.strategy.grows());
-    let written = rows.for_each_page(fill, &mut |id, state| pages.write(id, &state));
+    let written = rows.for_each_page(fill, &mut |id, state| {
+        stop.check()?;
+        pages.write(id, &state)
+    });
     match pages.failed.take() {
         Some(error) => return Err(error),
         None => written?,
@@ -112,10 +116,11 @@ pub fn import(request: &ImportRequest) -> Result<Imported, TrainError> {
 
 /// Streams the Gaussians of `file` into `rows`, in the axes of their dataset. Returns the metadata, the size of the scene in
 /// the units of the file, which no file states, and the digest of the Gaussians.
-fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>) -> InputResult<(SceneMeta, f32, u64)> {
+fn read_rows(file: &Path, rows: &mut GaussianWriter<'_>, stop: &StopFlag) -> InputResult<(SceneMeta, f32, u64)> {
     let (header, sh_degree) = gaussians_header(file)?;
     let (mut sample, mut print) = (PositionSample::default(), GaussiansPrint::default());
     let meta = stream_columns(file, sh_degree, &mut |mut columns| {
+        stop.check()?;
         rotate_back(&mut columns, &header);
         sample.add(&columns.means);
         print.add(&columns);
@@ -155,7 +160,7 @@ fn memory_for_rows(request: &ImportRequest) -> InputResult<usize> {
     let least = FIXED_BYTES + pages + 16 * MIB;
     if request.host_mem < least {
         let problem = format!("{} is not enough", format_bytes(request.host_mem));
-        return Err(InputError::new("--host-mem", problem, format!("give at least {}", format_bytes(least))));
+        return Err(InputError::new("--host-mem", problem, format!("give at least {}", format_bytes_up(least))));
     }
     Ok((request.host_mem - FIXED_BYTES - pages) as usize)
 }

@@ -20,6 +20,7 @@ use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule};
 use crate::paging::stored::{PageLimits, check_values, layout_of, meta_from_label};
 use crate::scene::events::EventKind;
 use crate::scene::rows::Rows;
+use crate::scene::sightings;
 use crate::train::error::TrainError;
 use serde::Serialize;
 use std::collections::HashMap;
@@ -224,7 +225,7 @@ pub fn inspect_page(place: &StorePlace, generation: Option<&str>, id: PageId) ->
         rows_without_moments: rows_without_moments(&rows),
         opacity: spread(rows.columns.opacities.iter().map(|&o| 1.0 / (1.0 + f64::from(exp32(-o))))),
         sigma: spread(rows.columns.scales.chunks_exact(3).map(sigma)),
-        views: spread(rows.count.iter().map(|&c| f64::from(c))),
+        views: spread(rows.count.iter().map(|&word| f64::from(sightings::views(word)))),
         fault: check_values(&rows, state.trainer.step).err(),
     })
 }

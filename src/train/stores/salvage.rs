@@ -36,6 +36,7 @@ use crate::report::run_files::CONFIG_FILE;
 use crate::scene::page_layout::{capacity_bytes, read_page, write_page};
 use crate::scene::page_meta::PageMeta;
 use crate::train::error::TrainError;
+use crate::train::inputs::signals::StopFlag;
 use crate::train::step::pages::SceneRules;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -97,7 +98,7 @@ struct SalvageSource {
 /// Rebuilds a store.
 /// Errors: the store is in use or of another version, all of it is damaged, or the new folder cannot be written. No new
 /// store is left then.
-pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged, TrainError> {
+pub fn salvage(place: &StorePlace, request: &SalvageRequest, stop: &StopFlag) -> Result<Salvaged, TrainError> {
     refuse_existing(&request.to)?;
     // Hold the lock until the end, so that no trainer writes meanwhile.
     let _lock = refuse_if_in_use(&place.folder)?;
@@ -124,8 +125,8 @@ pub fn salvage(place: &StorePlace, request: &SalvageRequest) -> Result<Salvaged,
     let scan = scan_slots(&place.folder, format.map(|f| f.layout))?;
     let source = source_of(place, format, scan, notes)?;
     match map {
-        Some(store) => with_state(&store, source, request),
-        None => without_state(place, source, request),
+        Some(store) => with_state(&store, source, request, stop),
+        None => without_state(place, source, request, stop),
     }
 }
 
@@ -188,6 +189,7 @@ fn with_state(
     store: &StoreReader,
     mut source: SalvageSource,
     request: &SalvageRequest,
+    stop: &StopFlag,
 ) -> Result<Salvaged, TrainError> {
     let latest = store.find(None)?;
     let mut state = run_state_of(store, latest)?;
@@ -195,6 +197,7 @@ fn with_state(
     let found = source.by_page();
     let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
     for page in store.pages_at(latest)? {
+        stop.check()?;
         let rows = meta_from_label(page.page, &page.label).map(|m| m.rows);
         let what = match reader.payload(page.page, &page.slot) {
             Ok(_) => {
@@ -229,6 +232,7 @@ fn with_state(
     };
     let mut histogram = GradHistogram::default();
     for (id, Kept { slot, label, is_older }) in &kept {
+        stop.check()?;
         let payload = reader.payload(*id, slot).map_err(|what| changed(&source.folder, *id, &what))?;
         let meta = meta_from_label(*id, label);
         match meta.filter(|_| *is_older) {
@@ -299,11 +303,13 @@ fn without_state(
     place: &StorePlace,
     mut source: SalvageSource,
     request: &SalvageRequest,
+    stop: &StopFlag,
 ) -> Result<Salvaged, TrainError> {
     let mut reader = source.reader();
     let found = source.by_page();
     let (mut kept, mut lost) = (BTreeMap::new(), Vec::new());
     for (id, versions) in &found {
+        stop.check()?;
         let mut first = None;
         let instead = versions.iter().find_map(|h| match Whole::read(&mut reader, h) {
             Ok(whole) => Some(whole),

@@ -7,7 +7,9 @@ mod bench;
 mod fixture;
 
 use crate::support::scenes::{self, stderr};
-use crate::support::workdir::{CKPT, TRAIN, least_memory};
+#[cfg(target_os = "linux")]
+use crate::support::small_drive::Small;
+use crate::support::workdir::{CKPT, Running, TRAIN, least_memory, split_ply};
 use bench::{Bench, Ply, changed_pages, generations, pin};
 use gsscale::exchange::meta::SceneMeta;
 use gsscale::exchange::ply::write_gaussians;
@@ -51,6 +53,8 @@ fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let page = bench.ckpt_json(&format!("inspect out --page {name}"));
     assert!(number(&page, "since") == b && page["fault"].is_null() && number(&page, "rows") > 0, "{page}");
     assert!(page["stamp"]["most"].as_f64().unwrap() <= last["step"].as_f64().unwrap());
+    let views = page["views"]["most"].as_f64().unwrap();
+    assert!(views <= 40.0, "{views} views since a round that is at most 40 steps ago");
     assert!(bench.ckpt(&format!("inspect out --page {name}")).contains(&format!("page        {name}")));
 
     for deep in ["", "--deep"] {
@@ -75,7 +79,7 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
     assert!(bench.export("out", "") == want, "the export is not what the trainer wrote");
     // The minimum budget, from the tool's own message.
     let least = least_memory(&bench.fails("export out --out x.ply --host-mem 1MiB", &[]));
-    let within = format!("--host-mem {}MiB", least + 1.0);
+    let within = format!("--host-mem {least}MiB");
     assert!(bench.export("out", &within) == want, "the budget changed the file");
 
     // The box is in the coordinates of the dataset, which are those of this file.
@@ -112,6 +116,83 @@ fn an_export_is_the_trainers_file_byte_for_byte_and_can_be_a_part_of_it() {
         std::fs::remove_file(bench.path(other)).unwrap();
     }
     bench.fails("export out --out no/folder.ply", &["no/folder.ply"]);
+    bench.fails("export out --out spill/mine.ply", &["it would lie in a store", "name a place outside"]);
+    // In the frame of the run's cameras.
+    let local = bench.ckpt("export out --out local.ply --export-frame local");
+    assert!(local.contains("positions are local: local.transform.json leads back"), "{local}");
+    assert!(split_ply(&bench.bytes("local.ply")).0.contains("comment frame local"));
+}
+
+#[test]
+fn what_stopped_attempts_leave_is_in_nobodys_way() {
+    let bench = Bench::empty();
+    write_gaussians(&bench.path("in.ply"), &wave(60_000), &SceneMeta::default()).unwrap();
+    // Small pages that are compressed hard take minutes.
+    let slow = "import in.ply --out store --page-rows 16 --spill-codec zstd:19";
+    let begin = |flags: &str| Running::spawn(&bench, &mut bench.command(CKPT, flags));
+    let written = || bench.path("store.part/FORMAT").exists();
+    let said = begin(slow).once(written).signal("TERM").ends(143);
+    assert!(said.contains("was stopped") && !bench.exists("store.part") && !bench.exists("store"), "{said}");
+    assert!(begin(slow).once(written).kill());
+    assert!(bench.exists("store.part"), "it left nothing, so the test shows nothing");
+    let quick = "import in.ply --out store --page-rows 1024";
+    for least in ["--page-rows 100", "--page-rows 512", "--page-rows 777"] {
+        let refused = bench.fails(&format!("import in.ply --out other {least} --host-mem 2MiB"), &[]);
+        bench.ckpt(&format!("import in.ply --out other {least} --host-mem {}MiB", least_memory(&refused)));
+        bench.remove("other");
+    }
+    bench.ckpt(quick);
+    assert!(!bench.exists("store.part"));
+    // A store under such a name may be anybody's.
+    bench.ckpt("clone store other.part");
+    bench.fails("clone store other", &["other.part", "an earlier attempt left", "remove it, or name another folder"]);
+    assert!(bench.is_intact("other.part"));
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_drive_that_is_too_small_for_a_new_store_is_named() {
+    let bench = Bench::empty();
+    write_gaussians(&bench.path("in.ply"), &wave(20_000), &SceneMeta::default()).unwrap();
+    bench.ckpt("import in.ply --out store");
+    let Some(_drive) = Small::mount(&bench.path("drive"), 1 << 20) else { return };
+    for room in [1u64 << 20, 6 << 20] {
+        _drive.resize(room);
+        for flags in ["import in.ply --out drive/new", "clone store drive/new", "salvage store --out drive/new"] {
+            bench.fails(flags, &["drive/new", "there is no space", "name a folder on another drive"]);
+            assert!(!bench.exists("drive/new.part"), "{flags}");
+        }
+    }
+}
+
+#[test]
+fn positions_that_floats_move_are_told() {
+    let bench = Bench::empty();
+    let gaussians = wave(500);
+    let write = |name: &str, kind: &str, offset: f64| {
+        let names = [
+            "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2",
+            "rot_3",
+        ];
+        let of = |name: &str| format!("property float {name}\n");
+        let place: String = ["x", "y", "z"].map(|axis| format!("property {kind} {axis}\n")).concat();
+        let rest: String = names.map(of).concat();
+        let mut ply = format!("ply\nformat ascii 1.0\nelement vertex 500\n{place}{rest}end_header\n");
+        for row in 0..500 {
+            let mean = gaussians.row(Column::Means, row);
+            let at = |axis: usize| f64::from(mean[axis]) + offset;
+            ply += &format!("{} {} {} 1 1 1 2 -3 -3 -4 1 0 0 0\n", at(0), at(1), at(2));
+        }
+        bench.write(name, ply);
+    };
+    // At 4.6 million, floats are half a unit apart; sigma is .05.
+    let said = |name: &str| stderr(&bench.succeeds(CKPT, &format!("import {name} --out {name}.store")));
+    write("utm.ply", "double", 4_567_890.0);
+    let utm = said("utm.ply");
+    assert!(utm.contains("Gaussians moved by more than a tenth of their size"), "{utm}");
+    write("near.ply", "double", 40.0);
+    write("floats.ply", "float", 4_567_890.0);
+    assert_eq!([said("near.ply"), said("floats.ply")], ["", ""]);
 }
 
 #[test]
@@ -208,7 +289,7 @@ fn a_run_that_was_rolled_back_or_cloned_ends_with_the_same_bytes() {
     assert!(bench.is_intact("copy"));
     assert_ne!(bench.ckpt_json("inspect copy")["identity"], bench.ckpt_json("inspect out")["identity"]);
     bench.fails("clone out copy", &["exists already"]);
-    bench.fails("clone out copy/sub", &["in another store"]);
+    bench.fails("clone out copy/sub", &["would lie in a store"]);
 
     // The run then uses its copy, and does not return to a store that lacks the newer steps.
     bench.go_on_until_stopped("--spill-dir copy");
