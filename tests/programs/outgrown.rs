@@ -71,6 +71,11 @@ fn a_scene_that_grows_stays_within_its_memory_and_within_less_than_its_views_tak
         assert!(least * 4 < most * 3, "none gave way: {frames:?}");
         assert!(work.count(out, "bytes_read") > work.count(out, "other_bytes_read"), "{out}: no step read a page");
     }
+    // 42 MiB of Gaussians belong on a drive.
+    work.refuses(
+        &format!("{GROWING} --out none --host-mem 40MiB"),
+        &["name a folder on a fast drive with --spill-dir", "give at least"],
+    );
     // 92 MiB do not hold the largest view of the grown scene. Its pages move to the drive of its checkpoint; a run whose pages have a
     // drive from the start is that of `a_run_whose_views_outgrow_its_memory_goes_in_batches`.
     let said = work.train(&format!("{GROWING} --out out --overwrite --host-mem 92MiB"));

@@ -483,7 +483,7 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
 }
 
 /// Gaussians that take less memory than this in frames hardly leave any to the rest of a run when they lie on a drive, bytes.
-const SPILL_PAYS: u64 = 64 << 20;
+const SPILL_PAYS: u64 = 32 << 20;
 
 fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>) -> InputResult<()> {
     let Some(budget) = host_mem else { return Ok(()) };
