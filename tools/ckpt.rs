@@ -52,6 +52,7 @@ pub struct Args {
 #[derive(Subcommand)]
 enum Command {
     /// Lists generations and named checkpoints
+    #[command(alias = "list")]
     Ls(Ls),
     /// Shows a store, its training state, or one page
     Inspect(Inspect),

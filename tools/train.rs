@@ -295,6 +295,10 @@ fn finish(outcome: &RunOutcome, quiet: bool) -> ExitCode {
             count => format!(" (without {} that too few photos see)", format_grouped(count)),
         };
         gsscale::tell!("  Gaussians   {}{left_out}", out.join(PLY_FILE).display());
+        for export in summary.export.iter().chain(&summary.more_exports) {
+            let is_spz = export.file.extension().is_some_and(|ending| ending == "spz");
+            gsscale::tell!("  {}         {}", if is_spz { "SPZ" } else { "SOG" }, out.join(&export.file).display());
+        }
         if out.join(SETTINGS_FILE).is_file() {
             gsscale::tell!("  start view  {} (for viewers)", out.join(SETTINGS_FILE).display());
         }

@@ -58,9 +58,9 @@ fn start(args: Args) -> Result<(), TrainError> {
     let of_run = config.as_deref().map(|config| config.with_file_name(""));
     let saved = of_run.filter(|folder| folder.join(METRICS_FILE).is_file());
     let config = args.config.or(config).map_or_else(|| Ok(TrainConfig::default()), |file| TrainConfig::read(&file))?;
-    let (mut config, spill_dir) = (config, args.keys.spill_dir.clone());
+    let (mut config, spill_dir, host_mem) = (config, args.keys.spill_dir.clone(), args.keys.host_mem);
     args.keys.apply(&mut config);
-    let config = config_to_show(config, &file, spill_dir);
+    let config = config_to_show(config, &file, spill_dir, host_mem);
     config.check()?;
     let on_port = |port| Live::begin(SocketAddr::from(([127, 0, 0, 1], port)));
     let live = args.serve.map_or_else(|| on_port(8080).or_else(|_| on_port(0)), Live::begin)?;

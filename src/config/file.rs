@@ -290,7 +290,8 @@ config_keys! {
     "Output" {
         /// Evaluate on the held-out photos every N steps; 0 = only at the end
         [value_parser = parse_count32] eval_every: u32 = 0 => Free;
-        /// Write a PLY and keep a named checkpoint (step-N) every N steps; 0 = only a PLY at the end
+        /// Write a PLY and keep a named checkpoint (step-N) every N steps, which goes at the end without --keep-checkpoint; 0 = only
+        /// a PLY at the end
         [value_parser = parse_count32] save_every: u32 = 0 => Free;
         /// Write a line of metrics every N steps
         [value_parser = parse_count32] log_every: u32 = 100 => Free;

@@ -1,6 +1,8 @@
 //! Every config file parses and passes its checks; default.toml equals the built-in defaults.
 
 use gsscale::config::file::{ConfigKey, KEYS, Shown, TrainConfig, default_file};
+use gsscale::config::values::ByteSize;
+use gsscale::train::run::viewer::config_to_show;
 use std::path::PathBuf;
 
 fn configs() -> PathBuf {
@@ -48,4 +50,14 @@ fn every_config_file_is_valid() {
         seen += 1;
     }
     assert!(seen >= 3, "only {seen} config files");
+}
+
+/// The memory of a run was for pages on a drive that is gone.
+#[test]
+fn a_viewer_has_its_own_memory() {
+    let of_run = TrainConfig { host_mem: ByteSize(1 << 20), spill_dir: "pages".to_string(), ..TrainConfig::default() };
+    let own = config_to_show(of_run.clone(), "a.ply".as_ref(), None, None);
+    assert_eq!((own.host_mem, own.spill_dir.as_str()), (ByteSize(0), ""));
+    let asked = config_to_show(of_run, "a.ply".as_ref(), None, Some(ByteSize(7 << 20)));
+    assert_eq!(asked.host_mem, ByteSize(7 << 20));
 }

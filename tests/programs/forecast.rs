@@ -39,6 +39,11 @@ fn a_forecast_says_what_memory_holds() {
     let plan = planned(&work, capped).0;
     let number = |key: &str| plan["run"][key].as_f64().unwrap();
     assert!(number("bytes_written") > 0.0 && number("bytes_written") <= number("drive_bytes"), "{plan}");
+    // Six named checkpoints, and as many more PLYs.
+    let saved = planned(&work, &format!("{capped} --save-every 100")).0;
+    let saved = |key: &str| saved["run"][key].as_f64().unwrap();
+    assert_eq!(saved("ply_bytes"), 7.0 * number("ply_bytes"));
+    assert!(saved("drive_bytes_peak") > 1.5 * number("drive_bytes_peak"), "{plan}");
     // 200,000 Gaussians are 45 MiB of pages beside some 20 of the program.
     let large = |memory: &str| dry(&format!("--max-gaussians 200000 --host-mem {memory}"));
     assert!(!large("4GiB").contains("has outgrown"));

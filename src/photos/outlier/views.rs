@@ -344,6 +344,10 @@ impl PhotoParameter for OutlierViews {
             let (name, unexplained) = (&dataset.views[view].name, self.state.unexplained(view));
             json!({ "name": name, "unexplained": unexplained, "is_left_out": self.are_left_out })
         };
+        // The pictures of a run that is too short for a warning are rough to its end.
+        if !self.are_left_out && self.steps < WARNED_FROM_EPOCH * self.train_views {
+            return Vec::new();
+        }
         let views: Vec<Value> = self.state.named().map(of_view).collect();
         if views.is_empty() { Vec::new() } else { vec![(OUTLIER_VIEWS, views.into())] }
     }

@@ -182,6 +182,7 @@ pub struct Forecast {
     /// Expected peak bytes on the drive, all files counted: the pages with their versions of the commits that are kept, or the checkpoint
     /// of a run in memory.
     pub drive_bytes_peak: u64,
+    /// Bytes of the PLY, and of those of --save-every.
     pub ply_bytes: u64,
     /// Bytes that import and steps write to the drive; 0 for a run that stays in memory.
     pub bytes_written: f64,
@@ -322,7 +323,8 @@ impl Forecast {
             bytes => bytes,
         };
         let [of_first, of_last] = versions(is_in_memory, commits);
-        let of_all = of_first * tiers.pages[0] + of_last * pages_then;
+        let kept = named_checkpoints(config);
+        let of_all = of_first * tiers.pages[0] + (of_last + kept) * pages_then;
         let slots = slots_of(pages_then, of_all, measured.changed_share);
         // A run that makes a second commit fills one more segment: evicted versions wait there until the next commit frees them, and
         // the scene gains pages after its first commit.
@@ -342,9 +344,9 @@ impl Forecast {
             host_mem,
             drive_bytes,
             drive_bytes_peak,
-            ply_bytes: ply_bytes(config, last),
+            ply_bytes: (1 + kept) * ply_bytes(config, last),
             bytes_written: if is_in_memory { 0.0 } else { bytes_of_steps },
-            commit_bytes,
+            commit_bytes: commit_bytes + (kept * state_bytes) as f64,
             seconds,
             shorter: Vec::new(),
             drive_seconds,
@@ -533,6 +535,11 @@ fn refuse_small_drive(free: u64, pages: u64, frame_bytes: u64) -> InputResult<()
     Err(InputError::new("--spill-dir", problem, remedy))
 }
 
+/// The named checkpoints of --save-every, each with a PLY beside it. A checkpoint may hold a version of every page.
+fn named_checkpoints(config: &TrainConfig) -> u64 {
+    u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0))
+}
+
 /// Refuses a drive that cannot hold the `now` pages of a scene, and warns of one that may not hold the `most` pages of the
 /// grown scene with its last commits.
 fn check_drive(
@@ -542,8 +549,7 @@ fn check_drive(
     frame_bytes: u64,
     changed_share: f64,
 ) -> InputResult<()> {
-    // Each named checkpoint of --save-every may hold a version of every page.
-    let kept = u64::from(config.steps.saturating_sub(1).checked_div(config.save_every).unwrap_or(0));
+    let kept = named_checkpoints(config);
     refuse_small_drive(free, now, frame_bytes)?;
     let of_all = most.saturating_mul(VERSIONS.saturating_add(kept));
     let with_past = drive_bytes(slots_of(most, of_all, changed_share), frame_bytes);

@@ -475,9 +475,12 @@ fn warn_of_growth(config: &TrainConfig, plan: &TierPlan, host_mem: Option<u64>, 
         _ if then <= left => return,
         cap => format!("with --max-gaussians {cap} the view may need {then} pages with {left} frames"),
     };
+    let when = match times < 1.05 {
+        true => "as soon as the scene grows".to_string(),
+        false => format!("when the scene has grown about {times:.1} times"),
+    };
     crate::tell!(
-        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: when the scene has \
-         grown about {times:.1} times, steps on such views take several batches and read more; more --frames or --host-mem \
+        "warning: the view {view} needs {needed} pages, there are {frames} frames, and {until}: {when}, steps on such views take several batches and read more; more --frames or --host-mem \
          avoid it"
     );
 }

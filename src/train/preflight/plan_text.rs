@@ -3,7 +3,7 @@
 use super::device_memory;
 use super::forecast::{Forecast, Reach, first_pages};
 use super::plan::LargestView;
-use crate::base::units::{counted, format_bytes, format_grouped, format_seconds};
+use crate::base::units::{counted, format_bytes, format_bytes_up, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
 use crate::config::values::{Choice, Chosen, Residence};
@@ -157,8 +157,9 @@ fn describe_tiers(forecast: &Forecast, tiers: &Tiers, has_named_limit: bool) -> 
     }
     if let Some(limit) = forecast.host_mem.filter(|limit| has_named_limit && *limit < memory.total()) {
         text.push_str(&format!(
-            "        more than --host-mem {}, since one view of the grown scene takes that: lower --max-gaussians, or make the photos smaller\n",
-            format_bytes(limit)
+            "        more than --host-mem {}, also with the fewest frames: give at least {}, lower --max-gaussians, or make the photos smaller\n",
+            format_bytes(limit),
+            format_bytes_up(memory.total())
         ));
     }
     text.push_str(&part(&frames, memory.frames));

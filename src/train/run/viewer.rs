@@ -14,7 +14,7 @@ use crate::base::error::InputError;
 use crate::base::units::counted_are;
 use crate::checkpoint::interval::CommitEvery;
 use crate::config::file::TrainConfig;
-use crate::config::values::Chosen;
+use crate::config::values::{ByteSize, Chosen};
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
 use crate::densify::strategy::StrategyName;
@@ -52,14 +52,20 @@ pub struct ShowRequest {
     pub live: Live,
 }
 
-/// The config of a run that only shows `gaussians`: nothing grows, adapts, or is kept. The spill directory is that of `keys` alone, since
-/// that of the run is its checkpoint.
-pub fn config_to_show(config: TrainConfig, gaussians: &Path, spill_dir: Option<String>) -> TrainConfig {
+/// The config of a run that only shows `gaussians`: nothing grows, adapts, or is kept. Spill directory and memory are those of the viewer
+/// alone: the run's directory is its checkpoint, and its memory was for pages on a drive.
+pub fn config_to_show(
+    config: TrainConfig,
+    gaussians: &Path,
+    spill_dir: Option<String>,
+    host_mem: Option<ByteSize>,
+) -> TrainConfig {
     TrainConfig {
         init_ply: gaussians.to_string_lossy().into_owned(),
         pages_file: String::new(),
         first_appearance: String::new(),
         spill_dir: spill_dir.unwrap_or_default(),
+        host_mem: host_mem.unwrap_or(ByteSize(0)),
         steps: 1,
         frames: 0,
         max_gaussians: 0,

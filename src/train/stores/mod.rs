@@ -100,7 +100,13 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
         _ if config.residence().spill_dir().is_some() && (config.keep_checkpoint || !is_finished(dir)) => {
             ("its pages may have been moved", "name their folder instead: gsscale-ckpt ls FOLDER".to_string())
         }
-        true => ("it is removed when a run ends", "its result is point_cloud.ply in the same folder".to_string()),
+        true => {
+            let ply = shell_word(dir.join(PLY_FILE));
+            let remedy = format!(
+                "its result is {ply}; for other formats: gsscale-ckpt import {ply} --out STORE, then gsscale-ckpt export STORE --out FILE.spz"
+            );
+            ("it is removed when a run ends", remedy)
+        }
         false => (
             "the run has not made a commit",
             format!("wait for one if it still trains; if it was stopped: gsscale-train --resume {}", shell_word(dir)),
