@@ -26,7 +26,7 @@ fn budgets_that_are_too_small_are_refused_with_numbers_and_alternatives() {
     // A drive would take more memory than so few Gaussians.
     let said = refuses(&work, "--host-mem 8MiB", &["--host-mem: 8.0 MiB", "give at least", "of memory"]);
     assert!(!said.contains("--spill-dir"), "{said}");
-    work.train(&format!("scene --dry-run --host-mem {}MiB", least_memory(&said)));
+    work.train(&format!("scene --dry-run --steps 12 --host-mem {}MiB", least_memory(&said)));
     refuses(&work, "--host-mem 8MiB --spill-dir spill", &["8.0 MiB", "take", "at least"]);
     assert!(!work.exists("spill"), "a refused run leaves no spill directory");
     refuses(&work, "--frames 1 --page-rows 64", &["--frames: 1", "give at least 2"]);
