@@ -53,8 +53,6 @@ fn inspecting_a_store_reports_what_the_run_left_and_changes_nothing() {
     let page = bench.ckpt_json(&format!("inspect out --page {name}"));
     assert!(number(&page, "since") == b && page["fault"].is_null() && number(&page, "rows") > 0, "{page}");
     assert!(page["stamp"]["most"].as_f64().unwrap() <= last["step"].as_f64().unwrap());
-    let views = page["views"]["most"].as_f64().unwrap();
-    assert!(views <= 40.0, "{views} views since a round that is at most 40 steps ago");
     assert!(bench.ckpt(&format!("inspect out --page {name}")).contains(&format!("page        {name}")));
 
     for deep in ["", "--deep"] {
