@@ -51,9 +51,9 @@ pub fn part_of(target: &Path) -> PathBuf {
     PathBuf::from(name)
 }
 
-/// The `.part` name for `target`, if neither exists. What an attempt that was killed before its first commit left is removed.
+/// The `.part` name of a new store for `target`, if neither exists. Removes what an attempt that was killed before its first commit left there.
 /// Errors: one of them exists, or `target` lies in a store.
-pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
+pub fn claim_new_store(target: &Path) -> InputResult<PathBuf> {
     let part = part_of(target);
     if std::fs::symlink_metadata(target).is_ok() {
         return Err(InputError::new(target, "exists already", "name a folder that does not exist; its parent must"));
@@ -67,7 +67,7 @@ pub fn refuse_existing(target: &Path) -> InputResult<PathBuf> {
         }
     }
     if std::fs::symlink_metadata(&part).is_ok() {
-        let problem = "it is what an earlier attempt left, and is not certain to be worthless";
+        let problem = "an earlier attempt left this folder, and it may hold a whole store";
         return Err(InputError::new(part, problem, "remove it, or name another folder"));
     }
     refuse_inside_store(target)?;
@@ -99,7 +99,7 @@ impl NewStore {
     /// Starts a store for `target`, which does not exist. It may lie on a network drive: its pages are written once, in order.
     /// Errors: `target` exists, or the drive fails.
     pub fn create(target: &Path, layout: SlotLayout, codec: Codec) -> Result<NewStore, ReadError> {
-        let part = refuse_existing(target)?;
+        let part = claim_new_store(target)?;
         let spill = SpillDir::create(&part, layout, true)?;
         let begin = || -> Result<(Commits, PagedStore), ReadError> {
             let opened = Opened::create(Box::new(DriveFolder::new(&part)), commit_config(spill.format().store))?;

@@ -14,7 +14,7 @@ use crate::page::folder::spill_dir::SpillDir;
 use crate::page::format::codec::Codec;
 use crate::page::format::slot_header::{SlotRef, StoredAs};
 use crate::page::map::opening::Opened;
-use crate::page::tool::new_store::{NewStore, refuse_existing};
+use crate::page::tool::new_store::{NewStore, claim_new_store};
 use crate::page::tool::reading::{Access, StoreReader, commit_config};
 use crate::page::versions::slots::SlotLayout;
 use crate::train::error::TrainError;
@@ -155,7 +155,7 @@ pub struct ClonedStore {
 /// Errors: the store is in use or damaged (the error names the page), or `to` cannot be written. No store is left at
 /// `to` then.
 pub fn clone_store(place: &StorePlace, to: &Path, stop: &StopFlag) -> Result<ClonedStore, TrainError> {
-    refuse_existing(to)?;
+    claim_new_store(to)?;
     let store = place.open(Access::Pages)?;
     store.find(None)?;
     let live = store.live_versions()?;

@@ -22,7 +22,7 @@ use crate::exchange::meta::{ExportFrame, SceneMeta};
 use crate::exchange::ply::{gaussians_header, holds_gaussians};
 use crate::page::format::codec::Codec;
 use crate::page::map::commit::CommitError;
-use crate::page::tool::new_store::{NewStore, refuse_existing};
+use crate::page::tool::new_store::{NewStore, claim_new_store};
 use crate::page::versions::slots::SlotLayout;
 use crate::paging::stored::label;
 use crate::scene::page_layout::{PageLayout, capacity_bytes, write_page};
@@ -70,7 +70,7 @@ pub struct Imported {
 /// Errors: the file cannot be read or holds no Gaussians, the budget is too small, or the folder cannot be written. No
 /// store is left then.
 pub fn import(request: &ImportRequest, stop: &StopFlag) -> Result<Imported, TrainError> {
-    refuse_existing(&request.out)?;
+    claim_new_store(&request.out)?;
     if !holds_gaussians(&request.file)? {
         let remedy = "train on points with gsscale-train --init-ply";
         return Err(InputError::new(&request.file, "it holds points, not Gaussians", remedy).into());

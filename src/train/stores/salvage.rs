@@ -27,7 +27,7 @@ use crate::densify::strategy::{Effect, effect_of};
 use crate::page::format::slot_header::{SlotHeader, SlotRef};
 use crate::page::format::spill_format::SpillFormat;
 use crate::page::map::commit::CommitError;
-use crate::page::tool::new_store::{NewStore, refuse_existing};
+use crate::page::tool::new_store::{NewStore, claim_new_store};
 use crate::page::tool::reading::{Access, ReadError, StoreReader, WitnessRule, format_at, refuse_if_in_use};
 use crate::page::tool::slot_reader::{Scan, SlotReader, scan_slots};
 use crate::page::versions::slots::SlotLayout;
@@ -99,7 +99,7 @@ struct SalvageSource {
 /// Errors: the store is in use or of another version, all of it is damaged, or the new folder cannot be written. No new
 /// store is left then.
 pub fn salvage(place: &StorePlace, request: &SalvageRequest, stop: &StopFlag) -> Result<Salvaged, TrainError> {
-    refuse_existing(&request.to)?;
+    claim_new_store(&request.to)?;
     // Hold the lock until the end, so that no trainer writes meanwhile.
     let _lock = refuse_if_in_use(&place.folder)?;
     let mut notes = Vec::new();
