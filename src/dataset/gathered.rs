@@ -135,7 +135,8 @@ impl<'a> Gathered<'a> {
     ) -> InputResult<Vec<RawView>> {
         self.photos.finish(&mut self.views, warnings);
         if !self.missing.is_empty() && !self.options.allow_missing {
-            let near = self.photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
+            let photos = self.photos.without(self.views.iter().map(|view| view.image_path.as_path()));
+            let near = photos.near_misses(&self.missing.iter().map(String::as_str).collect::<Vec<_>>());
             let are = counted_are(self.missing.len() as u64, "photo");
             let problem = format!("{are} missing: {}{near}", listed(&self.missing));
             return Err(InputError::new(file, problem, words.photo_is_missing).at(words.photos));

@@ -398,7 +398,8 @@ fn drop_missing(
     let are = if names.len() == 1 { "is" } else { "are" };
     let mut problem = format!("{} of {total} photos {are} missing: {}", names.len(), list_names(names.iter().copied()));
     if !options.allow_missing || present.is_empty() {
-        let photos = PhotoFiles::in_folders(root, vec![image_folder.to_path_buf()], true);
+        let photos = PhotoFiles::in_folders(root, vec![image_folder.to_path_buf()], true)
+            .without(present.iter().map(|(view, _)| view.image_path.as_path()));
         problem.push_str(&photos.near_misses(&names));
     }
     if !options.allow_missing {

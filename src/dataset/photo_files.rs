@@ -8,7 +8,7 @@
 //! silent; 3. folders are listed only if a name is not found as it is written; 4. a view keeps the name that its model states.
 
 use super::model::{RawView, ReadOptions};
-use super::name_index::{NameIndex, folded, split_ending, split_folder};
+use super::name_index::{NameIndex, PictureFile, folded, split_ending, split_folder};
 use super::paths::{StatedName, read_name};
 use crate::base::text::{as_windows_1252, has_raw_bytes, raw_byte, raw_bytes};
 use rayon::prelude::*;
@@ -52,6 +52,8 @@ pub(super) struct PhotoFiles {
     /// Names of views that were stated outside of the scene, and what was stated.
     outside: RefCell<BTreeMap<String, String>>,
     code_page: RefCell<CodePageNames>,
+    /// Files that are not proposed, with links resolved.
+    taken: BTreeSet<PathBuf>,
 }
 
 impl PhotoFiles {
@@ -67,7 +69,18 @@ impl PhotoFiles {
             near: RefCell::default(),
             outside: RefCell::default(),
             code_page: RefCell::default(),
+            taken: BTreeSet::new(),
         }
+    }
+
+    /// Keeps [`PhotoFiles::near_misses`] from proposing the photos of other views: renamed, they would stand for the wrong view.
+    pub fn without<'a>(mut self, photos: impl Iterator<Item = &'a Path>) -> PhotoFiles {
+        self.taken.extend(photos.filter_map(|path| path.canonicalize().ok()));
+        self
+    }
+
+    fn is_free(&self, file: &PictureFile) -> bool {
+        self.taken.is_empty() || !file.path.canonicalize().is_ok_and(|path| self.taken.contains(&path))
     }
 
     /// The photos of a scene whose names include their folder: in `root` and, if the image folder is `images` (many programs'
@@ -244,6 +257,7 @@ impl PhotoFiles {
             let stem = folded(split_folder(name).1);
             let paths = index
                 .with_stem(split_ending(&stem).0)
+                .filter(|file| self.is_free(file))
                 .map(|e| e.path.strip_prefix(&self.root).unwrap_or(&e.path).display());
             let paths: Vec<String> = paths.take(SHOWN).map(|path| path.to_string()).collect();
             shown.extend((!paths.is_empty()).then(|| format!("'{name}' may be {}", paths.join(" or "))));
@@ -255,8 +269,11 @@ impl PhotoFiles {
             return format!("; {}: rename the files or the entries of the model", shown.join("; "));
         }
         let index = self.index("");
-        let others: Vec<String> =
-            index.entries().filter(|e| e.is_readable()).map(|e| e.path.display().to_string()).collect();
+        let others: Vec<String> = index
+            .entries()
+            .filter(|e| e.is_readable() && self.is_free(e))
+            .map(|e| e.path.display().to_string())
+            .collect();
         others.first().map_or(String::new(), |one| {
             format!("; the scene holds {} pictures of other names, such as {one}", others.len())
         })

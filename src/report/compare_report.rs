@@ -6,7 +6,7 @@
 
 use super::chart::{Chart, Mark};
 use super::html::{Cell, Page, slider};
-use super::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PICTURES_FOLDER, SUMMARY_FILE};
+use super::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PICTURES_FOLDER, SUMMARY_FILE, VIEWS_FILE};
 use super::run_report::{curve, listed_pictures, read_json, read_metrics, read_text, readable_picture};
 use crate::base::error::InputResult;
 use serde_json::Value;
@@ -33,6 +33,8 @@ struct Compared {
     trained_on: [Option<f64>; 2],
     /// Values of [`PHOTO_KEYS`] for the held-out figures.
     judged_on: [Option<f64>; 2],
+    /// Pictures of the held-out views, if known.
+    held_out: Option<BTreeSet<String>>,
     /// Differences to the first run that matter for the comparison.
     remarks: Vec<String>,
 }
@@ -48,8 +50,39 @@ impl Compared {
             true => (evaluated, photos(&folder.join(EVALUATED_AS_FILE))),
             false => (summary.clone(), trained_on),
         };
+        // A later evaluation lists no views.
+        let listed = json(VIEWS_FILE).as_array().cloned().filter(|views| !is_evaluated_again && !views.is_empty());
+        let held_out = listed.map(|views| views.iter().map(|view| view["picture"].to_string()).collect());
         let (folder, remarks) = (folder.to_path_buf(), Vec::new());
-        Ok(Compared { name, folder, metrics, summary, judged, is_evaluated_again, trained_on, judged_on, remarks })
+        Ok(Compared {
+            name,
+            folder,
+            metrics,
+            summary,
+            judged,
+            is_evaluated_again,
+            trained_on,
+            judged_on,
+            held_out,
+            remarks,
+        })
+    }
+
+    /// Why the held-out figures are of other photos than those of the first run, as far as known.
+    fn other_photos(&self, first: &Compared) -> Option<&'static str> {
+        let scene = |run: &Compared| {
+            let path = PathBuf::from(run.judged["scene"].as_str()?);
+            Some(path.canonicalize().unwrap_or(path))
+        };
+        // A relative path may have been meant from another folder.
+        let is_other = |(own, first): (PathBuf, PathBuf)| !own.ends_with(&first) && !first.ends_with(&own);
+        if scene(self).zip(scene(first)).is_some_and(is_other) {
+            return Some("judged on another scene");
+        }
+        let views = |run: &Compared| run.judged["test"]["views"].as_u64();
+        let differ = views(self).zip(views(first)).is_some_and(|(own, first)| own != first)
+            || self.held_out.as_ref().zip(first.held_out.as_ref()).is_some_and(|(own, first)| own != first);
+        differ.then_some("judged on other held-out photos")
     }
 
     fn psnr(&self) -> Option<f64> {
@@ -76,6 +109,7 @@ impl Compared {
                 others.map(|(key, own, first)| format!("{what} with {key} {} instead of {}", round(own), round(first))),
             );
         }
+        remarks.extend(self.other_photos(first).map(String::from));
         let variant = |run: &Compared| run.judged["ssim_variant"].as_str().map(str::to_string);
         if let Some((own, first)) = variant(self).zip(variant(first)).filter(|(own, first)| own != first) {
             remarks.push(format!("SSIM is {own} instead of {first}"));
@@ -210,10 +244,11 @@ fn evenly(count: usize, max: usize) -> Vec<usize> {
 fn add_table(page: &mut Page, runs: &[Compared]) {
     let first = &runs[0];
     let against = |run: &Compared| {
-        // PSNR on photos of another size, as far as known, is a different measure.
+        // PSNR on other photos, or on photos of another size, as far as known, is a different measure.
         let mut sizes = run.judged_on.into_iter().zip(first.judged_on);
         let is_same_size = sizes.all(|(own, first)| own.zip(first).is_none_or(|(own, first)| own == first));
-        let both = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && is_same_size);
+        let is_same_measure = is_same_size && run.other_photos(first).is_none();
+        let both = run.psnr().zip(first.psnr()).filter(|_| run.folder != first.folder && is_same_measure);
         both.map(|(own, first)| own - first)
     };
     let row = |run: &Compared| {
@@ -241,7 +276,6 @@ fn add_table(page: &mut Page, runs: &[Compared]) {
 
 #[cfg(test)]
 mod tests {
-    use super::super::run_files::VIEWS_FILE;
     use super::*;
     use serde_json::json;
     use tempfile::TempDir;
@@ -270,7 +304,7 @@ mod tests {
     }
 
     fn evaluate(folder: &Path, psnr: f64, ssim: &str) {
-        let report = json!({"ssim_variant": ssim, "test": {"views": 1, "psnr": psnr, "ssim": 0.25}});
+        let report = json!({"ssim_variant": ssim, "test": {"views": 0, "psnr": psnr, "ssim": 0.25}});
         std::fs::write(folder.join(EVALUATED_FILE), report.to_string()).unwrap();
     }
 
@@ -301,6 +335,28 @@ mod tests {
         assert!(compare_report(&[base.clone(), half]).unwrap().contains("-0.750"));
         let alike = compare_report(&[base.clone(), base]).unwrap();
         assert!(!alike.contains(" *<") && !alike.contains("trained or judged differently"));
+    }
+
+    #[test]
+    fn other_held_out_photos_have_a_remark_and_no_difference() {
+        let parent = TempDir::new().unwrap();
+        let of_scene = |name: &str, psnr: f64, views: usize, scene: &str| {
+            let folder = run(parent.path(), name, (psnr, 1.0, "same"), views);
+            let summary = std::fs::read_to_string(folder.join(SUMMARY_FILE)).unwrap();
+            let summary = summary.replacen('{', &format!("{{\"scene\":\"{scene}\","), 1);
+            std::fs::write(folder.join(SUMMARY_FILE), summary).unwrap();
+            folder
+        };
+        let base = of_scene("base", 26.0, 2, "scans/a");
+        let against = |folder: PathBuf| compare_report(&[base.clone(), folder]).unwrap();
+        let fewer = against(of_scene("fewer", 27.5, 1, "scans/a"));
+        assert!(fewer.contains("<td>judged on other held-out photos</td>") && !fewer.contains("+1.500"), "{fewer}");
+        let elsewhere = against(of_scene("elsewhere", 27.5, 2, "scans/b"));
+        assert!(elsewhere.contains("<td>judged on another scene</td>") && !elsewhere.contains("+1.500"));
+        let moved = of_scene("moved", 27.5, 2, "/data/scans/a");
+        assert!(against(moved.clone()).contains("+1.500"), "the same scene by its absolute path");
+        std::fs::write(moved.join(VIEWS_FILE), r#"[{"picture": "view00.png"}, {"picture": "view07.png"}]"#).unwrap();
+        assert!(against(moved).contains("<td>judged on other held-out photos</td>"));
     }
 
     #[test]

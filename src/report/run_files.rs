@@ -31,6 +31,10 @@ pub const EVALUATED_FILE: &str = "evaluated.json";
 pub const DIAGNOSIS_FILE: &str = "diagnosis.json";
 /// Config of that evaluation.
 pub const EVALUATED_AS_FILE: &str = "evaluated-as.toml";
+/// Figures of a published run beside those that were published, of `gsscale-bench run`.
+pub const PUBLISHED_FILE: &str = "published.json";
+/// The same as a page.
+pub const PUBLISHED_PAGE_FILE: &str = "published.html";
 
 /// What stands under a name in the output folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,7 +64,7 @@ pub enum Tells {
 }
 
 /// All files, in the order in which they are removed: without the config, the rest is not taken for a run's.
-pub const RUN_FILES: [(RunFile, Tells); 17] = [
+pub const RUN_FILES: [(RunFile, Tells); 19] = [
     (RunFile::File(CONFIG_FILE), Tells::Start),
     (RunFile::File(DIAGNOSIS_FILE), Tells::Start),
     (RunFile::File(METRICS_FILE), Tells::Steps),
@@ -76,6 +80,8 @@ pub const RUN_FILES: [(RunFile, Tells); 17] = [
     (RunFile::SavedPlys, Tells::Result),
     (RunFile::File(EVALUATED_FILE), Tells::Evaluation),
     (RunFile::File(EVALUATED_AS_FILE), Tells::Evaluation),
+    (RunFile::File(PUBLISHED_FILE), Tells::Evaluation),
+    (RunFile::File(PUBLISHED_PAGE_FILE), Tells::Evaluation),
     // First, so that the folder is empty when its pictures are removed.
     (RunFile::File(VIEWS_FILE), Tells::Result),
     (RunFile::Pictures(PICTURES_FOLDER), Tells::Result),

@@ -145,6 +145,16 @@ fn missing_photos_are_listed_by_name() {
     let dataset = load_dataset(raw.clone(), &LoadOptions { allow_missing: true, ..LoadOptions::default() }).unwrap();
     assert_eq!(dataset.views.len(), 7);
     assert!(has_warning(&dataset, "23 of 30"));
+    // Another file of the name may be the photo, unless it is that of another view.
+    let photos = folder.path().join("images/block");
+    std::fs::create_dir(&photos).unwrap();
+    std::fs::copy(&raw.views[0].image_path, photos.join("p02.png")).unwrap();
+    let mut two = RawScene { root: folder.path().to_path_buf(), views: raw.views[..3].to_vec(), ..raw };
+    let error = refusal(&two, &LoadOptions::default());
+    assert!(error.problem.contains("'p02.png' may be images/block/p02.png"), "{error}");
+    two.views[1].image_path = photos.join("p02.png");
+    let error = refusal(&two, &LoadOptions::default());
+    assert!(!error.problem.contains("may be") && error.problem.contains("holds 6 pictures of other names"), "{error}");
 }
 
 #[test]

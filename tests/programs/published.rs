@@ -4,7 +4,7 @@
 use crate::support::lookalike::write_lookalike;
 use crate::support::lpips::lpips_weights;
 use crate::support::scenes::{stderr, told};
-use crate::support::workdir::{BENCH, EVAL, Workdir, says};
+use crate::support::workdir::{BENCH, EVAL, Running, Workdir, says};
 use gsscale::config::file::TrainConfig;
 use gsscale::config::published::{BUILT_IN, PublishedRun};
 use gsscale::config::values::Chosen;
@@ -192,6 +192,12 @@ fn a_run_is_set_beside_the_published_one() {
     assert!(before == work.files(data), "nothing is written into the dataset");
     // The same figures again without training. Another SSIM or LPIPS gives no difference to the published one.
     lpips_weights(&work.path(""));
+    let weights = format!("{RUBBLE} --no-train --lpips");
+    work.refuses_with(
+        BENCH,
+        &format!("{weights} none.safetensors"),
+        &["none.safetensors", "reading the LPIPS weights"],
+    );
     let again = |more: &str| {
         work.json_and_words(BENCH, &format!("{RUBBLE} --no-train --quiet --lpips lpips_alex.safetensors {more}")).0
     };
@@ -214,6 +220,12 @@ fn a_run_is_set_beside_the_published_one() {
         assert_eq!(test["color_corrected"]["method"], method);
         assert!(test["color_corrected"]["cc_psnr"].is_number() && test["psnr"] == again["ours"]["test"]["psnr"]);
     }
+    // A run that was killed has no figures.
+    fs::remove_file(work.path("out/summary.json")).unwrap();
+    work.refuses_with(BENCH, &format!("{RUBBLE} --no-train"), &["has not ended", "gsscale-train --resume out"]);
+    // Another run in the folder takes the table away.
+    work.train(&format!("{data} --out out --overwrite --steps 2 --device cpu"));
+    assert!(!work.exists("out/published.json") && !work.exists("out/published.html"));
 }
 
 #[test]
@@ -236,6 +248,20 @@ fn the_defaults_of_gsscale_are_set_beside_both() {
     let (again, _) = work.json_and_words(BENCH, &format!("{RUBBLE} --with-defaults --no-train --quiet"));
     // The PLY holds unit quaternions.
     assert!((psnr(&again, "with_defaults") - psnr(&line, "with_defaults")).abs() < 0.01);
+    // The command of a run that was stopped before it came to the defaults trains these.
+    fs::remove_dir_all(work.path("out/defaults")).unwrap();
+    let (again, said) = work.json_and_words(BENCH, &format!("{RUBBLE} {SHORT} --with-defaults --no-train"));
+    assert!((psnr(&again, "with_defaults") - psnr(&line, "with_defaults")).abs() < 0.01);
+    says(&said, &["into out/defaults, which holds no run yet"]);
+    lpips_weights(&work.path(""));
+    let stopped = "run rubble --data colmap-merged --out stopped --with-defaults --lpips lpips_alex.safetensors";
+    let long = format!("{stopped} --steps 100000 --data-factor 1 --device cpu");
+    let said = Running::spawn(&work, &mut work.command(BENCH, &long)).after_lines("stopped", 1).stop();
+    says(&said, &[&format!("for the table: gsscale-bench {stopped}").replace(" --lpips lpips_alex.safetensors", "")]);
+    says(
+        &said,
+        &[" --steps=100000", " --data-factor=1", " --lpips lpips_alex.safetensors --lpips-range signed --no-train"],
+    );
 }
 
 #[test]
@@ -267,6 +293,20 @@ fn an_incomplete_folder_is_told_from_a_complete_one() {
         work.refuses_with(BENCH, &format!("{RUBBLE} --steps 2"), words);
         assert!(!work.exists("out"), "nothing is left behind");
     };
+    work.refuses_with(BENCH, &format!("{RUBBLE} --no-train"), &["no run in this folder", "leave out --no-train"]);
+    work.refuses_with(BENCH, &format!("{RUBBLE} --dry-run --lpips none.safetensors"), &["none.safetensors"]);
+    // The size is that of the photos, and the counts are those of the used ones.
+    work.write("views.txt", "000000.jpg\n000001.jpg\n");
+    fs::write(work.path("mine.toml"), BUILT_IN[0].1.replacen("[1152, 864]", "[96, 64]", 1)).unwrap();
+    let flags = "run mine.toml --data colmap-merged --dry-run --device cpu --views-file views.txt";
+    says(
+        &stderr(&work.succeeds(BENCH, flags)),
+        &[
+            "2 photos instead of 1678",
+            "1 held-out photo instead of 21",
+            "photos of 24x16 instead of 96x64: the photos are reduced already: use --data-factor 1",
+        ],
+    );
     fs::remove_file(data.join("val/rgbs/000006.jpg")).unwrap();
     refuses(&["1 of 24 photos is missing: 000006.jpg"]);
     fs::remove_dir_all(data.join("val/sparse")).unwrap();

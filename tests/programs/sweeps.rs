@@ -117,6 +117,14 @@ fn a_sweep_that_is_killed_goes_on_where_it_stopped() {
         "half runs are removed: {runs:?}"
     );
     assert!(lines(&work, &flags).is_empty(), "all are done");
+    // In a scene with another photo, nothing is done; no time of a file counts.
+    let (photo, to_do) =
+        (&work.photos()[0], || work.printed(BENCH, &format!("{flags} --list-runs")).matches("to do").count());
+    let before = std::fs::read(photo).unwrap();
+    std::fs::write(photo, [&before[..], &[0]].concat()).unwrap();
+    assert_eq!(to_do(), planned);
+    std::fs::write(photo, before).unwrap();
+    assert_eq!(to_do(), 0);
     let table = work.printed(BENCH, &flags);
     assert!(table.starts_with("| run ") && table.contains("the same bits") && !table.contains('{'), "{table}");
 
@@ -159,7 +167,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
         ("sweep pareto scene --out out --share 100", "--share"),
         ("sweep pareto scene scene --out out", "another scene has this name"),
         ("sweep ladder /nowhere --out out", "nowhere"),
-        ("sweep no-such-list scene --out out", "no-such-list"),
+        ("sweep no-such-list scene --out out", "name one of cells, pareto"),
         ("compare scene scene --out out", "metrics.jsonl"),
     ] {
         refuses(flags, words);
@@ -178,6 +186,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     refuses_list(&with("{ name = \"plain\" }"), "two runs plain");
     refuses_list(&with("{ name = \"a\", environment = { PATH = \"/\" } }"), "PATH");
     refuses_list(&with("{ name = \"a\", set = { stepz = 3 } }"), "stepz");
+    refuses_list(&with("{ name = \"a, b\" }"), "'a, b' has a comma");
     refuses_list(&with("{ name = \"a\", times = { optimizer = 2.0 } }"), "optimizer is no number");
     refuses_list(&with("{ name = \"a\", set = { data-factor = 0.5 } }"), "data-factor");
     let in_cells =

@@ -108,6 +108,8 @@ struct Entry {
 
 /// The runs of a scene.
 pub struct Plan {
+    /// The settings that runs change.
+    pub base: TrainConfig,
     pub reference: TrainConfig,
     /// The runs: those of the reference with all seeds, then all others seed by seed.
     pub runs: Vec<Planned>,
@@ -120,17 +122,20 @@ impl List {
     pub fn read(path: &Path) -> InputResult<List> {
         let text = match BUILT_IN.iter().find(|(name, _)| path.as_os_str() == *name) {
             Some((_, text)) => (*text).to_string(),
-            None => read_text(
-                path,
-                FILE_BYTES_MAX,
-                "give a file, or cells, pareto, ladder, ladder-gpu, speed or stability",
-            )?,
+            None => read_text(path, FILE_BYTES_MAX, "").map_err(|e| {
+                let problem = format!("neither a list of this program nor a readable file: {}", e.problem);
+                let names = BUILT_IN.map(|(name, _)| name).join(", ");
+                InputError::new(path, problem, format!("name one of {names}, or a TOML file"))
+            })?,
         };
         let refused = |problem: String| InputError::new(path, problem, "see \"Sweeps\" in configs/README.md");
         let list: List = toml::from_str(&text).map_err(|e| refused(e.to_string()))?;
         let mut names = BTreeSet::new();
         for (group, entry) in list.entries() {
             let name = name_of(group, entry);
+            if name.contains(',') {
+                return Err(refused(format!("the name '{name}' has a comma, which separates names in --only")));
+            }
             if let Some(variable) = entry.environment.keys().find(|v| !v.starts_with(OWN_VARIABLES)) {
                 return Err(refused(format!("{name} sets {variable}, which does not begin with {OWN_VARIABLES}")));
             }
@@ -214,12 +219,12 @@ impl List {
                 }
             }
         }
-        let surroundings = Surroundings::of(place)?;
+        let surroundings = Surroundings::of(place, &planner.base)?;
         let mut keys = BTreeSet::new();
         planned.retain(|run| keys.insert(run.key(&surroundings)));
         let reference = planned.first().map(|run| run.config.clone());
         let reference = reference.ok_or_else(|| InputError::new("--seeds", "no seed is given", "use --seeds 1,2,3"))?;
-        Ok(Plan { reference, runs: planned, dataset: planner.dataset })
+        Ok(Plan { base: planner.base, reference, runs: planned, dataset: planner.dataset })
     }
 
     /// What other programs reached on the scene in this folder, if runs like `reference` see its photos as they are and hold every eighth out.

@@ -9,17 +9,22 @@ use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::machine::reset_host_bytes_peak;
 use gsscale::base::say::shell_word;
+use gsscale::base::text::read_text;
+use gsscale::base::units::counted;
 use gsscale::base::whole_file::write_whole;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
-use gsscale::config::limits::read_options;
+use gsscale::config::limits::{load_options, read_options, simd_path};
 use gsscale::config::new_run;
 use gsscale::config::published::{BUILT_IN, PublishedRun, differences};
 use gsscale::config::values::Chosen;
 use gsscale::dataset::layout::{Layout, find_layout};
-use gsscale::dataset::model::{RawScene, Split};
+use gsscale::dataset::loader::target_size;
+use gsscale::dataset::model::{RawView, Split};
+use gsscale::dataset::photo_header::read_header;
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::render::lpips::InputRange;
-use gsscale::report::run_files::{CONFIG_FILE, SUMMARY_FILE};
+use gsscale::render::lpips::weights::read_lpips;
+use gsscale::report::run_files::{BEGUN_FILE, CONFIG_FILE, PUBLISHED_FILE, PUBLISHED_PAGE_FILE, SUMMARY_FILE};
 use gsscale::train::error::TrainError;
 use gsscale::train::log::report::Summary;
 use gsscale::train::run::begin::run;
@@ -27,6 +32,7 @@ use gsscale::train::run::eval_file::{EvalExtras, evaluate_file};
 use gsscale::train::run::request::{Existing, RunRequest};
 use gsscale::train::state::trainer::Trainer;
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -72,7 +78,7 @@ pub struct Args {
     /// Check the folder, print the setup and the memory of the run, then stop
     #[arg(long)]
     dry_run: bool,
-    /// Evaluate the results in the output folder instead of training
+    /// Evaluate the results in the output folder instead of training; --with-defaults still trains its run if there is none
     #[arg(long, conflicts_with_all = ["dry_run", "overwrite", "tier"])]
     no_train: bool,
     /// Replace the results of an earlier run in the output folder
@@ -109,7 +115,7 @@ struct Setting {
 pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, TrainError> {
     let mut run = PublishedRun::find(&args.run)?;
     let out = args.out.clone().unwrap_or_else(|| Path::new("runs").join(&run.name));
-    let finished = if args.no_train { Some(TrainConfig::read(&out.join(CONFIG_FILE))?) } else { None };
+    let finished = if args.no_train { Some(config_of_ended(&out)?) } else { None };
     // With --no-train, the tier is that of the finished run.
     let of_finished = finished.as_ref().and_then(|config| run.tier_of(config)).map(str::to_string);
     if let Some(tier) = args.tier.clone().or(of_finished) {
@@ -119,6 +125,10 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     let mut config = finished.unwrap_or_else(|| setting.published.clone());
     args.keys.clone().apply(&mut config);
     config.check()?;
+    if let Some(weights) = &args.lpips {
+        // Hours of training come before their use.
+        read_lpips(weights, simd_path(&config))?;
+    }
     setting.caveats.extend(differences(&setting.published, &config));
     check_photos(args, &config, &mut setting)?;
     if !args.quiet {
@@ -140,7 +150,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
     }
     let ours = measure(args, &setting.out, &config, summary)?;
     let with_defaults = match args.with_defaults {
-        true => match run_with_defaults(args, &setting)? {
+        true => match run_with_defaults(args, &setting, &config)? {
             Ok(ours) => Some(ours),
             Err(code) => return Ok(code),
         },
@@ -157,8 +167,8 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<ExitCode, Tra
         with_defaults: with_defaults.as_ref(),
     };
     let json = comparison.json();
-    write_whole(&setting.out.join("published.json"), format!("{json:#}\n").as_bytes())?;
-    write_whole(&setting.out.join("published.html"), comparison.page().as_bytes())?;
+    write_whole(&setting.out.join(PUBLISHED_FILE), format!("{json:#}\n").as_bytes())?;
+    write_whole(&setting.out.join(PUBLISHED_PAGE_FILE), comparison.page().as_bytes())?;
     if !args.quiet {
         gsscale::tell!("{}", comparison.text());
     }
@@ -194,18 +204,33 @@ fn settle(run: PublishedRun, args: &Args, out: PathBuf) -> InputResult<Setting> 
 fn check_photos(args: &Args, config: &TrainConfig, setting: &mut Setting) -> InputResult<()> {
     let raw = read_scene(&args.data, &ReadOptions { points_later: true, ..read_options(config) })?;
     let (facts, caveats) = (&setting.run.facts, &mut setting.caveats);
-    let (views, held_out) = (raw.views.len(), held_out(&raw, config));
-    for (what, published, found) in [("photos", facts.views, views), ("held-out photos", facts.held_out, held_out)] {
+    let list = match config.views_file.as_str() {
+        "" => None,
+        file => Some(read_text(Path::new(file), 1 << 30, "give a file with the name of a photo on each line")?),
+    };
+    let listed: Option<BTreeSet<&str>> = list.as_deref().map(|text| text.lines().collect());
+    let is_used = |view: &RawView| listed.as_ref().is_none_or(|names| names.contains(view.name.as_str()));
+    // A views file takes photos away and moves none to the other set.
+    let used: Vec<(usize, &RawView)> = raw.views.iter().enumerate().filter(|(_, view)| is_used(view)).collect();
+    let held_out = used.iter().filter(|(i, view)| is_held_out(*i, view, config)).count();
+    for (what, published, found) in [("photo", facts.views, used.len()), ("held-out photo", facts.held_out, held_out)] {
         if let Some(published) = published.filter(|&n| n as usize != found) {
-            caveats.push(format!("{found} {what} instead of {published}"));
+            caveats.push(format!("{} instead of {published}", counted(found as u64, what)));
         }
     }
-    let k = raw.views[0].intrinsics;
-    let used = [k.width, k.height].map(|side| f64::from(side) / config.data_factor);
-    // Undistortion and rounding change the size by a few pixels; another set of photos differs by more.
-    let is_off = |size: &[u32; 2]| (0..2).any(|i| (used[i] / f64::from(size[i]) - 1.0).abs() > 0.01);
-    if let Some([w, h]) = facts.size.filter(is_off) {
-        caveats.push(format!("photos of {:.0}x{:.0} instead of {w}x{h}", used[0], used[1]));
+    // The loader refuses a photo without a header.
+    let header = used.iter().find(|(_, view)| view.image_path.is_file()).map(|(_, view)| read_header(&view.image_path));
+    if let (Some([w, h]), Some(Ok(header))) = (facts.size, header) {
+        let (options, stored) = (load_options(config), (header.width, header.height));
+        let trained_on = target_size(stored, options.data_factor, options.max_resolution);
+        // Undistortion and rounding change the size by a few pixels; another set of photos differs by more.
+        let is_near = |own: u32, published: u32| (f64::from(own) / f64::from(published) - 1.0).abs() <= 0.01;
+        let is_published = |size: (u32, u32)| is_near(size.0, w) && is_near(size.1, h);
+        if !is_published(trained_on) {
+            let is_reduced = config.data_factor > 1.0 && is_published(stored);
+            let remedy = if is_reduced { ": the photos are reduced already: use --data-factor 1" } else { "" };
+            caveats.push(format!("photos of {}x{} instead of {w}x{h}{remedy}", trained_on.0, trained_on.1));
+        }
     }
     if raw.points_path.is_none() && raw.points.positions.is_empty() && config.init_ply.is_empty() {
         caveats.push("starts from random points: the folder has no points".to_string());
@@ -213,14 +238,14 @@ fn check_photos(args: &Args, config: &TrainConfig, setting: &mut Setting) -> Inp
     Ok(())
 }
 
-fn held_out(raw: &RawScene, config: &TrainConfig) -> usize {
-    let by_index = |i: usize| match (u32::try_from(config.test_after), config.test_every) {
-        (Ok(after), _) => i > after as usize,
-        (Err(_), 0) => false,
-        (Err(_), every) => i.is_multiple_of(every as usize),
-    };
-    let is_test = |(i, split): (usize, Option<Split>)| split.map_or_else(|| by_index(i), |s| s == Split::Test);
-    raw.views.iter().map(|view| view.split).enumerate().filter(|v| is_test(*v)).count()
+/// Whether the view with this index in the scene is held out.
+fn is_held_out(index: usize, view: &RawView, config: &TrainConfig) -> bool {
+    match (view.split, u32::try_from(config.test_after), config.test_every) {
+        (Some(split), _, _) => split == Split::Test,
+        (None, Ok(after), _) => index > after as usize,
+        (None, Err(_), 0) => false,
+        (None, Err(_), every) => index.is_multiple_of(every as usize),
+    }
 }
 
 /// Trains to the end, into `out`. A dry run and a stopped run return only an exit code.
@@ -245,36 +270,69 @@ fn train(
     }
     let [name, data, all] = [&args.run, &args.data, &setting.out].map(shell_word);
     let resume = format!("gsscale-train --resume {}", shell_word(out));
-    let more = if args.with_defaults { " --with-defaults" } else { "" };
+    let mut more = String::new();
+    if args.with_defaults {
+        more.push_str(" --with-defaults");
+        // The command trains the run with the defaults if that has not begun.
+        for (key, value) in new_run::given_keys(None, &args.keys)? {
+            let value = value.as_str().map_or_else(|| value.to_string().replace(['[', ']', ' '], ""), str::to_string);
+            more.push_str(&format!(" {}", shell_word(format!("--{key}={value}"))));
+        }
+    }
+    if let Some(weights) = &args.lpips {
+        more.push_str(&format!(" --lpips {} --lpips-range {}", shell_word(weights), args.lpips_range.name()));
+    }
     gsscale::tell!(
         "stopped; to go on: {resume}; for the table: gsscale-bench run {name} --data {data} --out {all}{more} --no-train"
     );
     Ok(Err(ExitCode::from(outcome.exit_code as u8)))
 }
 
-/// The run with the defaults of gsscale: photos, held-out photos, first points and the variant of SSIM are those of the published run.
-fn run_with_defaults(args: &Args, setting: &Setting) -> Result<Result<Ours, ExitCode>, TrainError> {
+/// The run with the defaults of gsscale: photos, held-out photos, first points and the variant of SSIM are those of `first`, the config of
+/// the other run.
+fn run_with_defaults(
+    args: &Args,
+    setting: &Setting,
+    first: &TrainConfig,
+) -> Result<Result<Ours, ExitCode>, TrainError> {
     let out = setting.out.join(DEFAULTS_FOLDER);
-    if args.no_train {
-        let config = TrainConfig::read(&out.join(CONFIG_FILE))?;
+    if args.no_train && has_run(&out) {
+        let config = config_of_ended(&out)?;
         return Ok(Ok(measure(args, &out, &config, read_summary(&out)?)?));
     }
-    let (published, mut keys) = (&setting.published, args.keys.clone());
-    keys.data_factor.get_or_insert(published.data_factor);
-    keys.test_every.get_or_insert(published.test_every);
-    keys.test_after.get_or_insert(published.test_after);
-    keys.init_ply.get_or_insert_with(|| published.init_ply.clone());
-    keys.ssim_variant.get_or_insert(published.ssim_variant);
+    let mut keys = args.keys.clone();
+    keys.data_factor.get_or_insert(first.data_factor);
+    keys.test_every.get_or_insert(first.test_every);
+    keys.test_after.get_or_insert(first.test_after);
+    keys.init_ply.get_or_insert_with(|| first.init_ply.clone());
+    keys.ssim_variant.get_or_insert(first.ssim_variant);
     let config = new_run::of_new_run(None, &keys)?;
     config.check()?;
     if !args.quiet {
-        gsscale::tell!("run     the same photos with the defaults of gsscale, into {}", out.display());
+        let why = if args.no_train { ", which holds no run yet" } else { "" };
+        gsscale::tell!("run     the same photos with the defaults of gsscale, into {}{why}", out.display());
     }
     reset_host_bytes_peak();
     Ok(match train(args, (setting, &out), &config)? {
         Ok(summary) => Ok(measure(args, &out, &config, summary)?),
         Err(code) => Err(code),
     })
+}
+
+fn has_run(out: &Path) -> bool {
+    [CONFIG_FILE, BEGUN_FILE].iter().any(|name| out.join(name).exists())
+}
+
+/// The config of a run for its figures. Errors: there is no run, or it has not ended.
+fn config_of_ended(out: &Path) -> InputResult<TrainConfig> {
+    if !has_run(out) {
+        return Err(InputError::new(out, "there is no run in this folder", "leave out --no-train"));
+    }
+    if !out.join(SUMMARY_FILE).exists() {
+        let remedy = format!("gsscale-train --resume {}, then this command again", shell_word(out));
+        return Err(InputError::new(out, "the run in this folder has not ended", remedy));
+    }
+    TrainConfig::read(&out.join(CONFIG_FILE))
 }
 
 fn read_summary(out: &Path) -> InputResult<Summary> {

@@ -10,6 +10,7 @@ use gsscale::config::published::PublishedRun;
 use gsscale::optim::moments::Moments;
 use gsscale::render::metrics::SsimVariant;
 use gsscale::report::html::{Cell, Page};
+use gsscale::report::run_files::PUBLISHED_PAGE_FILE;
 use gsscale::train::log::report::{Summary, TestMetrics};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -196,7 +197,7 @@ impl Comparison<'_> {
         lines.extend(aligned(&table).iter().map(|row| row.join("  ")));
         lines.extend(self.facts());
         lines.extend(self.caveats.iter().map(|c| format!("not the published run: {c}")));
-        lines.push(format!("report: {}", self.out.join("published.html").display()));
+        lines.push(format!("report: {}", self.out.join(PUBLISHED_PAGE_FILE).display()));
         lines.join("\n")
     }
 

@@ -16,8 +16,10 @@ use gsscale::base::whole_file::{open_locked, write_whole};
 use gsscale::cells::work::{Done, status};
 use gsscale::cells::{City, machine_flags};
 use gsscale::config::file::TrainConfig;
+use gsscale::config::limits::read_options;
 use gsscale::config::values::{ByteSize, Choice};
 use gsscale::dataset::disturb::Disturbance;
+use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::photos::outlier::views;
 use gsscale::report::run_files::{CONFIG_FILE, EVALUATED_AS_FILE, EVALUATED_FILE, PLY_FILE, SUMMARY_FILE};
 use gsscale::train::log::report::Summary;
@@ -49,20 +51,22 @@ pub struct Place {
 
 /// Everything except the settings that the figures of a run depend on.
 pub struct Surroundings {
-    /// Scene, drive, program, processor and threads, as one text.
+    /// Scene and its content, drive, program, processor and threads, as one text.
     text: String,
     /// Suffix of this sweep's folders on the drive, which other sweeps may also use.
     mark: String,
 }
 
 impl Surroundings {
-    /// Reads scene, drive, program and machine. Errors: `gsscale-train` is missing.
-    pub fn of(place: &Place) -> InputResult<Surroundings> {
+    /// Reads scene, drive, program and machine; `base` says where the photos lie.
+    /// Errors: `gsscale-train` is missing, or the scene cannot be read.
+    pub fn of(place: &Place, base: &TrainConfig) -> InputResult<Surroundings> {
         let program = digest(&beside("gsscale-train")?.0)?;
         // The default folder in --out is not part of the key: an output folder may move with its results.
         let drive = place.spill.as_ref().map_or_else(String::new, |path| resolved(path).display().to_string());
         let (threads, cpu) = (rayon::current_num_threads(), cpu_model());
-        let text = format!("{}\n{drive}\n{program}\n{threads}\n{cpu}", resolved(&place.scene).display());
+        let (scene, content) = (resolved(&place.scene), content_of(&place.scene, base)?);
+        let text = format!("{}\n{content}\n{drive}\n{program}\n{threads}\n{cpu}", scene.display());
         let mark = format!("{:08x}", xxh3_64(resolved(&place.out).as_os_str().as_encoded_bytes()) as u32);
         Ok(Surroundings { text, mark })
     }
@@ -155,12 +159,17 @@ impl Planned {
 impl Sweep {
     /// Opens or creates the output folder, with its results; removes the leftovers of interrupted runs.
     /// Errors: the folder cannot be written, another sweep uses it, or the results cannot be read.
-    pub fn open(place: &Place, base: &TrainConfig, pace_steps: u32, json: bool) -> InputResult<Sweep> {
+    pub fn open(
+        place: &Place,
+        surroundings: Surroundings,
+        base: &TrainConfig,
+        pace_steps: u32,
+        json: bool,
+    ) -> InputResult<Sweep> {
         let (Place { scene, out, spill }, base) = (place.clone(), base.clone());
         make_folder(&out.join("runs"))?;
         let lock = lock(&out)?;
         let log = ResultsLog::open(&out.join(RESULTS))?;
-        let surroundings = Surroundings::of(place)?;
         let spill = spill.unwrap_or_else(|| out.join("spill"));
         // This process holds the lock, so no run uses these files.
         remove_parts(&out.join("runs"), &[".part", ".part.toml"])?;
@@ -423,8 +432,23 @@ fn lock(out: &Path) -> InputResult<File> {
     })
 }
 
+/// Digest of the views of a scene, of the lengths of their photos, and of its points. Times of files do not count: a copy is the same.
+fn content_of(scene: &Path, base: &TrainConfig) -> InputResult<String> {
+    let options = ReadOptions { allow_missing: true, points_later: true, ..read_options(base) };
+    let (raw, mut hash) = (read_scene(scene, &options)?, Xxh3::new());
+    for view in &raw.views {
+        let bytes = std::fs::metadata(&view.image_path).map_or(0, |about| about.len());
+        let facts = format!("{}\n{bytes} {:?} {:?} {:?}\n", view.name, view.intrinsics, view.pose, view.split);
+        hash.update(facts.as_bytes());
+    }
+    hash.update(bytemuck::cast_slice(&raw.points.positions));
+    hash.update(raw.points.colors.as_flattened());
+    let points = raw.points_path.map_or(Ok(String::new()), |path| digest(&path))?;
+    Ok(format!("{:016x}{points}", hash.digest()))
+}
+
 fn digest(path: &Path) -> InputResult<String> {
-    let io = |e: std::io::Error| InputError::io(path, "reading the result", &e);
+    let io = |e: std::io::Error| InputError::io(path, "reading", &e);
     let mut file = File::open(path).map_err(io)?;
     let (mut hash, mut buffer) = (Xxh3::new(), vec![0; 1 << 20]);
     loop {

@@ -114,7 +114,7 @@ pub fn start(args: &Args, print: &mut dyn FnMut(&Value)) -> Result<(), TrainErro
     for (place, plan) in &plans {
         let in_order = list.in_order(&plan.runs);
         match args.list_runs {
-            true => list_runs(place, &in_order)?,
+            true => list_runs(place, plan, &in_order)?,
             false => sweep_scene(args, &list, place, plan, &in_order, print)?,
         }
     }
@@ -132,7 +132,7 @@ fn sweep_scene(
 ) -> Result<(), TrainError> {
     // The reference of disturbed scenes is no training of the scene itself.
     let pace_steps = if plan.dataset.is_some() { 0 } else { args.pace_steps };
-    let mut sweep = Sweep::open(place, &plan.reference, pace_steps, args.json)?;
+    let mut sweep = Sweep::open(place, Surroundings::of(place, &plan.base)?, &plan.reference, pace_steps, args.json)?;
     let open = sweep.open_runs(&plan.runs);
     let (all, count) = (plan.runs.len(), open.len().min(args.max_runs.unwrap_or(usize::MAX)));
     gsscale::tell!("{}: {} of {all} runs are done; {count} to do now", place.scene.display(), all - open.len());
@@ -181,9 +181,9 @@ fn in_words(config: &TrainConfig) -> String {
 }
 
 /// Prints the runs and which of them are done.
-fn list_runs(place: &Place, runs: &[Planned]) -> InputResult<()> {
+fn list_runs(place: &Place, plan: &Plan, runs: &[Planned]) -> InputResult<()> {
     let records = ResultsLog::peek(&place.out.join(RESULTS))?;
-    let surroundings = Surroundings::of(place)?;
+    let surroundings = Surroundings::of(place, &plan.base)?;
     for run in runs {
         let state = match successful_run(&records, &run.key(&surroundings)) {
             Some(record) => format!("done in {:.0} s", record.wall_seconds),
