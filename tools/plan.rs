@@ -187,8 +187,14 @@ fn start(args: &Args) -> InputResult<String> {
     }
     let mut rows = Vec::new();
     for &frames in &frames {
-        for order in orders(args, &scene.config) {
-            rows.push(row(args, &scene, frames, order)?);
+        let mut compared = Vec::new();
+        for asked in orders(args, &scene.config) {
+            let order = order(args, &scene, frames, asked)?;
+            // Where nobody named the orders, the one that auto chose needs no second row.
+            if !args.compare_orders.is_empty() || !compared.contains(&order) {
+                compared.push(order);
+                rows.push(row(args, &scene, frames, order, asked)?);
+            }
         }
     }
     let devices = args.bus.map_or(Ok(Vec::new()), |bus| device_rows(args, &scene, &rows, bus))?;
@@ -401,8 +407,7 @@ fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
     InputError::new("--frames", error.to_string(), remedy)
 }
 
-fn row(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> InputResult<Row> {
-    let order = order(args, scene, frames, asked)?;
+fn row(args: &Args, scene: &Scene, frames: usize, order: Order, asked: Chosen<Order>) -> InputResult<Row> {
     let views = ViewOrder::new(order, scene.config.seed, &scene.cameras);
     let steps = scene.config.steps.min((EPOCHS * scene.cameras.len() as u32).max(1));
     let run = |policy, reads_ahead| {

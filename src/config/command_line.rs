@@ -9,6 +9,28 @@ use clap::builder::StyledStr;
 use clap::error::{ContextKind, ContextValue};
 use std::ffi::OsString;
 
+/// Programs that draw Gaussians and train none. Their help shows the keys that say what is drawn, beside which photos and where.
+const DRAWING_PROGRAMS: &[&str] = &["eval", "view"];
+const DRAWING_KEYS: &[&str] = &[
+    "images",
+    "data_factor",
+    "max_resolution",
+    "test_every",
+    "views_file",
+    "masks",
+    "invert_masks",
+    "allow_missing",
+    "image_cache",
+    "background",
+    "color_correct",
+    "up",
+    "host_mem",
+    "spill_dir",
+    "threads",
+    "device",
+    "device_mem",
+];
+
 /// Parses the command line of a program with [`TrainOverrides`](super::file::TrainOverrides), its name first; prints help and usage errors and
 /// exits.
 pub fn parse_arguments<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[OsString]) -> T {
@@ -119,6 +141,7 @@ pub fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Co
         return command;
     }
     let defaults = toml::Table::try_from(TrainConfig::default()).unwrap_or_default();
+    let draws_only = DRAWING_PROGRAMS.contains(&command.get_name().trim_start_matches("gsscale-"));
     for key in KEYS {
         let value =
             defaults.get(&key.name()).map(|value| value.as_str().map_or_else(|| value.to_string(), str::to_string));
@@ -128,7 +151,8 @@ pub fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Co
             let help = arg.get_help().map(ToString::to_string).unwrap_or_default();
             let end = [". ", "; "].iter().filter_map(|mark| help.find(mark)).min().unwrap_or(help.len());
             let arg = arg.help(format!("{}{default}", &help[..end])).long_help(format!("{help}{default}"));
-            let arg = arg.hide(key.shown == Shown::Nowhere).hide_short_help(key.shown != Shown::First);
+            let is_hidden = key.shown == Shown::Nowhere || draws_only && !DRAWING_KEYS.contains(&key.field);
+            let arg = arg.hide(is_hidden).hide_short_help(key.shown != Shown::First);
             let in_short =
                 |arg: clap::Arg| arg.help_heading(None::<&str>).value_name("VALUE").hide_possible_values(true);
             if is_short { in_short(arg) } else { arg }
@@ -142,7 +166,10 @@ pub fn with_help_of_keys(mut command: clap::Command, is_short: bool) -> clap::Co
         command = command.term_width(100);
     }
     let hidden = KEYS.iter().filter(|key| key.shown == Shown::Nowhere).count();
-    let more = format!("{hidden} more keys, for work on the program and for comparisons, are in configs/README.md.");
+    let more = match draws_only {
+        true => String::from("All other flags of gsscale-train are accepted, too."),
+        false => format!("{hidden} more keys, for work on the program and for comparisons, are in configs/README.md."),
+    };
     let last = command.get_after_help().map_or(more.clone(), |text| format!("{text}\n\n{more}"));
     command.after_long_help(last)
 }

@@ -306,7 +306,7 @@ config_keys! {
         /// bytes, sog a folder with levels of detail, which web viewers load in parts
         export: Exports = Exports { spz: false, sog: false } => Free common;
         /// Leave Gaussians that fewer than two photos see out of the result files (the checkpoint keeps them): auto, on or off.
-        /// auto leaves out at most .1 %: where more have one photo only those without any, and none where more have no photo
+        /// auto is on where these are at most .1 % of all; otherwise it leaves out those that no photo sees, if they are at most .1 %
         export_clean: Chosen<bool> = Chosen(None) => Free;
         /// Coordinates of the exported files (PLY, SPZ, SOG): dataset or local
         export_frame: ExportFrame = ExportFrame::Dataset => Free;

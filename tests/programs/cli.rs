@@ -2,7 +2,7 @@
 //! names the file, the place and the remedy, with a non-zero exit code, and without an output folder.
 
 use crate::support::scenes::{TextModel, stderr, stdout};
-use crate::support::workdir::{BENCH, EVAL, TRAIN, Workdir, says};
+use crate::support::workdir::{BENCH, EVAL, TRAIN, VIEW, Workdir, says};
 use gsscale::config::file::{KEYS, Shown};
 use gsscale::config::habits::ADVICE;
 use gsscale::config::values::choices;
@@ -307,6 +307,16 @@ fn help_is_grouped_and_has_examples() {
         said.lines().filter_map(|line| line.strip_prefix("      --")?.split([' ', '[']).next()).collect();
     let shown = KEYS.iter().filter(|key| flags.contains(&key.name().as_str())).count();
     assert!(shown <= 50 && shown == KEYS.iter().filter(|key| key.shown != Shown::Nowhere).count(), "{flags:?}");
+    // Programs that only draw show no keys of training, and accept them.
+    for program in [EVAL, VIEW] {
+        let said = stdout(&work.output(program, "--help"));
+        assert!(
+            said.contains("--host-mem <") && said.contains("--test-every <") && !said.contains("--refine-every"),
+            "{said}"
+        );
+    }
+    let said = work.refuses_with(EVAL, "none.ply scene --refine-every 50", &["none.ply"]);
+    assert!(!said.contains("--refine-every"), "{said}");
     // The short help has the examples first.
     let said = stdout(&work.output(TRAIN, "-h"));
     assert!(said.lines().count() <= 30, "{said}");

@@ -1,6 +1,6 @@
 //! `gsscale-plan` through its binary: sums that agree, exact lists, and refusals with a remedy.
 
-use crate::support::scenes::{stderr, told};
+use crate::support::scenes::{stderr, stdout, told};
 use crate::support::workdir::{TRAIN, Workdir};
 use serde_json::Value;
 
@@ -111,6 +111,8 @@ fn a_run_folder_knows_its_scene_and_too_little_memory_is_refused() {
     work.write("run/config.toml", "steps = 77\n[resolved]\nscene = \"scene\"\n");
     let output = work.output(PLAN, "run --page-rows 16 --compare-frames 100%");
     assert!(told(&output).contains("of all 77 steps"), "{}", told(&output));
+    // Everything fits, so auto is shuffle, and one row says both.
+    assert_eq!(stdout(&output).lines().filter(|line| line.starts_with("shuffle")).count(), 1, "{}", stdout(&output));
     // Given frames need no given memory.
     for named in ["--frames 80", "--compare-frames 100%"] {
         plan(&work, &format!("--page-rows 16 --host-mem 1MiB {named}"));

@@ -7,7 +7,7 @@
 //! f64 qw qx qy qz tx ty tz, u32 camera, name NUL, u64 m, m x {f64 x, f64 y, i64 point}}`; points `u64 n, n x {u64 id,
 //! f64 x y z, u8 r g b, f64 error, u64 m, m x {u32 image, u32 index}}`.
 
-use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
+use super::{Cameras, DAMAGED, ImageRecord, NO_LENS, PointTally, models};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::text_of;
 use crate::dataset::model::TakePoint;
@@ -141,7 +141,7 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
             *value = source.take("camera parameters").map(f64::from_le_bytes)?;
         }
         let intrinsics = models::intrinsics(model, size, &params[..model.params])
-            .map_err(|p| source.error(at, format!("camera {id} has {p}")))?;
+            .map_err(|p| InputError::new(path, format!("camera {id} has {p}"), NO_LENS).at(format!("byte {at}")))?;
         if cameras.insert(id, intrinsics).is_some() {
             return Err(source.error(at, format!("camera {id} has a second definition")));
         }

@@ -6,7 +6,7 @@
 //! camera name`, each followed by one line, possibly empty, of `x y point` triples; points `id x y z r g b error`, then
 //! the track.
 
-use super::{Cameras, DAMAGED, ImageRecord, PointTally, models};
+use super::{Cameras, DAMAGED, ImageRecord, NO_LENS, PointTally, models};
 use crate::base::error::{InputError, InputResult};
 use crate::base::text::{TextReader, shown};
 use crate::dataset::loose_json::is_no_number;
@@ -156,8 +156,10 @@ pub(super) fn read_cameras(path: &Path, warnings: &mut Vec<String>) -> InputResu
         while !words.rest.is_empty() && params.len() <= model.params {
             params.push(words.number("a camera parameter")?);
         }
-        let intrinsics = models::intrinsics(model, size, &params)
-            .map_err(|p| lines.error(format!("camera {id} has a wrong entry: {p}")))?;
+        let intrinsics = models::intrinsics(model, size, &params).map_err(|p| {
+            let problem = format!("camera {id} has a wrong entry: {p}");
+            InputError::new(path, problem, NO_LENS).at(format!("line {}", lines.line))
+        })?;
         if cameras.insert(id, intrinsics).is_some() {
             return Err(lines.error(format!("camera {id} has a second definition")));
         }

@@ -127,7 +127,7 @@ fn cameras_with_impossible_numbers_are_refused() {
     for focal in [0.0, -500.0, f64::NAN, f64::INFINITY, 1e-9, 1e30] {
         let mut m = model(1);
         m.cameras[1].params[0] = focal;
-        refused_in_both(&m, "cameras", &["camera 7", "focal length"]);
+        refused_in_both(&m, "cameras", &["camera 7", "focal length", "gsscale-poses"]);
     }
     for size in [(0, 480), (640, 0), (1 << 40, 480), (640, 65_536)] {
         let mut m = model(1);
