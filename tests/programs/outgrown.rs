@@ -5,11 +5,10 @@
 use crate::support::memory_group::MemoryGroup;
 #[cfg(target_os = "linux")]
 use crate::support::scenes::stderr;
+use crate::support::scenes::told;
 #[cfg(target_os = "linux")]
 use crate::support::small_drive::Small;
-#[cfg(target_os = "linux")]
-use crate::support::workdir::TRAIN;
-use crate::support::workdir::{Workdir, least_memory, says};
+use crate::support::workdir::{TRAIN, Workdir, least_memory, says};
 use gsscale::dataset::synthetic::{CityOptions, write_city};
 
 const MIB: f64 = 1048576.0;
@@ -85,6 +84,19 @@ fn a_scene_that_grows_stays_within_its_memory_and_within_less_than_its_views_tak
     same_within(&work, "out", 92.0 * MIB);
     let [pinned, whole] = ["out", "alone"].map(|out| work.count(out, "pages_pinned_max"));
     assert!(work.summary("out")["finished"] == true && pinned < whole, "no view was cut: {pinned} of {whole}");
+}
+
+/// The least memory of a run that outgrows it counts pages in transfer, and is enough.
+#[test]
+fn the_least_memory_of_a_run_that_outgrows_it_is_enough() {
+    let work = Workdir::city(48, 160, 104, 1500);
+    let dry = |budget: f64| {
+        work.output(TRAIN, &format!("scene --steps 300 --schedule run-length --strategy long-axis --dry-run --device cpu --host-mem {budget}MiB"))
+    };
+    let said = told(&dry(32.0));
+    says(&said, &["its pages move to checkpoint/", "in transfer, and the plan", "fewest frames"]);
+    let said = told(&dry(least_memory(&said)));
+    assert!(said.contains("memory  about") && !said.contains("fewest frames"), "{said}");
 }
 
 /// A photo from high above needs most of the memory for its own rows. Afterwards the frames have this memory again.

@@ -74,11 +74,11 @@ fn a_budget_that_was_refused_trains_with_what_the_remedy_names() {
     let work = large();
     // First frames get an eighth of this budget, which does not hold the pages of the largest view.
     let more = "scene --steps 12 --prefetch-bytes 1MiB --page-rows 16 --strategy none --spill-dir spill";
-    let enough = least_memory(&work.refuses(&format!("{more} --out out --host-mem 32MiB"), &[])) + 0.1;
-    work.train(&format!("{more} --out out --host-mem {enough:.1}MiB"));
+    let enough = least_memory(&work.refuses(&format!("{more} --out out --host-mem 32MiB"), &[]));
+    work.train(&format!("{more} --out out --host-mem {enough}MiB"));
     // A dry run prints the same for frames over a drive, and needs no folder.
     let dry = |budget: &str| work.output(TRAIN, &format!("{more} --dry-run --host-mem {budget}"));
-    let (enough, too_little) = (dry(&format!("{enough:.1}MiB")), dry("32MiB"));
+    let (enough, too_little) = (dry(&format!("{enough}MiB")), dry("32MiB"));
     let said = told(&enough);
     assert!(enough.status.success() && said.contains("frames of pages") && said.contains("drive  "), "{said}");
     let said = stderr(&too_little);

@@ -246,8 +246,8 @@ fn least_memory(need: &LargestNeed, memory: &MemoryEstimate, host_mem: Option<u6
 }
 
 /// The budget with a margin that makes it enough at the next start, too: the memory of the graphics driver differs from
-/// start to start by up to 1/20.
-fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
+/// start to start by up to 1/20, and that of a view by some tenths of a mebibyte, as threads share its tiles.
+pub(super) fn with_margin(bytes: u64, memory: &MemoryEstimate) -> u64 {
     bytes + bytes / 50 + memory.base / 16
 }
 
@@ -342,6 +342,10 @@ pub(super) fn limit_memory(
     for (memory, rows_then) in memory[1..].iter_mut().zip([rows_at_most(config, rows), last]) {
         let growth = rows_then as f64 / rows.max(1) as f64;
         let pages = (tiers.largest_view.pages as f64 * growth).ceil() as u64;
+        // A run that outgrows its memory has pages in transfer from then on.
+        if tiers.frames.is_none() && memory.total() > budget {
+            memory.staging = first_staging_bytes(config, budget);
+        }
         let frames = shrink_to_budget(config, &LargestNeed { frame_bytes: tiers.frame_bytes, pages }, budget, memory);
         frames_at_end = Some(match tiers.frames {
             None => frames,
@@ -504,7 +508,7 @@ fn check_in_memory([start, most, _]: &[MemoryEstimate; 3], host_mem: Option<u64>
         };
         let remedy = format!(
             "{spill}give at least {}, or lower --image-cache, --sh-degree or the size of the photos",
-            format_bytes_up(start.total())
+            format_bytes_up(with_margin(start.total(), start))
         );
         return Err(InputError::new("--host-mem", problem, remedy));
     }

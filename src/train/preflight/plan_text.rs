@@ -2,7 +2,7 @@
 
 use super::device_memory;
 use super::forecast::{Forecast, Reach, first_pages};
-use super::plan::LargestView;
+use super::plan::{LargestView, with_margin};
 use crate::base::units::{counted, format_bytes, format_bytes_up, format_grouped, format_seconds};
 use crate::config::file::TrainConfig;
 use crate::config::limits;
@@ -159,7 +159,7 @@ fn describe_tiers(forecast: &Forecast, tiers: &Tiers, has_named_limit: bool) -> 
         text.push_str(&format!(
             "        more than --host-mem {}, also with the fewest frames: give at least {}, lower --max-gaussians, or make the photos smaller\n",
             format_bytes(limit),
-            format_bytes_up(memory.total())
+            format_bytes_up(with_margin(memory.total(), memory))
         ));
     }
     text.push_str(&part(&frames, memory.frames));
