@@ -7,7 +7,7 @@
 //! doubling is undone: the rows of least weight are removed ([`super::long_axis`]). PSNR cannot say that: where photos do not match to
 //! the pixel, it prefers a blurred picture. `benches/RESULTS.md` has the measurements, `benches/TRIED.md` what failed.
 //!
-//! Photos bound the count, too: a Gaussian beyond one for each few dozen of their pixels costs time and brings next to nothing
+//! Photos bound the count, too: a Gaussian beyond one for each two dozen of their pixels costs time and brings next to nothing
 //! ([`GrowthRule::most`]).
 //!
 //! A doubling takes two rounds, so checks come every two rounds. A scene waits while it has fewer Gaussians than allowed, and
@@ -48,7 +48,7 @@ impl Quality {
     fn demand(self) -> DoublingDemand {
         match self {
             Quality::Draft => DoublingDemand { gain: 0.8, share: 0.5, pixels: 128 },
-            Quality::Normal => DoublingDemand { gain: 0.3, share: 0.4, pixels: 32 },
+            Quality::Normal => DoublingDemand { gain: 0.3, share: 0.4, pixels: 24 },
             Quality::Archive => DoublingDemand { gain: 0.1, share: 0.25, pixels: 8 },
         }
     }
@@ -69,7 +69,7 @@ const GAP_OF_A_LAG: f64 = 1.6;
 const PATIENCE: usize = 3;
 /// The first allowed number is at least this part of the most Gaussians. Below the second part, one check allows two doublings.
 const FIRST_PART_OF_MOST: u64 = 16;
-const SMALL_PART_OF_MOST: u64 = 8;
+const SMALL_PART_OF_MOST: u64 = 11;
 /// The least factor of a stage of growth.
 const LEAST_STAGE: f64 = 1.2;
 /// A scene has grown when it has this share of the Gaussians that it was allowed.
@@ -146,6 +146,13 @@ pub struct GrowthCheck {
     pub allowed: u64,
 }
 
+impl GrowthCheck {
+    /// Whether no check follows.
+    pub fn is_final(&self) -> bool {
+        matches!(self.decision, GrowthDecision::Ends | GrowthDecision::Undoes)
+    }
+}
+
 /// The state of the decision about the count.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct GrowthState {
@@ -162,7 +169,7 @@ impl GrowthState {
 
     /// Whether the count is decided for good.
     pub fn is_decided(&self) -> bool {
-        self.checks.last().is_some_and(|last| matches!(last.decision, GrowthDecision::Ends | GrowthDecision::Undoes))
+        self.checks.last().is_some_and(GrowthCheck::is_final)
     }
 
     /// The checks from the one that decided the last doubling on, and what was allowed before, if no check has judged the doubling.
@@ -228,14 +235,25 @@ impl GrowthRule {
         rows.max(self.most(pixels) / FIRST_PART_OF_MOST)
     }
 
-    /// The final number of Gaussians if every check doubles what is allowed, for a scene of `rows` and training photos
+    /// The final number of Gaussians if every check after `last` doubles what is allowed, for a scene of `rows` and training photos
     /// of `pixels` [`counted_pixels`]. Each round of `rounds` at most doubles the scene, up to what is allowed then.
-    pub fn reachable(&self, rows: u64, pixels: u64, rounds: impl Iterator<Item = u32>) -> u64 {
-        let (mut now, mut allowed, mut before) = (rows, self.first(rows, pixels), None);
+    pub fn reachable(
+        &self,
+        rows: u64,
+        pixels: u64,
+        last: Option<&GrowthCheck>,
+        rounds: impl Iterator<Item = u32>,
+    ) -> u64 {
+        let mut now = rows;
+        let mut allowed = last.map_or_else(|| self.first(rows, pixels), |check| check.allowed);
+        let (mut before, mut is_first) = (last.map(|check| check.step.saturating_sub(1)), last.is_none());
         for step in rounds {
-            let has_grown = now as f64 >= GROWN * allowed as f64;
-            if has_grown && self.is_due(before, step) && !self.is_past(LAST_PART, step) {
-                allowed = self.more(allowed, pixels).max(allowed);
+            if self.is_due(before, step) && !self.is_past(LAST_PART, step) {
+                // The first check doubles whatever the scene has.
+                if is_first || now as f64 >= GROWN * allowed as f64 {
+                    allowed = self.more(allowed, pixels).max(allowed);
+                }
+                is_first = false;
             }
             now = now.saturating_mul(2).min(allowed).max(now);
             before = Some(step);
@@ -254,6 +272,11 @@ impl GrowthRule {
     fn more(&self, allowed: u64, pixels: u64) -> u64 {
         let is_small = allowed < self.most(pixels) / SMALL_PART_OF_MOST;
         allowed.saturating_mul(if is_small { 4 } else { 2 }).min(self.most(pixels))
+    }
+
+    /// Whether photos of `pixels` [`counted_pixels`] allow a stage of growth beyond `allowed` Gaussians.
+    pub fn has_room(&self, allowed: u64, pixels: u64) -> bool {
+        self.more(allowed, pixels) as f64 >= LEAST_STAGE * allowed as f64
     }
 
     /// Whether runs are long enough for the measurements of which scenes grow (`UNIT_MEASURED`).
@@ -294,7 +317,7 @@ impl GrowthRule {
         let (ViewMetrics { psnr, ssim }, ViewMetrics { psnr: trained_psnr, ssim: trained_ssim }) = (held_out, trained);
         let DoublingDemand { gain: gain_least, share: share_least, .. } = self.quality.demand();
         let more = self.more(before.allowed(), pixels);
-        let has_room = more as f64 >= LEAST_STAGE * before.allowed() as f64;
+        let has_room = self.has_room(before.allowed(), pixels);
         let is_last = self.is_past(LAST_PART, step);
         let gap = trained_psnr - psnr;
         let has_grown = gaussians as f64 >= GROWN * before.allowed() as f64;
@@ -381,7 +404,7 @@ mod tests {
         state.checks.iter().map(|check| (check.allowed, check.decision)).collect()
     }
 
-    const PIXELS: u64 = 8_704_000;
+    const PIXELS: u64 = 6_528_000;
 
     #[test]
     fn every_check_may_double_what_is_allowed() {
@@ -390,10 +413,11 @@ mod tests {
             rule.reachable(
                 rows,
                 PIXELS,
+                None,
                 (1..).map(|round| steps / 6 + round * every).take_while(|&step| step < steps * 4 / 5),
             )
         };
-        let most = PIXELS / 32;
+        let most = PIXELS / 24;
         // Checks of short runs allow as many doublings; rounds that are rare leave no time for them.
         assert_eq!([reach(500, 16, 6750), reach(3000, 100, 6750), reach(3000, 100, 2 * most)], [most, most, 2 * most]);
         assert_eq!(reach(3000, 900, 100), 400);
@@ -414,7 +438,7 @@ mod tests {
             [26.1, 27.4],
         ];
         assert_eq!([0, 117_315, 469_260, 1_920_000].map(counted_pixels), [0, 117_315, 237_299, 480_000]);
-        let most = PIXELS / 32;
+        let most = PIXELS / 24;
         let first = GrowthRule::new(Quality::Normal, 3000).first(3000, PIXELS);
         assert_eq!(first, most / 16, "more than 3,000 points");
         let doubled = [(4 * first, Doubles), (8 * first, Doubles), (most, Doubles), (most, Ends)];

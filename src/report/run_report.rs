@@ -241,7 +241,7 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
             (hits + misses > 0.0).then(|| hits / (hits + misses))
         };
         charts.extend([
-            (traffic, "Bytes of pages read from and written to the spill directory."),
+            (traffic, "Bytes of pages read from and written to the drive."),
             (
                 over_steps(metrics, "Waiting for pages", "seconds since the start", waiting),
                 "Time in which a step waited for a page.",
@@ -260,19 +260,44 @@ fn tier_charts(metrics: &[Value]) -> Vec<(String, String)> {
     drawn.map(|(chart, caption)| (chart.svg(), caption.to_string())).collect()
 }
 
+/// What the checks of growth measured, from the one that last allowed more Gaussians to the last one.
+fn growth_text(checks: &[Value], allowed: f64, gaussians: &Value) -> String {
+    let more: Vec<&Value> = checks.iter().filter(|check| check["decision"] == "doubles").collect();
+    let mut text = format!(
+        "By its last check the run allows up to {} Gaussians (--quality). Some training photos were held out for these checks, {} of which \
+         allowed more, {} not. More are allowed while held-out photos gain enough, and nearly as much as photos that the run trains on, up to a \
+         Gaussian for some pixels of the photos.",
+        short(allowed),
+        more.len(),
+        checks.len() - more.len()
+    );
+    if let (Some(since), Some(last)) = (more.last(), checks.last()) {
+        let gain = |name: &str| last[name].as_f64().unwrap_or(0.0) - since[name].as_f64().unwrap_or(0.0);
+        if since["step"] != last["step"] {
+            text += &format!(
+                " Since the last check that allowed more, held-out photos gained {:.2} dB and {:.3} of SSIM, the others {:.2} dB and {:.3}.",
+                gain("psnr"),
+                gain("ssim"),
+                gain("trained_psnr"),
+                gain("trained_ssim")
+            );
+        }
+        if last["decision"] == "undoes" {
+            text += " More Gaussians fitted noise, since the SSIM of held-out photos did not rise: the run undid the last doubling.";
+        }
+    }
+    if gaussians.as_f64().is_some_and(|rows| rows > allowed) {
+        text += " A cap (--max-gaussians) or a first PLY gave the scene more than that.";
+    }
+    text
+}
+
 /// Why the scene has the number of Gaussians that it has, if the run decided it.
 fn add_growth(page: &mut Page, summary: &Value) {
     let checks = summary["growth"].as_array().map_or(&[][..], Vec::as_slice);
     let Some(allowed) = checks.last().and_then(|last| last["allowed"].as_f64()) else { return };
     page.heading("Number of Gaussians");
-    let undone =
-        " More Gaussians fitted noise, since the SSIM of these photos did not rise: the run undid the last doubling.";
-    page.paragraph(&format!(
-        "The run decided that up to {} Gaussians pay (--quality). It held some training photos out. The scene doubled once, and again as long \
-         as these photos gained a good share of what the photos gained that it trained on.{}",
-        short(allowed),
-        if checks.iter().any(|check| check["decision"] == "undoes") { undone } else { "" }
-    ));
+    page.paragraph(&growth_text(checks, allowed, &summary["gaussians"]));
     let of = |name: &str| checks.iter().filter_map(|c| Some((c["step"].as_f64()?, c[name].as_f64()?))).collect();
     let rows = Chart::new("Gaussians allowed", "step", "").with("", of("allowed"), Mark::LineAndDots).zero_based();
     let psnr = Chart::new("PSNR of training photos", "step", "dB").with("held out", of("psnr"), Mark::LineAndDots);

@@ -32,7 +32,14 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     let lines = work.metrics("out");
     assert_eq!((&lines[0]["growth"], &lines.last().unwrap()["growth"]), (&Value::Null, last));
     let report = work.text("out/report.html");
-    assert!(report.contains("Number of Gaussians") && report.contains("held out"));
+    assert!(
+        report.contains("Number of Gaussians")
+            && report.contains("held out")
+            && report.contains("of which allowed more")
+    );
+    // More steps keep the decision, from the result as from a checkpoint.
+    work.train("--resume out --steps 66 --device cpu --quiet");
+    assert_eq!(work.summary("out")["growth"], growth);
     // Draft asks for more of a doubling, and the last check cannot come after the last round.
     run("--quality draft --refine-stop 40");
     let draft = work.summary("out")["growth"].clone();
@@ -63,4 +70,18 @@ fn a_scene_with_too_few_views_to_decide_by_keeps_its_count() {
     assert!(kept["gaussians"].as_u64() <= Some(500) && kept["growth"] == Value::Null, "{kept}");
     // That is the run with its first count as the cap, and with it the scene recycles Gaussians.
     assert!(run("--max-gaussians 500").1 == ply && run("--recycle 0").1 != ply);
+}
+
+/// Three of 17 training photos are held out: the third, the eighth and the thirteenth.
+#[test]
+fn a_run_that_cannot_measure_its_held_out_photos_says_so() {
+    let work = Workdir::city(20, 64, 48, 500);
+    std::fs::create_dir(work.path("scene/masks")).unwrap();
+    for photo in [3, 9, 14].map(|index| work.photos()[index].clone()) {
+        let name = format!("scene/masks/{}.png", photo.file_name().unwrap().to_string_lossy());
+        image::GrayImage::new(64, 48).save(work.path(&name)).unwrap();
+    }
+    let said = told(&work.succeeds(TRAIN, DECIDES));
+    assert_eq!(said.matches("the number of Gaussians cannot be decided").count(), 1, "{said}");
+    assert!(said.contains("masks of 3 of 17 training photos") && !said.contains("Gaussians up to"), "{said}");
 }

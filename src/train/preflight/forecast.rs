@@ -116,8 +116,8 @@ impl TrainingPhotos {
 
 /// The number of Gaussians that a run with `rows` Gaussians after `steps_done` steps will reach, and how that is known. A guess is at most one
 /// Gaussian for each of the `pixels` of the training photos: a Gaussian without a pixel of its own soon has no gradient that splits it.
-/// Before the first of the `checks` of a run that decides its count, the forecast is what that check will allow if few photos see each place
-/// and the run is long enough to find that out, and otherwise a doubling at every check.
+/// Until the `checks` of a run have decided its count, the forecast is what the first check allows if few photos see each place
+/// and the run is long enough to find that out, and otherwise a doubling at every check that is left.
 pub fn reach(
     config: &TrainConfig,
     rows: u64,
@@ -139,11 +139,14 @@ pub fn reach(
     let pixels = photos.pixels;
     match (limits::growth_rule(config), checks.last()) {
         (None, _) => (guess(rows, rounds.count() as u32, every).min(pixels[0].max(rows)), Reach::Guess),
-        (Some(rule), None) if photos.overlap_little() && rule.is_of_measured_length() => {
-            (rule.after_first_check(rows, pixels[1]), Reach::Sparse)
+        (Some(_), Some(check)) if check.is_final() => (check.allowed.max(rows), Reach::Decided),
+        (Some(rule), last) if photos.overlap_little() && rule.is_of_measured_length() => {
+            let allowed = last.map_or_else(|| rule.after_first_check(rows, pixels[1]), |check| check.allowed);
+            (allowed.max(rows), Reach::Sparse)
         }
-        (Some(rule), None) => (rule.reachable(rows, pixels[1], rounds.map(|round| round * every)), Reach::Decided),
-        (Some(_), Some(check)) => (check.allowed.max(rows), Reach::Decided),
+        (Some(rule), last) => {
+            (rule.reachable(rows, pixels[1], last, rounds.map(|round| round * every)), Reach::Decided)
+        }
     }
 }
 
@@ -280,7 +283,7 @@ pub(crate) fn plan_run(
         };
         forecast.shorter = SHORTER_STEPS.into_iter().filter(|steps| 2 * steps <= config.steps).map(of_steps).collect();
     }
-    if !(matches!(known, Reach::Decided | Reach::Sparse) && last > rows && trainer.growth().is_empty()) {
+    if !(matches!(known, Reach::Decided | Reach::Sparse) && last > rows && !trainer.state.growth.is_decided()) {
         return Ok(forecast);
     }
     let [first, most, _] = memory;
@@ -742,8 +745,8 @@ mod tests {
         let decides = TrainConfig { strategy: StrategyName::LongAxis, ..config() };
         assert_eq!(
             reach(&decides, 41_321, well_seen(9_600_000), 0, &[]),
-            (300_000, Reach::Decided),
-            "one for 32 pixels"
+            (400_000, Reach::Decided),
+            "one for 24 pixels"
         );
         assert_eq!(
             reach(&decides, 41_321, well_seen(9600), 0, &[]),
@@ -754,7 +757,7 @@ mod tests {
         assert_eq!(reach(&decides, 41_321, hardly_seen, 0, &[]), (82_642, Reach::Sparse));
         // The checks of a short run hold no scene back.
         let short = TrainConfig { steps: 500, refine_start: 83, refine_every: 16, refine_stop: 400, ..decides.clone() };
-        assert_eq!(reach(&short, 41_321, hardly_seen, 0, &[]), (300_000, Reach::Decided));
+        assert_eq!(reach(&short, 41_321, hardly_seen, 0, &[]), (400_000, Reach::Decided));
         let check = GrowthCheck {
             step: 1001,
             gaussians: 41_000,
@@ -765,7 +768,11 @@ mod tests {
             decision: GrowthDecision::Doubles,
             allowed: 165_284,
         };
-        assert_eq!(reach(&decides, 60_000, well_seen(PIXELS), 1001, &[check]), (165_284, Reach::Decided));
+        // The checks that are left may double until one has decided.
+        assert_eq!(reach(&decides, 60_000, well_seen(9_600_000), 1001, &[check]), (400_000, Reach::Decided));
+        let decided = GrowthCheck { decision: GrowthDecision::Ends, ..check };
+        assert_eq!(reach(&decides, 60_000, well_seen(9_600_000), 1001, &[decided]), (165_284, Reach::Decided));
+        assert_eq!(reach(&decides, 60_000, hardly_seen, 1001, &[check]), (165_284, Reach::Sparse));
         assert_eq!(reach(&TrainConfig { max_gaussians: 9, ..decides }, 5, well_seen(PIXELS), 0, &[]), (9, Reach::Cap));
     }
 

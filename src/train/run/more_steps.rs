@@ -136,7 +136,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         first_rows,
         keep_result_as,
     };
-    trainer.begin_after(summary.steps, summary.train_seconds);
+    trainer.begin_after(&summary);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }
 

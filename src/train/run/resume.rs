@@ -362,6 +362,11 @@ fn print_resume(
     if !changes.numbers.is_empty() {
         crate::tell!("warning: every page is updated to that step by the old rules and rewritten once");
     }
+    if state.trainer.growth.is_decided() && changes.numbers.iter().any(|line| line.starts_with("quality")) {
+        crate::tell!(
+            "warning: the number of Gaussians was decided before, so --quality changes nothing; --max-gaussians sets another"
+        );
+    }
     if request.quiet {
         return;
     }
@@ -532,7 +537,7 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
             "{} Gaussians of {PLY_FILE}",
             format_grouped(summary.gaussians.saturating_sub(summary.gaussians_left_out))
         );
-        return Ok(with_changes(steps_to_do(&request.out, &from, summary.steps, &config, true), &changes));
+        return Ok(with_changes(steps_to_do(&request.out, &from, summary.steps, &config, true, ""), &changes));
     }
     match state {
         Some(state) => committed(request, &earlier, config, &state),
@@ -553,18 +558,21 @@ fn committed(
     let (changes, ..) = goal(request, earlier, &mut config, state)?;
     let from = format!("the last commit, {} Gaussians", format_grouped(state.rows));
     let is_extended = is_extended(&config, state);
-    Ok(with_changes(steps_to_do(&request.out, &from, state.trainer.step, &config, is_extended), &changes))
+    let growth = &state.trainer.growth;
+    let grows = if growth.first > 0 && !growth.is_decided() { ", more if the scene grows" } else { "" };
+    Ok(with_changes(steps_to_do(&request.out, &from, state.trainer.step, &config, is_extended, grows), &changes))
 }
 
 fn with_changes(text: String, changes: &Changes) -> String {
     changes.free.iter().chain(&changes.numbers).fold(text, |text, change| format!("{text}\nchange  {change}"))
 }
 
-fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig, is_extended: bool) -> String {
+/// `grows` says what growth may add to the time.
+fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig, is_extended: bool, grows: &str) -> String {
     let left = config.steps.saturating_sub(done);
     let [done, all, more] = [done, config.steps, left].map(|steps| format_grouped(steps.into()));
     let time = seconds_of_a_step(out).map_or(String::new(), |seconds| {
-        format!(" and about {} at the pace of its last steps", format_seconds(seconds * f64::from(left)))
+        format!(" and about {} at the pace of its last steps{grows}", format_seconds(seconds * f64::from(left)))
     });
     let rates = text_of_rates(config).filter(|_| is_extended);
     let rates = rates.map_or(String::new(), |rates| format!("\n{rates}"));

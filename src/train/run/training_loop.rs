@@ -13,6 +13,7 @@ use crate::base::machine::host_bytes_peak;
 use crate::base::units::format_bytes;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::growth::GrowthDecision;
 use crate::paging::error::PagingError;
 use crate::render::Traffic;
 use crate::report::run_files::saved_ply_name;
@@ -161,6 +162,9 @@ impl TrainingLoop<'_> {
             let forecast = self.forecast.filter(|_| check.allowed != allowed);
             let costs = forecast.and_then(|forecast| forecast.costs_text(check.allowed));
             costs.iter().for_each(|line| self.progress.say(line));
+            if check.decision == GrowthDecision::Ends && self.trainer.is_at_most_of_photos(self.dataset) {
+                self.progress.say("  which is as many as --quality allows for photos of so many pixels");
+            }
         }
         Ok(true)
     }

@@ -17,7 +17,7 @@ use crate::checkpoint::run_state::{LastTest, TrainerState};
 use crate::config::limits::RunOptions;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
-use crate::densify::growth::GrowthCheck;
+use crate::densify::growth::{GrowthCheck, GrowthState};
 use crate::densify::strategy::{RowCount, Strategy};
 use crate::optim::method::{Method, OptimizerPlace};
 use crate::paging::pager::{Pager, PagerConfig};
@@ -32,7 +32,7 @@ use crate::scene::events::{Event, EventKind, EventLog};
 use crate::scene::image::Target;
 use crate::schedule::order::{Order, ViewOrder};
 use crate::train::error::TrainError;
-use crate::train::log::report::{TestMetrics, TierTraffic};
+use crate::train::log::report::{Summary, TestMetrics, TierTraffic};
 use crate::train::step::batch::RowsInHost;
 use crate::train::step::comparison::Comparison;
 use crate::train::step::device_flights::StepToRecord;
@@ -180,8 +180,11 @@ impl Trainer {
 
     /// Counts the steps from `step` on: an earlier run has done them, in `train_seconds` seconds. Call this before the first
     /// step.
-    pub(crate) fn begin_after(&mut self, step: u32, train_seconds: f64) {
-        (self.state.step, self.state.train_seconds) = (step, train_seconds);
+    pub(crate) fn begin_after(&mut self, summary: &Summary) {
+        (self.state.step, self.state.train_seconds) = (summary.steps, summary.train_seconds);
+        // What the run has decided stays decided.
+        let first = summary.growth.iter().map(|check| check.allowed).min().unwrap_or(0);
+        self.state.growth = GrowthState { first, checks: summary.growth.clone() };
     }
 
     /// Renders views forward and backward so that the memory of a view is allocated; the scene stays unchanged. Returns
@@ -306,7 +309,8 @@ impl Trainer {
             return sound.map(|()| outcome);
         }
         note_idle(&mut self.state, &outcome, self.scene.rows(), dataset, &self.options.init_ply)?;
-        self.masked.note(&outcome, view, self.state.step + 1 == self.options.steps, dataset);
+        let is_last = self.state.step + 1 == self.options.steps;
+        self.masked.note(&outcome, view, is_last, (dataset, targets), self.turns.held_out_views());
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
@@ -488,6 +492,12 @@ impl Trainer {
         self.state.growth.allowed()
     }
 
+    /// Whether the photos allow no more Gaussians than the last check did.
+    pub fn is_at_most_of_photos(&self, dataset: &Dataset) -> bool {
+        let rule = self.options.strategy.growth();
+        rule.is_some_and(|rule| !rule.has_room(self.state.growth.allowed(), self.turns.pixels(dataset)))
+    }
+
     /// The checks by which the run decides its count so far.
     pub fn growth(&self) -> &[GrowthCheck] {
         &self.state.growth.checks
@@ -596,13 +606,16 @@ impl Trainer {
             // A photo that was never trained on has no exposure yet. All checks of a run use one measure, also after exposures were dropped.
             fits_exposures: self.options.photos.appearance.is_on(),
         };
-        // Without a view that counts the count stays as it is, too.
         let measured = [&held_out, &trained].map(|views| measure(&mut self.now(), &compared, views));
         let [held_out, trained] = measured;
-        if let (Some(held_out), Some(trained)) = (held_out?, trained?) {
-            let counts = [self.scene.rows_bound(), self.turns.pixels(dataset)];
-            let check = rule.check(step, counts, [held_out, trained], &self.state.growth);
-            self.state.growth.checks.push(check);
+        match (held_out?, trained?) {
+            (Some(held_out), Some(trained)) => {
+                let counts = [self.scene.rows_bound(), self.turns.pixels(dataset)];
+                let check = rule.check(step, counts, [held_out, trained], &self.state.growth);
+                self.state.growth.checks.push(check);
+            }
+            // Without a view that counts the count stays as it is.
+            _ => self.masked.tell_undecided(),
         }
         self.state.train_seconds += started.elapsed().as_secs_f64();
         Ok(())

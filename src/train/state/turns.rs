@@ -41,6 +41,11 @@ impl Turns {
         self.views.iter().map(|&view| counted_pixels(dataset.views[view].camera.pixels() as u64)).sum()
     }
 
+    /// The training views that are held out while the run decides its count, as indices in `dataset.views`.
+    pub fn held_out_views(&self) -> impl Iterator<Item = usize> {
+        self.held_out.positions.iter().map(|&position| self.views[position])
+    }
+
     /// Index in `dataset.views` of the view of a 0-based step.
     pub fn view_at(&mut self, step: u32, photos: &PhotoParameters) -> usize {
         let position = self.order.view_at(step);

@@ -150,11 +150,30 @@ pub(crate) fn note_idle(
 pub(crate) struct MaskedPhotos {
     steps: usize,
     views: BTreeSet<usize>,
+    is_undecided_told: bool,
 }
 
 impl MaskedPhotos {
-    /// Notes the photo of a step, and warns once of all masked ones: after an epoch, or after the last step.
-    pub fn note(&mut self, outcome: &StepOutcome, view: usize, is_last: bool, dataset: &Dataset) {
+    /// Warns once that nothing can be measured by which a run would decide its count.
+    pub fn tell_undecided(&mut self) {
+        if !std::mem::replace(&mut self.is_undecided_told, true) {
+            crate::tell!(
+                "warning: masks exclude every pixel of the training photos that the run holds out, or of those that it compares with them, so \
+                 the number of Gaussians cannot be decided and hardly grows; --max-gaussians sets another"
+            );
+        }
+    }
+
+    /// Notes the photo of a step, and warns once of all masked ones: after an epoch, or after the last step. The `held_out` training views
+    /// have no step then.
+    pub fn note(
+        &mut self,
+        outcome: &StepOutcome,
+        view: usize,
+        is_last: bool,
+        (dataset, targets): (&Dataset, &TargetCache),
+        held_out: impl Iterator<Item = usize>,
+    ) {
         let photos = dataset.train_views().len();
         if self.steps >= photos {
             return;
@@ -163,7 +182,12 @@ impl MaskedPhotos {
         if outcome.is_masked {
             self.views.insert(view);
         }
-        if self.steps < photos || self.views.is_empty() {
+        if self.steps < photos {
+            return;
+        }
+        // A photo that cannot be read is an error of its step.
+        self.views.extend(held_out.filter(|&view| targets.get(view).is_ok_and(|target| !target.counts())));
+        if self.views.is_empty() {
             return;
         }
         let names: Vec<&str> = self.views.iter().take(NAMED).map(|&view| dataset.views[view].name.as_str()).collect();
