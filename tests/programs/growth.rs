@@ -41,11 +41,17 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     work.train("--resume out --steps 66 --device cpu --quiet");
     assert_eq!(work.summary("out")["growth"], growth);
     // Draft asks for more of a doubling, and the last check cannot come after the last round.
-    run("--quality draft --refine-stop 40");
+    let said = run("--quality draft --refine-stop 40");
+    // 17 photos of 64 x 48 pixels, and 128 pixels for a Gaussian: fewer than the 500 at the start.
+    assert!(said.contains("which is as many as --quality allows"), "{said}");
     let draft = work.summary("out")["growth"].clone();
     let of_draft = draft.as_array().unwrap();
     assert!(of_draft.iter().all(|check| of(check, "step") < 40), "{draft}");
     assert!(of(of_draft.last().unwrap(), "allowed") <= of(last, "allowed"), "{draft}");
+    // After the decision another quality decides nothing.
+    run("--keep-checkpoint");
+    let said = work.train("--resume out --steps 66 --quality draft --accept-changes --device cpu");
+    assert!(said.contains("was decided before, so --quality changes nothing"), "{said}");
     // A cap that is given is the user's decision.
     run("--max-gaussians 600");
     assert_eq!(work.summary("out")["growth"], Value::Null);
