@@ -52,6 +52,10 @@ fn a_run_says_why_it_has_as_many_gaussians_as_it_has() {
     run("--keep-checkpoint");
     let said = work.train("--resume out --steps 66 --quality draft --accept-changes --device cpu");
     assert!(said.contains("was decided before, so --quality changes nothing"), "{said}");
+    // Nor where the run goes on from its result.
+    work.remove("out/checkpoint");
+    let said = work.train("--resume out --steps 72 --quality archive --accept-changes --device cpu");
+    assert!(said.contains("was decided before, so --quality changes nothing"), "{said}");
     // A cap that is given is the user's decision.
     run("--max-gaussians 600");
     assert_eq!(work.summary("out")["growth"], Value::Null);

@@ -9,6 +9,7 @@ use crate::checkpoint::run_state::DatasetPrint;
 use crate::config::file::{Class, ConfigKey, KEYS, Resolved, TrainConfig};
 use crate::config::limits;
 use crate::dataset::loader::Dataset;
+use crate::densify::growth::GrowthState;
 use serde::Deserialize;
 use std::path::Path;
 
@@ -56,6 +57,15 @@ pub(super) struct Changes {
 }
 
 impl Changes {
+    /// Warns of a new --quality for a run whose checks have decided its count.
+    pub fn warn_of_decided_count(&self, growth: &GrowthState) {
+        if growth.is_decided() && self.numbers.iter().any(|line| line.starts_with("quality ")) {
+            crate::tell!(
+                "warning: the number of Gaussians was decided before, so --quality changes nothing; --max-gaussians sets another"
+            );
+        }
+    }
+
     /// Compares the keys of `config` with those that were `written`, by a run on the instruction path `simd`.
     /// Errors: what was written cannot be read.
     pub fn of_config(file: &Path, written: &str, simd: &str, config: &TrainConfig) -> InputResult<Changes> {

@@ -137,6 +137,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
         keep_result_as,
     };
     trainer.begin_after(&summary);
+    changes.warn_of_decided_count(&trainer.state.growth);
     plan_and_train(&request, &dataset, tiers, trainer, Begun { past: Some(past), run, ..begun })
 }
 

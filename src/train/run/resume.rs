@@ -362,11 +362,7 @@ fn print_resume(
     if !changes.numbers.is_empty() {
         crate::tell!("warning: every page is updated to that step by the old rules and rewritten once");
     }
-    if state.trainer.growth.is_decided() && changes.numbers.iter().any(|line| line.starts_with("quality")) {
-        crate::tell!(
-            "warning: the number of Gaussians was decided before, so --quality changes nothing; --max-gaussians sets another"
-        );
-    }
+    changes.warn_of_decided_count(&state.trainer.growth);
     if request.quiet {
         return;
     }

@@ -162,7 +162,7 @@ impl TrainingLoop<'_> {
             let forecast = self.forecast.filter(|_| check.allowed != allowed);
             let costs = forecast.and_then(|forecast| forecast.costs_text(check.allowed));
             costs.iter().for_each(|line| self.progress.say(line));
-            if check.decision == GrowthDecision::Ends && self.trainer.is_at_most_of_photos(self.dataset) {
+            if check.decision == GrowthDecision::Ends && self.trainer.photos_allow_no_more(self.dataset) {
                 self.progress.say("  which is as many as --quality allows for photos of so many pixels");
             }
         }

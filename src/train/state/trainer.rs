@@ -492,8 +492,8 @@ impl Trainer {
         self.state.growth.allowed()
     }
 
-    /// Whether the photos allow no more Gaussians than the last check did.
-    pub fn is_at_most_of_photos(&self, dataset: &Dataset) -> bool {
+    /// Whether the pixels of the photos allow no stage of growth beyond the Gaussians that the last check allowed.
+    pub fn photos_allow_no_more(&self, dataset: &Dataset) -> bool {
         let rule = self.options.strategy.growth();
         rule.is_some_and(|rule| !rule.has_room(self.state.growth.allowed(), self.turns.pixels(dataset)))
     }
