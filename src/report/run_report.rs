@@ -265,8 +265,8 @@ fn growth_text(checks: &[Value], allowed: f64, gaussians: &Value) -> String {
     let more: Vec<&Value> = checks.iter().filter(|check| check["decision"] == "doubles").collect();
     let mut text = format!(
         "By its last check the run allows up to {} Gaussians (--quality). Some training photos were held out for these checks, {} of which \
-         allowed more, {} not. More are allowed while held-out photos gain enough, and nearly as much as photos that the run trains on, up to a \
-         Gaussian for some pixels of the photos.",
+         allowed more, {} not. More are allowed while held-out photos gain enough, and nearly as much as photos that the run trains on, up to the \
+         number that --quality allows for the pixels of the photos.",
         short(allowed),
         more.len(),
         checks.len() - more.len()

@@ -25,7 +25,7 @@ use std::path::{Path, PathBuf};
 pub(super) const LOOKED_FOR: &str = "COLMAP's cameras and images files (.bin or .txt) in sparse/*, sparse, colmap/sparse/*, colmap/sparse and the folder itself";
 /// Remedy for a file that COLMAP cannot have written.
 const DAMAGED: &str = "the file is damaged or cut short: copy it again or export the model again";
-/// Remedy for a camera that no lens is. COLMAP writes one where a reconstruction fails.
+/// Remedy for intrinsics that no lens has. COLMAP writes such where a reconstruction fails.
 const NO_LENS: &str = "the file is damaged, or the reconstruction of this camera failed (too few photos, or all from one line or in one \
      direction): copy it again, or find the poses again with gsscale-poses";
 const STAY_INSIDE: &str = "image names must be relative to the image folder and stay inside it";

@@ -159,7 +159,7 @@ impl MaskedPhotos {
         if !std::mem::replace(&mut self.is_undecided_told, true) {
             crate::tell!(
                 "warning: masks exclude every pixel of the training photos that the run holds out, or of those that it compares with them, so \
-                 the number of Gaussians cannot be decided and hardly grows; --max-gaussians sets another"
+                 the number of Gaussians cannot be decided and stays near its start; --max-gaussians sets another"
             );
         }
     }
