@@ -1,12 +1,18 @@
-//! Facts about this machine and process, for reports. No training result depends on them.
+//! Facts about this machine and process, for reports and budgets. No training result depends on them. Linux tells them in /proc; elsewhere
+//! they come from [`crate::base::without_proc`].
 
+use crate::base::without_proc;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicU64;
+use std::sync::atomic::Ordering::Relaxed;
 
 /// CPU seconds, user and system, of all threads of this process so far; `None` if the system does not report them.
 ///
 /// From /proc/self/stat, whose ticks are hundredths of a second on every Linux (USER_HZ).
 pub fn process_cpu_seconds() -> Option<f64> {
-    cpu_seconds_of(&std::fs::read_to_string("/proc/self/stat").ok()?).map(|[user, system]| user + system)
+    let stat = std::fs::read_to_string("/proc/self/stat").ok();
+    let linux = stat.and_then(|stat| cpu_seconds_of(&stat)).map(|[user, system]| user + system);
+    linux.or_else(without_proc::process_cpu_seconds)
 }
 
 /// Fields 14 and 15 are the ticks. The second field is the program's name in parentheses, which may contain anything,
@@ -47,7 +53,8 @@ pub fn cpu_model() -> String {
 /// Memory that this process can still allocate, bytes: the smaller of the machine's available memory and the rest of
 /// its control groups' limits. `None` if the system does not report it.
 pub fn memory_available() -> Option<u64> {
-    let machine = meminfo_available(&std::fs::read_to_string("/proc/meminfo").ok()?)?;
+    let linux = std::fs::read_to_string("/proc/meminfo").ok().and_then(|text| meminfo_available(&text));
+    let machine = linux.or_else(without_proc::memory_available)?;
     let groups = std::fs::read_to_string("/proc/self/cgroup").unwrap_or_default();
     let left = group_folders(&groups).iter().filter_map(|(folder, files)| left_in_group(folder, files)).min();
     Some(left.map_or(machine, |left| left.min(machine)))
@@ -97,21 +104,26 @@ fn left_in_group(folder: &Path, files: &GroupFiles) -> Option<u64> {
     Some(limit.saturating_sub(used.saturating_sub(cache)))
 }
 
-/// Peak resident size of this process, bytes; `None` if the system does not report it.
+/// Peak resident size of this process, bytes; `None` if the system does not report it. Off Linux the largest size that a call of this
+/// function found.
 pub fn host_bytes_peak() -> Option<u64> {
-    status_field("VmHWM:")
+    status_field("VmHWM:").or_else(|| without_proc::host_bytes_now().map(|now| now.max(SEEN.fetch_max(now, Relaxed))))
 }
+
+/// The largest answer of [`host_bytes_peak`] off Linux.
+static SEEN: AtomicU64 = AtomicU64::new(0);
 
 /// Makes [`host_bytes_peak`] count from now on, for a process that trains several times. Where the system cannot do that, the peak stays
 /// that of the whole process.
 pub fn reset_host_bytes_peak() {
     // Linux; a failure leaves the larger peak.
     let _ = std::fs::write("/proc/self/clear_refs", "5");
+    SEEN.store(0, Relaxed);
 }
 
 /// Current resident size of this process, bytes; `None` if the system does not report it.
 pub fn host_bytes_now() -> Option<u64> {
-    status_field("VmRSS:")
+    status_field("VmRSS:").or_else(without_proc::host_bytes_now)
 }
 
 /// A size in /proc/self/status, bytes.
@@ -132,6 +144,7 @@ mod tests {
     use super::*;
 
     #[test]
+    #[cfg(target_os = "linux")]
     fn groups_are_found_with_their_ancestors_in_both_versions() {
         let folders = |text: &str| -> Vec<String> {
             group_folders(text).iter().map(|(folder, files)| format!("{} {}", folder.display(), files.limit)).collect()

@@ -22,3 +22,4 @@ pub mod trace;
 pub mod units;
 pub mod whole_file;
 pub mod whole_folder;
+pub mod without_proc;

@@ -106,7 +106,7 @@ impl PartFile {
     pub fn finish(mut self, file: File) -> InputResult<()> {
         let target = &self.target;
         file.sync_all().map_err(|e| InputError::io(target, "flushing to the disk", &e))?;
-        std::fs::rename(&self.part.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
+        rename(&self.part.path, target).map_err(|e| InputError::io(target, "replacing the file", &e))?;
         self.part.is_renamed = true;
         match sync_folder(folder_of(target)) {
             Err(e) if !is_sync_unsupported(&e) => Err(InputError::io(target, "flushing the folder to the disk", &e)),
@@ -115,18 +115,54 @@ impl PartFile {
     }
 }
 
+#[cfg(unix)]
+fn are_one(a: &std::fs::Metadata, b: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    a.dev() == b.dev() && a.ino() == b.ino()
+}
+
 /// Whether the open `file` is the one that `path` names.
 #[cfg(unix)]
 pub fn is_same_file(path: &Path, file: &File) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    let same = |a: &std::fs::Metadata, b: &std::fs::Metadata| a.dev() == b.dev() && a.ino() == b.ino();
-    matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if same(&a, &b))
+    matches!((std::fs::symlink_metadata(path), file.metadata()), (Ok(a), Ok(b)) if are_one(&a, &b))
 }
 
-#[cfg(not(unix))]
-pub fn is_same_file(path: &Path, _file: &File) -> bool {
-    // A file that was renamed or removed has left its name.
-    std::fs::symlink_metadata(path).is_ok()
+/// Whether two paths name one file, also by links.
+#[cfg(unix)]
+pub fn are_one_file(a: &Path, b: &Path) -> bool {
+    matches!((std::fs::metadata(a), std::fs::metadata(b)), (Ok(a), Ok(b)) if are_one(&a, &b))
+}
+
+#[cfg(windows)]
+pub fn are_one_file(a: &Path, b: &Path) -> bool {
+    same_file::is_same_file(a, b).unwrap_or(false)
+}
+
+#[cfg(windows)]
+pub fn is_same_file(path: &Path, file: &File) -> bool {
+    use same_file::Handle;
+    let open = file.try_clone().and_then(Handle::from_file);
+    matches!((Handle::from_path(path), open), (Ok(a), Ok(b)) if a == b)
+}
+
+/// Renames a file or a folder; a file of the new name is replaced. On Windows a program that looks at files as they appear, such as a virus
+/// scanner, keeps others from renaming them meanwhile: then this tries again for a second.
+pub fn rename(from: &Path, to: &Path) -> io::Result<()> {
+    // "Access denied" and "used by another process".
+    const HELD: [i32; 2] = [5, 32];
+    let began = Instant::now();
+    loop {
+        match std::fs::rename(from, to) {
+            Err(error)
+                if cfg!(windows)
+                    && error.raw_os_error().is_some_and(|code| HELD.contains(&code))
+                    && began.elapsed() < Duration::from_secs(1) =>
+            {
+                std::thread::sleep(BETWEEN_TRIES);
+            }
+            done => return done,
+        }
+    }
 }
 
 /// The temporary file `.NAME.part` of a target, which a process that is killed leaves; `None` if the target names no file.

@@ -8,7 +8,7 @@
 //! the temporary folder of a target, as far as the file system has locks: `.NAME.lock` beside it.
 
 use super::error::{InputError, InputResult};
-use super::whole_file::{LockedFile, folder_of, hidden_beside, sync_folder};
+use super::whole_file::{LockedFile, folder_of, hidden_beside, rename, sync_folder};
 use std::fs::File;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -39,7 +39,7 @@ impl PartFolder {
         let lock = LockedFile::open(beside(".lock")?, target, Duration::ZERO)?;
         // A process that was killed between the two renames left `.old`; one that was killed earlier left `.part`.
         if old.is_dir() && !target.exists() {
-            std::fs::rename(&old, target).map_err(|e| InputError::io(target, "restoring the older folder", &e))?;
+            rename(&old, target).map_err(|e| InputError::io(target, "restoring the older folder", &e))?;
         }
         remove_ours(&path, is_ours)?;
         std::fs::create_dir(&path).map_err(|e| InputError::io(target, "creating the folder", &e))?;
@@ -79,11 +79,11 @@ impl PartFolder {
         remove_ours(&self.old, self.is_ours)?;
         let is_replaced = self.target.is_dir();
         if is_replaced {
-            std::fs::rename(&self.target, &self.old).map_err(|e| io("moving the older folder away", &e))?;
+            rename(&self.target, &self.old).map_err(|e| io("moving the older folder away", &e))?;
         }
-        if let Err(e) = std::fs::rename(&self.path, &self.target) {
+        if let Err(e) = rename(&self.path, &self.target) {
             if is_replaced {
-                let _ = std::fs::rename(&self.old, &self.target);
+                let _ = rename(&self.old, &self.target);
             }
             return Err(io("giving the folder its name", &e));
         }
@@ -190,8 +190,9 @@ mod tests {
         let part = PartFolder::create(&target, is_text).unwrap();
         std::fs::create_dir_all(target.join("photos")).unwrap();
         std::fs::write(target.join("photos/1.jpg"), b"").unwrap();
-        assert!(part.finish().unwrap_err().problem.contains("photos/1.jpg"));
-        assert!(PartFolder::create(&target, is_text).unwrap_err().problem.contains("photos/1.jpg"));
+        let names_it = |error: InputError| error.problem.replace('\\', "/").contains("photos/1.jpg");
+        assert!(names_it(part.finish().unwrap_err()));
+        assert!(names_it(PartFolder::create(&target, is_text).unwrap_err()));
         assert!(target.join("photos/1.jpg").exists());
         assert_eq!(std::fs::read_dir(root.path()).unwrap().count(), 1, "no temporary folder is left");
         assert!(PartFolder::create(Path::new(".."), is_text).unwrap_err().problem.contains("names no folder"));

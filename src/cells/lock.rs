@@ -20,6 +20,8 @@ const LOCK: &str = "lock";
 /// Time between heartbeats, and the age from which an owner whose end the system does not tell counts as lost.
 const BEAT: Duration = Duration::from_secs(10);
 const LOST_AFTER: Duration = Duration::from_secs(90);
+/// On Windows nobody can read a file that another process has locked, so the heartbeat alone holds a cell.
+const HAS_LOCKS: bool = cfg!(unix);
 
 /// A cell that this process works on, until dropped.
 #[derive(Debug)]
@@ -45,7 +47,9 @@ impl CellLock {
         let made = folder.join(format!("{LOCK}.{:032x}", draw_identity()));
         let file = options.clone().create_new(true).open(&made).map_err(failed)?;
         write_token(&file, &token).map_err(failed)?;
-        let _ = file.try_lock();
+        if HAS_LOCKS {
+            let _ = file.try_lock();
+        }
         let named = std::fs::hard_link(&made, &path).or_else(|error| match error.kind() {
             ErrorKind::AlreadyExists => Err(error),
             // The folder knows no second names.
@@ -59,6 +63,7 @@ impl CellLock {
                 let file = options.open(&path).map_err(failed)?;
                 let owner = std::fs::read_to_string(&path).map_err(failed)?;
                 let is_gone = match file.try_lock() {
+                    _ if !HAS_LOCKS => false,
                     Err(TryLockError::WouldBlock) => return Ok(Err(owner)),
                     // The system's lock says nothing about processes of other machines.
                     locked => locked.is_ok() && machine_of(&owner) == system_name(),

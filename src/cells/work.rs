@@ -20,7 +20,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::system_name;
 use crate::base::text::read_text;
-use crate::base::whole_file::{sync_folder, write_whole};
+use crate::base::whole_file::{rename, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits;
 use crate::config::new_run;
@@ -396,7 +396,7 @@ fn publish(folder: &Path, out: &Path, lock: &CellLock) -> Result<Option<u32>, Tr
     // A copy is part of what a stopped worker leaves.
     clone_store(&find_store(out)?, &made, &StopFlag::default())?;
     // Copying takes long. Another owner's copy of this number stays: no folder is renamed over one with files.
-    let named = if lock.is_held() { std::fs::rename(&made, &copy) } else { Err(ErrorKind::Other.into()) };
+    let named = if lock.is_held() { rename(&made, &copy) } else { Err(ErrorKind::Other.into()) };
     if let Err(error) = named {
         remove_store(&made)?;
         if lock.is_held() {

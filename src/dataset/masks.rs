@@ -253,10 +253,10 @@ mod tests {
         let mut warnings = Vec::new();
         let masks = MaskIndex::scan(root.path(), &images).assign(&named, &mut warnings);
         let mark = |mask: FoundMask| {
-            let path = mask.path.strip_prefix(root.path()).unwrap().to_str().unwrap().to_string();
+            let path = mask.path.strip_prefix(root.path()).unwrap().to_str().unwrap().replace('\\', "/");
             if mask.inverted { format!("not {path}") } else { path }
         };
-        (masks.into_iter().map(|mask| mask.map(mark)).collect(), warnings.join("\n"))
+        (masks.into_iter().map(|mask| mask.map(mark)).collect(), warnings.join("\n").replace('\\', "/"))
     }
 
     #[test]

@@ -22,7 +22,7 @@ use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
 use crate::base::units::{counted_are, format_grouped, format_seconds};
-use crate::base::whole_file::write_whole;
+use crate::base::whole_file::{are_one_file, rename, write_whole};
 use crate::base::whole_folder::remove_ours;
 use crate::dataset::colmap::looks_like_colmap;
 use crate::dataset::exif::GpsPlace;
@@ -474,7 +474,7 @@ impl PoseSearch {
             said.push(format!("{ORIGIN_FILE} is of an earlier model, not of this one: remove it"));
         }
         let sparse = self.scene.join(SPARSE);
-        std::fs::rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
+        rename(&part, &sparse).map_err(|e| InputError::io(&sparse, "giving the model its name", &e))?;
         let aligned = alignment.map(|(origin, _, rest)| (origin, rest));
         let (scene, remedy) = (self.scene.clone(), self.remedy());
         Ok(FoundPoses { scene, photos: self.photos.len(), registered, missing, remedy, aligned, said })
@@ -668,7 +668,8 @@ fn remove_files(folder: &Path, ours: &dyn Fn(&str) -> bool) -> InputResult<()> {
 
 /// Locks a work folder, as long as the file is open.
 fn lock(work: &Path) -> InputResult<File> {
-    let lock = File::create(work.join("lock")).map_err(|e| InputError::io(work, "locking the folder", &e))?;
+    let options = File::options().write(true).create(true).truncate(false).clone();
+    let lock = options.open(work.join("lock")).map_err(|e| InputError::io(work, "locking the folder", &e))?;
     match lock.try_lock() {
         Err(TryLockError::WouldBlock) => {
             Err(InputError::new(work, "another search works in this folder", "wait for its end, or stop it"))
@@ -688,24 +689,6 @@ fn plain_name(i: usize, name: &str) -> String {
     format!("{i:06}.{}", ending.unwrap_or_default())
 }
 
-/// Whether two names are of one file, as far as the system tells.
-fn are_one_file(a: &Path, b: &Path) -> bool {
-    let facts = |path: &Path| std::fs::metadata(path);
-    facts(a).is_ok_and(|a| facts(b).is_ok_and(|b| are_one(&a, &b)))
-}
-
-/// Whether these are of two names of one file, as far as the system tells.
-#[cfg(unix)]
-fn are_one(a: &Metadata, b: &Metadata) -> bool {
-    use std::os::unix::fs::MetadataExt;
-    (a.dev(), a.ino()) == (b.dev(), b.ino())
-}
-
-#[cfg(not(unix))]
-fn are_one(_: &Metadata, _: &Metadata) -> bool {
-    false
-}
-
 /// Makes `name` a hard link to a photo of so many bytes, or a copy where the drive has no hard links. A link to the photo stays, and so does
 /// a complete copy that is younger than the photo. Anything else under `name` is replaced, so the caller must know that it is ours.
 /// Errors: the photo cannot be read, or the folder cannot be written.
@@ -714,7 +697,7 @@ fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
     let photo = photo.canonicalize().unwrap_or_else(|_| photo.to_path_buf());
     let stays = |now: Metadata, of_photo: Metadata| {
         let younger = now.modified().ok().zip(of_photo.modified().ok()).is_some_and(|(now, of_photo)| now > of_photo);
-        now.is_file() && now.len() == bytes && (younger || are_one(&now, &of_photo))
+        now.is_file() && now.len() == bytes && (younger || are_one_file(name, &photo))
     };
     if std::fs::symlink_metadata(name).is_ok_and(|now| std::fs::metadata(&photo).is_ok_and(|of| stays(now, of))) {
         return Ok(());
@@ -728,7 +711,7 @@ fn link(photo: &Path, bytes: u64, name: &Path) -> InputResult<()> {
     }
     // Two names of one file: a rename would leave both.
     absent(std::fs::remove_file(name)).map_err(fail)?;
-    std::fs::rename(&part, name).map_err(fail)
+    rename(&part, name).map_err(fail)
 }
 
 #[cfg(test)]

@@ -151,7 +151,7 @@ fn missing_photos_are_listed_by_name() {
     std::fs::copy(&raw.views[0].image_path, photos.join("p02.png")).unwrap();
     let mut two = RawScene { root: folder.path().to_path_buf(), views: raw.views[..3].to_vec(), ..raw };
     let error = refusal(&two, &LoadOptions::default());
-    assert!(error.problem.contains("'p02.png' may be images/block/p02.png"), "{error}");
+    assert!(error.problem.replace('\\', "/").contains("'p02.png' may be images/block/p02.png"), "{error}");
     two.views[1].image_path = photos.join("p02.png");
     let error = refusal(&two, &LoadOptions::default());
     assert!(!error.problem.contains("may be") && error.problem.contains("holds 6 pictures of other names"), "{error}");
@@ -373,8 +373,8 @@ fn masks_keep_white_and_can_be_inverted() {
     assert!(mask.iter().zip(&want).all(|(a, b)| *a == 255 - *b));
     let without = load_dataset(raw.clone(), &LoadOptions { masks: false, ..options }).unwrap();
     assert!(without.views.iter().all(|v| v.photo.mask.is_none()));
-    GrayImage::new(50, 48).save(masks.join("p02.png")).unwrap();
     std::fs::remove_file(masks.join("p02.PNG")).unwrap();
+    GrayImage::new(50, 48).save(masks.join("p02.png")).unwrap();
     assert!(refusal(&raw, &LoadOptions::default()).problem.contains("mask"));
     std::fs::write(masks.join("p02.png"), b"\x89PNG\r\n\x1a\n").unwrap();
     let error = refusal(&raw, &LoadOptions::default());

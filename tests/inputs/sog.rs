@@ -342,7 +342,7 @@ fn a_folder_appears_whole_and_never_replaces_files_of_others() {
     assert!(files(&sog) == before, "the target is unchanged");
     for inside in ["photo.jpg", "0_0/notes.txt"] {
         std::fs::write(sog.join(inside), b"mine").unwrap();
-        let said = create(&path).err().unwrap().to_string();
+        let said = create(&path).err().unwrap().to_string().replace('\\', "/");
         assert!(said.contains(inside) && said.contains("name a new folder"), "{said}");
         std::fs::remove_file(sog.join(inside)).unwrap();
     }

@@ -22,6 +22,7 @@ type Open = fn(&Path) -> Box<dyn PageEngine>;
 
 /// The engines that work on files, with and without the page cache, by name.
 fn file_engines() -> Vec<(&'static str, Open)> {
+    #[cfg_attr(not(target_os = "linux"), expect(unused_mut))]
     let mut engines: Vec<(&str, Open)> = vec![
         ("pread", |folder| Box::new(ThreadedEngine::pread(folder, 6, true).unwrap())),
         ("pread, buffered", |folder| Box::new(ThreadedEngine::pread(folder, 6, false).unwrap())),

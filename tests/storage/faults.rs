@@ -251,7 +251,7 @@ fn no_decision_reads_the_wall_clock() {
             if path.is_dir() {
                 folders.push(path);
             } else if std::fs::read_to_string(&path).is_ok_and(|text| text.contains("SystemTime")) {
-                readers.push(path.strip_prefix(&root).unwrap().to_string_lossy().into_owned());
+                readers.push(path.strip_prefix(&root).unwrap().to_string_lossy().replace('\\', "/"));
             }
         }
     }

@@ -69,7 +69,11 @@ pub fn free_bytes(folder: &Path) -> io::Result<Option<u64>> {
         let there = rustix::fs::statvfs(folder)?;
         Ok(Some(there.f_bavail.saturating_mul(there.f_frsize)))
     }
-    #[cfg(not(unix))]
+    #[cfg(windows)]
+    {
+        fs4::available_space(folder).map(Some)
+    }
+    #[cfg(not(any(unix, windows)))]
     {
         let _ = folder;
         Ok(None)
@@ -86,7 +90,9 @@ pub fn is_same_drive(a: &Path, b: &Path) -> bool {
     }
     #[cfg(not(unix))]
     {
-        let _ = (a, b);
-        true
+        // The letter or the share that a full path begins with.
+        let drive =
+            |folder: &Path| Some(std::fs::canonicalize(folder).ok()?.components().next()?.as_os_str().to_owned());
+        drive(a).zip(drive(b)).is_none_or(|(a, b)| a == b)
     }
 }

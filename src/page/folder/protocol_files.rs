@@ -4,7 +4,7 @@
 //! nothing outside the folder is accessed; a symbolic link in place of a file is an error; 3. only the owner can access
 //! new files.
 
-use crate::base::whole_file::sync_folder;
+use crate::base::whole_file::{rename, sync_folder};
 use crate::page::engine::segment_files::{allocate, with_safe_flags};
 use redb::StorageBackend;
 use std::fs::{File, OpenOptions};
@@ -71,7 +71,7 @@ impl Folder for DriveFolder {
     }
 
     fn rename(&self, from: &str, to: &str) -> io::Result<()> {
-        std::fs::rename(self.0.join(from), self.0.join(to))
+        rename(&self.0.join(from), &self.0.join(to))
     }
 
     fn remove(&self, name: &str) -> io::Result<()> {

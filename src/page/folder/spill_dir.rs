@@ -9,7 +9,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::host_name;
 use crate::base::say::shell_word;
-use crate::base::whole_file::{folder_of, is_same_file, sync_folder};
+use crate::base::whole_file::{folder_of, is_same_file, rename, sync_folder};
 use crate::page::engine::segment_files::{open_for_reading, segment_from_file_name, with_safe_flags};
 use crate::page::folder::file_system::{FileSystem, free_bytes};
 use crate::page::folder::protocol_files::{
@@ -403,11 +403,15 @@ fn take_lock(folder: &Path) -> InputResult<File> {
         let mut content = String::new();
         // A foreign file may be of any kind and length.
         let is_file = file.metadata().is_ok_and(|m| m.is_file());
-        let is_text = is_file && Read::by_ref(&mut file).take(512).read_to_string(&mut content).is_ok();
-        if !is_text || !(content.is_empty() || content.starts_with(LOCK_MAGIC)) {
+        let locked = file.try_lock();
+        let read = Read::by_ref(&mut file).take(512).read_to_string(&mut content);
+        // On Windows nobody reads a file that another process has locked.
+        let is_text = read.as_ref().is_ok_and(|_| content.is_empty() || content.starts_with(LOCK_MAGIC))
+            || cfg!(windows) && matches!(locked, Err(TryLockError::WouldBlock)) && read.is_err();
+        if !is_file || !is_text {
             return Err(InputError::new(path, "this LOCK file is not from gsscale", OTHER_FOLDER));
         }
-        match file.try_lock() {
+        match locked {
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => {
                 let who = content.strip_prefix(LOCK_MAGIC).unwrap_or("").trim().replace('\n', ", ");
@@ -474,7 +478,7 @@ fn write_format(folder: &Path, format: &SpillFormat) -> InputResult<()> {
         let mut file = with_safe_flags(OpenOptions::new().write(true).create(true).truncate(true)).open(&new)?;
         file.write_all(&format.to_bytes())?;
         file.sync_all()?;
-        std::fs::rename(&new, &path)?;
+        rename(&new, &path)?;
         sync_folder(folder)?;
         // The folder's own entry. If its parent cannot be opened, the first sync of a file must suffice.
         let _ = folder.parent().map(sync_folder);

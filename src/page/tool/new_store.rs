@@ -8,7 +8,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::ids::PageId;
-use crate::base::whole_file::{folder_of, sync_folder};
+use crate::base::whole_file::{folder_of, rename, sync_folder};
 use crate::page::engine::buffer::PageBuffer;
 use crate::page::engine::open::{IoEngine, open_engine};
 use crate::page::folder::protocol_files::DriveFolder;
@@ -176,7 +176,7 @@ impl NewStore {
                 InputError::new(&self.target, "was created meanwhile", "name another folder and start again").into()
             );
         }
-        std::fs::rename(&self.part, &self.target).map_err(failed)?;
+        rename(&self.part, &self.target).map_err(failed)?;
         self.spill = None;
         sync_folder(folder_of(&self.target)).map_err(failed)?;
         Ok(())

@@ -15,7 +15,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
 use crate::base::units::format_grouped;
-use crate::base::whole_file::{folder_of, open_locked, part_path, sync_folder, write_whole};
+use crate::base::whole_file::{folder_of, open_locked, part_path, rename, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::dataset::loader::Dataset;
@@ -328,7 +328,7 @@ pub(super) fn keep_result(out: &Path, kept: &Path) -> InputResult<()> {
         let _ = std::fs::remove_file(&beside);
         return Err(failed(error));
     }
-    std::fs::rename(&beside, kept).map_err(failed)?;
+    rename(&beside, kept).map_err(failed)?;
     // Where folders cannot be synced, the name is durable with the next sync of a file.
     let _ = sync_folder(out);
     Ok(())

@@ -185,6 +185,7 @@ pub fn refused(result: InputResult<RawScene>, file: &str, parts: &[&str]) -> Inp
 /// Whether some warning holds all of these.
 #[track_caller]
 pub fn warned(scene: &RawScene, parts: &[&str]) {
-    let found = scene.warnings.iter().any(|w| parts.iter().all(|p| w.contains(p)));
+    let says = |warning: &str| parts.iter().all(|part| warning.contains(part));
+    let found = scene.warnings.iter().any(|warning| says(&warning.replace('\\', "/")));
     assert!(found, "no warning says {parts:?}: {:?}", scene.warnings);
 }
