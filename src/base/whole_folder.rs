@@ -148,6 +148,7 @@ fn first_other(folder: &Path, inside: &Path, is_ours: IsOurs) -> std::io::Result
 #[allow(clippy::unwrap_used)] // a panic is a failed test
 mod tests {
     use super::*;
+    use std::path::MAIN_SEPARATOR;
 
     fn is_text(path: &Path) -> bool {
         path.extension().is_some_and(|e| e == "txt")
@@ -190,7 +191,7 @@ mod tests {
         let part = PartFolder::create(&target, is_text).unwrap();
         std::fs::create_dir_all(target.join("photos")).unwrap();
         std::fs::write(target.join("photos/1.jpg"), b"").unwrap();
-        let names_it = |error: InputError| error.problem.replace('\\', "/").contains("photos/1.jpg");
+        let names_it = |error: InputError| error.problem.replace(MAIN_SEPARATOR, "/").contains("photos/1.jpg");
         assert!(names_it(part.finish().unwrap_err()));
         assert!(names_it(PartFolder::create(&target, is_text).unwrap_err()));
         assert!(target.join("photos/1.jpg").exists());

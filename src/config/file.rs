@@ -243,8 +243,8 @@ config_keys! {
         /// each other after six passes (600 steps at least, half the run at most): at 3 % of the first points that they show. Runs that begin
         /// from Gaussians or random points, and runs of fewer than 1,200 steps, have none
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] robust_pixels: Chosen<bool> = Chosen(None) => Numbers;
-        /// Refine the poses of training photos: after the first tenth of the run each camera moves to where the scene fits its
-        /// photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. auto is on where photos
+        /// Refine the poses of training photos: after the first tenth of the run, and two passes over the photos, each camera moves
+        /// to where the scene fits its photo, by at most 2 % of the scene's size. For poses with noise; held-out photos keep theirs. auto is on where photos
         /// agree better with the first points when they are moved by some pixels. poses.json has the refined ones. Not with
         /// --optimizer-on device
         [num_args = 0..=1, default_missing_value = "on", require_equals = true] refine_poses: Chosen<bool> = Chosen(None) => Numbers;

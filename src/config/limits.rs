@@ -111,8 +111,8 @@ impl RunOptions {
                 // Drawn when a run begins.
                 landmarks: Vec::new(),
                 refine_poses: config.refine_poses.is_on(),
-                // A resume with more steps leaves the phases of refined poses and masks as they were.
-                steps: config.steps.min(schedule_steps(config)),
+                // A resume with more or fewer steps leaves the phases of refined poses and masks as they were.
+                steps: schedule_steps(config),
                 scene_scale,
             },
             export_frame: config.export_frame,

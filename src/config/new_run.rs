@@ -280,6 +280,8 @@ mod tests {
         assert_eq!((config.steps, config.schedule_steps, config.refine_stop), (30_000, 4200, short.refine_stop));
         assert_eq!((config.scales_lr, config.means_lr, config.refine_every), (short.scales_lr, 1e-4, 50));
         assert_eq!(RunOptions::new(&config, 1.0).photos.steps, 4200, "what is known of photos keeps its phases, too");
+        let leg = TrainConfig { steps: 2000, ..config.clone() };
+        assert_eq!(RunOptions::new(&leg, 1.0).photos.steps, 4200, "in a run of fewer steps, too");
         assert_eq!(config.others_lr_final, 0.01);
         // Few photos and poor points: both factors of the rate of positions hold.
         let poor = TrainOverrides { poor_points: Some(Chosen::ON), ..TrainOverrides::default() };

@@ -516,7 +516,6 @@ mod tests {
         }
         let problem = parse_choice::<Transfers>("x").unwrap_err();
         assert_eq!(problem, "unknown --transfers 'x': use overlap, ahead or demand");
-        // An engine that only tests and dry runs open.
     }
 
     #[test]

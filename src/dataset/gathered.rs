@@ -1,7 +1,8 @@
 //! The views that a reader gathers and the names of those that it leaves out; the checks that all readers apply to the numbers
 //! in a file; the wording of their warnings.
 //!
-//! Invariant: only a bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
+//! Invariant: only a bad pose, a list of names that lacks the view or, when allowed, a missing photo drops a view, with a warning that
+//! names it.
 
 use super::model::{Intrinsics, Lens, Pose, RawView, ReadOptions, Split};
 use super::photo_files::{Photo, PhotoFiles};

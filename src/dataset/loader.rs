@@ -463,7 +463,7 @@ fn check_photos(
     (root, image_folder): (&Path, &Path),
     warnings: &mut Vec<String>,
 ) -> InputResult<Vec<PhotoSource>> {
-    let index = if options.masks { MaskIndex::scan(root, image_folder) } else { MaskIndex::default() };
+    let index = if options.masks { MaskIndex::scan(root, image_folder)? } else { MaskIndex::default() };
     let named: Vec<(&str, &Path)> =
         views.iter().map(|(view, _)| (view.name.as_str(), view.image_path.as_path())).collect();
     let found = index.assign(&named, warnings);

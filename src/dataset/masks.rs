@@ -13,6 +13,7 @@
 
 use super::name_index::{NameIndex, PictureFile, folded, split_ending, split_folder};
 use super::photo_header::PhotoHeader;
+use crate::base::error::InputResult;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -58,7 +59,8 @@ pub(super) struct MaskIndex {
 impl MaskIndex {
     /// Lists the folders of masks in the scene's folder, beside the image folder if that is deeper, and inside the image folder;
     /// the first match wins. Missing folders count as empty.
-    pub fn scan(root: &Path, image_folder: &Path) -> Self {
+    /// Errors: a folder of masks cannot be listed.
+    pub fn scan(root: &Path, image_folder: &Path) -> InputResult<Self> {
         let mut index = MaskIndex { root: root.to_path_buf(), ..MaskIndex::default() };
         let beside = image_folder.parent().filter(|parent| parent.starts_with(root));
         for place in [Some(root), beside, Some(image_folder)].into_iter().flatten() {
@@ -74,12 +76,15 @@ impl MaskIndex {
                 }
             }
         }
+        if let Some(error) = index.in_folders.unlisted.take() {
+            return Err(error);
+        }
         let is_flat = image_folder == root;
         index.beside_photos.add(image_folder, "", &|name| match split_ending(name).1 {
             Some(_) => name.contains("mask"),
             None => !is_flat && !FOLDERS.contains(&name),
         });
-        index
+        Ok(index)
     }
 
     /// Whether there are no folders of masks with files in them.
@@ -237,6 +242,7 @@ fn normalised(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::path::MAIN_SEPARATOR;
 
     /// The masks of photos in `images/`, in a scene with these files.
     fn found(files: &[&str], photos: &[&str]) -> (Vec<Option<String>>, String) {
@@ -251,12 +257,12 @@ mod tests {
         let paths: Vec<PathBuf> = photos.iter().map(|name| images.join(name)).collect();
         let named: Vec<(&str, &Path)> = photos.iter().copied().zip(paths.iter().map(PathBuf::as_path)).collect();
         let mut warnings = Vec::new();
-        let masks = MaskIndex::scan(root.path(), &images).assign(&named, &mut warnings);
+        let masks = MaskIndex::scan(root.path(), &images).unwrap().assign(&named, &mut warnings);
         let mark = |mask: FoundMask| {
-            let path = mask.path.strip_prefix(root.path()).unwrap().to_str().unwrap().replace('\\', "/");
+            let path = mask.path.strip_prefix(root.path()).unwrap().to_str().unwrap().replace(MAIN_SEPARATOR, "/");
             if mask.inverted { format!("not {path}") } else { path }
         };
-        (masks.into_iter().map(|mask| mask.map(mark)).collect(), warnings.join("\n").replace('\\', "/"))
+        (masks.into_iter().map(|mask| mask.map(mark)).collect(), warnings.join("\n").replace(MAIN_SEPARATOR, "/"))
     }
 
     #[test]

@@ -6,7 +6,9 @@
 //! Invariants: 1. nothing is listed outside of the folders that are added, except through links in them; 2. what is found does not
 //! depend on the order in which the system lists files.
 
+use crate::base::error::InputError;
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use unicode_normalization::UnicodeNormalization;
 
@@ -89,6 +91,8 @@ pub(super) struct NameIndex {
     count: usize,
     /// Links to files that are not there.
     pub dangling: Vec<PathBuf>,
+    /// The first folder that is there and cannot be listed.
+    pub unlisted: Option<InputError>,
 }
 
 impl NameIndex {
@@ -99,7 +103,15 @@ impl NameIndex {
     }
 
     fn add_at(&mut self, folder: &Path, prefix: &str, wants: &dyn Fn(&str) -> bool, depth: usize) {
-        let Ok(entries) = std::fs::read_dir(folder) else { return };
+        let entries = match std::fs::read_dir(folder) {
+            Ok(entries) => entries,
+            Err(error) => {
+                if error.kind() != ErrorKind::NotFound {
+                    self.unlisted.get_or_insert_with(|| InputError::io(folder, "listing the folder", &error));
+                }
+                return;
+            }
+        };
         if !folder.canonicalize().is_ok_and(|own| self.seen.insert(own)) {
             return;
         }
@@ -194,6 +206,18 @@ mod tests {
             index.files.entry(split_ending(base).0.to_string()).or_default().push(entry);
         }
         index
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_listed_is_not_an_empty_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("masks");
+        std::fs::write(&file, "").unwrap();
+        let mut index = NameIndex::default();
+        index.add(&folder.path().join("none"), "", &|_| true);
+        assert!(index.unlisted.is_none());
+        index.add(&file, "", &|_| true);
+        assert!(index.unlisted.unwrap().problem.contains("listing the folder"));
     }
 
     #[test]

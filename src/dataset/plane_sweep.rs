@@ -18,7 +18,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Longer side of the photos that are compared, pixels.
 const SIDE: u32 = 240;
-/// Patches that are tried in all.
+/// Patches that are tried in all, unless [`PATCHES_OF_PHOTO`] asks for more.
 const PATCHES: usize = 24_000;
 /// Fewest patches of a photo that gives patches.
 const PATCHES_OF_PHOTO: usize = 64;

@@ -1,6 +1,6 @@
 //! The direction that is up in a scene, from its cameras and its points.
 //!
-//! Structure from motion leaves the axes of a scene arbitrary, so up is estimated. Three observations count, in the order
+//! Structure from motion leaves the axes of a scene arbitrary, so up is estimated. Four observations count, in the order
 //! of their weight:
 //!
 //! 1. photos are taken level: the horizontal axis of a picture is horizontal in the world, whether the camera looks ahead or

@@ -68,7 +68,10 @@ impl ExportFormat {
 
     /// Most memory of the format's sink for `rows` rows beside its input, bytes; a few MiB count as none.
     pub fn memory_bytes(self, rows: u64) -> u64 {
-        if self == ExportFormat::Sog { memory_bytes(rows) } else { 0 }
+        match self {
+            ExportFormat::Ply | ExportFormat::Spz => 0,
+            ExportFormat::Sog => memory_bytes(rows),
+        }
     }
 
     /// The export that a run writes beside its PLY; `None` for the PLY itself.

@@ -25,7 +25,7 @@ pub struct Written {
     /// `Local` instead of a requested `Dataset` if f32 cannot hold the offset. Tell the user.
     pub frame: ExportFrame,
     pub rows: u64,
-    /// Number of rows left out because a value was not finite.
+    /// Rows left out because a value was not finite, or is none that the format can hold.
     pub skipped: u64,
     pub bytes: u64,
     /// Rows by level, if the format has levels.
@@ -60,8 +60,8 @@ pub(super) trait Format {
     /// Takes a row in the frame of the file; false if no file of this format can hold it.
     fn put(&mut self, row: &ExportRow) -> InputResult<bool>;
 
-    /// Completes the file of `rows` rows, at least one; returns its bytes, and the rows of its levels.
-    fn complete(self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)>;
+    /// Completes the file of at least one row; returns its bytes, and the rows of its levels.
+    fn complete(self) -> InputResult<(u64, Option<LevelCounts>)>;
 
     /// What the format changes of the rows that it was given, for people.
     fn warnings(&self) -> Vec<String> {
@@ -113,7 +113,7 @@ impl<F: Format> GaussianSink for FormatSink<F> {
             }));
         }
         let warnings = format.warnings().into_iter().map(|problem| format!("{}: {problem}", path.display())).collect();
-        let (bytes, levels) = format.complete(rows)?;
+        let (bytes, levels) = format.complete()?;
         Ok(Written { frame: to_file.frame(), rows, skipped: given - rows, bytes, levels, warnings })
     }
 }

@@ -157,7 +157,8 @@ impl Format for SpzWriter {
         Ok(true)
     }
 
-    fn complete(mut self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)> {
+    fn complete(mut self) -> InputResult<(u64, Option<LevelCounts>)> {
+        let rows = self.rows;
         if u32::try_from(rows).is_err() {
             let problem = format!("an SPZ file holds at most {} Gaussians, and these are {rows}", u32::MAX);
             return Err(InputError::new(&self.path, problem, "export a part of the scene"));

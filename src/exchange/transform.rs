@@ -57,7 +57,7 @@ pub fn is_transform(path: &Path) -> bool {
 }
 
 /// Frame and axes of a PLY that does not state them, from the transform file beside it; `None` without one. An editor may have
-/// saved the PLY under another name: then the transform of the only other PLY in the folder counts.
+/// saved the PLY under another name: then the only transform of a PLY in the folder counts.
 /// Errors: the file cannot be read, or is not what this program writes.
 pub fn meta_beside(ply: &Path) -> InputResult<Option<SceneMeta>> {
     let own = transform_path(ply);

@@ -174,7 +174,7 @@ pub fn diagnose(dataset: &Dataset, points: &[ColoredPoint], count: u64) -> Input
     let in_views: Vec<f64> = views.par_iter().map(in_view).collect();
     let share = median(in_views.clone()) / first.len().max(1) as f64;
     let every = (points.len() as f64 * share / POINTS_WANTED) as usize;
-    let points = &thinned(points, every.clamp(1, points.len().div_ceil(POINTS_FIRST).max(1)))[..];
+    let points = &thinned(points, every.min(points.len().div_ceil(POINTS_FIRST)))[..];
     let header = |view: usize| &dataset.views[view].photo.header;
     let pixels: u64 = views.iter().map(|&view| u64::from(header(view).width) * u64::from(header(view).height)).sum();
     let affordable = (PIXELS_MOST as f64 / (pixels as f64 / views.len() as f64)) as usize;

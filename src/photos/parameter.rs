@@ -124,7 +124,7 @@ pub trait PhotoParameter {
     /// The values as a commit holds them. Errors: the values cannot be encoded.
     fn save(&self) -> Result<Encoded, EncodingError>;
 
-    /// Restores saved values, unless they are of another number of photos. Errors: no run can have written the values.
+    /// Restores saved values, of the photos that `past` names also where there are others now. Errors: no run can have written the values.
     fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError>;
 
     /// Sets start values from the dataset, unless values were restored. Returns warnings for the user.

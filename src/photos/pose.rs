@@ -296,6 +296,17 @@ fn check(saved: &Encoded) -> Result<(), ValuesError> {
     saved.decoded(PoseState::check).map(drop)
 }
 
+/// What to say of a run that ends before it refines poses.
+fn warning_of_no_refinement(steps: u32, views: usize) -> Option<String> {
+    let first = first_step(steps, views);
+    (first >= steps).then(|| {
+        format!(
+            "--refine-poses refines no pose in a run of {steps} steps: it begins after a tenth of the run and two passes over the \
+             {views} training photos, at step {first}"
+        )
+    })
+}
+
 impl PhotoParameter for Poses {
     fn name(&self) -> &'static str {
         KIND.name
@@ -308,6 +319,10 @@ impl PhotoParameter for Poses {
     fn restore(&mut self, saved: &Encoded, past: &PastViews) -> Result<(), ValuesError> {
         self.state = PoseState::of_views(past.of(&saved.decoded(PoseState::check)?.views));
         Ok(())
+    }
+
+    fn start(&mut self, _: &Dataset) -> Vec<String> {
+        warning_of_no_refinement(self.steps, self.train_views).into_iter().collect()
     }
 
     fn camera(&self, view: usize, camera: Camera) -> Camera {
@@ -447,6 +462,12 @@ mod tests {
         assert_eq!(state.check(), Ok(()));
         state.sums[0] += 1;
         assert!(state.check().is_err());
+    }
+
+    #[test]
+    fn a_run_that_ends_before_its_poses_are_refined_says_so() {
+        let said = warning_of_no_refinement(104, 52).unwrap();
+        assert!(said.contains("52 training photos, at step 104") && warning_of_no_refinement(105, 52).is_none());
     }
 
     #[test]

@@ -25,6 +25,7 @@ use crate::base::units::{counted_are, format_grouped, format_seconds};
 use crate::base::whole_file::{are_one_file, rename, write_whole};
 use crate::base::whole_folder::remove_ours;
 use crate::dataset::colmap::looks_like_colmap;
+use crate::dataset::colmap_write::make_folder;
 use crate::dataset::exif::GpsPlace;
 use crate::dataset::model::{RawScene, ReadOptions};
 use crate::dataset::read::{MORE_OVERLAP, SEARCH_END, SEARCH_FOLDER, SEARCH_STATE, read_scene};
@@ -36,7 +37,7 @@ use program::{CHUNK, DATABASE, FeatureOptions, LIST, PHOTOS, Phase, Program, Pro
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::fmt;
-use std::fs::{File, Metadata, TryLockError};
+use std::fs::{DirEntry, File, Metadata, TryLockError};
 use std::io::ErrorKind::NotFound;
 use std::path::{Path, PathBuf};
 
@@ -306,9 +307,10 @@ impl PoseSearch {
         };
         let images = self.scene.join("images");
         let entries = || std::fs::read_dir(work).into_iter().flatten().flatten();
-        // A search that was killed before its first word leaves its lock.
-        let is_only_lock = work.is_dir() && entries().all(|entry| entry.file_name() == "lock");
-        if !work.exists() || is_only_lock {
+        // A search that was killed before its first word leaves its lock, and a part of the word.
+        let is_trace = |entry: DirEntry| entry.file_name() == "lock" || entry.file_name() == ".state.json.part";
+        let has_begun = work.exists() && !(work.is_dir() && entries().all(is_trace));
+        if !has_begun {
             if self.links_photos && images.exists() {
                 let remedy = "name a new folder: gsscale-poses PHOTOS --out FOLDER";
                 return Err(InputError::new(images, "exists already", remedy));
@@ -339,8 +341,9 @@ impl PoseSearch {
         };
         crate::tell!("warning: the search begins again: it was {was}, and is {is} now");
         self.unlink_changed(&old, work)?;
-        clear(work)?;
+        // First: nothing of the old search may count as done once its files go.
         new.write(work)?;
+        clear(work)?;
         Ok((new, lock))
     }
 
@@ -679,10 +682,6 @@ fn lock(work: &Path) -> InputResult<File> {
     }
 }
 
-fn make_folder(folder: &Path) -> InputResult<()> {
-    std::fs::create_dir_all(folder).map_err(|e| InputError::io(folder, "creating the folder", &e))
-}
-
 /// The name in the work folder of the photo with this number.
 fn plain_name(i: usize, name: &str) -> String {
     let ending = Path::new(name).extension().map(|ending| ending.to_string_lossy().to_lowercase());
@@ -831,11 +830,13 @@ mod tests {
         std::fs::write(image("b.jpg"), "e").unwrap();
         second.link_photos(&work).unwrap();
         assert_eq!(read("b.jpg"), "e");
-        // A search that was killed before its first word does not take a folder of photos over.
+        // A search that was killed before its first word does not take a folder of photos over, and begins where there is none.
         drop(lock);
-        std::fs::remove_file(work.join(STATE_FILE)).unwrap();
+        std::fs::rename(work.join(STATE_FILE), work.join(".state.json.part")).unwrap();
         std::fs::remove_dir_all(work.join(PHOTOS)).unwrap();
         assert!(second.begin(&work).unwrap_err().problem.contains("exists already"));
+        std::fs::remove_dir_all(scene.join("images")).unwrap();
+        assert!(second.begin(&work).unwrap().0.done.is_empty());
     }
 
     #[test]

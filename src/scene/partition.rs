@@ -97,7 +97,7 @@ impl GiantCut {
     /// A search for the cut among `rows` rows whose sizes are streamed: count [`GiantCut::key`] of every row in every
     /// pass.
     pub fn search(rows: usize) -> RankSearch {
-        // Without giants any rank is valid: `found` is not called.
+        // Without giants any rank is valid: the search is done at once, and has no key.
         RankSearch::new((rows - giants(rows)) as u64, rows as u64)
     }
 

@@ -37,9 +37,6 @@ impl RankSearch {
     }
 
     pub fn next_pass(&mut self) {
-        if self.is_done() {
-            return;
-        }
         let mut bin = 0;
         while bin + 1 < self.bins.len() && self.rank >= self.bins[bin] {
             self.rank -= self.bins[bin];

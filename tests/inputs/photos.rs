@@ -12,7 +12,7 @@ use gsscale::dataset::resize::resize_area;
 use gsscale::dataset::target_cache::TargetCache;
 use gsscale::dataset::undistort::distort;
 use image::{DynamicImage, GrayImage, Luma, Rgb, RgbImage, RgbaImage};
-use std::path::Path;
+use std::path::{MAIN_SEPARATOR, Path};
 use std::sync::Arc;
 use tempfile::TempDir;
 
@@ -151,7 +151,7 @@ fn missing_photos_are_listed_by_name() {
     std::fs::copy(&raw.views[0].image_path, photos.join("p02.png")).unwrap();
     let mut two = RawScene { root: folder.path().to_path_buf(), views: raw.views[..3].to_vec(), ..raw };
     let error = refusal(&two, &LoadOptions::default());
-    assert!(error.problem.replace('\\', "/").contains("'p02.png' may be images/block/p02.png"), "{error}");
+    assert!(error.problem.replace(MAIN_SEPARATOR, "/").contains("'p02.png' may be images/block/p02.png"), "{error}");
     two.views[1].image_path = photos.join("p02.png");
     let error = refusal(&two, &LoadOptions::default());
     assert!(!error.problem.contains("may be") && error.problem.contains("holds 6 pictures of other names"), "{error}");

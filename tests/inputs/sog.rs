@@ -10,7 +10,7 @@ use gsscale::exchange::sink::Written;
 use gsscale::scene::columns::{Column, Columns};
 use gsscale::scene::rotation::Rotation;
 use serde_json::Value;
-use std::path::{Path, PathBuf};
+use std::path::{MAIN_SEPARATOR, Path, PathBuf};
 
 /// A chunk, with what its values are rounded to.
 pub(super) struct Chunk {
@@ -342,7 +342,7 @@ fn a_folder_appears_whole_and_never_replaces_files_of_others() {
     assert!(files(&sog) == before, "the target is unchanged");
     for inside in ["photo.jpg", "0_0/notes.txt"] {
         std::fs::write(sog.join(inside), b"mine").unwrap();
-        let said = create(&path).err().unwrap().to_string().replace('\\', "/");
+        let said = create(&path).err().unwrap().to_string().replace(MAIN_SEPARATOR, "/");
         assert!(said.contains(inside) && said.contains("name a new folder"), "{said}");
         std::fs::remove_file(sog.join(inside)).unwrap();
     }

@@ -111,6 +111,30 @@ fn a_run_that_goes_on_keeps_the_mean_of_given_exposures() {
     assert!(work.begin(&cut).after_lines("cut", 40).kill());
     let resumed = work.output(TRAIN, "--resume cut --quiet --device cpu --first-appearance=");
     assert!(resumed.status.success() && work.ply("cut") == work.ply("whole"), "the mean of given exposures is lost");
+    // A file that a resume names is not read, and not written down as if it had been.
+    let named = |out: &str| {
+        std::fs::read_to_string(work.path(out).join("config.toml")).unwrap().contains("given/appearance.json")
+    };
+    assert!(named("whole") && named("cut"));
+    // More steps without a checkpoint go on from the exposures that the run has learnt.
+    let exposures = |out: &str| {
+        let file = std::fs::read(work.path(out).join("appearance.json")).unwrap();
+        let file: serde_json::Value = serde_json::from_slice(&file).unwrap();
+        let images = file["images"].as_array().unwrap().iter();
+        images.map(|image| image["exposure"].as_f64().unwrap()).collect::<Vec<_>>()
+    };
+    let far = std::fs::read_to_string(work.path("given/appearance.json")).unwrap();
+    let mut far: serde_json::Value = serde_json::from_str(&far).unwrap();
+    far["images"].as_array_mut().unwrap().iter_mut().enumerate().for_each(|(i, image)| {
+        image["exposure"] = if i % 2 == 0 { 1.0 } else { -1.0 }.into();
+    });
+    std::fs::write(work.path("far.json"), far.to_string()).unwrap();
+    run(&work, "learnt", "--steps 240 --appearance exposure --first-appearance far.json");
+    let before = exposures("learnt");
+    work.train("--resume learnt --steps 242 --quiet --device cpu");
+    let moved = before.iter().zip(exposures("learnt")).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    // Two steps move an exposure by a few hundredths; those of the file are a stop away.
+    assert!(moved < 0.2 && before.iter().any(|exposure| exposure.abs() < 0.7), "{moved}: {before:?}");
 }
 
 #[test]

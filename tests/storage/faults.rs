@@ -48,7 +48,7 @@ use gsscale::page::versions::page_error::PageError;
 use gsscale::page::versions::paged_store::PagedStore;
 use redb::StorageBackend;
 use redb::backends::InMemoryBackend;
-use std::path::{Path, PathBuf};
+use std::path::{MAIN_SEPARATOR, Path, PathBuf};
 use std::sync::Arc;
 
 const CONFIG: CommitConfig = CommitConfig { store: 77, cache_bytes: 1 << 18, reserve_bytes: 0 };
@@ -251,7 +251,7 @@ fn no_decision_reads_the_wall_clock() {
             if path.is_dir() {
                 folders.push(path);
             } else if std::fs::read_to_string(&path).is_ok_and(|text| text.contains("SystemTime")) {
-                readers.push(path.strip_prefix(&root).unwrap().to_string_lossy().replace('\\', "/"));
+                readers.push(path.strip_prefix(&root).unwrap().to_string_lossy().replace(MAIN_SEPARATOR, "/"));
             }
         }
     }

@@ -48,9 +48,13 @@ pub fn read_parts(scene: &Path, options: &ReadOptions) -> InputResult<RawScene> 
     let mut names = BTreeSet::new();
     let mut shared = false;
     for (folder, split) in folders.iter().zip([Split::Train, Split::Test]) {
-        let named = options.images.as_ref().map(|name| folder.join(name));
-        let photos = named.filter(|photos| photos.is_dir()).or_else(|| photo_folder(folder)).ok_or_else(|| {
-            let problem = format!("no photos here; looked for {}", PHOTOS.join(", "));
+        let photos = match &options.images {
+            Some(images) => Some(folder.join(images)).filter(|photos| photos.is_dir()),
+            None => photo_folder(folder),
+        };
+        let photos = photos.ok_or_else(|| {
+            let places = options.images.clone().unwrap_or_else(|| PHOTOS.join(", "));
+            let problem = format!("no photos here; looked for {places}");
             InputError::new(folder, problem, "put them into rgbs or images, or name their folder with --images")
         })?;
         let points = (split == Split::Train).then_some(options.points_later);
@@ -86,8 +90,11 @@ pub(super) fn image_folders(
     if stated.is_dir() {
         return Ok(vec![stated]);
     }
-    let apart: Vec<PathBuf> =
-        ["train", "val", "test"].iter().filter_map(|part| photo_folder(&scene.join(part))).collect();
+    let in_part = |part: &&str| match &options.images {
+        Some(images) => Some(scene.join(part).join(images)).filter(|photos| photos.is_dir()),
+        None => photo_folder(&scene.join(part)),
+    };
+    let apart: Vec<PathBuf> = ["train", "val", "test"].iter().filter_map(in_part).collect();
     if !apart.is_empty() {
         return Ok(apart);
     }

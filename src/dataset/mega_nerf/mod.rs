@@ -49,6 +49,7 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
                            the views out with --allow-missing",
         no_view: REMEDY,
     };
+    let rgbs = options.images.as_deref().unwrap_or("rgbs");
     let photos = PhotoFiles::in_folders(folder, vec![folder.to_path_buf()], options.allow_missing);
     let mut gathered = Gathered::new(photos, options);
     for (part, split) in [("train", Split::Train), ("val", Split::Test)] {
@@ -60,12 +61,12 @@ pub fn read_mega_nerf(folder: &Path, options: &ReadOptions) -> InputResult<RawSc
             let stem = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
             // Mill-19 has .jpg, Sci-Art .JPG, others .png.
             let named = ["jpg", "JPG", "jpeg", "png", "PNG"]
-                .map(|extension| folder.join(part).join("rgbs").join(format!("{stem}.{extension}")));
+                .map(|extension| folder.join(part).join(rgbs).join(format!("{stem}.{extension}")));
             let Some(path) = named.into_iter().find(|path| path.is_file()) else {
-                gathered.missing.push(format!("{part}/rgbs/{stem}.*"));
+                gathered.missing.push(format!("{part}/{rgbs}/{stem}.*"));
                 continue;
             };
-            let name = format!("{part}/rgbs/{}", path.file_name().unwrap_or_default().to_string_lossy());
+            let name = format!("{part}/{rgbs}/{}", path.file_name().unwrap_or_default().to_string_lossy());
             let (intrinsics, pose) = read_metadata(&file, &origin, scale)?;
             gathered.add(Photo { name, path, exists: true }, intrinsics, pose, Some(split));
         }

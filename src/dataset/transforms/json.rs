@@ -73,7 +73,7 @@ struct TopLists {
 pub(super) fn load(path: &Path) -> InputResult<JsonFile> {
     let file = File::open(path).map_err(|e| InputError::io(path, "opening", &e))?;
     let length = file.metadata().map_err(|e| InputError::io(path, "reading", &e))?.len();
-    // Reserves room for the whole file and the check for its end, so that reading never reallocates.
+    // Reserves room for the whole file and the check for its end, so that reading rarely reallocates.
     let mut bytes = Vec::with_capacity(length.min(MAX_BYTES) as usize + 64);
     let mut limited = file.take(MAX_BYTES + 1);
     LooseJson::new(&mut limited).read_to_end(&mut bytes).map_err(|e| InputError::io(path, "reading", &e))?;

@@ -74,12 +74,11 @@ pub(super) fn find_photo(photos: &PhotoFiles, base: &str, images: Option<&str>, 
     photos.find_at(stated, read_name(base, stated)?, "", &|place| {
         let block = place.parent().unwrap_or(place);
         let (file, own) = (place.file_name()?, block.file_name().map(|name| name.to_string_lossy()));
-        let inside = match images {
-            Some(images) => vec![images],
-            None => INSIDE_BLOCK.into_iter().chain(own.as_deref()).collect(),
+        let inside = INSIDE_BLOCK.into_iter().chain(own.as_deref());
+        let places: Vec<PathBuf> = match images {
+            Some(images) => vec![block.join(images).join(file)],
+            None => std::iter::once(place.to_path_buf()).chain(inside.map(|sub| block.join(sub).join(file))).collect(),
         };
-        let mut places =
-            std::iter::once(place.to_path_buf()).chain(inside.into_iter().map(|sub| block.join(sub).join(file)));
-        places.find(|path| path.is_file()).map(|path| (path, String::new()))
+        places.into_iter().find(|path| path.is_file()).map(|path| (path, String::new()))
     })
 }

@@ -3,7 +3,7 @@
 //! its size, and only if the JSON does not state it.
 //!
 //! Invariants: 1. for any JSON content the result is a scene or an [`InputError`] that names file and key; 2. only a
-//! bad pose or, when allowed, a missing photo drops a view, with a warning that names it.
+//! bad pose, lists of names that lack the view or, when allowed, a missing photo drop a view, with a warning that names it.
 //!
 //! Files: a folder with `transforms_train.json` is a split scene. Its test set is `transforms_test.json`, or without it
 //! `transforms_val.json`, whose views are dropped otherwise, with a warning. Any other folder is read from `transforms.json`, whose
@@ -22,7 +22,7 @@ pub(in crate::dataset) mod pose;
 
 use crate::base::error::{InputError, InputResult};
 use crate::dataset::gathered::{Gathered, RefusalWords, left_out};
-use crate::dataset::model::{PointCloud, RawScene, RawView, ReadOptions, Split};
+use crate::dataset::model::{RawScene, RawView, ReadOptions, Split};
 use crate::dataset::paths::read_name;
 use crate::dataset::photo_files::{Photo, PhotoFiles, file_inside};
 use crate::dataset::photo_header::read_size;
@@ -43,7 +43,7 @@ pub fn looks_like_transforms(folder: &Path) -> bool {
 /// Errors: no JSON, broken JSON, keys of the wrong kind, unsupported cameras, names that leave the folder or occur twice, no
 /// view left, missing photos whose size is needed.
 pub fn read_transforms(path: &Path, options: &ReadOptions) -> InputResult<RawScene> {
-    let mut scene = RawScene { points: PointCloud::default(), ..RawScene::default() };
+    let mut scene = RawScene::default();
     let files = choose_files(path, &mut scene.warnings)?;
     let folder = files[0].0.parent().unwrap_or(Path::new(""));
     let photos = PhotoFiles::with_folders(folder, options.images.as_deref(), options);

@@ -41,7 +41,7 @@ pub(super) fn read_matrix(frame: &JsonNode<'_>) -> InputResult<[[f64; 4]; 4]> {
     Ok(matrix)
 }
 
-/// Divides the position by the scale of the rotation as well: MatrixCity's rotations times 0.01 come with positions in
+/// Multiplies the position by the scale of the rotation as well: MatrixCity's rotations times 0.01 come with positions in
 /// metres, its plain rotations with positions in 100 m.
 pub(super) fn scale_position(m: &mut [[f64; 4]; 4]) {
     let scale = (0..3).map(|c| DVec3::new(m[0][c], m[1][c], m[2][c]).length()).sum::<f64>() / 3.0;

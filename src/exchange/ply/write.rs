@@ -90,11 +90,11 @@ impl Format for PlyWriter {
         Ok(true)
     }
 
-    fn complete(self, rows: u64) -> InputResult<(u64, Option<LevelCounts>)> {
+    fn complete(self) -> InputResult<(u64, Option<LevelCounts>)> {
         let failed = |doing: &str, e: &std::io::Error| InputError::io(&self.path, doing, e);
         let mut file = self.out.into_inner().map_err(|e| failed("writing", e.error()))?;
-        if rows < self.rows_at_most {
-            let header = header_text(self.sh_degree, rows, self.rows_at_most, &self.meta, self.frame);
+        if self.rows < self.rows_at_most {
+            let header = header_text(self.sh_degree, self.rows, self.rows_at_most, &self.meta, self.frame);
             let written = file.seek(SeekFrom::Start(0)).and_then(|_| file.write_all(header.as_bytes()));
             written.map_err(|e| failed("writing", &e))?;
         }

@@ -215,7 +215,7 @@ impl Format for SogWriter {
         Ok(true)
     }
 
-    fn complete(mut self, _: u64) -> InputResult<(u64, Option<LevelCounts>)> {
+    fn complete(mut self) -> InputResult<(u64, Option<LevelCounts>)> {
         // A viewer needs a leaf.
         if self.group.is_empty() && self.leaves.is_empty() {
             self.group = std::mem::take(&mut self.giants);

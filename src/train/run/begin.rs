@@ -52,7 +52,8 @@ pub fn run(request: &RunRequest) -> Result<RunOutcome, TrainError> {
     let host_mem = host_budget(config.host_mem.0);
     let start = Start::read(&request.scene, config, host_mem)?;
     out_folder::check_apart_from_photos(&request.out, &start.dataset)?;
-    let (request, start, diagnosis) = adapt_to_photos(adapt_schedule(request, &start), start, host_mem)?;
+    let (request, start, diagnosis) = adapt_to_photos(request.clone(), start, host_mem)?;
+    let request = adapt_schedule(&request, &start);
     let (request, config) = (&request, &request.config);
     if let Some(known) = plan_text::too_large_for_a_dry_run(config, &start, host_mem).filter(|_| request.dry_run) {
         check_first_drive(config, start.rows)?;
@@ -266,7 +267,8 @@ pub fn forecast(scene: &Path, config: &TrainConfig, drive_rate: DriveRate) -> Re
     };
     let host_mem = host_budget(request.config.host_mem.0);
     let start = Start::read(&request.scene, &request.config, host_mem)?;
-    let (request, start, _) = adapt_to_photos(adapt_schedule(&request, &start), start, host_mem)?;
+    let (request, start, _) = adapt_to_photos(request, start, host_mem)?;
+    let request = adapt_schedule(&request, &start);
     if plan_text::too_large_for_a_dry_run(&request.config, &start, host_mem).is_some() {
         return Ok(None);
     }

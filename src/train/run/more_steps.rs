@@ -101,10 +101,7 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     let host_mem = host_budget(request.config.host_mem.0);
     let mut first = request.clone();
     // The first commit will hold the exposures, so the config does not name their file.
-    if first.config.first_appearance.is_empty()
-        && first.config.appearance.0.is_some_and(AppearanceMode::is_on)
-        && out.join(exposure::FILE).is_file()
-    {
+    if first.config.appearance.0.is_some_and(AppearanceMode::is_on) && out.join(exposure::FILE).is_file() {
         first.config.first_appearance = out.join(exposure::FILE).to_string_lossy().into_owned();
     }
     let FirstTrainer { dataset, mut trainer, tiers, begun } = first_trainer(&first, start, host_mem)?;
@@ -114,8 +111,12 @@ pub(super) fn train_more_steps(mut request: RunRequest, mut finished: FinishedRu
     for line in &changes.numbers {
         crate::tell!("warning: accepted from step {} on: {line}", summary.steps);
     }
-    let lost =
-        [(out.join(pose::FILE).exists(), "the refined poses"), (has_left_out(&out), "which photos were left out")];
+    let has_vignetting = first.config.appearance.0 == Some(AppearanceMode::Full) && out.join(exposure::FILE).is_file();
+    let lost = [
+        (out.join(pose::FILE).exists(), "the refined poses"),
+        (has_left_out(&out), "which photos were left out"),
+        (has_vignetting, "the vignetting of the cameras"),
+    ];
     let lost: String = lost.iter().filter(|(is_lost, _)| *is_lost).map(|(_, what)| format!(", {what}")).collect();
     crate::tell!(
         "warning: the checkpoint of {} is gone, so the run goes on from its Gaussians, kept as {}; lost: Adam's moments{lost}; \

@@ -337,8 +337,9 @@ fn resume_from(
     plan_and_train(&request, &dataset, tiers, trainer, begun)
 }
 
-/// Keeps the rate schedule of `then` in a run that is extended to more steps, unless a flag gives another.
+/// Keeps what a run reads only when it begins, and its rate schedule if it is extended to more steps, unless a flag gives another.
 fn keep_rates(config: &mut TrainConfig, keys: &TrainOverrides, then: &TrainConfig) {
+    config.first_appearance.clone_from(&then.first_appearance);
     if keys.schedule_steps.is_none() && config.steps != then.steps {
         config.schedule_steps = limits::schedule_steps(then);
     }

@@ -2,11 +2,11 @@
 //! refused.
 
 use super::transforms_good::read;
-use super::write::refused;
+use super::write::{refused, warned};
 use crate::support::lookalike::write_lookalike;
 use glam::DVec3;
 use gsscale::dataset::layout::{Layout, find_layout};
-use gsscale::dataset::model::{RawScene, Split};
+use gsscale::dataset::model::{RawScene, RawView, Split};
 use gsscale::dataset::read::{ReadOptions, read_scene};
 use gsscale::dataset::synthetic::CityOptions;
 use gsscale::exchange::ply::{PlyContent, read_ply};
@@ -189,6 +189,33 @@ fn hostile_matrix_city_folders_are_refused_or_say_what_is_left_out() {
     fs::write(folder.path().join(poses), b"{").unwrap();
     fs::write(folder.path().join("pose/block_all/transforms_test.json"), b"{}").unwrap();
     assert!(refusal(folder.path()).contains("not valid JSON"));
+}
+
+/// The folder that `--images` names counts in every layout: no other photos silently take its place.
+#[test]
+fn another_folder_of_photos_is_read_or_missed() {
+    let smaller = ReadOptions { images: Some("photos_4".into()), ..ReadOptions::default() };
+    for layout in [Layout::ColmapMerged, Layout::MegaNerf, Layout::MatrixCity] {
+        let folder = lookalike(layout);
+        let views = read(folder.path()).views;
+        match read_scene(folder.path(), &smaller) {
+            Err(error) => assert!(error.to_string().contains("photos_4"), "{}: {error}", layout.name()),
+            Ok(found) => warned(&found, &["8 of 8 photos have other names"]),
+        }
+        for view in &views {
+            let (photos, file) = (view.image_path.parent().unwrap(), view.image_path.file_name().unwrap());
+            // MatrixCity's photos lie in the folder of their block.
+            let smaller = match layout {
+                Layout::MatrixCity => photos.join("photos_4"),
+                _ => photos.with_file_name("photos_4"),
+            };
+            fs::create_dir_all(&smaller).unwrap();
+            fs::copy(&view.image_path, smaller.join(file)).unwrap();
+        }
+        let found = read_scene(folder.path(), &smaller).unwrap().views;
+        let is_smaller = |view: &RawView| view.image_path.parent().unwrap().ends_with("photos_4");
+        assert!(found.len() == views.len() && found.iter().all(is_smaller), "{}", layout.name());
+    }
 }
 
 #[test]

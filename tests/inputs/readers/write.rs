@@ -3,7 +3,7 @@
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::dataset::model::RawScene;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::{MAIN_SEPARATOR, Path, PathBuf};
 use tempfile::TempDir;
 
 /// The first line of a CSV of RealityCapture.
@@ -186,6 +186,6 @@ pub fn refused(result: InputResult<RawScene>, file: &str, parts: &[&str]) -> Inp
 #[track_caller]
 pub fn warned(scene: &RawScene, parts: &[&str]) {
     let says = |warning: &str| parts.iter().all(|part| warning.contains(part));
-    let found = scene.warnings.iter().any(|warning| says(&warning.replace('\\', "/")));
+    let found = scene.warnings.iter().any(|warning| says(&warning.replace(MAIN_SEPARATOR, "/")));
     assert!(found, "no warning says {parts:?}: {:?}", scene.warnings);
 }
