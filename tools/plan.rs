@@ -402,8 +402,9 @@ fn order(args: &Args, scene: &Scene, frames: usize, asked: Chosen<Order>) -> Inp
 fn too_few(scene: &Scene, error: &TooFewFrames) -> InputError {
     let most = scene.views.most().max(error.needed);
     let bytes = format_bytes(most as u64 * scene.frame_bytes);
-    let remedy =
-        format!("the largest view needs --frames {most}, {bytes} of --host-mem besides the run's other memory");
+    let remedy = format!(
+        "plan with --frames {most}, {bytes} of --host-mem besides the run's other memory; a run takes larger views in batches"
+    );
     InputError::new("--frames", error.to_string(), remedy)
 }
 

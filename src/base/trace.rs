@@ -1,7 +1,7 @@
 //! A trace of the process: the spans of work of its host threads, with their times, as JSON in Chrome's trace-event format.
 //! Perfetto (<https://ui.perfetto.dev>) and `chrome://tracing` open it.
 //!
-//! A process has at most one trace. Each span is written when it ends, so a process that is killed leaves a file that viewers still open:
+//! A process has at most one trace. Spans are written soon after they end, so a process that is killed leaves a file that viewers still open:
 //! the format allows the closing bracket to be missing.
 //!
 //! Not here: what a device does between two calls; which work is a span (the rooms that do the work).

@@ -65,6 +65,15 @@ fn format_scaled(bytes: u64, round: impl Fn(f64) -> f64) -> String {
 /// Errors: the text is no whole number from 0 on.
 pub fn parse_count(text: &str) -> Result<u64, String> {
     let wrong = || format!("'{text}' is not a count; write for example 30000 or 30k");
+    // Commas part groups of three digits: `1,5M` is not 15 million.
+    let are_groups = |number: &str| {
+        let mut groups = number.split(',');
+        let is_first = groups.next().is_some_and(|group| (1..=3).contains(&group.len()));
+        is_first && number.chars().all(|c| c.is_ascii_digit() || c == ',') && groups.all(|group| group.len() == 3)
+    };
+    if text.contains(',') && !are_groups(text.trim()) {
+        return Err(wrong());
+    }
     let plain: String = text.trim().chars().filter(|c| !matches!(c, '_' | ',')).collect();
     let (number, factor) = match plain.char_indices().last() {
         Some((at, 'k' | 'K')) => (&plain[..at], 1e3),
@@ -155,7 +164,23 @@ mod tests {
         for (text, want) in [("30000", 30_000), ("30k", 30_000), ("1.5M", 1_500_000), ("30_000", 30_000), ("0", 0)] {
             assert_eq!(parse_count(text), Ok(want));
         }
-        for wrong in ["", "k", "-3", "1.2345k", "30 k", "1e3", "nan", "infk", "9999999999M", "30kk", "+5k"] {
+        for wrong in [
+            "",
+            "k",
+            "-3",
+            "1.2345k",
+            "30 k",
+            "1e3",
+            "nan",
+            "infk",
+            "9999999999M",
+            "30kk",
+            "+5k",
+            "1,5k",
+            "1,5M",
+            "3,0000",
+            ",5",
+        ] {
             assert!(parse_count(wrong).is_err(), "{wrong}");
         }
         assert_eq!(parse_count32("4,294,967,295"), Ok(u32::MAX));

@@ -21,7 +21,7 @@ pub struct PagerStats {
     /// Needed pages that were in memory.
     #[serde(rename = "page_hits")]
     pub hits: u64,
-    /// Needed pages that were not in memory: on their way, or still to be read.
+    /// Needed pages that were not in memory for the step: on their way, being written back, or still to be read.
     #[serde(rename = "page_misses")]
     pub misses: u64,
     /// Misses that the plan of a planned step had left out.

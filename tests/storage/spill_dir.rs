@@ -91,6 +91,8 @@ fn removal_keeps_foreign_files() {
     symlink(&outside, folder.join(segment_file_name(3))).unwrap();
     std::fs::write(folder.join("notes.txt"), b"mine").unwrap();
     std::fs::create_dir(folder.join(segment_file_name(4))).unwrap();
+    // As a kill leaves a segment between the file and its space.
+    std::fs::write(folder.join(segment_file_name(5)), b"").unwrap();
     let kept = spill.remove().unwrap();
     let ours: Vec<String> = (1..5).map(segment_file_name).collect();
     assert_eq!(kept, [["notes.txt".to_string()].as_slice(), &ours].concat());

@@ -3,7 +3,7 @@
 //!
 //! The measurement uses the same engines as a run. Each engine has a segment of its own, because direct I/O on bytes
 //! that the page cache holds behaves differently. The segment files are unlinked before the measurement, so nothing is
-//! left behind however the process ends. Reads are as cold as the machine allows (direct I/O, or dropped from the page
+//! left behind, unless the process is killed while it makes them. Reads are as cold as the machine allows (direct I/O, or dropped from the page
 //! cache); caches of the drive itself, or of the host below a virtual drive, are part of the figure.
 //!
 //! Invariants: 1. every round visits every case, so that a drive whose speed varies treats all cases alike; figures are
@@ -181,6 +181,8 @@ impl ScratchSegments {
             return Err(InputError::new(folder, problem, "free space on that drive, or measure with a smaller file"));
         }
         let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
+        // Of an earlier process of this number, which was killed.
+        let _ = std::fs::remove_dir_all(&own);
         std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
         let opened = ScratchSegments::open_all(&own, engines, file_bytes, depth);
         if cfg!(not(unix)) {

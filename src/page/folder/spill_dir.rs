@@ -209,12 +209,15 @@ impl SpillDir {
         let file = open_for_reading(path);
         let bytes = file.and_then(|file| {
             let metadata = file.metadata()?;
+            if !metadata.is_file() {
+                return Err(io::ErrorKind::InvalidInput.into());
+            }
             file.take(HEADER_BYTES as u64).read_to_end(&mut header)?;
-            Ok(if metadata.is_file() { metadata.len() } else { 0 })
+            Ok(metadata.len())
         });
         let slot = header.first_chunk().map(SlotHeader::decode);
         match (bytes, slot) {
-            (Err(_) | Ok(0), _) => false,
+            (Err(_), _) => false,
             (Ok(_), Some(Ok(slot))) => slot.store == self.format.store,
             (Ok(bytes), _) => bytes <= self.format.layout.segment_bytes() && header.iter().all(|&b| b == 0),
         }

@@ -142,11 +142,6 @@ impl PagedStore {
         self.config.generation = self.config.generation.max(generation);
     }
 
-    /// Serial number of the next write.
-    pub fn serial(&self) -> u64 {
-        self.config.serial
-    }
-
     /// The error after which the store accepts no writes, if any.
     pub fn poison(&self) -> Option<&str> {
         self.poison.as_deref()
@@ -376,7 +371,6 @@ impl PagedStore {
             SlotHeader { store, page: pending.page, serial, slot, label }.encode(header);
         }
         self.traffic.bytes_written += bytes as u64;
-        self.traffic.payload_bytes_written += u64::from(slot.payload_bytes);
         self.submit(pending, buffer, bytes);
     }
 
@@ -508,7 +502,6 @@ pub struct PageDone {
 pub struct PageTraffic {
     pub bytes_read: u64,
     pub bytes_written: u64,
-    pub payload_bytes_written: u64,
     pub reads_repeated: u64,
 }
 

@@ -342,7 +342,7 @@ const ENOUGH_SHARE: f64 = 0.15;
 /// takes. When all pages fit into memory, nothing is read and the order is the one that training likes best: shuffle. Otherwise the
 /// run is replayed for each number of groups, and the smallest number that reads little is taken: randomness is given up only for
 /// bytes. The order belongs to the run: it is found once and recorded.
-/// Errors: a view needs more pages than there are frames.
+/// Errors: there are no frames.
 pub fn automatic_order(
     views: &ViewPages,
     cameras: &[Camera],
