@@ -191,7 +191,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
 /// machine, or another hour, may not have, such as a file that cannot be read.
 pub fn code_of(error: &TrainError) -> i32 {
     match error {
-        TrainError::Input(input) if input.kind.is_none() => NEVER,
+        TrainError::Input(input) | TrainError::Photo(input) if input.kind.is_none() => NEVER,
         TrainError::NonFinite { .. } => NEVER,
         _ => AGAIN,
     }

@@ -15,6 +15,9 @@ use crate::scene::page_split::SplitTooDeep;
 pub enum TrainError {
     #[error(transparent)]
     Input(#[from] InputError),
+    /// A photo cannot be read. The scene is that of the last step.
+    #[error(transparent)]
+    Photo(InputError),
     #[error("rendering failed: {0}{remedy}", remedy = .0.remedy().map_or(String::new(), |r| format!("\n  remedy: {r}")))]
     Render(#[from] RenderError),
     /// Pages could not be pinned or stored.

@@ -169,6 +169,7 @@ impl World {
         plan(faults);
         let (mut progress, stop) = (RunProgress::new(0, config.steps, true), StopFlag::default());
         let looped = TrainingLoop {
+            lacks_space: false,
             trainer: &mut trainer,
             dataset: &dataset,
             targets: &targets,

@@ -202,6 +202,9 @@ impl Checkpoint {
 
     /// Whether [`Checkpoint::between_steps`] may have something to do now.
     pub fn is_due(&self, trainer: &Trainer) -> bool {
+        if self.commits.is_none() && self.first.is_none() {
+            return false;
+        }
         let is_begun = self.name.is_some() || self.beside.is_some();
         is_begun || self.is_time() || (self.may_commit_early() && self.space_is_short(trainer))
     }
@@ -287,7 +290,10 @@ impl Checkpoint {
         self.make_first(trainer)?;
         let name = self.name.clone();
         let Some(origin) = &self.origin else { return Ok(()) };
-        let Some(commits) = &mut self.commits else { return Ok(()) };
+        let Some(commits) = &mut self.commits else {
+            self.name = None;
+            return Ok(());
+        };
         let written = trainer.scene.pager.stats().bytes_written;
         trainer.scene.pager.flush()?;
         let state = run_state(trainer, origin, metrics.sync()?)?;

@@ -284,7 +284,7 @@ fn goal(
     }
     let mut changes = Changes::of_config(file, &state.origin.config, &state.origin.simd, config)?;
     changes.check(file, request.accept_changes)?;
-    if !scene.is_dir() {
+    if !scene.exists() {
         let remedy = format!("if it was moved: gsscale-train --resume {} SCENE", shell_word(&request.out));
         return Err(InputError::new(scene, "the scene of this run is missing", remedy).into());
     }

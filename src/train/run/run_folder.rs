@@ -121,7 +121,14 @@ fn begin_files(
             out_folder::remove_evaluation(&request.out)?;
             let made_again = Resolved { gaussians: past.first_rows, ..resolved(request, dataset, trainer, begun.run) };
             let before = past.file.as_ref().map_or(&made_again, |(_, facts)| facts);
-            let facts = Resolved { run: begun.run, scene: absolute(&request.scene), ..before.clone() };
+            // What changes were accepted of.
+            let facts = Resolved {
+                run: begun.run,
+                scene: absolute(&request.scene),
+                train_views: made_again.train_views,
+                test_views: made_again.test_views,
+                ..before.clone()
+            };
             let kept = (past.config.clone(), facts);
             if past.file.as_ref() != Some(&kept) {
                 write_config(&path, &kept.0, &kept.1)?;
@@ -184,6 +191,7 @@ pub(super) fn train_into(
         targets: &targets,
         out,
         metrics: &mut metrics,
+        lacks_space: false,
         progress: &mut progress,
         stop,
         checkpoint,

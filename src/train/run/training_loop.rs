@@ -48,6 +48,8 @@ pub struct TrainingLoop<'a> {
     pub live: Option<LivePage>,
     /// What the run will take, to be named when a check of growth changes the count.
     pub forecast: Option<&'a Forecast>,
+    /// A line of the log waits for space on the drive of the results.
+    pub lacks_space: bool,
 }
 
 impl TrainingLoop<'_> {
@@ -92,7 +94,15 @@ impl TrainingLoop<'_> {
             }
             if due(log_every) || is_last || due(eval_every) {
                 let line = StepLine { test, ..self.step_line(&outcome, psnr, before) };
-                let written = self.metrics.write(line).map_err(TrainError::from);
+                match self.metrics.write(line).map_err(TrainError::from) {
+                    // A step in flight allows no commit: the line waits in the log.
+                    Err(error) if error.is_out_of_space() && self.trainer.is_ahead() => self.lacks_space = true,
+                    written => written.or_else(|error| self.make_space(error))?,
+                }
+            }
+            if self.lacks_space && !self.trainer.is_ahead() {
+                self.lacks_space = false;
+                let written = self.metrics.sync().map(drop).map_err(TrainError::from);
                 written.or_else(|error| self.make_space(error))?;
             }
             self.progress.step(done, ShownStep { gaussians: self.trainer.scene.rows(), psnr });
@@ -119,6 +129,7 @@ impl TrainingLoop<'_> {
         !is_wanted
             && !is_due
             && !is_shown
+            && !self.lacks_space
             && self.stop.exit_code().is_none()
             && !self.stop.is_late()
             && !self.trainer.run_memory().is_outgrown()
@@ -285,12 +296,14 @@ impl TrainingLoop<'_> {
         Ok(())
     }
 
-    /// Commits what a run can be resumed from, before it ends with `error`: the last good step of a run that lacked frames or
+    /// Commits what a run can be resumed from, before it ends with `error`: the last good step of a run that lacked frames or a photo or
     /// whose renderer failed, or the cut in progress of a step that failed half-way. Adds the least memory to an error about
     /// frames.
     fn commit_before_end(&mut self, error: TrainError) -> TrainError {
-        let is_last_step_good =
-            matches!(error, TrainError::Render(_) | TrainError::Paging(PagingError::WorkingSet { .. }));
+        let is_last_step_good = matches!(
+            error,
+            TrainError::Render(_) | TrainError::Photo(_) | TrainError::Paging(PagingError::WorkingSet { .. })
+        );
         if let Some(checkpoint) = self.checkpoint.as_deref_mut() {
             let done = match self.trainer.is_torn {
                 true => checkpoint.finish_cut(self.trainer),

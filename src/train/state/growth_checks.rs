@@ -36,7 +36,7 @@ pub(super) fn measure(
     let (mut psnrs, mut ssims) = (Vec::with_capacity(views.len()), Vec::with_capacity(views.len()));
     for (i, (view, camera)) in views.iter().enumerate() {
         comparing.targets.prefetch(&views[i..views.len().min(i + 2)].iter().map(|(view, _)| *view).collect::<Vec<_>>());
-        let target = comparing.targets.get(*view)?;
+        let target = comparing.targets.get(*view).map_err(TrainError::Photo)?;
         if target.counts() {
             let ViewMetrics { psnr, ssim } = measure_view(now, comparing, camera, &target)?;
             psnrs.push(psnr);

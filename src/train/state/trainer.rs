@@ -88,6 +88,8 @@ pub(crate) struct Ahead {
     pub is_allowed: bool,
     /// The error that kept a step from being recorded ahead.
     failed: Option<TrainError>,
+    /// The step that was recorded ahead last, 0-based, and its photo.
+    photo: Option<(u32, Arc<Target>)>,
     /// Rows that each view listed last; 0 or missing for a view that this process has not drawn.
     rows_of_views: Vec<u32>,
 }
@@ -286,7 +288,11 @@ impl Trainer {
         }
         self.look_ahead(dataset);
         let photo = trace::span("photo");
-        let target = targets.get(view)?;
+        let target = match self.ahead.photo.take() {
+            // The step is in flight: its photo may have become unreadable since it was recorded.
+            Some((step, target)) if step == self.state.step => target,
+            _ => targets.get(view).map_err(TrainError::Photo)?,
+        };
         drop(photo);
         let started = Instant::now();
         let is_left_out = self.photos.iter().any(|parameter| parameter.leaves_out(view));
@@ -314,7 +320,7 @@ impl Trainer {
         if self.options.optimizer == Method::Dense {
             // The step has changed rows; an error here leaves a state between two steps.
             self.is_torn = true;
-            self.scene.settle_all(self.state.step + 1)?;
+            self.scene.settle_all(self.state.step + 1).map_err(TrainError::torn)?;
             self.is_torn = false;
         }
         self.end_step_of_photo(view, &outcome, &target, dataset);
@@ -420,11 +426,12 @@ impl Trainer {
         }
         let Some(&view) = self.turns.coming(self.state.step, 2, &self.photos).get(1) else { return Ok(()) };
         let photo = trace::span("photo");
-        let target = targets.get(view)?;
+        // The step itself reports a photo that cannot be read, with nothing in flight.
+        let Ok(target) = targets.get(view) else { return Ok(()) };
         drop(photo);
         match self.record(dataset, 1, &target) {
             Err(error @ TrainError::Paging(_)) => self.ahead.failed = Some(error),
-            other => drop(other?),
+            recorded => self.ahead.photo = recorded?.then_some((step + 1, target)),
         }
         Ok(())
     }

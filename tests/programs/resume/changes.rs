@@ -2,7 +2,7 @@
 
 use super::bench::{Bench, Place, SELDOM};
 use crate::support::scenes::TextModel;
-use crate::support::workdir::{copy_folder, sorted_rows};
+use crate::support::workdir::{Workdir, copy_folder, sorted_rows};
 
 #[test]
 fn what_changed_is_said_and_left_as_it_was() {
@@ -129,4 +129,38 @@ fn a_scene_and_a_start_that_were_moved_are_named_and_the_run_goes_on() {
     // Afterwards the file exists.
     bench.go_on("");
     assert!(bench.ply("out") == want, "the scene is another");
+}
+
+/// A drive of photos that goes away and comes back costs no step.
+#[test]
+fn a_photo_that_cannot_be_read_ends_the_run_with_a_commit() {
+    let work = Workdir::city(14, 64, 48, 300);
+    let flags = "scene --steps 300 --device cpu --strategy none --log-every 1 --image-cache 1KiB --quiet";
+    work.train(&format!("{flags} --out whole"));
+    // In memory, which needs no flag, and through the drive.
+    for (out, drive) in [("memory", ""), ("drive", "--spill-dir spill")] {
+        let run = work.begin(&format!("{flags} --out {out} {drive} {SELDOM}")).after_lines(out, 8);
+        std::fs::rename(work.path("scene/images"), work.path("gone")).unwrap();
+        let said = run.ends(1);
+        assert!(said.contains("opening the photo failed"), "{said}");
+        std::fs::rename(work.path("gone"), work.path("scene/images")).unwrap();
+        assert!(work.count(out, "steps") < 300, "the run had all its photos in memory");
+        let said = work.train(&format!("--resume {out} --device cpu"));
+        assert!(!said.contains("begins again") && work.ply(out) == work.ply("whole"), "{said}");
+    }
+}
+
+/// A scene may be the file `transforms.json`, also in the commands that go on with its run. Accepted photos are those of later runs.
+#[test]
+fn a_run_on_a_file_of_transforms_goes_on_with_the_photos_that_were_accepted() {
+    let work = Workdir::city(16, 64, 48, 300);
+    TextModel::of(&work.scene()).write_transforms(&work.scene());
+    work.train("scene/transforms.json --out out --steps 20 --device cpu --keep-checkpoint --quiet");
+    work.refuses(
+        "--resume out --steps 30 --test-every 4 --device cpu",
+        &["test-every was 8 and is 4", "--accept-changes"],
+    );
+    work.train("--resume out --steps 30 --test-every 4 --accept-changes --device cpu --keep-checkpoint=false --quiet");
+    let said = work.train("--resume out --steps 40 --device cpu");
+    assert!(said.contains("12 views to train on, 4 held out") && work.summary("out")["steps"] == 40, "{said}");
 }
