@@ -144,7 +144,7 @@ struct RunArgs {
     /// The scene with the photos, if this machine has it elsewhere
     #[arg(long)]
     scene: Option<PathBuf>,
-    /// Time between copies of the cell's commits into the folder of the city (900, 15min), seconds by default
+    /// Time between copies of the cell's commits into the folder of the city (900, 15min; 0: at the end only)
     #[arg(long, default_value_t = COPY_EVERY, value_parser = parse_seconds)]
     copy_every: f64,
     /// Print only warnings and errors

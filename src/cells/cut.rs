@@ -172,6 +172,8 @@ fn fitting_cells(seen: &Seen, request: &CutRequest, growth: f64) -> InputResult<
         CellCount::Cells(cells) => (cells, u64::MAX),
         CellCount::MostGaussians(most) => (1, most),
     };
+    // The smallest largest cell so far, and the number of cells that were asked for.
+    let mut smallest = (u64::MAX, cells);
     loop {
         if cells > seen.pages.len() {
             let problem = format!("the prior has {} pages, too few for {cells} cells", seen.pages.len());
@@ -186,6 +188,17 @@ fn fitting_cells(seen: &Seen, request: &CutRequest, growth: f64) -> InputResult<
         let largest = drafts.iter().map(rows).max().unwrap_or(0);
         if largest as f64 * growth <= most as f64 {
             return Ok((leaves, drafts));
+        }
+        if largest < smallest.0 {
+            smallest = (largest, cells);
+        } else if cells > 2 * smallest.1 + 8 {
+            let least = (smallest.0 as f64 * growth).ceil() as u64;
+            let problem = format!("{most} Gaussians are too few for a cell with its margin and {VIEWS_LEAST} photos");
+            return Err(InputError::new(
+                "--max-gaussians-per-cell",
+                problem,
+                format!("give at least {least}, or cut with a smaller --margin"),
+            ));
         }
         cells += 1;
     }

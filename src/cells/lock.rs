@@ -46,7 +46,7 @@ impl CellLock {
         // The file appears under its name when it has its owner and is locked: who finds it unlocked knows that its owner is gone.
         let made = folder.join(format!("{LOCK}.{:032x}", draw_identity()));
         let file = options.clone().create_new(true).open(&made).map_err(failed)?;
-        write_token(&file, &token).map_err(failed)?;
+        write_token(&file, &token).inspect_err(|_| drop(std::fs::remove_file(&made))).map_err(failed)?;
         if HAS_LOCKS {
             let _ = file.try_lock();
         }
@@ -129,7 +129,8 @@ pub(crate) fn owner_of(folder: &Path) -> Option<String> {
 fn age(path: &Path, folder: &Path) -> InputResult<Duration> {
     let failed = |e: Error| InputError::io(folder, "reading the time of the folder", &e);
     let probe = folder.join(format!("lock.{:032x}", draw_identity()));
-    std::fs::write(&probe, b"?").map_err(failed)?;
+    // On a full drive the file is empty, and has its time all the same.
+    let _ = std::fs::write(&probe, b"?");
     let now = std::fs::metadata(&probe).and_then(|of| of.modified());
     std::fs::remove_file(&probe).map_err(failed)?;
     let then = std::fs::metadata(path).and_then(|of| of.modified()).map_err(failed)?;

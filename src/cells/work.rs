@@ -90,7 +90,7 @@ pub struct WorkRequest {
     pub scene: Option<PathBuf>,
     /// Keys of this machine.
     pub keys: TrainOverrides,
-    /// Seconds between copies.
+    /// Seconds between copies; 0 = one copy, at the end.
     pub copy_every: f64,
     pub quiet: bool,
 }
@@ -162,7 +162,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
     let train = || -> Result<i32, TrainError> {
         let mut has_begun = place.fetch(&folder)?;
         while stop.exit_code().is_none() {
-            let leg = Some(Duration::from_secs_f64(request.copy_every));
+            let leg = (request.copy_every > 0.0).then(|| Duration::from_secs_f64(request.copy_every));
             let (config, keys) = (TrainConfig { keep_checkpoint: true, ..config.clone() }, keys.clone());
             let (out, quiet) = (place.out.as_path(), request.quiet);
             let outcome = begin_or_resume(AnyRun { scene: &scene, out, has_begun, config, keys, leg, quiet })?;

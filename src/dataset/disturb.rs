@@ -137,6 +137,21 @@ struct TrainView<'a> {
 /// The training photos of a disturbed scene.
 /// Errors: nothing is left to train on.
 pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputResult<DisturbedPlan> {
+    let train = views_to_train_on(dataset, disturbance, seed)?;
+    let is_wrong = |t: &&TrainView<'_>| {
+        let is_blurred = matches!(disturbance, Disturbance::Blurred { one_in } if is_chosen(seed, t.number, *one_in));
+        is_blurred || !std::ptr::eq(t.view, t.shown)
+    };
+    let wrong = train.iter().filter(is_wrong).map(|t| photo_name(TRAIN, t.number, disturbance)).collect();
+    Ok(DisturbedPlan { test_after: train.len() as u32 - 1, wrong })
+}
+
+/// The training views with the photos and poses that the disturbance gives them.
+fn views_to_train_on<'a>(
+    dataset: &'a Dataset,
+    disturbance: &Disturbance,
+    seed: u64,
+) -> InputResult<Vec<TrainView<'a>>> {
     let train = train_views(dataset, disturbance, seed);
     if train.is_empty() || dataset.points.is_empty() {
         let problem = "the disturbance leaves no photo to train on, or the scene has no points";
@@ -146,12 +161,7 @@ pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputRes
             "disturb a scene with more photos and with points",
         ));
     }
-    let is_wrong = |t: &&TrainView<'_>| {
-        let is_blurred = matches!(disturbance, Disturbance::Blurred { one_in } if is_chosen(seed, t.number, *one_in));
-        is_blurred || !std::ptr::eq(t.view, t.shown)
-    };
-    let wrong = train.iter().filter(is_wrong).map(|t| photo_name(TRAIN, t.number, disturbance)).collect();
-    Ok(DisturbedPlan { test_after: train.len() as u32 - 1, wrong })
+    Ok(train)
 }
 
 /// Writes the scene of `dataset` to `folder`, which must be new, with a disturbance.
@@ -160,8 +170,7 @@ pub fn write_disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturban
     if folder.exists() {
         return Err(InputError::new(folder, "the folder exists", "choose another folder"));
     }
-    plan(dataset, disturbance, seed)?;
-    let train = train_views(dataset, disturbance, seed);
+    let train = views_to_train_on(dataset, disturbance, seed)?;
     let held_out: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Test).collect();
     make_folder(&folder.join("images"))?;
     let of_train = train.par_iter().map(|t| {
@@ -182,13 +191,28 @@ pub fn write_disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturban
     write_model(&folder.join("sparse"), &ColmapModel { cameras, images, points, tiles: vec![[0.0; 3]] })
 }
 
+/// Whether [`write_disturbed`] makes a file of this path in its folder, whole or in part.
+pub fn is_of_disturbed(path: &Path) -> bool {
+    let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    let whole = name.strip_prefix('.').and_then(|name| name.strip_suffix(".part")).unwrap_or(name);
+    let number = whole.strip_suffix(".png").or_else(|| whole.strip_suffix(".jpg")).unwrap_or_default();
+    let number = number.strip_prefix([TRAIN, HELD_OUT]).and_then(|number| number.strip_prefix('_'));
+    let is_photo = number.is_some_and(|number| number.len() >= 6 && number.bytes().all(|digit| digit.is_ascii_digit()));
+    match path.parent() {
+        Some(folder) if folder == Path::new("images") => is_photo,
+        Some(folder) if folder == Path::new("sparse/0") || folder == Path::new("sparse.partial/0") => {
+            ["cameras.bin", "images.bin", "points3D.bin"].contains(&whole)
+        }
+        _ => false,
+    }
+}
+
 /// Name of a photo; those of a set are in the order of their numbers.
 fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
     let extension = if matches!(disturbance, Disturbance::Jpeg { .. }) { "jpg" } else { "png" };
     format!("{set}_{number:06}.{extension}")
 }
 
-/// The training views with the photos and poses that the disturbance gives them.
 fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
     let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
     let shown = match disturbance {

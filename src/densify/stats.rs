@@ -37,13 +37,11 @@ impl GradHistogram {
         self.bins.iter().zip(0..=u16::MAX).filter(|(rows, _)| **rows > 0).map(|(&rows, bin)| (bin, rows)).collect()
     }
 
-    /// The histogram with these bins of [`GradHistogram::filled`]; `None` if a bin number is out of range.
-    pub fn from_filled(filled: &[(u16, u32)]) -> Option<GradHistogram> {
+    /// The histogram with these bins of [`GradHistogram::filled`]. Every u16 is the number of a bin.
+    pub fn from_filled(filled: &[(u16, u32)]) -> GradHistogram {
         let mut histogram = GradHistogram::default();
-        for &(bin, rows) in filled {
-            *histogram.bins.get_mut(usize::from(bin))? = rows;
-        }
-        Some(histogram)
+        filled.iter().for_each(|&(bin, rows)| histogram.bins[usize::from(bin)] = rows);
+        histogram
     }
 
     pub fn add_rows(&mut self, rows: &Rows<'_>) {
@@ -282,7 +280,7 @@ mod tests {
         let grown = |room: u64| rows_from_bin(&state.view(), histogram.split_bin(room));
         // Row 0 has score 0, which never grows.
         assert_eq!([0, 1, 7, 99, 100].map(grown), [0, 1, 7, 99, 99]);
-        assert_eq!(GradHistogram::from_filled(&histogram.filled()), Some(histogram.clone()));
+        assert_eq!(GradHistogram::from_filled(&histogram.filled()), histogram);
         let mut recounted = GradHistogram::default();
         recounted.add_rows(&state.view());
         assert_eq!(recounted, histogram);

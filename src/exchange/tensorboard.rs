@@ -35,8 +35,11 @@ impl EventFile {
     pub fn create(folder: &Path, first_step: Option<u32>) -> InputResult<EventFile> {
         std::fs::create_dir_all(folder)
             .map_err(|e| InputError::io(folder, "creating the folder of event files", &e))?;
-        // A run may be resumed within one second. Names sort by time, which is the order in which TensorBoard reads them.
-        let (seconds, mut number) = (seconds_now() as u64, 0);
+        // Names sort by time, which is the order in which TensorBoard reads them. A run may be resumed within one second, and on a machine
+        // whose clock is behind.
+        let earlier =
+            std::fs::read_dir(folder).into_iter().flatten().flatten().filter_map(|entry| seconds_of(&entry.path()));
+        let (seconds, mut number) = (earlier.fold(seconds_now() as u64, u64::max), 0);
         let (path, file) = loop {
             let path = folder.join(format!("events.out.tfevents.{seconds:010}.gsscale.{number:03}"));
             match File::create_new(&path) {
@@ -124,10 +127,15 @@ fn append_whole<W: Write>(
 
 /// Whether a file has a name as [`EventFile::create`] gives them.
 pub fn is_event_file(path: &Path) -> bool {
-    let name = path.file_name().and_then(|name| name.to_str());
-    let parts = name.and_then(|name| name.strip_prefix("events.out.tfevents.")?.split_once(".gsscale."));
+    seconds_of(path).is_some()
+}
+
+/// The time in the name of an event file; `None` for another file.
+fn seconds_of(path: &Path) -> Option<u64> {
+    let name = path.file_name()?.to_str()?;
+    let (seconds, number) = name.strip_prefix("events.out.tfevents.")?.split_once(".gsscale.")?;
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
-    parts.is_some_and(|(seconds, number)| is_number(seconds) && is_number(number))
+    seconds.parse().ok().filter(|_| is_number(seconds) && is_number(number))
 }
 
 fn seconds_now() -> f64 {
@@ -208,6 +216,15 @@ mod tests {
             (result.is_ok(), file.0.len())
         };
         assert_eq!([append(b"record"), append(b"record"), append(b"four")], [(true, 6), (false, 6), (true, 10)]);
+    }
+
+    #[test]
+    fn a_later_file_sorts_behind_earlier_ones_of_a_clock_that_is_ahead() {
+        let folder = tempfile::tempdir().expect("a scratch folder");
+        let ahead = folder.path().join(format!("events.out.tfevents.{}.gsscale.000", seconds_now() as u64 + 600));
+        std::fs::write(&ahead, b"").expect("written");
+        let later = EventFile::create(folder.path(), Some(3)).expect("created").path;
+        assert!(later > ahead && is_event_file(&later), "{} after {}", later.display(), ahead.display());
     }
 
     #[test]

@@ -75,8 +75,9 @@ pub fn meta_beside(ply: &Path) -> InputResult<Option<SceneMeta>> {
 
 fn only_one_beside(ply: &Path) -> Option<(PathBuf, Transform)> {
     let entries = std::fs::read_dir(folder_of(ply)).ok()?.flatten().map(|entry| entry.path());
-    let is_transform =
-        |path: &PathBuf| path.to_str().is_some_and(|name| name.ends_with(&format!(".{TRANSFORM_ENDING}")));
+    let is_transform = |path: &PathBuf| {
+        path.file_name().is_some_and(|name| name.to_string_lossy().ends_with(&format!(".{TRANSFORM_ENDING}")))
+    };
     let of_ply = |t: &Transform| t.file.as_ref().is_some_and(|name| name.to_ascii_lowercase().ends_with(".ply"));
     let mut found = entries.filter(is_transform).filter_map(|path| read(&path).ok().filter(of_ply).map(|t| (path, t)));
     found.next().filter(|_| found.next().is_none())

@@ -102,6 +102,11 @@ pub struct Chart {
     pub is_log: bool,
 }
 
+/// Whether an axis can hold a value: the differences of such values are finite.
+fn is_drawable(value: f64) -> bool {
+    value.abs() < 1e300
+}
+
 impl Chart {
     pub fn new(title: &str, x: &str, y: &str) -> Chart {
         let [title, x, y] = [title, x, y].map(str::to_string);
@@ -117,7 +122,7 @@ impl Chart {
     /// Adds a series with a colour number.
     #[must_use]
     pub fn with_color(mut self, name: &str, points: Vec<(f64, f64)>, mark: Mark, color: usize) -> Chart {
-        let points = points.into_iter().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+        let points = points.into_iter().filter(|(x, y)| is_drawable(*x) && is_drawable(*y)).collect();
         self.series.push(Series { name: name.to_string(), points, mark, color });
         self
     }
@@ -278,7 +283,7 @@ impl Chart {
     /// Both ends of each range; ranges that are not finite are dropped.
     fn bars(&self) -> impl Iterator<Item = [(f64, f64); 2]> {
         let all = self.ranges.iter().map(|&(x, low, high)| [(x, low), (x, high)]);
-        all.filter(|ends| ends.iter().all(|(x, y)| x.is_finite() && y.is_finite()))
+        all.filter(|ends| ends.iter().all(|(x, y)| is_drawable(*x) && is_drawable(*y)))
     }
 
     /// Ranges of the axes, with a margin; never empty.

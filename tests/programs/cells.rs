@@ -328,6 +328,8 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     for flags in ["--margin nan", "--view-share nan", "--cells 0", "--network 0"] {
         cells.refuses(&format!("cut scene --out city --cells 2 {flags}"), &[&flags[..flags.find(' ').unwrap()]]);
     }
+    let said = cells.says("cut scene --out city --dry-run --max-gaussians-per-cell 10").1;
+    says(&said, &["--max-gaussians-per-cell", "10 Gaussians are too few", "give at least"]);
     // A dry run plans for a larger scene, and writes nothing.
     let plan = cells.0.text("city/plan.toml");
     let larger = "--dry-run --cells 5 --machines 3 --as-if 40000,100M,8MB,0.05";
@@ -343,7 +345,7 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     says(&said, &["keys.toml", "gsscale-cells prior"]);
     assert!(!cells.0.exists("other"));
     // Legs of one step: most of the time the worker is between two of them.
-    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > Some(0));
+    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 1e-6").once(|| cells.newest(0) > Some(0));
     let (code, said) = cells.says("run city --cell 0");
     assert_eq!(code, Some(75), "{said}");
     says(&said, &["another process works on cell 0"]);
@@ -356,7 +358,7 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     assert_eq!(cells.says("run city --cell 0 --host-mem 1MiB").0, Some(75));
     // A worker that was taken for lost gives its copy no name.
     let before = cells.newest(0);
-    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 0").once(|| cells.newest(0) > before);
+    let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 1e-6").once(|| cells.newest(0) > before);
     let worker = worker.signal("STOP");
     cells.0.write("city/cells/0/lock", "another process 1 of another machine");
     says(&worker.signal("CONT").ends(75), &["another process has taken cell 0 over", "another machine"]);
@@ -404,11 +406,11 @@ fn a_cell_whose_worker_was_killed_before_its_first_step_goes_on_from_the_copy() 
     assert!(cells.begin("run city --cell 0 --spill-dir one").once(marked).kill());
     let mark = format!("{}/run/.gsscale-begun.toml", cells.place("one", 0));
     std::fs::remove_file(cells.0.path("city/cells/0/lock")).unwrap();
-    let worker = cells.begin("run city --cell 0 --spill-dir two --threads 1 --copy-every 0");
+    let worker = cells.begin("run city --cell 0 --spill-dir two --threads 1 --copy-every 1e-6");
     worker.once(|| cells.newest(0).is_some()).signal("TERM").signal("TERM").ends(75);
     let copied = cells.newest(0);
     assert!(cells.0.exists(&mark), "the first worker left no mark");
-    let worker = cells.begin("run city --cell 0 --spill-dir one --threads 1 --copy-every 0");
+    let worker = cells.begin("run city --cell 0 --spill-dir one --threads 1 --copy-every 1e-6");
     worker.once(|| cells.newest(0) > copied).signal("TERM").ends(75);
     assert!(!cells.0.exists(&mark));
 }
@@ -439,7 +441,7 @@ fn cells_with_few_photos_or_none_are_joined_to_a_neighbour() {
     cells.0.write("none.txt", "\n");
     cells.0.refuses("scene --out x --views-file none.txt", &["none.txt", "it lists no photo"]);
     // However short its legs are, a cell is evaluated and done.
-    cells.done("run city --cell 0 --copy-every 0");
+    cells.done("run city --cell 0 --copy-every 1e-6");
     let done: toml::Table = cells.0.text("city/cells/0/done.toml").parse().unwrap();
     assert!(done["psnr"].as_float().is_some_and(|psnr| psnr > 5.0), "{done:?}");
 }

@@ -133,6 +133,10 @@ impl List {
         let mut names = BTreeSet::new();
         for (group, entry) in list.entries() {
             let name = name_of(group, entry);
+            // The folder of a disturbed scene has the name of its group.
+            if group.name.contains(['/', '\\', ':']) || group.name.starts_with('.') {
+                return Err(refused(format!("the group '{}' has a name that is no folder's", group.name)));
+            }
             if name.contains(',') {
                 return Err(refused(format!("the name '{name}' has a comma, which separates names in --only")));
             }

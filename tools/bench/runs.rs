@@ -134,15 +134,19 @@ pub fn use_drive(config: &mut TrainConfig, frames: u32) {
 }
 
 impl Planned {
-    /// Digest of all settings, the seed, the scene, and the surroundings.
+    /// Digest of all settings with the content of the files that they name, the seed, the scene, and the surroundings. A missing file
+    /// counts as empty: the run refuses it.
     pub fn key(&self, surroundings: &Surroundings) -> String {
         let settings = toml::to_string(&self.config).unwrap_or_default();
+        let config = &self.config;
+        let files = [&config.init_ply, &config.pages_file, &config.views_file, &config.first_appearance];
+        let files = files.map(|path| digest(Path::new(path)).unwrap_or_default()).join("\n");
         let how = self.scene.as_ref().map_or(String::new(), |scene| format!("\n{}", scene.how));
         let environment: String = self.environment.iter().map(|(name, value)| format!("\n{name}={value}")).collect();
         let city = self.city.as_ref().map_or(String::new(), |city| {
             format!("\n{:?}\n{}\n{}", city.cut, city.keys, city.reference.key(surroundings))
         });
-        let all = format!("{}\n{settings}{how}{environment}{city}", surroundings.text);
+        let all = format!("{}\n{settings}{how}{environment}{city}\n{files}", surroundings.text);
         format!("{:016x}", xxh3_64(all.as_bytes()))
     }
 

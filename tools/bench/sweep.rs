@@ -4,14 +4,15 @@
 
 use super::list::{List, Plan};
 use super::results_log::{ResultsLog, successful_run};
-use super::runs::{Place, Planned, RESULTS, Surroundings, Sweep, remove};
+use super::runs::{Place, Planned, RESULTS, Surroundings, Sweep};
 use super::sweep_page::{sweep_page, sweep_table};
 use clap::Parser;
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::whole_file::write_whole;
+use gsscale::base::whole_folder::remove_ours;
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::new_run;
-use gsscale::dataset::disturb::write_disturbed;
+use gsscale::dataset::disturb::{is_of_disturbed, write_disturbed};
 use gsscale::train::error::TrainError;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -151,10 +152,10 @@ fn sweep_scene(
         gsscale::tell!("run {} of {count}: {}, seed {}", i + 1, run.name, run.config.seed);
         let folder = run.scene.as_ref().map(|scene| scene.folder.as_path());
         if folder != made {
-            made.iter().try_for_each(|folder| remove(folder))?;
+            made.iter().try_for_each(|folder| remove_ours(folder, is_of_disturbed))?;
             if let (Some(scene), Some(dataset)) = (&run.scene, &plan.dataset) {
                 // Of an earlier call that was interrupted: the lock of the sweep says that nobody uses it.
-                remove(&scene.folder)?;
+                remove_ours(&scene.folder, is_of_disturbed)?;
                 write_disturbed(&scene.folder, dataset, &scene.disturbance, run.config.seed)?;
             }
             made = folder;
@@ -162,7 +163,7 @@ fn sweep_scene(
         sweep.run(run, print)?;
         write_page(&sweep)?;
     }
-    made.iter().try_for_each(|folder| remove(folder))?;
+    made.iter().try_for_each(|folder| remove_ours(folder, is_of_disturbed))?;
     let table = write_page(&sweep)?;
     if !args.json {
         gsscale::say!("{table}");

@@ -71,7 +71,7 @@ def main() -> int:
             try:
                 code = ray.get(reference)
             except Exception as error:  # of Ray, or the last attempt
-                code = str(error).splitlines()[-1]
+                code = (str(error).splitlines() or [repr(error)])[-1]
             if code != 0:
                 failed.append(f"cell {cell}: {code}")
         subprocess.run([PROGRAM, "status", city], check=False)

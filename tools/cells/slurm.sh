@@ -18,9 +18,10 @@ if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     shift 2
     last=$(($(grep -c '^\[\[cells\]\]' "$city/plan.toml") - 1))
     job=$(CITY=$city sbatch --parsable --array="0-$last" "$@" --export=ALL "$0") || exit 1
-    printf -v merge 'gsscale-cells merge %q --out %q' "$city" "$(realpath -m "$out")"
     # Of a city with a cell that cannot be trained there is nothing to merge: the job goes instead of waiting for ever.
-    sbatch "$@" --dependency="afterok:$job" --kill-on-invalid-dep=yes --job-name=gsscale-merge --wrap "$merge"
+    # The paths travel in the environment: the shell that runs the command may quote otherwise than this one.
+    CITY=$city OUT=$(realpath -m "$out") sbatch "$@" --dependency="afterok:$job" --kill-on-invalid-dep=yes --export=ALL \
+        --job-name=gsscale-merge --wrap 'gsscale-cells merge "$CITY" --out "$OUT"'
     exit
 fi
 

@@ -12,8 +12,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 /// Alignment of memory, offsets and lengths that every drive accepts for direct I/O, bytes.
 pub const ALIGNMENT: usize = 4096;
 
-/// Buffers smaller than this, in bytes, come from the heap.
-const MAPPED_LEAST: usize = 32 << 10;
+/// Buffers smaller than this, in bytes, come from the heap. A frame is larger: from the heap it would take [`ALIGNMENT`] bytes more
+/// than a budget counts, a sixth of a frame of 64 rows.
+const MAPPED_LEAST: usize = 2 * ALIGNMENT;
 
 /// An aligned buffer of fixed length. Moved, never copied, between frames and transfers.
 pub struct PageBuffer {

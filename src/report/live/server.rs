@@ -175,7 +175,7 @@ async fn metrics(State(served): State<Served>, Query(From { from }): Query<From>
 fn lines_from(file: &Path, from: u64) -> io::Result<(Vec<u8>, u64)> {
     let mut file = std::fs::File::open(file)?;
     let length = file.metadata()?.len();
-    file.seek(SeekFrom::Start(from))?;
+    file.seek(SeekFrom::Start(from.min(length)))?;
     let mut lines = Vec::new();
     file.take(METRICS_BYTES).read_to_end(&mut lines)?;
     let end = lines.iter().rposition(|byte| *byte == b'\n').map_or(0, |at| at + 1);

@@ -145,7 +145,6 @@ impl PagedScene {
             }
         }
         let histogram = GradHistogram::from_filled(&state.histogram);
-        let histogram = histogram.ok_or_else(|| CommitError::Contradiction("statistics without bins".to_string()))?;
         Ok(PagedScene { pager, rules, histogram, rows: state.rows, rows_bound: state.rows_bound })
     }
 
@@ -528,12 +527,17 @@ impl WorkingSet {
     /// Bytes held for rows.
     pub fn bytes(&self) -> usize {
         let columns = self.columns.bytes() + self.gradients.columns.bytes();
-        self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
+        let gradients = &self.gradients;
+        let footprints =
+            size_of::<[f32; 2]>() * gradients.means2d.capacity() + size_of::<[u32; 2]>() * gradients.radii.capacity();
+        let weights = size_of::<[f32; 2]>() * gradients.weights.capacity();
+        self.row_from_working.capacity() * size_of::<u32>() + columns + footprints + weights
     }
 
-    /// Bytes of one row that is stored with `sh_degree`: its number, values, gradients, and the footprint's gradient and radii.
+    /// Bytes of one row that is stored with `sh_degree`: its number, values and gradients, the footprint's gradient and radii, and the
+    /// weights, which most strategies ask for.
     pub fn row_bytes(sh_degree: u8) -> usize {
-        4 + 2 * 4 * row_width(sh_degree) + 16
+        4 + 2 * 4 * row_width(sh_degree) + 16 + 8
     }
 
     /// Frees the memory of a working set that has room for many more than `rows` rows. Returns whether it did.
