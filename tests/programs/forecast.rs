@@ -111,9 +111,12 @@ fn dry_run_plan_and_run_say_the_same() {
         if name.ends_with("capped") {
             // The run ends in its first tenth below the cap at most, and the memory announced is that of the cap.
             assert!(last == 12_000 && rows > 0.9 * 12_000.0, "{name}: {rows} of {last}");
-            // A tenth, and what the bare program differs by between systems, as for the memory of any plan.
-            let off = (number("memory_bytes") as f64 - peak).abs();
-            assert!(peak == 0.0 || off <= 0.1 * peak + 4e6, "{name}: {off} bytes off {peak}");
+            // A tenth, and what the bare program differs by between systems, as for the memory of any plan. A run of 100 steps fills
+            // little of the 16 MiB that are set aside for the plan of coming steps.
+            let plan = if name.starts_with("on a drive") { 16.0 * 1048576.0 } else { 0.0 };
+            let over = number("memory_bytes") as f64 - peak;
+            let slack = 0.1 * peak + 4e6;
+            assert!(peak == 0.0 || (-slack..=slack + plan).contains(&over), "{name}: {over} bytes off {peak}");
         } else {
             // The rounds after 40 and 60 steps. Of few Gaussians each adds .6.
             let first = plan["gaussians"][0].as_u64().unwrap();

@@ -527,17 +527,12 @@ impl WorkingSet {
     /// Bytes held for rows.
     pub fn bytes(&self) -> usize {
         let columns = self.columns.bytes() + self.gradients.columns.bytes();
-        let gradients = &self.gradients;
-        let footprints =
-            size_of::<[f32; 2]>() * gradients.means2d.capacity() + size_of::<[u32; 2]>() * gradients.radii.capacity();
-        let weights = size_of::<[f32; 2]>() * gradients.weights.capacity();
-        self.row_from_working.capacity() * size_of::<u32>() + columns + footprints + weights
+        self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
     }
 
-    /// Bytes of one row that is stored with `sh_degree`: its number, values and gradients, the footprint's gradient and radii, and the
-    /// weights, which most strategies ask for.
+    /// Bytes of one row that is stored with `sh_degree`: its number, values, gradients, and the footprint's gradient and radii.
     pub fn row_bytes(sh_degree: u8) -> usize {
-        4 + 2 * 4 * row_width(sh_degree) + 16 + 8
+        4 + 2 * 4 * row_width(sh_degree) + 16
     }
 
     /// Frees the memory of a working set that has room for many more than `rows` rows. Returns whether it did.
