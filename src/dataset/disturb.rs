@@ -147,6 +147,7 @@ pub fn plan(dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> InputRes
 }
 
 /// The training views with the photos and poses that the disturbance gives them.
+/// Errors: as [`plan`].
 fn views_to_train_on<'a>(
     dataset: &'a Dataset,
     disturbance: &Disturbance,
@@ -199,7 +200,7 @@ pub fn is_of_disturbed(path: &Path) -> bool {
     let number = number.strip_prefix([TRAIN, HELD_OUT]).and_then(|number| number.strip_prefix('_'));
     let is_photo = number.is_some_and(|number| number.len() >= 6 && number.bytes().all(|digit| digit.is_ascii_digit()));
     match path.parent() {
-        Some(folder) if folder == Path::new("images") => is_photo,
+        Some(folder) if folder == Path::new("images") || folder == Path::new("masks") => is_photo,
         Some(folder) if folder == Path::new("sparse/0") || folder == Path::new("sparse.partial/0") => {
             ["cameras.bin", "images.bin", "points3D.bin"].contains(&whole)
         }
@@ -213,6 +214,7 @@ fn photo_name(set: char, number: usize, disturbance: &Disturbance) -> String {
     format!("{set}_{number:06}.{extension}")
 }
 
+/// As [`views_to_train_on`]; may be empty.
 fn train_views<'a>(dataset: &'a Dataset, disturbance: &Disturbance, seed: u64) -> Vec<TrainView<'a>> {
     let views: Vec<&View> = dataset.views.iter().filter(|view| view.split == Split::Train).collect();
     let shown = match disturbance {

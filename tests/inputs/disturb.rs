@@ -1,7 +1,8 @@
 //! Disturbed scenes: what is disturbed, and that nothing else is.
 
+use gsscale::base::whole_folder::check_ours;
 use gsscale::config::file::TrainConfig;
-use gsscale::dataset::disturb::{Disturbance, plan, write_disturbed};
+use gsscale::dataset::disturb::{Disturbance, is_of_disturbed, plan, write_disturbed};
 use gsscale::dataset::loader::{Dataset, View};
 use gsscale::dataset::model::Split;
 use gsscale::dataset::photo::decode;
@@ -23,6 +24,8 @@ fn city(folder: &Path) -> Dataset {
 fn disturbed(folder: &Path, dataset: &Dataset, disturbance: &Disturbance, seed: u64) -> Dataset {
     let to = folder.join(format!("{disturbance:?} {seed}").replace(|c: char| !c.is_alphanumeric(), "-"));
     write_disturbed(&to, dataset, disturbance, seed).unwrap();
+    // A sweep may remove what it wrote, and nothing else.
+    check_ours(&to, is_of_disturbed).unwrap();
     let test_after = i64::from(plan(dataset, disturbance, seed).unwrap().test_after);
     prepare(&to, &TrainConfig { test_after, ..TrainConfig::default() }).unwrap().dataset
 }
@@ -130,4 +133,15 @@ fn swapped_views_are_the_wrong_ones() {
     assert!(plan(&dataset, &found, 1).unwrap().wrong.is_empty());
     let together = Disturbance::Together { stops: 1.0, share: 0.2, boxes: 20 };
     assert_eq!(plan(&dataset, &together, 1).unwrap().wrong, wrong);
+}
+
+#[test]
+fn masks_of_a_disturbed_scene_are_ours_and_other_files_are_not() {
+    let folder = TempDir::new().unwrap();
+    let boxes = Disturbance::Boxes { count: 20, are_masked: true };
+    disturbed(folder.path(), &city(folder.path()), &boxes, 1);
+    let to = std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
+    let to = to.into_iter().find(|path| path.join("masks").is_dir()).unwrap();
+    std::fs::write(to.join("masks/notes.txt"), "mine").unwrap();
+    assert!(check_ours(&to, is_of_disturbed).is_err_and(|e| e.to_string().contains("notes.txt")));
 }

@@ -190,7 +190,7 @@ fn wrong_input_is_refused_and_a_run_that_fails_stops_nobody() {
     for climbing in ["../scene", "/scene", ".."] {
         let group =
             list.replace(", RUN", "").replace("name = \"\"", &format!("name = \"{climbing}\"\ndisturb = \"nothing\""));
-        refuses_list(&group, "a name that is no folder's");
+        refuses_list(&group, "cannot name a folder");
     }
     refuses_list(&with("{ name = \"a\", times = { optimizer = 2.0 } }"), "optimizer is no number");
     refuses_list(&with("{ name = \"a\", set = { data-factor = 0.5 } }"), "data-factor");

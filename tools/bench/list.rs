@@ -133,9 +133,11 @@ impl List {
         let mut names = BTreeSet::new();
         for (group, entry) in list.entries() {
             let name = name_of(group, entry);
-            // The folder of a disturbed scene has the name of its group.
+            // A disturbed scene lies in a folder that is named after its group.
             if group.name.contains(['/', '\\', ':']) || group.name.starts_with('.') {
-                return Err(refused(format!("the group '{}' has a name that is no folder's", group.name)));
+                let problem =
+                    format!("the group '{}' cannot name a folder: it begins with . or contains / \\ or :", group.name);
+                return Err(refused(problem));
             }
             if name.contains(',') {
                 return Err(refused(format!("the name '{name}' has a comma, which separates names in --only")));
