@@ -468,7 +468,9 @@ fn fold_rows(workgroup: Group, place: Place) {
     v_splats[at] = of_mean;
     v_splats[at + 1u] = of_conic;
     v_splats[at + 2u] = of_color;
-    let most = max(largest_magnitude(of_mean), max(largest_magnitude(of_conic), largest_magnitude(of_color)));
+    // The weights are no gradients: a bright picture may make them larger than a gradient may be.
+    let of_place = max(largest_magnitude(vec4<f32>(v_mean, v_opacity, 0.0)), largest_magnitude(vec4<f32>(of_conic.xyz, 0.0)));
+    let most = max(of_place, largest_magnitude(of_color));
     if most > LARGEST_SPLAT_GRAD_BITS {
         atomicAdd(&unusable, 1u);
     }

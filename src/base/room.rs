@@ -34,7 +34,7 @@ pub fn extend<T: Copy>(values: &mut Vec<T>, more: &[T]) {
 }
 
 /// Reserves capacity for `len` values in total. The first allocation is exact, for vectors that never grow.
-fn reserve<T>(values: &mut Vec<T>, len: usize) {
+pub fn reserve<T>(values: &mut Vec<T>, len: usize) {
     if len > values.capacity() {
         let to_spare = if values.capacity() == 0 { 0 } else { (len / 8).min(SPARE_MOST) };
         values.reserve_exact(len + to_spare - values.len());

@@ -251,6 +251,16 @@ impl Gpu {
         self.max_binding_bytes
     }
 
+    /// Refuses a binding of `need` bytes that the device cannot make: work in smaller parts does not help a buffer that a stage needs
+    /// whole.
+    pub fn check_binding(&self, stage: &str, binding: &str, need: u64) -> GpuResult<()> {
+        let limit = self.max_binding_bytes;
+        if need <= limit {
+            return Ok(());
+        }
+        Err(GpuError::BindingTooLarge { stage: stage.into(), binding: binding.into(), need, limit })
+    }
+
     /// Alignment of the offsets of bound windows, bytes.
     pub fn offset_alignment(&self) -> u64 {
         self.offset_alignment

@@ -17,7 +17,8 @@
 //!    binding 0.
 //! 2. Workgroups are 1-D. Beyond 65,535 workgroups [`groups_1d`] folds them into two dimensions, and the shader finds
 //!    its index with `linear_group` of `shared/dispatch.wgsl`.
-//! 3. Counts come from uniforms or buffers, never from `arrayLength`: a view of an empty buffer still spans some bytes.
+//! 3. Counts come from uniforms or buffers: a view of an empty buffer still spans some bytes. `arrayLength` counts only a table
+//!    that is never empty (`recent` of `gather.wgsl`).
 //! 4. No workgroup waits for another; no invocation loops more than 65,535 times in total.
 //! 5. Contents of a new buffer are arbitrary (it may be reused): use [`Recorder::clear`] where zeros are needed. Workgroup memory is
 //!    arbitrary too: a stage writes a word before it reads the word.

@@ -292,14 +292,7 @@ impl Recorder<'_> {
             if binding.kind == BindingKind::Uniform {
                 continue;
             }
-            if view.size > self.gpu.max_binding_bytes() {
-                return Err(GpuError::BindingTooLarge {
-                    stage: stage.into(),
-                    binding: name.clone(),
-                    need: view.size,
-                    limit: self.gpu.max_binding_bytes(),
-                });
-            }
+            self.gpu.check_binding(stage, name, view.size)?;
             if view.offset % self.gpu.offset_alignment() != 0 {
                 let alignment = self.gpu.offset_alignment();
                 return problem(format!("{name} begins at byte {}, not a multiple of {alignment}", view.offset));

@@ -15,6 +15,7 @@
 pub use super::image_pair::{ImagePair, Reference, SsimVariant};
 use super::image_pair::{WINDOW, counted};
 use super::ssim_band::{BandKernel, BandSums, GradientBand};
+use crate::base::room;
 use crate::base::simd::{SimdPath, dispatch};
 use crate::scene::image::{Image, Target};
 use rayon::prelude::*;
@@ -151,13 +152,13 @@ impl ImageLoss {
         let plan = LossPlan::new(pair.width, pair.height, pair.mask, options);
         let LossPlan { variant, l1_weight, ssim_weight, .. } = plan;
         let n = pair.pixels();
-        v_rgb.resize(3 * n, 0.0);
+        room::resize(v_rgb, 3 * n, 0.0);
         if plan.samples == 0.0 {
             v_rgb.fill(0.0);
             return plan.value(0.0, 0.0, 0.0);
         }
         let bands = pair.height.div_ceil(BAND_ROWS);
-        self.sums.resize(3 * bands, BandSums::default());
+        room::resize(&mut self.sums, 3 * bands, BandSums::default());
         let planes = v_rgb.par_chunks_mut(n).zip(self.sums.par_chunks_mut(bands)).enumerate();
         planes.for_each(|(channel, (v_plane, sums))| {
             let parts = v_plane.par_chunks_mut(BAND_ROWS * pair.width).zip(sums).enumerate();

@@ -114,7 +114,7 @@ pub fn count(order: &[u32], packed: &Packed, grid: Grid, range: TileRange, simd:
     let tiles = grid.tiles();
     let len = chunk_len(order.len(), ROWS_PER_CHUNK, CHUNKS_MAX);
     tile_counts.clear();
-    tile_counts.resize(order.len().div_ceil(len) * tiles, 0);
+    room::resize(tile_counts, order.len().div_ceil(len) * tiles, 0);
     if tiles == 0 {
         return;
     }

@@ -3,12 +3,14 @@
 //! Invariant: intersections of a tile are in depth order, because the chunks of the counting sort are cut in depth
 //! order and each chunk writes in that order.
 
+use crate::base::room;
+
 /// `tile_counts` is `[chunks][tiles]`: the number of intersections of each chunk of the drawn rows in each tile. On
 /// return `tile_offsets` (tiles + 1 entries, the last is the total) holds the start of each tile's list, and `cursors`
 /// (`[chunks][tiles]`) the start of each chunk's part of it.
 pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u64>, cursors: &mut Vec<u64>) {
     tile_offsets.clear();
-    tile_offsets.resize(tiles + 1, 0);
+    room::resize(tile_offsets, tiles + 1, 0);
     for counts in tile_counts.chunks_exact(tiles.max(1)) {
         for (sum, &count) in tile_offsets[1..].iter_mut().zip(counts) {
             *sum += u64::from(count);
@@ -18,7 +20,7 @@ pub fn isect_offsets(tile_counts: &[u32], tiles: usize, tile_offsets: &mut Vec<u
         tile_offsets[tile + 1] += tile_offsets[tile];
     }
     cursors.clear();
-    cursors.resize(tile_counts.len(), 0);
+    room::resize(cursors, tile_counts.len(), 0);
     if tile_counts.is_empty() {
         return;
     }

@@ -7,6 +7,7 @@
 //! Least-significant-digit radix sort with 11-bit digits. Every chunk owns the places that its histogram reserved, so
 //! the parallel scatter writes each place once; relaxed atomic stores express this in safe Rust.
 
+use crate::base::room;
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -37,8 +38,8 @@ impl DepthSort {
         let of_chunk = |radii: &[[u32; 2]]| radii.iter().filter(|r| **r != [0, 0]).count();
         let counts: Vec<usize> = radii.par_chunks(ROWS_PER_CHUNK).map(of_chunk).collect();
         let visible = counts.iter().sum();
-        self.keys.resize_with(visible, AtomicU64::default);
-        self.other.resize_with(visible, AtomicU64::default);
+        room::resize_with(&mut self.keys, visible, AtomicU64::default);
+        room::resize_with(&mut self.other, visible, AtomicU64::default);
         let mut rest = &mut self.keys[..];
         let places = counts.into_iter().map(|count| rest.split_off_mut(..count).unwrap_or_default());
         let chunks: Vec<(usize, &mut [AtomicU64])> = places.enumerate().collect();
@@ -61,7 +62,7 @@ impl DepthSort {
         let digit = |key: &AtomicU64| (key.load(Relaxed) >> shift) as usize & (DIGITS - 1);
         let len = chunk_len(n, ROWS_PER_CHUNK, CHUNKS_MAX);
         self.places.clear();
-        self.places.resize(n.div_ceil(len) * DIGITS, 0);
+        room::resize(&mut self.places, n.div_ceil(len) * DIGITS, 0);
         self.places.par_chunks_mut(DIGITS).zip(self.keys.par_chunks(len)).for_each(|(counts, keys)| {
             for key in keys {
                 counts[digit(key)] += 1;

@@ -17,6 +17,7 @@ use super::lanes::Lane;
 use super::raster::{Lists, NEVER, TILE_PIXELS, copy_lanes, exp2_bounded, log2_max_alpha};
 use super::splats::{Grid, LOG2_ALPHA_MIN};
 use super::tile_block::{Block, ROWS, prefetch_splats};
+use crate::base::room;
 use crate::base::simd::{Kernel, LANES, dispatch, fma};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -37,10 +38,10 @@ pub struct Raster {
 impl Raster {
     /// Sets the size, keeping allocations; the content is unspecified.
     pub fn resize(&mut self, tiles: usize) {
-        self.rgb.resize(tiles * 3 * TILE_PIXELS, 0.0);
-        self.t_final.resize(tiles * TILE_PIXELS, 0.0);
-        self.stop.resize(tiles * TILE_PIXELS, 0);
-        self.evaluated.resize(tiles, 0);
+        room::resize(&mut self.rgb, tiles * 3 * TILE_PIXELS, 0.0);
+        room::resize(&mut self.t_final, tiles * TILE_PIXELS, 0.0);
+        room::resize(&mut self.stop, tiles * TILE_PIXELS, 0);
+        room::resize(&mut self.evaluated, tiles, 0);
     }
 
     /// Bytes kept between views.

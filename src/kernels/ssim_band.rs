@@ -2,8 +2,8 @@
 //! `image_loss` decides averages, weights and bands.
 //!
 //! A band is processed in tiles of at most [`TILE`] columns, each row by row from top to bottom: an input row enters a
-//! ring of eleven; then the map row five above it can be computed, and the gradient row ten above it. Only these rings
-//! are stored (about 100 KB on the stack), so memory does not grow with the picture and stays in the second-level
+//! ring of [`RING`], of which a window reads eleven; then the map row five above it can be computed, and the gradient row ten above it. Only these rings
+//! are stored (155 KiB on the stack), so memory does not grow with the picture and stays in the second-level
 //! cache.
 //!
 //! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:

@@ -185,8 +185,8 @@ impl CpuRenderer {
     fn finish_picture(&mut self, grid: Grid) {
         let pixels = grid.width as usize * grid.height as usize;
         (self.image.width, self.image.height) = (grid.width, grid.height);
-        self.image.rgb.resize(3 * pixels, 0.0);
-        self.alpha.resize(pixels, 0.0);
+        room::resize(&mut self.image.rgb, 3 * pixels, 0.0);
+        room::resize(&mut self.alpha, pixels, 0.0);
         untile(grid, &self.raster, &mut self.image.rgb, &mut self.alpha);
     }
 
@@ -301,6 +301,7 @@ impl CpuRenderer {
             return rows;
         }
         self.colors.clear();
+        room::reserve(&mut self.colors, rows.len());
         self.colors.extend(self.packed.splats[rows].iter().map(|splat| splat.color));
         0..self.colors.len()
     }
@@ -478,7 +479,7 @@ impl Renderer for CpuRenderer {
             self.gradient.reset(view.camera.pixels());
             // No photo was compared.
             self.errors.clear();
-            self.errors.resize(if self.weighs { view.camera.pixels() } else { 0 }, 0.0);
+            room::resize(&mut self.errors, if self.weighs { view.camera.pixels() } else { 0 }, 0.0);
         }
         Ok(&mut self.gradient)
     }

@@ -60,6 +60,7 @@ use super::{
     Gradients, LossOptions, LossValue, PictureGradient, RenderError, RenderOptions, Renderer, RowBatches,
     none_if_out_of_memory,
 };
+use crate::base::room;
 use crate::gpu::{DeviceKind, Gpu, GpuResult, Traffic};
 use crate::kernels::image_loss::LossPlan;
 use crate::kernels::uniforms::pack_target;
@@ -303,7 +304,7 @@ impl Renderer for GpuRenderer {
                 let bytes = recorder.read_back("rasterize_fwd", &view.pixels.rgb.view())?;
                 gpu.submit(recorder)?;
                 (image.width, image.height) = (width, height);
-                image.rgb.resize(3 * view.of.camera.pixels(), 0.0);
+                room::resize(&mut image.rgb, 3 * view.of.camera.pixels(), 0.0);
                 bytes.copy_to(&mut image.rgb)?;
                 view.image_is_read = true;
             }

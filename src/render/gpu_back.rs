@@ -93,6 +93,7 @@ pub(super) fn record_picture_back(
 fn upload_gradient(gpu: &Gpu, recorder: &mut Recorder<'_>, gradient: &PictureGradient) -> GpuResult<Buffer> {
     let alpha = gradient.v_alpha.as_deref().unwrap_or_default();
     let [of_rgb, of_alpha] = [&gradient.v_rgb[..], alpha].map(|planes| size_of_val(planes) as u64);
+    gpu.check_binding("rasterize_bwd", "v_rgb", of_rgb + of_alpha)?;
     let planes = gpu.buffer("v_rgb", of_rgb + of_alpha)?;
     recorder.upload(&planes.slice(0, of_rgb), &gradient.v_rgb)?;
     recorder.upload(&planes.slice(of_rgb, of_alpha), alpha)?;

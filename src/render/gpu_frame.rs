@@ -40,6 +40,14 @@ pub struct Pairs {
     pub values: Buffer,
 }
 
+impl Pairs {
+    /// Room for `capacity` pairs, with arbitrary contents.
+    pub fn new(gpu: &Gpu, capacity: u32) -> GpuResult<Pairs> {
+        let buffer = |label| gpu.buffer(label, 4 * u64::from(capacity));
+        Ok(Pairs { keys: buffer("sort keys")?, values: buffer("sort values")? })
+    }
+}
+
 /// The rows of a view in depth order, with the offsets of their intersections.
 #[derive(Debug)]
 pub struct Ranks {
@@ -63,8 +71,10 @@ pub struct Pixels {
 
 impl Pixels {
     /// The buffers of a picture, with arbitrary contents.
+    /// Errors: a picture that does not fit one binding, before the ranges of its tiles are made smaller in vain.
     pub fn new(gpu: &Gpu, grid: Grid) -> GpuResult<Pixels> {
         let pixels = u64::from(grid.width) * u64::from(grid.height);
+        gpu.check_binding("rasterize_fwd", "rgb", 12 * pixels)?;
         Ok(Pixels {
             rgb: gpu.buffer("picture", 12 * pixels)?,
             t_final: gpu.buffer("transmittance", 4 * pixels)?,

@@ -6,7 +6,7 @@
 //!
 //! Invariant: a picture whose lists lacked room is drawn again, and so is its loss, before anything of it is read.
 
-use super::gpu_frame::{Blend, Demand, Pixels, splat_bytes};
+use super::gpu_frame::{Blend, Demand, Pairs, Pixels, splat_bytes};
 use super::gpu_loss::LossStage;
 use super::gpu_ranges::{PLACE_BYTES, RangeStages, Ranges};
 use super::gpu_rows::{DeviceColumns, RowSource, RowStages, SplatRows};
@@ -54,7 +54,7 @@ impl ViewStages {
         let mut recorder = gpu.begin("forward");
         rows.geometry(gpu, &mut recorder, &columns, &all)?;
         let into = SplatRows::from(&splats);
-        let keys = TileStages::keys(gpu, count)?;
+        let keys = Pairs::new(gpu, count)?;
         self.rows.project_fwd(gpu, &mut recorder, camera, options.eps2d, &columns, into, Some(&keys))?;
         let grid = Grid::new(camera.width, camera.height);
         let ranks =

@@ -279,7 +279,7 @@ impl Ranges<'_> {
             let copied = self.copy(&mut recorder, segments, range)?;
             let (splats, bases) = (copied.splats.view(), &copied.places.bases);
             let frame = self.lists(&mut recorder, &copied, range)?;
-            self.tiles.blend(&mut recorder, &splats, &frame, self.pixels)?;
+            self.tiles.blend(&mut recorder, &splats, &frame, self.pixels, range.room.list_max)?;
             let total = copied.ranks.offsets.slice(words(copied.ranks.rows), 4);
             let copied_rows = bases.slice(words(segments.len() as u32), 4);
             for (word, view) in [total, frame.longest.slice(0, 4), copied_rows].iter().enumerate() {

@@ -16,7 +16,7 @@
 //! its gate was open; 3. nothing here waits but [`PageRenderer::finish_step`](super::pages::PageRenderer::finish_step).
 
 use super::RenderError;
-use super::gpu_frame::{Demand, FrameRoom, Pixels, splat_bytes};
+use super::gpu_frame::{Demand, FrameRoom, Pairs, Pixels, splat_bytes};
 use super::gpu_loss::value;
 use super::gpu_pages::{DevicePages, PagesView};
 use super::gpu_picture::ViewStages;
@@ -51,7 +51,7 @@ pub(super) fn rows_and_picture(
     let splats = gpu.buffer("splats", splat_bytes(count))?;
     held.source(&of_view, &batch, &table).geometry(gpu, &mut recorder, &columns, &(0..count as usize))?;
     let into = SplatRows::from(&splats);
-    let keys = TileStages::keys(gpu, count)?;
+    let keys = Pairs::new(gpu, count)?;
     rows.project_fwd(gpu, &mut recorder, camera, of.options.eps2d, &columns, into, Some(&keys))?;
     let grid = Grid::new(camera.width, camera.height);
     let ranks = tiles.order(gpu, &mut recorder, &splats.view(), count, grid, TileRange::all(grid), Some(keys))?;

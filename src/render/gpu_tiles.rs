@@ -190,10 +190,7 @@ impl TileStages {
         let places = gpu.buffer("places of sort blocks", words(entries + 1))?;
         let totals = recorder.buffer_zeroed("digits", words(DIGITS * bits.div_ceil(DIGIT_BITS)))?;
         let mut from = pairs;
-        let mut to = Pairs {
-            keys: gpu.buffer("sort keys", words(capacity))?,
-            values: gpu.buffer("sort values", words(capacity))?,
-        };
+        let mut to = Pairs::new(gpu, capacity)?;
         for (pass, shift) in (0..bits).step_by(DIGIT_BITS as usize).enumerate() {
             let totals = totals.slice(words(DIGITS) * pass as u64, words(DIGITS));
             let pass = recorder.uniform(&SortUniforms { capacity, live_at, blocks, shift })?;
@@ -215,11 +212,6 @@ impl TileStages {
         Ok(from)
     }
 
-    /// Buffers for the keys of the rows of a view.
-    pub fn keys(gpu: &Gpu, rows: u32) -> GpuResult<Pairs> {
-        Ok(Pairs { keys: gpu.buffer("sort keys", words(rows))?, values: gpu.buffer("sort values", words(rows))? })
-    }
-
     /// Records the depth sort of the rows and the offsets of their intersections with the tiles of `range`. `splats` holds
     /// `rows` records. `keys` are those that the projection wrote; `None` if it wrote none.
     pub fn order(
@@ -236,7 +228,7 @@ impl TileStages {
         let pairs = match keys {
             Some(pairs) => pairs,
             None => {
-                let pairs = TileStages::keys(gpu, rows)?;
+                let pairs = Pairs::new(gpu, rows)?;
                 let depth = recorder.uniform(&SortUniforms { capacity: rows, live_at: 0, blocks: 0, shift: 0 })?;
                 let views = [depth, pairs.keys.view(), pairs.values.view(), splats.clone()];
                 recorder.dispatch("radix_sort", &self.pipelines.depth_keys, &views, groups)?;
@@ -276,10 +268,7 @@ impl TileStages {
     ) -> GpuResult<Frame> {
         let (grid, capacity) = (blend.grid, room.capacity);
         let tiles = grid.tiles_x * grid.tiles_y;
-        let pairs = Pairs {
-            keys: gpu.buffer("tiles of intersections", words(capacity))?,
-            values: gpu.buffer("intersections", words(capacity))?,
-        };
+        let pairs = Pairs::new(gpu, capacity)?;
         let row_from_isect = gpu.buffer("rows of intersections", words(capacity))?;
         let view = recorder.uniform(&IsectUniforms {
             grid: grid_words(grid),
@@ -342,21 +331,22 @@ impl TileStages {
         pixels: &Pixels,
     ) -> GpuResult<Frame> {
         let frame = self.lists(gpu, recorder, splats, ranks, blend, TileRange::all(blend.grid), room)?;
-        self.blend(recorder, splats, &frame, pixels)?;
+        let entries = self.seen.map_or(FIRST_LIST, |seen| seen.list_max);
+        self.blend(recorder, splats, &frame, pixels, entries)?;
         Ok(frame)
     }
 
-    /// Records the blending of the tiles of a frame.
+    /// Records the blending of the tiles of a frame, in dispatches for lists of some `entries` entries.
     pub fn blend(
         &self,
         recorder: &mut Recorder<'_>,
         splats: &BufferView,
         frame: &Frame,
         pixels: &Pixels,
+        entries: u32,
     ) -> GpuResult<()> {
         let segments = frame.room.list_max.div_ceil(SEGMENT_FWD).max(1);
-        let entries = self.seen.map_or(FIRST_LIST, |seen| seen.list_max).min(SEGMENT_FWD);
-        let bands: Vec<TileRange> = self.back.bands(frame.range, entries);
+        let bands: Vec<TileRange> = self.back.bands(frame.range, entries.min(SEGMENT_FWD));
         for (segment, &band) in (0..segments).flat_map(|segment| bands.iter().map(move |band| (segment, band))) {
             let mut flags = 0;
             flags |= if segment == 0 && frame.part.is_nearest { SEGMENT_FIRST } else { 0 };

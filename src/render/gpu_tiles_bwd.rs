@@ -96,8 +96,8 @@ impl BackStages {
         Ok(BackStages { dispatch_pairs: DISPATCH_PAIRS, plain, weighing: None })
     }
 
-    /// The bands of tiles of a range that get a dispatch each, and a submission each if there are several. No list has more than `entries`
-    /// entries.
+    /// The bands of tiles of a range that get a dispatch each, and a submission each if there are several. A dispatch blends `entries` entries of
+    /// each list.
     pub(super) fn bands(&self, range: TileRange, entries: u32) -> Vec<TileRange> {
         let pairs_of_tile = 256 * u64::from(entries.max(1));
         range.bands(u32::try_from(self.dispatch_pairs / pairs_of_tile).unwrap_or(u32::MAX)).collect()

@@ -1,5 +1,7 @@
 //! Images as data: rendered pictures and the photos they are compared with.
 
+use crate::base::room;
+
 /// A rendered picture: planar f32, `[3][height][width]`, not clamped.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Image {
@@ -88,7 +90,7 @@ impl PictureGradient {
     /// Sets the gradient to zeros for a picture of `pixels` pixels; reuses the allocation.
     pub fn reset(&mut self, pixels: usize) {
         self.v_rgb.clear();
-        self.v_rgb.resize(3 * pixels, 0.0);
+        room::resize(&mut self.v_rgb, 3 * pixels, 0.0);
         self.v_alpha = None;
     }
 

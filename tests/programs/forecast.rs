@@ -126,6 +126,29 @@ fn dry_run_plan_and_run_say_the_same() {
     }
 }
 
+/// One photo of a hundred times the pixels, which is none of those that are spread over the scene: its memory is in every forecast.
+#[test]
+fn the_largest_photo_is_in_the_forecast() {
+    let (work, model) = Workdir::small_model();
+    let short = "--steps 24 --strategy none --device cpu";
+    let bytes = |flags: &str| planned(&work, flags).0["run"]["memory_bytes"].as_u64().unwrap();
+    let before = bytes(short);
+    let ([w, h], [fx, fy, cx, cy]) = (model.size.map(|x| 10 * x), model.pinhole.map(|x| 10.0 * x));
+    let second = format!("2 PINHOLE {w} {h} {fx} {fy} {cx} {cy}\n");
+    work.write("scene/sparse/0/cameras.txt", work.text("scene/sparse/0/cameras.txt") + &second);
+    let name = &model.views[7].name;
+    let images = work.text("scene/sparse/0/images.txt").replace(&format!(" 1 {name}"), &format!(" 2 {name}"));
+    work.write("scene/sparse/0/images.txt", images);
+    image::RgbImage::new(w, h).save(work.path("scene/images").join(name)).unwrap();
+    let after = bytes(short);
+    // Picture, gradient, coverage and their copies by tiles: 56 bytes a pixel.
+    assert!(after - before >= 56 * u64::from(w * h), "{before} {after}");
+    work.train(&format!("scene --out out {short}"));
+    let peak = work.summary("out")["host_bytes_peak"].as_f64().unwrap();
+    // As above.
+    assert!((after as f64 - peak).abs() <= 0.1 * peak + 4e6, "{after} {peak}");
+}
+
 /// Very short runs: the guess of their Gaussians is of the right size, and the checkpoint takes about what is said for its Gaussians.
 #[test]
 fn forecasts_of_very_short_runs_hold() {

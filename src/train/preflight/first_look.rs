@@ -5,7 +5,7 @@
 //! start of a run.
 
 use super::forecast::STEP_OVER_RENDERING;
-use super::plan::{self, Probe, largest_view};
+use super::plan::{self, Probe, largest_view, with_largest_photo};
 use crate::base::ids::PageNo;
 use crate::config::file::TrainConfig;
 use crate::config::limits::RunOptions;
@@ -110,7 +110,12 @@ impl FirstPages<'_> {
         let dataset = &self.start.dataset;
         let mut trainer = Trainer::of_scene(scene, dataset, Box::new(CpuRenderer::new()), options.clone());
         let rows = self.index.iter().map(|page| u64::from(page.rows)).sum();
-        let probe = Probe { views: vec![view], rows, pages: self.index.len(), driver: 0 };
+        let probe = Probe {
+            views: with_largest_photo(&self.start.dataset, vec![view]),
+            rows,
+            pages: self.index.len(),
+            driver: 0,
+        };
         plan::frames_within(self.config, dataset, &mut trainer, &probe, largest.pages, host_mem)
     }
 

@@ -548,14 +548,27 @@ pub(super) struct Probe {
 }
 
 impl Probe {
-    /// The probe of a run: `largest` (the view that needs most pages) and a few views spread over the dataset. The
+    /// The probe of a run: `largest` (the view that needs most pages), the largest photo, and a few views spread over the dataset. The
     /// largest comes first, so that buffers get their final size at once instead of growing with spare capacity.
     pub fn of_run(dataset: &Dataset, trainer: &Trainer, largest: Option<usize>, driver: u64) -> Probe {
         let every = dataset.views.len().div_ceil(PROBE_VIEWS).max(1);
         let spread = (0..dataset.views.len()).step_by(every).filter(|view| largest != Some(*view));
         let views = largest.into_iter().chain(spread).collect();
+        let views = with_largest_photo(dataset, views);
         Probe { views, rows: trainer.scene.rows(), pages: trainer.scene.pager.index().len(), driver }
     }
+}
+
+/// The views, with that of the largest photo if it is larger than the photo of the first: pictures take memory of their own, and a
+/// device may hold none so large.
+pub(super) fn with_largest_photo(dataset: &Dataset, mut views: Vec<usize>) -> Vec<usize> {
+    let pixels = |view: usize| dataset.views[view].camera.pixels();
+    let largest = (0..dataset.views.len()).max_by_key(|view| pixels(*view));
+    if let Some(view) = largest.filter(|view| views.first().is_some_and(|first| pixels(*view) > pixels(*first))) {
+        views.retain(|other| *other != view);
+        views.insert(1, view);
+    }
+    views
 }
 
 /// Estimates the memory of a run with all pages in memory: without growth, grown to its cap, and with `last` Gaussians. The trainer renders

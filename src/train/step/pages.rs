@@ -527,12 +527,14 @@ impl WorkingSet {
     /// Bytes held for rows.
     pub fn bytes(&self) -> usize {
         let columns = self.columns.bytes() + self.gradients.columns.bytes();
-        self.row_from_working.capacity() * 4 + columns + self.gradients.means2d.capacity() * 16
+        let of_footprints = 16 * self.gradients.means2d.capacity() + 8 * self.gradients.weights.capacity();
+        self.row_from_working.capacity() * 4 + columns + of_footprints
     }
 
-    /// Bytes of one row that is stored with `sh_degree`: its number, values, gradients, and the footprint's gradient and radii.
+    /// Bytes of one row that is stored with `sh_degree`: its number, values, gradients, and the footprint's gradient, radii and
+    /// weights, which not every run collects.
     pub fn row_bytes(sh_degree: u8) -> usize {
-        4 + 2 * 4 * row_width(sh_degree) + 16
+        4 + 2 * 4 * row_width(sh_degree) + 24
     }
 
     /// Frees the memory of a working set that has room for many more than `rows` rows. Returns whether it did.

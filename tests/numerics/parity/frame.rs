@@ -339,8 +339,10 @@ fn a_picture_beyond_one_binding_is_an_error_that_names_need_limit_and_remedy() {
     let (rows, camera) = scene(4000, 160, 112);
     let error = gpu.draw(&rows, &camera, &RenderOptions::default()).unwrap_err();
     assert!(error.remedy().is_some_and(|text| text.contains("--max-resolution")), "{error}");
-    let RenderError::Device(GpuError::BindingTooLarge { need, limit, .. }) = error else { panic!("{error}") };
-    assert!(need > limit);
+    let RenderError::Device(GpuError::BindingTooLarge { binding, need, limit, .. }) = error else { panic!("{error}") };
+    assert!(binding == "rgb" && need == 12 * 160 * 112 && need > limit, "{binding}: {need} of {limit}");
+    let dispatches = gpu.gpu().traffic().work.dispatches;
+    assert!(dispatches < 100, "the lists were cut {dispatches} times in vain");
     let error = gpu.image().unwrap_err();
     assert!(matches!(error, RenderError::OutOfOrder { .. }), "no picture after an error: {error}");
     // Smaller views still work.

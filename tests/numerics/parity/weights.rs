@@ -2,6 +2,7 @@
 
 use super::frame::{bits, in_batches, photo, renderer, results_with, scene};
 use super::ranges::{least, wide_scene};
+use gsscale::base::math::LARGEST_SPLAT_GRAD;
 use gsscale::gpu::GpuOptions;
 use gsscale::render::cpu::CpuRenderer;
 use gsscale::render::{Gradients, LossOptions, RenderOptions, Renderer, RowBatches};
@@ -95,4 +96,22 @@ fn errors_are_those_of_what_was_compared() {
     compare("corrected", &weights(&mut gpu, true), &weights(&mut CpuRenderer::new(), true));
     let alone = weights(&mut gpu, false);
     assert!(alone.iter().any(|w| w[0] > 0.0) && alone.iter().all(|w| w[1] == 0.0));
+}
+
+/// Weights are no gradients: those of a bright picture make no row unusable.
+#[test]
+fn weights_of_a_bright_picture_make_no_row_unusable() {
+    let Some(mut gpu) = renderer(&GpuOptions::default()) else { return };
+    let (rows, camera) = scene(2000, 80, 60);
+    let options = RenderOptions { background: [1e7; 3], ..RenderOptions::default() };
+    for renderer in [&mut CpuRenderer::new() as &mut dyn Renderer, &mut gpu] {
+        renderer.weigh_rows(true).unwrap();
+        renderer.draw(&rows, &camera, &options).unwrap();
+        renderer.loss(&photo(80, 60, false), &LossOptions::default()).unwrap();
+        let mut grads = Gradients::default();
+        renderer.backpropagate(&rows, &mut grads).unwrap();
+        let most = grads.weights.iter().fold(0.0f32, |most, weights| most.max(weights[1]));
+        assert!(most > LARGEST_SPLAT_GRAD, "{}: no weight is larger than a gradient may be: {most:e}", renderer.name());
+        assert_eq!(renderer.unusable_splats().unwrap(), 0, "{}", renderer.name());
+    }
 }
