@@ -35,6 +35,7 @@ mod sweep_page;
 use clap::{Command, CommandFactory};
 use gsscale::base::error::{InputError, InputResult};
 use gsscale::base::say::exit_code;
+use gsscale::base::text::{OWN_FILE_MOST, read_text};
 use gsscale::config::command_line::{parse_arguments, parse_plain};
 use gsscale::config::file::{TrainConfig, TrainOverrides};
 use gsscale::config::limits::simd_path;
@@ -133,6 +134,6 @@ fn settle(file: Option<&Path>, keys: &TrainOverrides) -> Result<TrainConfig, Tra
 
 /// A file of a run.
 fn read_json<T: serde::de::DeserializeOwned>(path: &Path, remedy: &str) -> InputResult<T> {
-    let text = std::fs::read(path).map_err(|e| InputError::io(path, "reading", &e))?;
-    serde_json::from_slice(&text).map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), remedy))
+    let text = read_text(path, OWN_FILE_MOST, remedy)?;
+    serde_json::from_str(&text).map_err(|e| InputError::new(path, format!("cannot be parsed: {e}"), remedy))
 }

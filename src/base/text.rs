@@ -7,6 +7,7 @@
 //! Invariants: 1. the output is UTF-8 for any input; 2. memory is a constant; 3. UTF-8 keeps its bytes.
 
 use super::error::{InputError, InputResult};
+use serde::de::DeserializeOwned;
 use std::fs::File;
 use std::io::{ErrorKind, Read};
 use std::path::Path;
@@ -152,6 +153,16 @@ pub fn read_text(file: &Path, most: u64, remedy: &str) -> InputResult<String> {
     Ok(text)
 }
 
+/// Most bytes of a small file that this program has written, such as a summary.
+pub const OWN_FILE_MOST: u64 = 64 << 20;
+
+/// The JSON of a small file that this program has written; `None` if the file cannot be read, holds something else, or is larger than
+/// [`OWN_FILE_MOST`].
+pub fn own_json<T: DeserializeOwned>(file: &Path) -> Option<T> {
+    let text = std::io::read_to_string(File::open(file).ok()?.take(OWN_FILE_MOST)).ok()?;
+    serde_json::from_str(&text).ok()
+}
+
 /// The first characters of a file, from at most `most` of its bytes; nothing of a file that cannot be read.
 pub fn head_of(file: &Path, most: u64) -> String {
     let mut text = Vec::new();
@@ -268,5 +279,18 @@ mod tests {
         assert_eq!(shown(&read(b"a\xe2\x82")), "a\\xE2\\x82");
         assert_eq!(read(b"\xff\xfea\0\x00\xd8b"), "a\u{fffd}");
         assert!(!has_raw_bytes("Straße 図𝄞"));
+    }
+
+    #[test]
+    fn own_json_reads_no_more_than_a_small_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("summary.json");
+        assert_eq!(own_json::<[u8; 2]>(&path), None);
+        std::fs::write(&path, "[1, 2]").unwrap();
+        assert_eq!(own_json(&path), Some([1u8, 2]));
+        // White space and nothing else, far beyond the limit.
+        File::options().write(true).open(&path).unwrap().set_len(1 << 40).unwrap();
+        assert_eq!(own_json::<[u8; 2]>(&path), None);
+        assert!(read_text(&path, 1 << 20, "").unwrap_err().to_string().contains("larger than 1 MiB"));
     }
 }

@@ -11,6 +11,7 @@ use super::ring::pages_of_cell;
 use super::views::{Seen, SeenView, see};
 use super::{City, check_machine_keys, check_range, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
+use crate::base::text::{OWN_FILE_MOST, read_text};
 use crate::base::whole_file::write_whole;
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits;
@@ -322,10 +323,8 @@ fn neighbour(
 
 fn summary_of_prior<T: DeserializeOwned>(city: &City) -> InputResult<T> {
     let file = city.prior_run().join(SUMMARY_FILE);
-    let text = std::fs::read_to_string(&file).map_err(|e| {
-        let remedy = "finish the prior with the command that began it: gsscale-cells prior SCENE --out CITY";
-        InputError { remedy: remedy.into(), ..InputError::io(&file, "reading the result of the prior", &e) }
-    })?;
+    let remedy = "finish the prior with the command that began it: gsscale-cells prior SCENE --out CITY";
+    let text = read_text(&file, OWN_FILE_MOST, remedy).map_err(|e| InputError { remedy: remedy.into(), ..e })?;
     serde_json::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), "train the prior again"))
 }
 

@@ -18,7 +18,7 @@ use super::{City, config_of, toml_of};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::ids::{PageId, PageNo};
-use crate::base::text::read_text;
+use crate::base::text::{OWN_FILE_MOST, read_text};
 use crate::base::whole_file::{folder_of, part_path};
 use crate::base::whole_folder::PartFolder;
 use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved, write_config};
@@ -126,7 +126,7 @@ pub fn merge(request: &MergeRequest) -> Result<Merged, TrainError> {
     }
     let cells = hex(cells.digest());
     if request.out.exists() {
-        let before = std::fs::read_to_string(request.out.join(MERGED_FILE)).ok();
+        let before = read_text(&request.out.join(MERGED_FILE), OWN_FILE_MOST, "").ok();
         let before = before.and_then(|text| toml::from_str::<Merged>(&text).ok());
         let is_of_plan = before.as_ref().is_some_and(|merged| merged.plan == digest);
         let is_same = |merged: &Merged| is_of_plan && merged.cells == cells && request.out.join(PLY_FILE).is_file();

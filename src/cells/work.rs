@@ -19,7 +19,7 @@ use super::{AnyRun, City, begin_or_resume, check_machine_keys, check_range, conf
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::system_name;
-use crate::base::text::read_text;
+use crate::base::text::{OWN_FILE_MOST, read_text};
 use crate::base::whole_file::{rename, sync_folder, write_whole};
 use crate::config::file::{TrainConfig, TrainOverrides};
 use crate::config::limits;
@@ -202,11 +202,11 @@ pub fn code_of(error: &TrainError) -> i32 {
 pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<Option<Done>> {
     let folder = city.cell(cell);
     let file = folder.join(DONE_FILE);
-    let text = match std::fs::read_to_string(&file) {
-        Err(e) if e.kind() == ErrorKind::NotFound => return Ok(None),
-        read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
-    };
+    if !file.exists() {
+        return Ok(None);
+    }
     let again = "remove the file and the cell's folder copy, and run the cell again";
+    let text = read_text(&file, OWN_FILE_MOST, again)?;
     let done: Done = toml::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), again))?;
     if done.files == plan.cells[cell].files {
         return Ok(Some(done).filter(|done| copy_of(&folder, done.copy).is_dir()));

@@ -2,7 +2,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
-use crate::base::text::{as_windows_1252, has_raw_bytes, head_of, shown};
+use crate::base::text::{as_windows_1252, has_raw_bytes, head_of, own_json, shown};
 use crate::base::units::{counted, counted_are};
 use crate::dataset::gathered::{listed, sort_views};
 use crate::dataset::model::RawScene;
@@ -171,8 +171,7 @@ pub const PHOTOS_LEAST: usize = 3;
 
 /// Whether a search for the poses of a scene has come to its end.
 fn is_searched(scene: &Path) -> bool {
-    let state = std::fs::read(scene.join(SEARCH_FOLDER).join(SEARCH_STATE)).unwrap_or_default();
-    let state: serde_json::Value = serde_json::from_slice(&state).unwrap_or_default();
+    let state: serde_json::Value = own_json(&scene.join(SEARCH_FOLDER).join(SEARCH_STATE)).unwrap_or_default();
     state["done"].as_array().is_some_and(|done| done.iter().any(|phase| phase == SEARCH_END))
 }
 

@@ -21,6 +21,7 @@ pub mod similar;
 use crate::base::count::Count;
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
+use crate::base::text::own_json;
 use crate::base::units::{counted_are, format_grouped, format_seconds};
 use crate::base::whole_file::{are_one_file, rename, write_whole};
 use crate::base::whole_folder::remove_ours;
@@ -390,8 +391,8 @@ impl PoseSearch {
     fn pairs(&self, work: &Path, state: &mut SearchState, watch: &mut Watch<'_>) -> InputResult<Vec<(u32, u32)>> {
         let file = work.join(PAIRS_FILE);
         let is_pair = |&(a, b): &(u32, u32)| a < b && (b as usize) < self.photos.len();
-        let chosen = || serde_json::from_slice::<Vec<(u32, u32)>>(&std::fs::read(&file).ok()?).ok();
-        if let Some(pairs) = chosen().filter(|pairs| state.is_done("pairs") && pairs.iter().all(is_pair)) {
+        let chosen: Option<Vec<(u32, u32)>> = own_json(&file);
+        if let Some(pairs) = chosen.filter(|pairs| state.is_done("pairs") && pairs.iter().all(is_pair)) {
             return Ok(pairs);
         }
         let total = self.photos.len() as u32;
@@ -570,9 +571,8 @@ impl SearchState {
 
     /// That of a work folder of ours.
     fn read(work: &Path) -> Option<SearchState> {
-        let text = std::fs::read(work.join(STATE_FILE)).ok()?;
         // An older program may have kept less of each photo: then its search begins again.
-        let state: serde_json::Value = serde_json::from_slice(&text).ok()?;
+        let state: serde_json::Value = own_json(&work.join(STATE_FILE))?;
         (state["made_by"] == MADE_BY).then(|| serde_json::from_value(state).unwrap_or_default())
     }
 

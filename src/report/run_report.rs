@@ -375,7 +375,7 @@ fn add_views(page: &mut Page, run: &Path, progress: &dyn Fn(usize, usize)) {
     page.heading("Held-out views");
     let stride = views.len().div_ceil(VIEWS_MAX);
     if stride > 1 {
-        page.paragraph(&format!("One in {stride} of {} views; renders/test has all.", views.len()));
+        page.paragraph(&format!("{} of {} views; renders/test has all.", views.len().div_ceil(stride), views.len()));
     }
     let mut sliders = Vec::new();
     for (i, (file, view)) in views.iter().step_by(stride).enumerate() {

@@ -15,6 +15,8 @@ use serde::de::DeserializeOwned;
 use std::io::{Cursor, ErrorKind};
 use std::path::{Component, Path, PathBuf};
 
+/// Largest file, bytes.
+const FILE_MOST: u64 = 1 << 30;
 /// Most rows of a SOG. They take up to 1 GB, and their pictures .1 GB.
 const ROWS_MAX: usize = 1 << 22;
 /// Largest logarithm of a position: f32 holds its exponential.
@@ -268,8 +270,12 @@ fn read_file(path: &Path) -> InputResult<Vec<u8>> {
         other => other,
     };
     // Checked before opening: opening a pipe would block until somebody writes to it.
-    if !std::fs::metadata(path).map_err(io)?.is_file() {
+    let metadata = std::fs::metadata(path).map_err(io)?;
+    if !metadata.is_file() {
         return Err(malformed(path, "this is not a regular file"));
+    }
+    if metadata.len() > FILE_MOST {
+        return Err(malformed(path, "the file is larger than 1 GiB"));
     }
     std::fs::read(path).map_err(io)
 }

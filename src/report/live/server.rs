@@ -5,7 +5,7 @@
 //! | `/` | the page |
 //! | `/status` | [`super::Status`] as JSON |
 //! | `/metrics?from=BYTE` | the run's metrics.jsonl from that byte on, whole lines |
-//! | `/picture?view=..&turn=..&tilt=..&distance=..&width=..` | a PNG of [`super::Orbit`] |
+//! | `/picture?view=..&turn=..` | a PNG of the [`super::Orbit`] with these fields, and the defaults of the others |
 //!
 //! Invariant: whatever peers do, they hold at most [`CONNECTIONS_MOST`] connections, [`METRICS_MOST`] answers of metrics and
 //! [`PICTURES_MOST`] pictures in memory, each for a bounded time.

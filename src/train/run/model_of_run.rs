@@ -2,6 +2,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
+use crate::base::text::own_json;
 use crate::base::whole_file::folder_of;
 use crate::config::file::{TrainConfig, read_resolved};
 use crate::exchange::foreign::refuse_folder_of_sogs;
@@ -55,7 +56,7 @@ pub fn gaussians_left_out(run: &Path) -> u64 {
 
 /// The summary of the finished run in this folder.
 pub(super) fn read_summary(run: &Path) -> Option<Summary> {
-    serde_json::from_str(&std::fs::read_to_string(run.join(SUMMARY_FILE)).ok()?).ok()
+    own_json(&run.join(SUMMARY_FILE))
 }
 
 /// The error for the folder of a run that has no result yet.

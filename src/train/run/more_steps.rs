@@ -17,6 +17,7 @@ use super::run_folder::{Begun, PastRun};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
+use crate::base::text::own_json;
 use crate::base::units::format_grouped;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
@@ -156,9 +157,8 @@ fn has_left_out(out: &Path) -> bool {
 
 /// A figure of the summary; null if there is none.
 fn figure(out: &Path, name: &str) -> serde_json::Value {
-    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
-    let summary: serde_json::Value = serde_json::from_slice(&summary).unwrap_or_default();
-    summary[name].clone()
+    own_json(&out.join(SUMMARY_FILE))
+        .map_or(serde_json::Value::Null, |summary: serde_json::Value| summary[name].clone())
 }
 
 /// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.

@@ -393,7 +393,9 @@ fn finished_outcome(
     let summary = read_summary(&request.out).filter(|s| s.finished && s.steps >= config.steps);
     let Some(summary) = summary else { return Ok(None) };
     let folder = config.residence().checkpoint_folder(&request.out);
-    let is_its_place = folder == earlier.config.residence().checkpoint_folder(&request.out);
+    // The command may name the folder in another form than the config, which holds absolute paths.
+    let place = |folder: &Path| folder.canonicalize().unwrap_or_else(|_| absolute(folder));
+    let is_its_place = place(&folder) == place(&earlier.config.residence().checkpoint_folder(&request.out));
     let stored = if SpillDir::exists_in(&folder) {
         open_own(&folder, earlier.claim(request), config.residence().spill_dir().is_none()).unwrap_or_else(|error| {
             crate::tell!("warning: {} is left alone: {error}", folder.display());

@@ -24,6 +24,7 @@ pub use salvage::{LostPage, SalvageRequest, Salvaged, salvage};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
+use crate::base::text::own_json;
 use crate::checkpoint::run_state::RunState;
 use crate::config::file::{TrainConfig, read_resolved};
 use crate::config::limits::RunOptions;
@@ -117,8 +118,7 @@ pub fn find_store(dir: &Path) -> InputResult<StorePlace> {
 
 /// Whether the run in a folder has done all of its steps.
 fn is_finished(out: &Path) -> bool {
-    let summary = std::fs::read(out.join(SUMMARY_FILE)).unwrap_or_default();
-    serde_json::from_slice(&summary).is_ok_and(|summary: serde_json::Value| summary["finished"] == true)
+    own_json(&out.join(SUMMARY_FILE)).is_some_and(|summary: serde_json::Value| summary["finished"] == true)
 }
 
 /// The run state of a generation.

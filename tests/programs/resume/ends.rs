@@ -160,14 +160,19 @@ fn what_a_killed_removal_leaves_of_a_store_goes_with_the_next_resume() {
     let work = scene();
     work.run("out", "--steps 12 --spill-dir spill --keep-checkpoint --device cpu");
     copy_folder(&work.path("spill"), &work.path("kept"));
-    for left in [&["FORMAT", "LOCK", "witness", "map.redb"][..], &["FORMAT", "LOCK", "witness"], &["FORMAT"]] {
-        work.remove("spill");
-        std::fs::create_dir(work.path("spill")).unwrap();
-        left.iter().for_each(|name| {
-            std::fs::copy(work.path("kept").join(name), work.path("spill").join(name)).unwrap();
-        });
-        work.train("--resume out --keep-checkpoint=false --quiet");
-        assert!(!work.exists("spill"), "{left:?}");
+    let all: Vec<String> = work.files("kept").keys().map(|name| name.display().to_string()).collect();
+    let all: Vec<&str> = all.iter().map(String::as_str).chain(["LOCK"]).collect();
+    assert!(all.contains(&"map.redb"), "{all:?}");
+    for left in [&all, &["FORMAT", "LOCK", "witness", "map.redb"][..], &["FORMAT", "LOCK", "witness"], &["FORMAT"]] {
+        for named in ["", "--spill-dir spill", "--spill-dir scene/../spill"] {
+            work.remove("spill");
+            std::fs::create_dir(work.path("spill")).unwrap();
+            left.iter().for_each(|name| {
+                std::fs::copy(work.path("kept").join(name), work.path("spill").join(name)).unwrap();
+            });
+            work.train(&format!("--resume out --keep-checkpoint=false --quiet {named}"));
+            assert!(!work.exists("spill"), "{left:?} {named}");
+        }
     }
 }
 
