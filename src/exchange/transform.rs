@@ -144,12 +144,21 @@ mod tests {
     #[test]
     fn the_matrices_lead_there_and_back() {
         let folder = tempfile::tempdir().unwrap();
+        #[cfg(not(target_os = "linux"))]
         let ply = folder.path().join("a.b.ply");
+        // A folder of any name.
+        #[cfg(target_os = "linux")]
+        let ply = {
+            use std::os::unix::ffi::OsStrExt;
+            let odd = folder.path().join(std::ffi::OsStr::from_bytes(b"n\xff"));
+            std::fs::create_dir(&odd).unwrap();
+            odd.join("a.b.ply")
+        };
         let upright = Rotation::upright([0.2, 0.3, 0.9]);
         let meta = SceneMeta { upright, origin: [5.0, -6.0, 7.0], scale: 2.0, ..SceneMeta::default() };
         for frame in [ExportFrame::Dataset, ExportFrame::Local] {
             write_transform(&ply, &meta, frame, Some(VIEWER_UP)).unwrap();
-            let text = std::fs::read_to_string(folder.path().join("a.b.transform.json")).unwrap();
+            let text = std::fs::read_to_string(ply.with_file_name("a.b.transform.json")).unwrap();
             let value: serde_json::Value = serde_json::from_str(&text).unwrap();
             let apply = |name: &str, p: [f64; 3]| {
                 let at = |i: usize, j: usize| value[name][i][j].as_f64().unwrap();

@@ -694,6 +694,11 @@ mod tests {
         assert!(Chart::new("a", "b", "c").svg().contains("no data"));
         let flat = Chart::new("a", "b", "c").with("", vec![(5.0, 1.0), (5.0, 1.0)], Mark::Line).zero_based().svg();
         assert!(flat.contains("polyline"));
+        // Axes of any length have few ticks.
+        for most in [1e300, 1e308, f64::MAX] {
+            let svg = Chart::new("a", "b", "c").with("", vec![(-most, 0.0), (most, most)], Mark::Line).svg();
+            assert!(svg.len() < 100_000, "{most:e}: {} bytes", svg.len());
+        }
     }
 
     #[test]

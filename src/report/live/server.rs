@@ -310,6 +310,20 @@ mod tests {
         drop(silent);
     }
 
+    #[test]
+    fn metrics_from_beyond_the_end_are_none() {
+        let live = live();
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), "{\"step\":1}\n").unwrap();
+        live.set_metrics(file.path().to_path_buf());
+        for (from, lines) in [(0, 1), (11, 0), (12, 0), (1 << 63, 0), (u64::MAX, 0)] {
+            let mut answer = String::new();
+            request(&live, &format!("/metrics?from={from}")).read_to_string(&mut answer).unwrap();
+            let is_right = answer.starts_with("HTTP/1.1 200") && answer.matches("step").count() == lines;
+            assert!(is_right, "{from}: {answer}");
+        }
+    }
+
     /// Peers ask for metrics and pictures, in one connection after the other, and never read the answers.
     #[test]
     fn answers_that_nobody_reads_are_dropped_and_keep_nobody_out() {
