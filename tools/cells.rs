@@ -29,7 +29,8 @@ Examples:
   gsscale-cells seam city runs/city                                             what the borders cost
 
 Give what is to be trained (--steps, --max-gaussians, --max-resolution, ...) to `prior` alone. Every command may be repeated: it goes on, or
-says that it is done. Exit codes of `run`: 0 done, 75 again (here or elsewhere), 2 never again.";
+says that it is done. Exit codes of `run`: 0 done, 75 again (here or elsewhere), 76 again when the
+other process that has the cell has ended, 2 never again.";
 
 /// Trains a city in cells, on several machines or one after the other.
 #[derive(Parser)]

@@ -47,6 +47,8 @@ use std::time::Duration;
 
 /// Exit code: another attempt may succeed, here or elsewhere.
 pub const AGAIN: i32 = 75;
+/// Exit code: another process has the cell. Waiting for it is no attempt.
+pub const TAKEN: i32 = 76;
 /// Exit code: no further attempt will succeed.
 pub const NEVER: i32 = 2;
 
@@ -148,7 +150,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
         Ok(lock) => lock,
         Err(owner) => {
             crate::tell!("another process works on cell {}: {owner}", request.cell);
-            return Ok(AGAIN);
+            return Ok(TAKEN);
         }
     };
     // The owner before may have ended in the meantime.
@@ -181,6 +183,7 @@ pub fn work(request: &WorkRequest) -> Result<i32, WorkError> {
         if !lock.is_held() {
             let owner = owner_of(&folder).unwrap_or_default();
             crate::tell!("another process has taken cell {} over: {owner}", request.cell);
+            return Ok(TAKEN);
         }
         Ok(AGAIN)
     };

@@ -347,7 +347,7 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     // Legs of one step: most of the time the worker is between two of them.
     let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 1e-6").once(|| cells.newest(0) > Some(0));
     let (code, said) = cells.says("run city --cell 0");
-    assert_eq!(code, Some(75), "{said}");
+    assert_eq!(code, Some(76), "{said}");
     says(&said, &["another process works on cell 0"]);
     worker.signal("TERM").ends(75);
     says(&cells.done("status city"), &["cell 0:", "waiting", "0 of 2 cells are done"]);
@@ -361,7 +361,7 @@ fn a_cell_has_one_owner_and_stops_with_a_copy_and_changed_plans_are_refused() {
     let worker = cells.begin("run city --cell 0 --threads 1 --copy-every 1e-6").once(|| cells.newest(0) > before);
     let worker = worker.signal("STOP");
     cells.0.write("city/cells/0/lock", "another process 1 of another machine");
-    says(&worker.signal("CONT").ends(75), &["another process has taken cell 0 over", "another machine"]);
+    says(&worker.signal("CONT").ends(76), &["another process has taken cell 0 over", "another machine"]);
     std::fs::remove_file(cells.0.path("city/cells/0/lock")).unwrap();
     cells.refuses("merge city --out whole", &["cells 0, 1 are not done"]);
     for (file, from, to) in [("plan.toml", "steps = ", "steps = 1"), ("cells/1/pages.txt", "\n", " frozen\n")] {

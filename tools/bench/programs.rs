@@ -56,9 +56,9 @@ pub fn beside(program: &str) -> InputResult<(PathBuf, Option<&str>)> {
 /// Errors: the program was interrupted, which is no result: the sweep ends too, and the next call repeats this run.
 pub fn problem(output: &Output) -> InputResult<String> {
     let said = String::from_utf8_lossy(&output.stderr);
-    // A cell that a signal has stopped ends with 75; so does one that lacks something, with an error.
+    // A cell that a signal has stopped ends with 75, and one that another process has with 76; one that lacks something says an error.
     let is_interrupted = match output.status.code() {
-        Some(75) => !said.contains("error: "),
+        Some(75 | 76) => !said.contains("error: "),
         code => matches!(code, Some(130 | 143)),
     };
     if is_interrupted {

@@ -21,6 +21,7 @@ import ray
 
 PROGRAM = os.environ.get("GSSCALE_CELLS", "gsscale-cells")
 AGAIN = 75
+TAKEN = 76
 # Seconds between attempts where another process has the cell: the lock of a machine that is lost counts for 90.
 PAUSE = 30
 
@@ -30,14 +31,10 @@ class TryAgain(Exception):
 
 
 def run_cell(city: str, cell: int, flags: list[str]) -> int:
-    lock = pathlib.Path(city, "cells", str(cell), "lock")
-    while True:
-        code = subprocess.run([PROGRAM, "run", city, "--cell", str(cell), "--quiet", *flags], check=False).returncode
-        if code == AGAIN:
-            time.sleep(PAUSE)
-        # Waiting for another process that has the cell is no attempt.
-        if code != AGAIN or not lock.exists():
-            break
+    command = [PROGRAM, "run", city, "--cell", str(cell), "--quiet", *flags]
+    # Waiting for another process that has the cell is no attempt.
+    while (code := subprocess.run(command, check=False).returncode) == TAKEN:
+        time.sleep(PAUSE)
     # A signal that nobody handled, such as that of a machine without memory, gives a negative code.
     if code == AGAIN or code < 0:
         raise TryAgain(f"cell {cell}: exit code {code}")

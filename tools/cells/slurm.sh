@@ -6,7 +6,7 @@
 # GSSCALE_FLAGS holds flags for `gsscale-cells run`, such as "--host-mem 20GiB"; SPILL_DIR a folder on a fast drive of each node.
 # A task that is preempted, cancelled or comes to its time limit commits, and copies the commit into the city. Slurm queues a preempted task
 # again, this script one that comes to its limit, a hundred times, as one whose machine lacks something; and one whose worker is killed, such as
-# for want of memory, ten times.
+# for want of memory, ten times. A task whose cell another process has waits for it, which is no attempt.
 #SBATCH --job-name=gsscale-cells
 #SBATCH --requeue
 #SBATCH --signal=B:USR1@120
@@ -25,23 +25,29 @@ if [ -z "${SLURM_ARRAY_TASK_ID:-}" ]; then
     exit
 fi
 
-# Word splitting of the flags is wanted.
-# shellcheck disable=SC2086
-gsscale-cells run "$CITY" --cell "$SLURM_ARRAY_TASK_ID" --quiet ${SPILL_DIR:+--spill-dir "$SPILL_DIR"} ${GSSCALE_FLAGS:-} &
-worker=$!
 # Before the time limit the script alone is warned.
-cancelled=
-trap 'kill -TERM $worker' USR1
-trap 'cancelled=1; kill -TERM $worker 2> /dev/null' TERM
-# A wait ends with a signal, the last one with the worker.
-while kill -0 $worker 2> /dev/null; do
+stopped='' cancelled='' worker=''
+trap 'stopped=1; kill -TERM $worker 2> /dev/null' USR1
+trap 'stopped=1 cancelled=1; kill -TERM $worker 2> /dev/null' TERM
+attend() {
+    "$@" &
+    worker=$!
+    # A wait ends with a signal, the last one with the worker.
+    while kill -0 $worker 2> /dev/null; do
+        wait $worker
+    done
     wait $worker
+}
+while :; do
+    # Word splitting of the flags is wanted.
+    # shellcheck disable=SC2086
+    attend gsscale-cells run "$CITY" --cell "$SLURM_ARRAY_TASK_ID" --quiet ${SPILL_DIR:+--spill-dir "$SPILL_DIR"} ${GSSCALE_FLAGS:-}
+    code=$?
+    { [ $code -eq 76 ] && [ -z "$stopped" ] && attend sleep 30; } || break
 done
-wait $worker
-code=$?
 [ -z "$cancelled" ] || exit $code
 attempts=0
-[ $code -eq 75 ] && attempts=100
+[ $code -eq 75 ] || [ $code -eq 76 ] && attempts=100
 [ $code -gt 128 ] && attempts=10
 if [ "${SLURM_RESTART_COUNT:-0}" -lt $attempts ]; then
     scontrol requeue "${SLURM_ARRAY_JOB_ID}_${SLURM_ARRAY_TASK_ID}"
