@@ -4,10 +4,12 @@
 
 use super::file::{KEYS, Shown, TrainConfig};
 use super::habits::{ALIASES, advice_for, with_our_spelling};
+use crate::base::error::InputError;
 use crate::base::say::as_called;
 use clap::builder::StyledStr;
 use clap::error::{ContextKind, ContextValue};
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 /// Programs that draw Gaussians and train none. Their help shows the keys that say what is drawn, beside which photos and where.
 const DRAWING_PROGRAMS: &[&str] = &["eval", "view"];
@@ -71,8 +73,21 @@ pub fn parse_plain<T: clap::CommandFactory + clap::FromArgMatches>(arguments: &[
 
 fn parse<T: clap::FromArgMatches>(command: clap::Command, arguments: &[OsString]) -> T {
     let matches = in_words_of_caller(command.clone()).try_get_matches_from(arguments);
+    if matches.as_ref().map_or_else(clap::Error::use_stderr, |_| true)
+        && let Some(name) = not_utf8(arguments.get(1..).unwrap_or_default())
+    {
+        let problem = "the name is not UTF-8, so text files such as config.toml cannot hold it";
+        crate::tell!("error: {}", InputError::new(name, problem, "rename the folder or file"));
+        std::process::exit(2);
+    }
     let matches = matches.unwrap_or_else(|error| without_odd_tips(error, &command).exit());
     T::from_arg_matches(&matches).unwrap_or_else(|e| e.exit())
+}
+
+/// An argument that is not UTF-8, or the working folder, which is a part of every relative path.
+fn not_utf8(arguments: &[OsString]) -> Option<PathBuf> {
+    let mut named = arguments.iter().map(PathBuf::from).chain(std::env::current_dir().ok());
+    named.find(|path| path.to_str().is_none())
 }
 
 /// The flag of this name, with its dashes, of a command or of one of its commands.

@@ -102,6 +102,42 @@ fn missing_and_broken_photos_are_refused() {
     trains(&work, "--allow-missing");
 }
 
+/// The text files of a run and of a city could not name such a folder. macOS makes none.
+#[cfg(target_os = "linux")]
+#[test]
+fn folders_whose_names_are_not_utf8_are_refused_at_once() {
+    use crate::support::workdir::CKPT;
+    use std::ffi::OsStr;
+    use std::os::unix::ffi::OsStrExt;
+    let work = Workdir::city(3, 32, 24, 100);
+    let (odd, cells) = (OsStr::from_bytes(b"odd\xff"), env!("CARGO_BIN_EXE_gsscale-cells"));
+    let inside = work.path("").join(odd);
+    std::fs::create_dir(&inside).unwrap();
+    let before = work.files("");
+    for (program, flags) in [
+        (TRAIN, "ODD --out out"),
+        (TRAIN, "scene --out ODD"),
+        (TRAIN, "scene --out out --spill-dir ODD"),
+        (TRAIN, "--resume ODD"),
+        (EVAL, "ODD"),
+        (VIEW, "ODD"),
+        (CKPT, "inspect ODD"),
+        (cells, "prior scene --out ODD"),
+        (cells, "run city --cell 0 --spill-dir ODD"),
+    ] {
+        let words =
+            |name: &'static OsStr| flags.split(' ').map(move |word| if word == "ODD" { name } else { word.as_ref() });
+        for (folder, name) in [(&work.path(""), odd), (&inside, "plain".as_ref())] {
+            let output = Command::new(program).current_dir(folder).args(words(name)).output().unwrap();
+            let said = stderr(&output);
+            assert_eq!(output.status.code(), Some(2), "{flags}: {said}");
+            says(&said, &["odd\u{fffd}", "is not UTF-8", "remedy: rename"]);
+        }
+    }
+    assert!(work.files("") == before && std::fs::read_dir(&inside).unwrap().next().is_none());
+    assert!(Command::new(TRAIN).current_dir(&inside).arg("--help").output().unwrap().status.success());
+}
+
 #[test]
 fn output_folders_that_have_a_run_are_refused() {
     let (work, _) = Workdir::small_model();
