@@ -9,7 +9,7 @@
 use super::error::{InputError, InputResult};
 use serde::de::DeserializeOwned;
 use std::fs::File;
-use std::io::{ErrorKind, Read};
+use std::io::{BufRead, BufReader, ErrorKind, Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// Bytes converted together.
@@ -168,6 +168,30 @@ pub fn head_of(file: &Path, most: u64) -> String {
     let mut text = Vec::new();
     let read = File::open(file).and_then(|file| TextReader::new(file.take(most)).read_to_end(&mut text));
     if read.is_ok() { String::from_utf8_lossy(&text).into_owned() } else { String::new() }
+}
+
+/// The text of the last bytes of a file, at most `most`; nothing of a file that cannot be read.
+pub fn tail_of(file: &Path, most: u64) -> String {
+    let mut tail = Vec::new();
+    let read = File::open(file).and_then(|mut file| {
+        let length = file.metadata()?.len();
+        file.seek(SeekFrom::Start(length.saturating_sub(most)))?;
+        file.take(most).read_to_end(&mut tail)
+    });
+    if read.is_ok() { String::from_utf8_lossy(&tail).into_owned() } else { String::new() }
+}
+
+/// Most bytes of a line of [`lines_of`]; the rest of a longer one counts as the next.
+const LINE_MOST: u64 = 1 << 20;
+
+/// The lines of a file with their ends, up to one that cannot be read. A file that cannot be opened has none.
+pub fn lines_of(file: &Path) -> impl Iterator<Item = Vec<u8>> + use<> {
+    let mut opened = File::open(file).map(BufReader::new).ok();
+    std::iter::from_fn(move || {
+        let mut line = Vec::new();
+        let read = opened.as_mut()?.take(LINE_MOST).read_until(b'\n', &mut line);
+        read.is_ok_and(|bytes| bytes > 0).then_some(line)
+    })
 }
 
 /// The text of bytes that are UTF-8 or of a code page.

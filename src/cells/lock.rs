@@ -9,6 +9,7 @@
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::draw_identity;
 use crate::base::machine::system_name;
+use crate::base::text::head_of;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io::{Error, ErrorKind, Seek, Write};
 use std::path::{Path, PathBuf};
@@ -17,6 +18,8 @@ use std::time::Duration;
 
 /// Name of the lock in the folder of a cell.
 const LOCK: &str = "lock";
+/// Most bytes of an owner's name.
+const OWNER_MOST: u64 = 512;
 /// Time between heartbeats, and the age from which an owner whose end the system does not tell counts as lost.
 const BEAT: Duration = Duration::from_secs(10);
 const LOST_AFTER: Duration = Duration::from_secs(90);
@@ -61,7 +64,7 @@ impl CellLock {
             Ok(()) => file,
             Err(error) if error.kind() == ErrorKind::AlreadyExists => {
                 let file = options.open(&path).map_err(failed)?;
-                let owner = std::fs::read_to_string(&path).map_err(failed)?;
+                let owner = head_of(&path, OWNER_MOST);
                 let is_gone = match file.try_lock() {
                     _ if !HAS_LOCKS => false,
                     Err(TryLockError::WouldBlock) => return Ok(Err(owner)),
@@ -84,12 +87,12 @@ impl CellLock {
         let (alive, ended) = channel::<()>();
         let lock = CellLock { path: path.clone(), token: token.clone(), _alive: alive, _file: file };
         if !lock.is_held() {
-            return Ok(Err(std::fs::read_to_string(&path).unwrap_or_default()));
+            return Ok(Err(head_of(&path, OWNER_MOST)));
         }
         std::thread::spawn(move || {
             while ended.recv_timeout(BEAT) == Err(RecvTimeoutError::Timeout) {
                 // A beat that is missed is made up by the next.
-                if std::fs::read_to_string(&path).is_ok_and(|owner| owner == token) {
+                if head_of(&path, OWNER_MOST) == token {
                     let _ = write_token(&beating, &token);
                 }
             }
@@ -99,7 +102,7 @@ impl CellLock {
 
     /// Whether the cell is still this process's.
     pub fn is_held(&self) -> bool {
-        std::fs::read_to_string(&self.path).is_ok_and(|owner| owner == self.token)
+        head_of(&self.path, OWNER_MOST) == self.token
     }
 }
 
@@ -119,7 +122,10 @@ fn write_token(mut file: &File, token: &str) -> std::io::Result<()> {
 /// The owner of a cell that is worked on now, as far as the folder tells.
 pub(crate) fn owner_of(folder: &Path) -> Option<String> {
     let path = folder.join(LOCK);
-    let owner = std::fs::read_to_string(&path).ok()?;
+    if !path.exists() {
+        return None;
+    }
+    let owner = head_of(&path, OWNER_MOST);
     // In a folder that cannot be written the age is unknown.
     let is_lost = age(&path, folder).is_ok_and(|age| age > LOST_AFTER);
     (!is_lost).then_some(owner)
@@ -159,5 +165,14 @@ mod tests {
             assert_eq!(owner_of(folder.path()), Some(owners[0].token.clone()));
         }
         assert_eq!(owner_of(folder.path()), None);
+    }
+
+    #[test]
+    fn of_a_huge_lock_a_name_is_read() {
+        let folder = tempfile::tempdir().unwrap();
+        File::create(folder.path().join(LOCK)).unwrap().set_len(8 << 30).unwrap();
+        let owner = CellLock::take(folder.path()).unwrap().unwrap_err();
+        assert_eq!(owner.len() as u64, OWNER_MOST);
+        assert_eq!(owner_of(folder.path()), Some(owner));
     }
 }

@@ -8,6 +8,7 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::text::read_text;
 use crate::base::whole_file::write_whole;
 use crate::dataset::model::{Intrinsics, RawScene};
+use crate::photos::exposure;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
 use std::io::ErrorKind;
@@ -181,11 +182,11 @@ pub(crate) fn hex(digest: u64) -> String {
 /// Errors: that cannot be read.
 pub(crate) fn prior_digest(city: &City, rows: u64) -> InputResult<String> {
     let file = city.prior_appearance();
-    let found = match std::fs::read(&file) {
-        Err(e) if e.kind() == ErrorKind::NotFound => Vec::new(),
-        read => read.map_err(|e| InputError::io(&file, "reading", &e))?,
+    let found = match read_text(&file, exposure::FILE_BYTES_MAX, "train the prior again") {
+        Err(e) if e.kind == Some(ErrorKind::NotFound) => String::new(),
+        read => read?,
     };
-    Ok(format!("{}{}", hex(rows), hex(xxh3_64(&found))))
+    Ok(format!("{}{}", hex(rows), hex(xxh3_64(found.as_bytes()))))
 }
 
 /// Digest of the names, lenses and poses of the photos of a scene that are listed in `names`, one a line.

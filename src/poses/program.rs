@@ -7,6 +7,7 @@
 
 use crate::base::error::{InputError, InputResult};
 use crate::base::say::shell_word;
+use crate::base::text::tail_of;
 use serde_json::json;
 use std::fs::File;
 use std::io::Read;
@@ -22,6 +23,8 @@ const SCRIPT: &str = include_str!("../../tools/poses/pycolmap.py");
 const OLD_PYCOLMAP: &str = "old pycolmap ";
 /// Lines of the log that an error shows.
 const LAST_LINES: usize = 6;
+/// Most bytes of its log that are looked through for them, and that are read together.
+const LOG_BYTES: u64 = 1 << 20;
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
 const INSTALL: &str = "install one of them, and name this folder again:\n  \
@@ -230,7 +233,7 @@ impl Program {
                 None => std::thread::sleep(LOOK_EVERY),
             }
         };
-        let text = std::fs::read(&log).map(|bytes| String::from_utf8_lossy(&bytes).into_owned()).unwrap_or_default();
+        let text = tail_of(&log, LOG_BYTES);
         // Photos without a model are no failure of the program; pycolmap ends without an error then.
         if status.success() || matches!(phase, Phase::Model) && text.contains("failed to create") {
             return Ok(());
@@ -370,10 +373,13 @@ struct GrowingLog {
 
 impl GrowingLog {
     fn new_ones(&mut self, take: &mut dyn FnMut(&str)) -> std::io::Result<()> {
-        self.file.read_to_end(&mut self.begun)?;
-        let Some(end) = self.begun.iter().rposition(|&byte| byte == b'\n') else { return Ok(()) };
-        let whole: Vec<u8> = self.begun.drain(..=end).collect();
-        String::from_utf8_lossy(&whole).lines().for_each(take);
+        while (&self.file).take(LOG_BYTES).read_to_end(&mut self.begun)? > 0 {
+            let end = self.begun.iter().rposition(|&byte| byte == b'\n').map_or(0, |at| at + 1);
+            // A line of this length says nothing of the search.
+            let end = if self.begun.len() as u64 > LOG_BYTES { self.begun.len() } else { end };
+            let whole: Vec<u8> = self.begun.drain(..end).collect();
+            String::from_utf8_lossy(&whole).lines().for_each(&mut *take);
+        }
         Ok(())
     }
 }

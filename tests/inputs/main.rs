@@ -6,6 +6,7 @@ mod support;
 mod configs;
 mod disturb;
 mod exif;
+mod huge_files;
 mod import;
 mod moved_model;
 mod photos;

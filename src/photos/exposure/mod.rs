@@ -80,7 +80,7 @@ impl AppearanceMode {
 /// Exposure and colours of each photo, vignetting of each camera.
 pub const FILE: &str = "appearance.json";
 /// Longest such file: a million photos have some 400 MB.
-const FILE_BYTES_MAX: u64 = 1 << 30;
+pub(crate) const FILE_BYTES_MAX: u64 = 1 << 30;
 
 pub(super) const KIND: Kind = Kind { name: "appearance", file: Some(FILE), first, check, finding };
 

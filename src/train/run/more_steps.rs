@@ -17,7 +17,7 @@ use super::run_folder::{Begun, PastRun};
 use crate::base::error::InputError;
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
-use crate::base::text::own_json;
+use crate::base::text::{lines_of, own_json};
 use crate::base::units::format_grouped;
 use crate::config::file::{Resolved, TrainConfig};
 use crate::config::limits::schedule_steps;
@@ -163,8 +163,7 @@ fn figure(out: &Path, name: &str) -> serde_json::Value {
 
 /// Bytes of the run's metrics up to its result at `step`: an attempt that was cut off before its first commit left more.
 fn metrics_until(out: &Path, step: u32) -> u64 {
-    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
-    let step_of = |line: &str| serde_json::from_str::<serde_json::Value>(line).ok()?["step"].as_u64();
-    let is_past = |line: &&str| step_of(line).is_some_and(|at| at <= u64::from(step));
-    metrics.split_inclusive('\n').take_while(is_past).map(|line| line.len() as u64).sum()
+    let step_of = |line: &[u8]| serde_json::from_slice::<serde_json::Value>(line).ok()?["step"].as_u64();
+    let is_past = |line: &Vec<u8>| step_of(line).is_some_and(|at| at <= u64::from(step));
+    lines_of(&out.join(METRICS_FILE)).take_while(is_past).map(|line| line.len() as u64).sum()
 }

@@ -14,9 +14,10 @@ use super::request::{Existing, RunRequest};
 use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
+use crate::base::text::{lines_of, own_json, read_text};
 use crate::base::units::format_grouped;
 use crate::base::whole_file::{folder_of, open_locked, part_path, rename, sync_folder, write_whole};
-use crate::config::file::{TrainConfig, TrainOverrides, read_resolved};
+use crate::config::file::{FILE_BYTES_MAX, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::values::checkpoint_folder;
 use crate::dataset::loader::Dataset;
 use crate::exchange::format::ExportFormat;
@@ -284,19 +285,18 @@ fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputR
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
 /// lie elsewhere.
 pub(super) fn has_results(out: &Path) -> bool {
-    let metrics = std::fs::read_to_string(out.join(METRICS_FILE)).unwrap_or_default();
-    let commits = |line: &str| serde_json::from_str::<StepLine>(line).ok()?.commits.map(|report| report.commits);
+    let lines = || lines_of(&out.join(METRICS_FILE));
+    let commits = |line: Vec<u8>| serde_json::from_slice::<StepLine>(&line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
     let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
-    let has_result = match std::fs::read(out.join(SUMMARY_FILE)) {
+    let has_result = match own_json::<serde_json::Value>(&out.join(SUMMARY_FILE)) {
         // A run that an error ended before its first commit wrote the Gaussians that it had. Beginning again passes through them.
-        Ok(summary) => !serde_json::from_slice(&summary)
-            .is_ok_and(|summary: serde_json::Value| summary["finished"] == false && summary["commits"] == 0),
+        Some(summary) => summary["finished"] != false || summary["commits"] != 0,
         // A PLY beside metrics but without a summary comes from a run without commits that was killed while it wrote its
         // results. Beginning again gives the same PLY, which replaces the old one as a whole.
-        Err(_) => has(SUMMARY_FILE) || (has(PLY_FILE) && metrics.is_empty()),
+        None => has(SUMMARY_FILE) || (has(PLY_FILE) && lines().next().is_none()),
     };
-    has_result || has_saved() || metrics.lines().filter_map(commits).any(|commits| commits > 0)
+    has_result || has_saved() || lines().filter_map(commits).any(|commits| commits > 0)
 }
 
 /// Refuses to begin a run again that left results.
@@ -447,7 +447,7 @@ pub(super) fn settings_of_mark(
     let path = out.join(BEGUN_FILE);
     let remedy = "remove the file, and start the run again with its first command";
     let refuse = |problem: String| InputError::new(&path, problem, remedy);
-    let text = std::fs::read_to_string(&path).map_err(failed(&path, "reading the settings"))?;
+    let text = read_text(&path, FILE_BYTES_MAX, remedy)?;
     let mut config = TrainConfig::parse(&text).map_err(refuse)?;
     let BegunMark { resolved } = toml::from_str(&text).map_err(|e| refuse(e.to_string()))?;
     keys.clone().apply(&mut config);

@@ -18,9 +18,10 @@ use crate::base::error::{InputError, InputResult};
 use crate::base::identity::RunId;
 use crate::base::say::shell_word;
 use crate::base::simd::SimdPath;
+use crate::base::text::{lines_of, read_text};
 use crate::base::units::{format_grouped, format_seconds};
 use crate::checkpoint::run_state::{DatasetPrint, RunState};
-use crate::config::file::{Resolved, TrainConfig, TrainOverrides, read_resolved};
+use crate::config::file::{FILE_BYTES_MAX, Resolved, TrainConfig, TrainOverrides, read_resolved};
 use crate::config::limits::{self, RunOptions};
 use crate::config::values::{Chosen, checkpoint_folder};
 use crate::page::folder::spill_dir::{SpillDir, segments_in};
@@ -250,7 +251,7 @@ fn result_to_continue(
         return Ok(None);
     };
     keep_rates(config, &request.keys, &earlier.config);
-    let text = std::fs::read_to_string(&earlier.path).map_err(|e| InputError::io(&earlier.path, "reading", &e))?;
+    let text = read_text(&earlier.path, FILE_BYTES_MAX, "give a TOML file of keys")?;
     let changes = Changes::of_config(&earlier.path, &text, &file.1.simd, config)?;
     let accepts_changes = request.accept_changes;
     Ok(Some(FinishedRun { file: file.clone(), run: earlier.run, summary, changes, accepts_changes }))
@@ -583,8 +584,8 @@ fn steps_to_do(out: &Path, from: &str, done: u32, config: &TrainConfig, is_exten
 
 /// Seconds of a step by the metrics of the second half of the run.
 fn seconds_of_a_step(out: &Path) -> Option<f64> {
-    let text = std::fs::read_to_string(out.join(METRICS_FILE)).ok()?;
-    let lines: Vec<StepLine> = text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect();
+    let lines = lines_of(&out.join(METRICS_FILE));
+    let lines: Vec<StepLine> = lines.filter_map(|line| serde_json::from_slice(&line).ok()).collect();
     let last = lines.last().filter(|last| last.step > 0)?;
     let half = lines.iter().rfind(|line| line.step <= last.step / 2);
     let (steps, seconds) = half.map_or((0, 0.0), |line| (line.step, line.seconds));
