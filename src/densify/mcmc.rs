@@ -31,7 +31,7 @@ use crate::scene::events::{EventKind, RelocationRound};
 use crate::scene::rows::{Rows, RowsMut};
 
 /// Share of the rows drawn since the last round that a round adds.
-const GROWTH: f64 = 0.05;
+pub const GROWTH: f64 = 0.05;
 /// Factor of the noise on the rate of the means.
 const NOISE: f64 = 5e5;
 /// Steepness of the fall of the noise with the opacity, and the opacity at which it is at half.

@@ -57,7 +57,7 @@ const SCRIPT: &str = "\
 document.querySelectorAll('.slider').forEach(function(s){var o=s.querySelector('.over');
 function fit(){o.querySelector('img').style.width=s.clientWidth+'px';}
 function to(f){f=Math.max(0,Math.min(1,f));o.style.width=(f*100)+'%';s.setAttribute('aria-valuenow',Math.round(f*100));}
-s.addEventListener('pointermove',function(e){var r=s.getBoundingClientRect();to((e.clientX-r.left)/r.width);});
+['pointermove','pointerdown'].forEach(function(n){s.addEventListener(n,function(e){var r=s.getBoundingClientRect();to((e.clientX-r.left)/r.width);});});
 s.addEventListener('keydown',function(e){var f=+s.getAttribute('aria-valuenow')/100;
 if(e.key==='ArrowLeft')to(f-.05);if(e.key==='ArrowRight')to(f+.05);});
 window.addEventListener('resize',fit);fit();to(.5);});

@@ -11,6 +11,7 @@
 //! runs to its end, and the first case is always measured).
 
 use crate::base::error::{InputError, InputResult};
+use crate::base::identity::draw_identity;
 use crate::base::rng::{Purpose, Stream};
 use crate::base::units::format_bytes;
 use crate::page::engine::buffer::PageBuffer;
@@ -180,9 +181,8 @@ impl ScratchSegments {
                 format!("{} are free, but measuring needs {}", format_bytes(free), format_bytes(file_bytes * 5 / 4));
             return Err(InputError::new(folder, problem, "free space on that drive, or measure with a smaller file"));
         }
-        let own = folder.join(format!("gsscale-measure-{}", std::process::id()));
-        // Of an earlier process of this number, which was killed.
-        let _ = std::fs::remove_dir_all(&own);
+        // A name of its own: what is removed below is what this process has made.
+        let own = folder.join(format!("gsscale-measure-{:016x}", draw_identity()));
         std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
         let opened = ScratchSegments::open_all(&own, engines, file_bytes, depth);
         if cfg!(not(unix)) {

@@ -732,6 +732,10 @@ mod tests {
         let capped = TrainConfig { max_gaussians: 5000, ..config() };
         assert_eq!(reach(&capped, 1000, well_seen(PIXELS), 0, &[]), (5000, Reach::Cap));
         assert_eq!(reach(&capped, 7000, well_seen(PIXELS), 0, &[]), (7000, Reach::Cap));
+        // Nineteen rounds that add a twentieth each.
+        let relocates = TrainConfig { strategy: StrategyName::Mcmc, ..capped.clone() };
+        assert_eq!(reach(&relocates, 1000, well_seen(PIXELS), 0, &[]), (2527, Reach::Cap));
+        assert_eq!(reach(&relocates, 4000, well_seen(PIXELS), 0, &[]), (5000, Reach::Cap));
         // After the last round nothing grows.
         assert_eq!(reach(&capped, 1000, well_seen(PIXELS), 2450, &[]), (1000, Reach::Constant));
         // Small photos cannot hold what rounds would add; a scene with more Gaussians than that keeps its number.

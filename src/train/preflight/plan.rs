@@ -13,6 +13,8 @@ use crate::base::units::{format_bytes, format_bytes_up};
 use crate::config::file::TrainConfig;
 use crate::dataset::loader::Dataset;
 use crate::dataset::target_cache::TargetCache;
+use crate::densify::mcmc;
+use crate::densify::strategy::StrategyName;
 use crate::paging::plan::batches;
 use crate::paging::simulation::replay::automatic_order;
 use crate::scene::columns::row_width;
@@ -531,9 +533,18 @@ const PROBE_VIEWS: usize = 6;
 /// intersections with tiles.
 const RENDERER_ROW_BYTES_MOST: u64 = 2048;
 
-/// Known upper bound of a run's rows: the current rows, or the cap if that is more.
+/// Known upper bound of a run's rows: the current rows, or the cap if that is more and rounds of a bounded growth can reach it.
 pub(crate) fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
-    if config.strategy.grows() { rows.max(config.max_gaussians) } else { rows }
+    match config.strategy {
+        StrategyName::None => rows,
+        StrategyName::Default | StrategyName::LongAxis => rows.max(config.max_gaussians),
+        StrategyName::Mcmc => {
+            let rounds = (config.refine_stop.min(config.steps).saturating_sub(1) / config.refine_every.max(1))
+                .saturating_sub(config.refine_start / config.refine_every.max(1));
+            let reachable = rows as f64 * (1.0 + mcmc::GROWTH).powi(rounds.min(1 << 20) as i32);
+            rows.max(config.max_gaussians.min(reachable.ceil() as u64))
+        }
+    }
 }
 
 /// Input of an estimate.

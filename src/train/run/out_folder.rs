@@ -284,11 +284,10 @@ fn remove_in(folder: &Path, is_ours: fn(&Path) -> bool, is_deep: bool) -> InputR
 
 /// Whether a new start would destroy something of the run in `out`: a result, or a logged commit whose checkpoint may
 /// lie elsewhere.
-pub(super) fn has_results(out: &Path) -> bool {
+fn has_results_beside_saved(out: &Path) -> bool {
     let lines = || lines_of(&out.join(METRICS_FILE));
     let commits = |line: Vec<u8>| serde_json::from_slice::<StepLine>(&line).ok()?.commits.map(|report| report.commits);
     let has = |name: &str| out.join(name).exists();
-    let has_saved = || saved(out).is_ok_and(|saved| !saved.is_empty());
     let has_result = match own_json::<serde_json::Value>(&out.join(SUMMARY_FILE)) {
         // A run that an error ended before its first commit wrote the Gaussians that it had. Beginning again passes through them.
         Some(summary) => summary["finished"] != false || summary["commits"] != 0,
@@ -296,20 +295,29 @@ pub(super) fn has_results(out: &Path) -> bool {
         // results. Beginning again gives the same PLY, which replaces the old one as a whole.
         None => has(SUMMARY_FILE) || (has(PLY_FILE) && lines().next().is_none()),
     };
-    has_result || has_saved() || lines().filter_map(commits).any(|commits| commits > 0)
+    has_result || lines().filter_map(commits).any(|commits| commits > 0)
 }
 
-/// Refuses to begin a run again that left results.
+/// As [`has_results_beside_saved`], with the files of `--save-every`.
+pub(super) fn has_results(out: &Path) -> bool {
+    has_results_beside_saved(out) || saved(out).is_ok_and(|saved| !saved.is_empty())
+}
+
+/// Refuses to begin a run again that left results. With `has_empty_store`, its store is here and holds no commit: the run was cut off
+/// between its first file of `--save-every` and the commit that follows, and writes the same file again.
 /// Errors: there are results, which would be replaced.
-pub(super) fn check_restart(out: &Path) -> InputResult<()> {
-    if !has_results(out) {
+pub(super) fn check_restart(out: &Path, has_empty_store: bool) -> InputResult<()> {
+    if !has_results_beside_saved(out) && (has_empty_store || !has_results(out)) {
         return Ok(());
     }
+    let newest = |name: &PathBuf| saved_step(name.file_name()?.to_str()?);
+    let result = Some(out.join(PLY_FILE)).filter(|ply| ply.is_file());
+    let result = result.or_else(|| saved(out).ok()?.into_iter().max_by_key(newest));
     let problem = "the run left results but no commit to resume from: a run that ends without --keep-checkpoint \
                    removes its checkpoint";
     let remedy = format!(
         "start a new run from its Gaussians with another --out and --init-ply {}",
-        shell_word(out.join(PLY_FILE))
+        shell_word(result.unwrap_or_else(|| out.join(PLY_FILE)))
     );
     Err(InputError::new(out, problem, remedy))
 }

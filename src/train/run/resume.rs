@@ -108,10 +108,10 @@ pub fn resume(request: &ResumeRequest) -> Result<RunOutcome, TrainError> {
     drop(lock);
     match found {
         Ok(Some(stored)) => resume_from(request, &earlier, config, earlier.adopted(stored)),
-        Ok(None) => restart(request, &earlier, config),
+        Ok(None) => restart(request, &earlier, config, true),
         // A run in memory creates its checkpoint at its first commit.
         Err(_) if is_in_output && !SpillDir::exists_in(&folder) && !has_results(&request.out) => {
-            restart(request, &earlier, config)
+            restart(request, &earlier, config, false)
         }
         Err(error) => Err(error),
     }
@@ -257,10 +257,15 @@ fn result_to_continue(
     Ok(Some(FinishedRun { file: file.clone(), run: earlier.run, summary, changes, accepts_changes }))
 }
 
-/// Restarts a run that was cut off before its first commit, from its config.
+/// Restarts a run that was cut off before its first commit, from its config. `has_empty_store` as in [`check_restart`].
 /// Errors: the run left results that would be replaced; else as [`run`].
-fn restart(request: &ResumeRequest, earlier: &Earlier, config: TrainConfig) -> Result<RunOutcome, TrainError> {
-    check_restart(&request.out)?;
+fn restart(
+    request: &ResumeRequest,
+    earlier: &Earlier,
+    config: TrainConfig,
+    has_empty_store: bool,
+) -> Result<RunOutcome, TrainError> {
+    check_restart(&request.out, has_empty_store)?;
     crate::tell!("{} was cut off before its first commit: it begins again", request.out.display());
     run(&request.to_run(&earlier.scene, config, Existing::BeginAgain))
 }
@@ -542,7 +547,7 @@ pub fn describe_resume(request: &ResumeRequest) -> Result<String, TrainError> {
     match state {
         Some(state) => committed(request, &earlier, config, &state),
         None => {
-            check_restart(&request.out)?;
+            check_restart(&request.out, SpillDir::exists_in(&folder))?;
             Ok(format!("resume  {out} was cut off before its first commit: it begins again"))
         }
     }

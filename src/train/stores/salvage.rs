@@ -386,11 +386,11 @@ fn drop_split_pages(
 ) {
     let mut known: BTreeSet<PageId> = found.keys().copied().collect();
     let newest = |id: &PageId| found.get(id).and_then(|of| of.first()).map_or(0, |h| h.serial);
-    let mut split = Vec::new();
+    let mut split = BTreeSet::new();
     for &id in found.keys() {
         let parts = descendants(id, &known);
         if parts.iter().map(newest).max().is_some_and(|serial| serial > newest(&id)) {
-            split.push(id);
+            split.insert(id);
         } else {
             parts.iter().for_each(|part| {
                 known.remove(part);

@@ -126,6 +126,10 @@ fn a_run_that_is_killed_before_its_first_commit_begins_again() {
     for (out, drive) in [("memory", ""), ("drive", "--spill-dir spill")] {
         let begun = work.begin(&format!("scene --quiet --device cpu --out {out} {flags} {drive} --commit-every 0"));
         assert!(begun.after_lines(out, 10).kill());
+        // A file of `--save-every`, which precedes the commit of its step. Without a store, the commit may be elsewhere.
+        if !drive.is_empty() {
+            work.write("drive/point_cloud_000005.ply", "of the run");
+        }
         let said = work.train(&format!("--resume {out} --quiet --device cpu"));
         assert!(said.contains("begins again") && work.ply(out) == work.ply("alone"), "{said}");
         assert!(!work.exists("spill/FORMAT"));
