@@ -165,8 +165,11 @@ pub const SEARCH_END: &str = "model";
 pub const MORE_OVERLAP: &str = "take more photos between the gaps, so that neighbours share two thirds of their content; leave out \
     blurred photos";
 /// What to do with photos that cannot be read.
-pub const CONVERT_PHOTOS: &str = "convert them to JPEG, for example with ImageMagick: mogrify -format jpg *.HEIC (or *.TIF, *.DNG); of a video, take pictures: \
-    ffmpeg -i VIDEO -vf fps=2 -qscale:v 2 %05d.jpg";
+pub const CONVERT_PHOTOS: &str =
+    "convert them to JPEG, for example with ImageMagick: mogrify -format jpg *.HEIC (or *.TIF, *.DNG)";
+/// What to do where there are too few photos.
+pub const PICTURES_OF_VIDEO: &str = "name a folder with at least three photos that overlap; of a video, take pictures first: ffmpeg -i VIDEO -vf \
+    fps=2 -qscale:v 2 PHOTOS/%05d.jpg";
 /// Fewest photos for which poses can be found.
 pub const PHOTOS_LEAST: usize = 3;
 

@@ -8,7 +8,7 @@ use crate::base::units::{counted, counted_are};
 use crate::dataset::exif::{GpsPlace, camera_and_place};
 use crate::dataset::masks::FOLDERS as MASK_FOLDERS;
 use crate::dataset::photo_header::{PhotoHeader, read_header};
-use crate::dataset::read::{CONVERT_PHOTOS, SEARCH_FOLDER, SEARCH_STATE};
+use crate::dataset::read::{CONVERT_PHOTOS, PICTURES_OF_VIDEO, SEARCH_FOLDER, SEARCH_STATE};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::Metadata;
@@ -39,6 +39,9 @@ pub struct FoundPhoto {
 /// The photos in `folder` and below it but not in `scene` below it, whose photos are links, and one sentence for each that cannot be used.
 /// Errors: the folder cannot be listed, or holds fewer than three photos that can be read.
 pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>, Vec<String>)> {
+    if folder.is_file() {
+        return Err(InputError::new(folder, "this is a file, not a folder of photos", PICTURES_OF_VIDEO));
+    }
     let mut names = Vec::new();
     let scene = scene.canonicalize().ok().filter(|scene| folder.canonicalize().is_ok_and(|folder| folder != *scene));
     let mut others = 0;
@@ -74,7 +77,7 @@ pub fn list_photos(folder: &Path, scene: &Path) -> InputResult<(Vec<FoundPhoto>,
             Some(first) => format!("{} can be read ({first})", counted(photos.len() as u64, "photo")),
             None => format!("{} here (JPEG or PNG)", counted_are(photos.len() as u64, "photo")),
         };
-        let remedy = if others > 0 { CONVERT_PHOTOS } else { "name a folder with at least three photos that overlap" };
+        let remedy = if others > 0 { CONVERT_PHOTOS } else { PICTURES_OF_VIDEO };
         return Err(InputError::new(folder, problem, remedy));
     }
     Ok((photos, said))

@@ -186,8 +186,9 @@ fn charts(runs: &[Compared]) -> Vec<Chart> {
                 let is_other = is_test && run.is_evaluated_again && run.judged_on != run.trained_on;
                 let mut points = if is_other { Vec::new() } else { curve(&run.metrics, x, of) };
                 if is_test {
-                    // The metrics do not contain the final evaluation.
+                    // A later evaluation replaces that of the run, which the metrics hold.
                     let end = if x == "step" { &run.summary["steps"] } else { &run.summary["train_seconds"] };
+                    points.retain(|&(at, _)| Some(at) != end.as_f64());
                     points.extend(end.as_f64().zip(run.psnr()));
                 }
                 chart = chart.with(&run.label(), points, if is_test { Mark::LineAndDots } else { Mark::Line });

@@ -17,7 +17,7 @@ main{max-width:1080px;margin:0 auto;padding:28px 20px 60px}
 h1{font-size:26px;margin:0 0 4px}
 h1,p{overflow-wrap:anywhere}
 h2{font-size:18px;margin:36px 0 10px}
-p.dim,figcaption,td.dim{color:var(--dim)}
+p.dim,figcaption{color:var(--dim)}
 section.tiles{display:flex;flex-wrap:wrap;gap:12px;margin:18px 0}
 .tile{background:var(--paper);border:1px solid var(--line);border-radius:8px;padding:10px 16px;min-width:130px}
 .tile b{display:block;font-size:21px}

@@ -39,7 +39,7 @@ pub fn page_map_legend(tiles: &[PageTile]) -> String {
     };
     format!(
         "<p style=\"display:flex;flex-wrap:wrap;align-items:center;gap:6px 14px;margin:8px 0 0;font-size:14px\">\
-         <span style=\"white-space:nowrap\">needed by 0 views <span style=\"display:inline-block;width:110px;height:14px;\
+         <span>needed by 0 views <span style=\"display:inline-block;width:110px;height:14px;\
          vertical-align:-2px;background:linear-gradient(90deg,{stops})\"></span> {most} views</span>{places}</p>"
     )
 }

@@ -199,6 +199,8 @@ fn what_cannot_work_is_refused_with_a_remedy() {
     refused("nowhere", &["nowhere", "listing the photos"]);
     std::fs::create_dir(work.path("empty")).unwrap();
     refused("empty", &["0 photos", "three photos"]);
+    work.write("flight.mp4", "?");
+    refused("flight.mp4", &["this is a file", "ffmpeg"]);
     std::fs::create_dir_all(work.path("card/DCIM")).unwrap();
     for photo in work.photos() {
         std::fs::copy(&photo, work.path("card/DCIM").join(photo.file_name().unwrap())).unwrap();

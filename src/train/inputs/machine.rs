@@ -98,7 +98,7 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, device_use: DeviceUse) ->
     match renderer {
         Ok(renderer) => Ok(OpenedDevice { renderer: Box::new(renderer), ..OpenedDevice::cpu(None) }),
         Err(GpuError::NoHardwareGpu { .. }) => Ok(OpenedDevice::cpu(Some(
-            "there is no hardware GPU: the CPU renders (--list-devices shows what was found)",
+            "there is no hardware GPU: the CPU renders (gsscale-train --list-devices shows what was found)",
         ))),
         Err(error) if is_auto => {
             Ok(OpenedDevice::cpu(Some(&format!("the GPU cannot be used, so the CPU renders: {error}"))))
@@ -107,7 +107,7 @@ fn of_gpu(config: &TrainConfig, choice: &DeviceChoice, device_use: DeviceUse) ->
             let problem = format!("no usable GPU matches '{wanted}'; found: {found}");
             let remedy = match found.as_str() {
                 "none" => "install the Vulkan driver of your GPU, or use --device cpu",
-                _ => "choose one of --list-devices, or use --device cpu",
+                _ => "choose one of gsscale-train --list-devices, or use --device cpu",
             };
             Err(InputError::new("--device", problem, remedy).into())
         }

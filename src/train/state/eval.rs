@@ -25,7 +25,8 @@ use crate::scene::image::{Image, Target};
 use crate::train::error::TrainError;
 use crate::train::log::report::{ColorCorrected, HalfFitted, Predicted, TestMetrics, json_psnr};
 use crate::train::step::view::{SceneNow, draw};
-use std::path::{Path, PathBuf};
+use std::collections::HashSet;
+use std::path::Path;
 
 /// Steps of the fit to the left half of a photo: it has converged long before.
 const FIT_ROUNDS: usize = 10;
@@ -84,6 +85,7 @@ pub fn evaluate(
     let (mut psnrs, mut ssims, mut distances) = (Vec::new(), Vec::new(), Vec::new());
     let (mut corrected, mut halves, mut figures) = (Vec::new(), Vec::new(), Vec::new());
     let (mut predicted, mut drawn) = ([Vec::new(), Vec::new()], Vec::new());
+    let names = request.pictures.map_or(Vec::new(), |_| picture_names(dataset));
     for (i, &view) in request.views.iter().enumerate() {
         targets.prefetch(&request.views[i..request.views.len().min(i + 8)]);
         let target = match targets.get(view) {
@@ -112,9 +114,8 @@ pub fn evaluate(
             distances.extend(distance.filter(|x| !x.is_nan()));
         }
         if let Some(folder) = request.pictures {
-            let path = picture_path(folder, dataset, view);
-            write_pair(&path, image, &target)?;
-            let picture = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let picture = &names[view];
+            write_pair(&folder.join(picture), image, &target)?;
             figures.push(serde_json::json!({ "picture": picture, "psnr": of_view.0, "ssim": of_view.1 }));
         }
         let correct = request.predicted.as_ref().and_then(|of_views| of_views.get(i)).filter(|_| target.counts());
@@ -196,16 +197,21 @@ fn half_fitted(picture: &mut [f32], target: &Target, camera: &Camera, mode: Appe
     Some([as_it_is, psnr_of_columns(picture, target, right)].map(json_psnr))
 }
 
-/// File of a view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
+/// File of each view's picture: the view's name without extension, with `/` replaced by `_`, and prefixed with the view's
 /// index if two views would share a file.
-fn picture_path(folder: &Path, dataset: &Dataset, view: usize) -> PathBuf {
+fn picture_names(dataset: &Dataset) -> Vec<String> {
     let flat = |name: &str| {
         let flat = name.replace(['/', '\\'], "_");
         flat.rsplit_once('.').map_or(flat.clone(), |(stem, _)| stem.to_string())
     };
-    let stem = flat(&dataset.views[view].name);
-    let is_shared = dataset.views.iter().filter(|v| flat(&v.name) == stem).count() > 1;
-    folder.join(if is_shared { format!("{view:05}_{stem}.png") } else { format!("{stem}.png") })
+    let stems: Vec<String> = dataset.views.iter().map(|view| flat(&view.name)).collect();
+    let mut met = HashSet::new();
+    let shared: HashSet<&String> = stems.iter().filter(|stem| !met.insert(*stem)).collect();
+    let name = |(view, stem): (usize, &String)| match shared.contains(stem) {
+        true => format!("{view:05}_{stem}.png"),
+        false => format!("{stem}.png"),
+    };
+    stems.iter().enumerate().map(name).collect()
 }
 
 /// Writes render (left) beside photo (right).
