@@ -205,11 +205,11 @@ pub fn code_of(error: &TrainError) -> i32 {
 pub(crate) fn done_of(plan: &CityPlan, city: &City, cell: usize) -> InputResult<Option<Done>> {
     let folder = city.cell(cell);
     let file = folder.join(DONE_FILE);
-    if !file.exists() {
-        return Ok(None);
-    }
     let again = "remove the file and the cell's folder copy, and run the cell again";
-    let text = read_text(&file, OWN_FILE_MOST, again)?;
+    let text = match read_text(&file, OWN_FILE_MOST, again) {
+        Err(e) if e.kind == Some(ErrorKind::NotFound) => return Ok(None),
+        read => read?,
+    };
     let done: Done = toml::from_str(&text).map_err(|e| InputError::new(&file, e.to_string(), again))?;
     if done.files == plan.cells[cell].files {
         return Ok(Some(done).filter(|done| copy_of(&folder, done.copy).is_dir()));

@@ -251,8 +251,8 @@ impl Gpu {
         self.max_binding_bytes
     }
 
-    /// Refuses a binding of `need` bytes that the device cannot make: work in smaller parts does not help a buffer that a stage needs
-    /// whole.
+    /// Errors: a binding of `need` bytes exceeds the largest of the device. To be called before work on a buffer that a stage binds whole,
+    /// since cutting the other buffers smaller does not help.
     pub fn check_binding(&self, stage: &str, binding: &str, need: u64) -> GpuResult<()> {
         let limit = self.max_binding_bytes;
         if need <= limit {

@@ -2,9 +2,9 @@
 //! `image_loss` decides averages, weights and bands.
 //!
 //! A band is processed in tiles of at most [`TILE`] columns, each row by row from top to bottom: an input row enters a
-//! ring of [`RING`], of which a window reads eleven; then the map row five above it can be computed, and the gradient row ten above it. Only these rings
-//! are stored (155 KiB on the stack), so memory does not grow with the picture and stays in the second-level
-//! cache.
+//! ring of [`RING`], of which a window reads eleven; then the map row five above it can be computed, and the gradient row
+//! ten above it. Only these rings are stored (155 KiB on the stack), so memory does not grow with the picture and stays in
+//! the second-level cache.
 //!
 //! SSIM (Wang, Bovik, Sheikh and Simoncelli 2004) with means m, over an 11x11 Gaussian window of sigma 1.5:
 //! S = (2 mx my + C1)(2 sxy + C2) / ((mx^2 + my^2 + C1)(sxx + syy + C2)). Only the sum sxx + syy occurs, so four

@@ -182,7 +182,7 @@ impl ScratchSegments {
             return Err(InputError::new(folder, problem, "free space on that drive, or measure with a smaller file"));
         }
         // A name of its own: what is removed below is what this process has made.
-        let own = folder.join(format!("gsscale-measure-{:016x}", draw_identity()));
+        let own = folder.join(format!("gsscale-measure-{:032x}", draw_identity()));
         std::fs::create_dir(&own).map_err(failed("creating a folder for the measurement"))?;
         let opened = ScratchSegments::open_all(&own, engines, file_bytes, depth);
         if cfg!(not(unix)) {

@@ -533,7 +533,8 @@ const PROBE_VIEWS: usize = 6;
 /// intersections with tiles.
 const RENDERER_ROW_BYTES_MOST: u64 = 2048;
 
-/// Known upper bound of a run's rows: the current rows, or the cap if that is more and rounds of a bounded growth can reach it.
+/// Known upper bound of a run's rows: the current rows, or the cap if that is more. A round of `mcmc` adds at most a twentieth, so few
+/// rounds may end below the cap.
 pub(crate) fn rows_at_most(config: &TrainConfig, rows: u64) -> u64 {
     match config.strategy {
         StrategyName::None => rows,
@@ -570,8 +571,8 @@ impl Probe {
     }
 }
 
-/// The views, with that of the largest photo if it is larger than the photo of the first: pictures take memory of their own, and a
-/// device may hold none so large.
+/// `views` with the view of the largest photo second, if that photo is larger than the first view's. Rendering it measures the memory of
+/// its picture, and shows whether the device can bind it.
 pub(super) fn with_largest_photo(dataset: &Dataset, mut views: Vec<usize>) -> Vec<usize> {
     let pixels = |view: usize| dataset.views[view].camera.pixels();
     let largest = (0..dataset.views.len()).max_by_key(|view| pixels(*view));

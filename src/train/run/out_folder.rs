@@ -303,8 +303,8 @@ pub(super) fn has_results(out: &Path) -> bool {
     has_results_beside_saved(out) || saved(out).is_ok_and(|saved| !saved.is_empty())
 }
 
-/// Refuses to begin a run again that left results. With `has_empty_store`, its store is here and holds no commit: the run was cut off
-/// between its first file of `--save-every` and the commit that follows, and writes the same file again.
+/// Refuses to begin a run again that left results. `has_empty_store`: the store of the run is here and holds no commit. Files of
+/// `--save-every` are no obstacle then: the run was cut off between its first such file and the commit of that step, and writes the file again.
 /// Errors: there are results, which would be replaced.
 pub(super) fn check_restart(out: &Path, has_empty_store: bool) -> InputResult<()> {
     if !has_results_beside_saved(out) && (has_empty_store || !has_results(out)) {
